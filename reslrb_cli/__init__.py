@@ -1,7 +1,7 @@
 """Gradients through light paths: reservoir light replay backpropagation on Mitsuba 3.
 
-`import reslrb_cli` needs no variant and does not load Mitsuba. Import it before Mitsuba: it chooses the libLLVM that
-Dr.Jit loads.
+`import reslrb_cli` needs no variant and does not load Mitsuba. Import `reslrb_cli` before Mitsuba, because `reslrb_cli`
+chooses the libLLVM that Dr.Jit loads.
 
 - `load` reads an experiment.
 - `optimize` recovers parameters in your own loop.

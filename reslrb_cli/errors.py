@@ -17,14 +17,15 @@ LINE_LENGTH = MESSAGE_LENGTH + 2 * PLACE_LENGTH
 def printable(text: object) -> str:
     """Return `text` with every unprintable character replaced by an escape such as `\\x1b`.
 
-    This covers control characters (a file name may contain terminal commands), marks that change the writing direction,
-    line breaks, and the surrogates that Python uses for bytes that are not UTF-8. Letters of all scripts are unchanged.
+    Unprintable characters are control characters, marks that change the writing direction, line breaks, and the
+    surrogates that Python uses for bytes that are not UTF-8. A file name may contain terminal commands as control
+    characters. Letters of all scripts are unchanged.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
 def one_line(text: object, most: int = MESSAGE_LENGTH) -> str:
-    """Return `text` as one printable line of at most `most` characters; `...` replaces the middle of a longer line."""
+    """Return `text` as one printable line of at most `most` characters. In a longer line, `...` replaces the middle."""
     line = " ".join(_shorten(str(text), 8 * most).split())  # shortened first, because splitting a long text is slow
     return _shorten(printable(_shorten(line, most)), most)
 
@@ -50,7 +51,7 @@ class ExitCode(enum.IntEnum):
 
 
 class ReslrbError(Exception):
-    """Base class of all errors that `reslrb` reports itself; `str(error)` is the line that the user sees."""
+    """Base class of all errors that `reslrb` reports itself. The user sees the line `str(error)`."""
 
     exit_code: ExitCode = ExitCode.USAGE
 
@@ -59,7 +60,7 @@ class ReslrbError(Exception):
 
 
 class ConfigError(ReslrbError):
-    """Error in the configuration or the input, located by file and key.
+    """Error in the configuration or the input. The file and the key give the error's place.
 
     `source` is the file as the user named it. `key` is the place in the file, such as `parameters[0].bounds`, or empty
     for the whole file. `message` says what is wrong and how to correct it.
@@ -74,7 +75,7 @@ class ConfigError(ReslrbError):
 
 
 class UnsupportedScene(ReslrbError):
-    """Scene that light tracing cannot render or differentiate; the message gives the reason.
+    """Scene that light tracing cannot render or differentiate. The message gives the reason.
 
     `option` is the setting that causes the error, such as `estimator`, or empty.
     """
@@ -87,7 +88,7 @@ class UnsupportedScene(ReslrbError):
 
 
 class BackendError(ReslrbError):
-    """Missing CUDA device or libLLVM; the message says what to install."""
+    """Missing CUDA device or libLLVM. The message says what to install."""
 
     exit_code = ExitCode.BACKEND
 
@@ -99,7 +100,7 @@ class OutOfMemory(ReslrbError):
 
 
 class NonFinite(ReslrbError):
-    """Value that must be finite but is not; raised before it reaches a parameter."""
+    """Value that must be finite but is not. The error is raised before the value reaches a parameter."""
 
     exit_code = ExitCode.NON_FINITE
 
@@ -149,7 +150,7 @@ _DRIVER_WORDS = (
 
 
 def is_machine_fault(error: BaseException) -> bool:
-    """Whether an exception says that the machine failed; out-of-memory errors do not count."""
+    """Whether an exception says that the machine failed. Out-of-memory errors do not count."""
     if isinstance(error, MachineError):
         return True
     if isinstance(error, OSError):
@@ -162,7 +163,7 @@ QUOTED_LENGTH = 200
 
 
 def tell(error: BaseException) -> tuple[str, int] | None:
-    """Return the line and the exit code for `error`, or None for a bug, which needs its traceback."""
+    """Return the line and the exit code for `error`, or None for a bug. A bug needs its traceback."""
     if isinstance(error, ReslrbError):
         return str(error), error.exit_code
     if isinstance(error, KeyboardInterrupt):

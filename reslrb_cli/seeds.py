@@ -12,7 +12,7 @@ import hashlib
 def seed(run_seed: int, iteration: int, view: int, purpose: str) -> int:
     """Return the seed of one use of random numbers, an integer in [0, 2**32).
 
-    `iteration` and `view` are the iteration and the sensor that the numbers are drawn for (0 if there is none), and
+    `iteration` and `view` are the iteration and the sensor for which the numbers are drawn, or 0 if there is none.
     `purpose` names the use (`"image"`, `"target"`, ...). The four arguments are hashed together (BLAKE2b). A sum would
     give neighbouring iterations and views the same seeds and therefore the same noise. The seeds of two different uses
     are equal with a probability of 2**-32.

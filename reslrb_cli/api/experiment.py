@@ -78,7 +78,7 @@ def held() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def called() -> Iterator[Callable[[], bool]]:
-    """Do the same as `held`. Also replace command-line options in the text of a ConfigError by the function's
+    """Do the same as `held`. In the text of a ConfigError, also replace command-line options by the function's
     arguments.
     """
     with held() as stop:
@@ -178,9 +178,9 @@ def gradient(
 ) -> tuple[float, dict[str, Array]]:
     """Return the loss of an experiment and its gradients by key.
 
-    Each gradient is a float32 array with the shape of its parameter. Its unit is the loss per unit of the parameter.
-    The result equals the gradient of a run's first iteration. The adjoint image also comes from the samples that
-    `run.adjoint` selects. The parameters have their initial values, or `values` as for `render`.
+    Each gradient is a float32 array with the shape of its parameter. The unit of a gradient is the loss per unit of the
+    parameter. The result equals the gradient of a run's first iteration. The adjoint image also comes from the samples
+    that `run.adjoint` selects. The parameters have their initial values, or `values` as for `render`.
 
     `spp` replaces `run.spp`. `seed` replaces `run.seed` for the samples only. The target and the measurements before
     the first iteration (`guiding: auto`, ...) still use the experiment's seed. Regularizers contribute to the gradient
@@ -228,8 +228,8 @@ def gradcheck(
         estimators of `reslrb` (docs/your_integrator.md).
     - `allow_code`: permit running the code of these files.
 
-    For your own integrators, the log (`logging.INFO`) reports noise and cost. It also gives hints if an integrator is
-    wrong.
+    For your own integrators, the log (`logging.INFO`) reports noise and cost. The log also gives hints if an integrator
+    is wrong.
 
     An interrupt stops the check after the current gradient and raises KeyboardInterrupt. Sets the experiment's Mitsuba
     variant if none is set. Raises ConfigError and UnsupportedScene.
@@ -315,8 +315,8 @@ def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], toleranc
 
     `run` is the run folder. `folder` must not exist or must be empty. `mi.load_file` loads the returned file.
 
-    For a lens or a mirror, the folder also holds the solid in millimetres. `tolerances` adds the effect of deviations
-    from the plan on the image, as `reslrb export` does.
+    For a lens or a mirror, the folder also holds the solid in millimetres. `tolerances` adds how deviations from the
+    plan change the image, as `reslrb export` does.
 
     Sets the experiment's Mitsuba variant if none is set. Raises ConfigError and UnsupportedScene.
     """

@@ -52,7 +52,7 @@ def watched(
 
 
 def _notebook() -> Callable[[bytes], None] | None:
-    """Return a function that shows a PNG in the notebook cell, replacing the previous one, or None without a
+    """Return a function that shows a PNG in the notebook cell in place of the previous PNG. Return None without a
     notebook.
     """
     ipython = sys.modules.get("IPython")

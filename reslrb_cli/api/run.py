@@ -45,15 +45,15 @@ logger = logging.getLogger(__name__)
 
 
 class Run:
-    """Optimisation that computes one iteration at a time; `optimize` returns it.
+    """Optimisation that computes one iteration at a time. `optimize` returns a `Run`.
 
     Iterate over a run to compute its iterations. Each iteration yields its `Record`, which is also a line of
     `metrics.jsonl`.
 
-    A run stops when you leave the loop (`break` or an error), at the end of a `with` block, and on `close`. Its folder
-    is then complete, as after Ctrl-C on the command line: manifest, checkpoint, parameters, final images and report,
-    with the lock released. A second loop continues where the first one stopped. An interrupt (Ctrl-C, a notebook's stop
-    button) ends the loop after the current iteration.
+    A run stops when you leave the loop (`break` or an error), at the end of a `with` block, and on `close`. The folder
+    of a stopped run is complete, as after Ctrl-C on the command line. The folder holds manifest, checkpoint,
+    parameters, final images and report, and its lock is released. A second loop continues where the first one stopped.
+    An interrupt (Ctrl-C, a notebook's stop button) ends the loop after the current iteration.
 
     Runs in one process share only the device. You can alternate between them: `zip(run_a, run_b)`.
     """
@@ -156,7 +156,7 @@ class Run:
     def close(self) -> None:
         """Stop the run and complete its folder. Does nothing if no loop is active.
 
-        If the folder cannot be completed, the error is raised here. `close` also raises an error that occurred while an
+        `close` raises an error if the folder cannot be completed. `close` also raises an error that occurred while an
         earlier loop was left. If the folder cannot be written to, the error is a MachineError.
         """
         loop = None if self._loop is None else self._loop()
@@ -188,8 +188,8 @@ class Run:
 
     @property
     def folder(self) -> Path | None:
-        """The run folder. The value is None before the first loop, because the first loop creates the folder. The value
-        is always None for a run that writes nothing.
+        """The run folder. The folder is None before the first loop, because the first loop creates the folder. The
+        folder is always None for a run that writes nothing.
         """
         return self._folder
 
@@ -222,7 +222,8 @@ class Run:
         """The gradients of the last iteration, by key. The result is empty before the first iteration.
 
         Each gradient has the shape of its parameter. In a stage of `run.stages`, gradients have the parameter's shape
-        in this stage. Gradients include regularizers and are not clamped. They may contain values that are not finite.
+        in this stage. Gradients include regularizers and are not clamped. Gradients may contain values that are not
+        finite.
         """
         course = self._begun.course
         return course.shown(course.state.gradients)
@@ -232,8 +233,8 @@ class Run:
         """The current image of each view, by sensor index.
 
         Images are float32 arrays (height, width, channels) with the exposure of the target. Each access renders the
-        images with separate seeds, so it does not change the run. The sample count per pixel equals the sample count of
-        images saved between iterations, which is at least 64. Raises the same errors as a run, such as ConfigError.
+        images with separate seeds, so an access does not change the run. The images have at least 64 samples per pixel,
+        as many as the images saved between iterations. Raises the same errors as a run, such as ConfigError.
         """
         course = self._begun.course
         problem = course.problem
@@ -277,11 +278,11 @@ def optimize(
                 print(record.iteration, record.loss)
         texture = run.parameters["floor.reflectance.data"]
 
-    `experiment` and `overrides` are the arguments of `load`; `experiment` may also be its result.
+    `experiment` and `overrides` are the arguments of `load`. `experiment` may also be a result of `load`.
 
-    `folder` is the run folder, with the same content as from `reslrb optimize`. If `folder` exists, the run is written
-    to `folder-2` and so on (see `Run.folder`). The setting `run.output` is then ignored, with a warning. Without
-    `folder`, only the caches of kernels and measurements are written.
+    `folder` is the run folder. The content is the same as from `reslrb optimize`. If `folder` exists, the run is
+    written to `folder-2` and so on (see `Run.folder`). With `folder`, the setting `run.output` is ignored, with a
+    warning. Without `folder`, only the caches of kernels and measurements are written.
 
     `resume` is the folder of an earlier run. The run continues exactly where the earlier run stopped. New results go to
     the earlier folder, or to `folder` if you give one. With `resume`, `experiment` is optional. If given, `experiment`
@@ -289,9 +290,9 @@ def optimize(
     iterations left and logs a warning.
 
     `loss` is your own loss function, `loss(image, target)` or `loss(image, target, weights)`. The arguments are
-    `mi.TensorXf` (height, width, channels), and the image is attached. It returns a `mi.Float` of width 1 or a tensor
-    with one entry. Pass it again with `resume`. `allow_code` permits running the code files that the experiment names
-    (`loss.file`, `integrator.file`).
+    `mi.TensorXf` (height, width, channels). The image tracks derivatives. The loss function returns a `mi.Float` of
+    width 1 or a tensor with one entry. Pass it again with `resume`. `allow_code` permits running the code files that
+    the experiment names (`loss.file`, `integrator.file`).
 
     Before returning, `optimize` sets the experiment's Mitsuba variant if none is set. `optimize` loads and checks all
     files and makes the target. `optimize` also chooses the settings that the experiment leaves to measurement. Raises
@@ -332,7 +333,7 @@ def optimize(
 
 
 def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
-    """Return the experiment with the caller's loss, and with its code allowed if `allow_code` is set."""
+    """Return the experiment with the caller's loss. If `allow_code` is set, the experiment's code may run."""
     config = config.with_code(allow_code or config.allows_code)
     if loss is not None and not callable(loss):
         reason = "is no function; a file's is named by the setting `loss: {type: custom, file: FILE.py:NAME}`"
@@ -347,8 +348,8 @@ def _reopened(
     loss: Loss | None,
     allow_code: bool,
 ) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
-    """Return the lock stack and the prepared run for a resumed run, and True if iterations are left. The stack holds
-    the lock of the run folder.
+    """Return the lock stack, the prepared run to resume, and True if iterations are left. The stack holds the lock of
+    the run folder.
     """
     with contextlib.ExitStack() as stack:
         earlier = stack.enter_context(open_earlier(folder, wanted, put_in))

@@ -1,1 +1,1 @@
-"""Choice of libLLVM and of the Mitsuba variant, both before anything is traced."""
+"""Choice of libLLVM and of the Mitsuba variant, before any tracing."""

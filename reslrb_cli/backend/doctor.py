@@ -1,6 +1,6 @@
 """Examination for `reslrb doctor`: versions, libraries, device, and a trial of each backend.
 
-The module also reports the name and memory of a device, and the number of paths that it traces at once.
+The module also reports a device's name, its memory, and the number of paths that the device traces at once.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ def ask_gpu(query: str) -> list[str]:
 
 
 def gpu_bytes(kind: str, most: int) -> int:
-    """Return the smallest `memory.total` or `memory.free` of the GPUs, at most `most`. Returns `most` if it is
-    unknown.
+    """Return `memory.total` or `memory.free` of the GPU with the smallest value, at most `most`. Returns `most` if it
+    is unknown.
     """
     return min([most, *(int(line) * 2**20 for line in ask_gpu(kind) if line.isdigit())])
 
 
 def of_system(file: str, name: str) -> str | None:
-    """Return the first entry `name` of a system file, or None if there is none."""
+    """Return the value of the first entry `name` in a system file, or None without an entry."""
     try:
         found = re.search(rf"^{name}\s*:\s*(.+)$", Path(file).read_text(), re.MULTILINE)
     except OSError:
@@ -80,7 +80,9 @@ def memory_bytes(variant: str) -> int:
 
 
 def resident_paths() -> int:
-    """Return the number of lanes that the current device runs simultaneously, each with its own thread-local memory."""
+    """Return the number of lanes that the current device runs simultaneously. Each lane has its own thread-local
+    memory.
+    """
     import drjit as dr
     import mitsuba as mi
 

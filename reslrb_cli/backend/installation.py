@@ -3,8 +3,8 @@
 `python_command` is the command line of a new Python process that finds the same packages.
 
 Plugins are loaded only from Mitsuba's own folder. A plugin is a shared library, and loading it runs its code. A scene
-file can name any plugin, and Mitsuba looks for `plugins/NAME.so` in the folder of the scene and in the working folder
-before its own folder.
+file can name any plugin. Mitsuba looks for `plugins/NAME.so` first in the scene's folder and in the working folder,
+then in its own folder.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def is_known(name: str) -> bool:
 
 
 def _is_registered(name: str) -> bool:
-    """Whether Python has registered a plugin of this name for the current variant."""
+    """True if Python has registered a plugin `name` for the current variant."""
     import mitsuba as mi
 
     # Mitsuba must be asked in a way that makes it load a library of that name where it finds one. A new resolver
@@ -87,7 +87,7 @@ def likely_parameters(name: str) -> list[str]:
 
 
 def nearest_plugin(name: str, type: mi.ObjectType) -> str | None:
-    """Return the plugin of this type with the most similar name, if any."""
+    """Return the plugin of type `type` whose name is most similar to `name`, or None."""
     near = difflib.get_close_matches(name.lower(), sorted(shipped_plugins()), n=5)
     return next((candidate for candidate in near if plugin_type(candidate) == type), None)
 
@@ -133,7 +133,7 @@ def looking_in(folders: Iterable[Path]) -> Iterator[None]:
 def python_command(code: str) -> list[str]:
     """Return the command line of a Python that runs `code` with the same modules as this process.
 
-    By default, Python looks in the working folder first, where a scene may contain a `numpy.py`.
+    By default, Python looks for modules in the working folder first. A scene there may contain a `numpy.py`.
     """
     path = [entry or os.getcwd() for entry in sys.path]
     return [sys.executable, "-c", f"import sys\nsys.path[:] = {path!r}\n{code}"]

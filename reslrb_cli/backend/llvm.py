@@ -1,8 +1,8 @@
 """Search for the libLLVM that Dr.Jit should load: the newest one on this machine that works.
 
-Dr.Jit looks for libLLVM only in Debian's folders. Dr.Jit also accepts LLVM versions under which Dr.Jit ends the
-process. An example is "Cannot select fminimum" with LLVM 15 and 16 on AVX-512 machines. The choice is therefore made
-here, before Dr.Jit is imported, and passed in DRJIT_LIBLLVM_PATH.
+Dr.Jit looks for libLLVM only in Debian's folders. Dr.Jit also accepts LLVM versions that make Dr.Jit end the process.
+For example, LLVM 15 and 16 fail with "Cannot select fminimum" on AVX-512 machines. This module therefore chooses
+libLLVM before Dr.Jit is imported, and passes the choice in DRJIT_LIBLLVM_PATH.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Library:
 
 
 def prepare() -> None:
-    """Choose libLLVM, unless the user did or Dr.Jit is loaded already, and load its missing dependencies.
+    """Choose libLLVM, unless the user has chosen one or Dr.Jit is already loaded. Also load missing dependencies.
 
     Never raises; `require` reports failures if LLVM is needed.
     """
@@ -56,7 +56,9 @@ def prepare() -> None:
 
 
 def require() -> Library:
-    """Return the libLLVM that Dr.Jit loads. Raises BackendError if it is missing, broken, or would end the process."""
+    """Return the libLLVM that Dr.Jit loads. Raises BackendError if libLLVM is missing, broken, or would end the
+    process.
+    """
     named = os.environ.get(VARIABLE)
     if named:
         library = _examine(Path(named))
@@ -74,7 +76,7 @@ def require() -> Library:
 
 @functools.cache
 def choose() -> tuple[Library | None, list[Library]]:
-    """Return the newest working libLLVM on this machine, or None, and the rejected ones."""
+    """Return the newest working libLLVM on this machine or None, and the rejected libraries."""
     passed_over: list[Library] = []
     best: Library | None = None
     for path in sorted(candidates(), key=lambda path: -(version_from_name(path) or MIN_VERSION)):
@@ -90,8 +92,8 @@ def choose() -> tuple[Library | None, list[Library]]:
 
 
 def candidates() -> list[Path]:
-    """Return every libLLVM in the known folders and in the dynamic loader's cache, each file once, nearest folder
-    first.
+    """Return every libLLVM in the known folders and in the dynamic loader's cache. Each file appears once, files in the
+    nearest folder first.
     """
     found = [path for folder in _folders() for path in sorted(folder.glob("libLLVM*")) if _NAME.fullmatch(path.name)]
     unique: dict[Path, Path] = {}
@@ -109,7 +111,7 @@ def version_from_name(path: Path) -> int | None:
 
 @functools.cache
 def _examine(path: Path) -> Library:
-    """Load `path` in a separate process, unless its name already rules it out."""
+    """Load the library `path` in a separate process, unless the file name already rules the library out."""
     named = version_from_name(path.resolve())
     if named is not None and named < MIN_VERSION:
         return Library(path, fault=_too_old(str(named)))

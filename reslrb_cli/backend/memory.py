@@ -2,9 +2,9 @@
 
 `free_bytes`, `resident_bytes` and `local_bytes` are the limits for forecasts.
 
-`own_memory` copies an array. Without the copy, Dr.Jit uses NumPy's memory, and its kernels depend on the alignment of
-this memory. The next array of the same size may have another alignment, so Dr.Jit would compile and record everything
-again.
+`own_memory` copies an array. Without the copy, Dr.Jit uses NumPy's memory. Dr.Jit's kernels then depend on the
+alignment of NumPy's memory. NumPy may align the next array of the same size differently. Dr.Jit would then compile and
+record everything again.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def resident_bytes() -> int:
 
 
 def local_bytes() -> int:
-    """Return the thread-local bytes that a path can use on the CPU, which is its share of a thread's stack.
+    """Return the thread-local bytes that a path can use on the CPU. Each path uses its share of a thread's stack.
 
-    A kernel that needs more thread-local memory overwrites other memory or crashes the process.
+    A kernel that needs more thread-local memory than this share overwrites other memory or crashes the process.
     """
     stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
     stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack

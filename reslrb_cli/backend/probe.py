@@ -1,4 +1,4 @@
-"""Trial of a variant in a separate process: it compiles and runs one kernel, traces one ray, and times both.
+"""Trial of a variant in a separate process. The trial compiles and runs one kernel, traces one ray, and times both.
 
 A faulty driver or libLLVM may crash the process instead of raising an exception. Only a parent process can detect this.
 """
@@ -56,8 +56,8 @@ _OURS = "reslrb_cli.errors.BackendError: "
 class Probe:
     """Result of the trial of a variant. `failure` describes the fault in one line, or is empty.
 
-    `compile_ms` is the time to compile and run a kernel of a million entries, and `run_ms` the time to run it again.
-    `ray_ms` is the time of the first ray through a scene, including compilation.
+    `compile_ms` is the time to compile and run a kernel of a million entries. `run_ms` is the time to run the kernel
+    again. `ray_ms` is the time of the first ray through a scene, including compilation.
     """
 
     failure: str = ""

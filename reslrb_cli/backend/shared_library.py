@@ -1,8 +1,8 @@
-"""Loader of a shared library with dependencies in the same folder. As a script, it prints the LLVM version of a
+"""Loader of a shared library with dependencies in the same folder. As a script, the module prints the LLVM version of a
 library.
 
-The module imports nothing of this package, so it can run by path in a bare interpreter. If a library crashes while it
-is loaded, only this interpreter ends.
+The module imports nothing of this package, so it can run by path in a bare interpreter. If a library crashes during
+loading, only this interpreter ends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MISSING = re.compile(
 
 
 def missing_library(message: str) -> str | None:
-    """Return the file name of the library that the dynamic loader could not find, from its `message`, or None."""
+    """Return the file name of the library that the dynamic loader reports as missing in `message`, or None."""
     found = _MISSING.search(message)
     return (found["so"] or Path(found["dylib"]).name) if found else None
 
@@ -28,7 +28,7 @@ def load(path: Path, depth: int = 0) -> ctypes.CDLL:
     """Load the library `path`. Dependencies that the system lacks are loaded from the same folder. Raises OSError.
 
     The dynamic loader uses libraries that are already in the process. Loading the dependencies first is therefore
-    enough, without an rpath and without LD_LIBRARY_PATH.
+    enough. Neither an rpath nor LD_LIBRARY_PATH is needed.
     """
     while True:
         try:
@@ -43,7 +43,7 @@ def load(path: Path, depth: int = 0) -> ctypes.CDLL:
 
 
 def llvm_version(library: ctypes.CDLL) -> tuple[int, int, int] | None:
-    """Return the version of a loaded libLLVM, or None before LLVM 16, which does not report it."""
+    """Return the version of a loaded libLLVM, or None for versions before 16, which report no version."""
     if not hasattr(library, "LLVMGetVersion"):
         return None
     parts = [ctypes.c_uint() for _ in range(3)]

@@ -71,8 +71,8 @@ def choose(name: str = "auto") -> tuple[str, str]:
 
 
 def works_under(variant: str) -> bool:
-    """Whether the integrators support this variant of Mitsuba: it must have derivatives, and three colour channels or
-    one.
+    """True if the integrators support `variant`. A supported variant has derivatives, and three colour channels
+    or one.
     """
     return variant.endswith(("_ad_rgb", "_ad_mono"))
 

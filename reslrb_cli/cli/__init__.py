@@ -77,7 +77,9 @@ class _Main(click.Group):
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
-        """Run the command line `args` and exit with its code; `standalone_mode=False` lets errors through."""
+        """Run the command line `args` and exit with its code. With `standalone_mode=False`, errors pass to the
+        caller.
+        """
         if not standalone_mode or os.environ.get(COMPLETE_VARIABLE):  # completions are bytes, not lines
             return super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
         self.debug = os.environ.get("RESLRB_DEBUG", "0") not in ("", "0")

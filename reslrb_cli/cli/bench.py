@@ -75,11 +75,11 @@ def command(
 ) -> int:  # fmt: skip
     """Measure time and peak memory of gradient steps against path depth, or another quantity (--sweep).
 
-    A step computes image, loss and gradient of every parameter of CONFIG, through its first sensor. Without CONFIG, the
-    scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in its own processes. If
-    an integrator runs out of memory, its result is recorded as out_of_memory. The measurement of the other integrators
-    continues. Ctrl-C keeps finished results. To continue after any interruption, repeat the command with the same
-    --json file.
+    A step computes the image of CONFIG's first sensor, the loss, and the gradient of every parameter. Without CONFIG,
+    the scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in its own processes.
+    If an integrator runs out of memory, its result is recorded as out_of_memory. The measurement of the other
+    integrators continues. Ctrl-C keeps finished results. To continue after any interruption, repeat the command with
+    the same --json file.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages
@@ -112,7 +112,7 @@ def command(
 
 
 def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[BenchResult], bool]:
-    """Measure, print and write; return all results, and whether the user interrupted."""
+    """Measure, print and write. Return all results, and True if the user interrupted."""
     from reslrb_cli.measure.bench import Bench
     from reslrb_cli.report.tables import bench_cells, bench_columns
 

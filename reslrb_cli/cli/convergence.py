@@ -66,12 +66,13 @@ def command(
     rounds: int | None, spps: tuple[int, ...] | None, reference: str | None, allow_code: bool,
     memory_limit: int | None, json_file: Path | None,
 ) -> int:  # fmt: skip
-    """Measure how fast the error of each method falls on CONFIG, at its initial values, through its first sensor.
+    """Measure how fast each method's error falls for CONFIG. The parameters have initial values, and the first sensor
+    is used.
 
-    Each method takes steps of run.spp samples per pixel in its own process, in turn. Errors are relative to the size of
-    the estimated quantity. With independent samples, the slope is -1/2. Efficiency is 1 / (relative variance *
-    seconds). Ctrl-C keeps finished results. To continue after any interruption, repeat the command with the same --json
-    file. docs/convergence.md explains the columns.
+    The methods take turns. Each method runs in its own process and takes steps of run.spp samples per pixel. Errors are
+    relative to the size of the estimated quantity. With independent samples, the slope is -1/2. Efficiency is 1 /
+    (relative variance * seconds). Ctrl-C keeps finished results. To continue after any interruption, repeat the command
+    with the same --json file. docs/convergence.md explains the columns.
     """
     began = time.monotonic()
     from reslrb_cli.backend.installation import load_packages
@@ -101,7 +102,7 @@ def command(
 
 
 def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
-    """Measure, print and write; return the results, and whether the user interrupted."""
+    """Measure, print and write. Return the results, and True if the user interrupted."""
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role
@@ -147,7 +148,7 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
 
 
 def _table(session: Session) -> Columns:
-    """Return a table whose columns fit the session's results, finished or expected."""
+    """Return a table with columns that fit the finished and the expected results of the session."""
     from reslrb_cli.measure.convergence.setup import Role
     from reslrb_cli.report.convergence_tables import method_columns
 

@@ -1,7 +1,7 @@
 """`reslrb example`: list the experiments that come with the program, and copy them.
 
-The experiments are in `configs/` and `scenes/` of the repository. `reslrb_cli/examples` links to them; in a wheel it
-contains copies.
+The experiments are in `configs/` and `scenes/` of the repository. `reslrb_cli/examples` links to these folders. In a
+wheel, `reslrb_cli/examples` contains copies.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _about(path: Path) -> str:
 @click.option("-o", "--output", "folder", type=click.Path(path_type=Path, file_okay=False), metavar="FOLDER",
               help="Folder to copy to. Default: a folder with the name of the experiment.")  # fmt: skip
 def command(name: str | None, folder: Path | None) -> int:
-    """Copy the experiment NAME, its configuration and its scene, to a folder; without NAME, list the experiments.
+    """Copy the experiment NAME (configuration and scene) to a folder. Without NAME, list the experiments.
 
     Existing files are never replaced.
     """
@@ -77,7 +77,8 @@ def command(name: str | None, folder: Path | None) -> int:
 def copy(path: Path, folder: Path) -> Path:
     """Copy the configuration `path` and the folders of its scenes into `folder`; return the path of the copy.
 
-    Raises ConfigError if a file exists already, before anything is written, or if `folder` cannot be written to.
+    Raises ConfigError before anything is written if a file exists already. Also raises ConfigError if `folder` cannot
+    be written to.
     """
     text = path.read_text(encoding="utf-8")
     scenes = [FOLDER / "scenes" / name for name in dict.fromkeys(_SCENE.findall(text))]

@@ -21,14 +21,15 @@ from reslrb_cli.cli.terminal import echo
         "For a lens or a mirror, also render its image with errors of light, distance, index and tool; takes "
         "about 15 images of run.final_spp.")  # fmt: skip
 def command(run: Path, overrides: tuple[str, ...], output: Path, tolerances: bool) -> None:
-    """Write the scene of the run in the folder RUN with its recovered values.
+    """Write the scene of a run with the recovered values. RUN is the run folder.
 
     Mitsuba needs only FOLDER/scene.xml and the files beside it: `mi.load_file("FOLDER/scene.xml")`. Variables and
     includes are resolved, and outdated elements are written for Mitsuba 3. Textures and meshes are copied. Recovered
     textures and meshes are in FOLDER/recovered.
 
-    For a configuration with a section `fabrication`, such as one from `reslrb lens`, the folder also contains the
-    closed solid in millimetres (lens.stl, .3mf, .obj, .ply), its heights (heights.png, .exr) and fabrication.json.
+    If the configuration has a section `fabrication`, for example from `reslrb lens`, FOLDER also contains the closed
+    solid in millimetres (lens.stl, .3mf, .obj, .ply). FOLDER then also contains the solid's heights (heights.png, .exr)
+    and fabrication.json.
     """
     from reslrb_cli.runs.export import check_export, write_export
 

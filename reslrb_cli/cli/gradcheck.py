@@ -1,4 +1,6 @@
-"""`reslrb gradcheck`: check the gradients of a scene, and measure which part of derivatives they lack (`--missing`)."""
+"""`reslrb gradcheck`: check the gradients of a scene. `--missing` measures which part of the derivatives the gradients
+lack.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,7 @@ CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget
 
 
 def _given(options: dict[str, str]) -> str | None:
-    """Return the first of `options` that the user gave; their keys are parameter names."""
+    """Return the first of `options` that the user gave. The keys of `options` are parameter names."""
     return next((option for name, option in options.items() if is_given(name)), None)
 
 
@@ -84,7 +86,7 @@ def run_missing(
 def run_suite_command(
     names: tuple[str, ...], estimators: str | None, seeds: int | None, json_file: Path | None, place: Place | None
 ) -> int:
-    """Run the named cases, or all cases without names; print a line for each and write the file.
+    """Run the named cases, or all cases without names. Print a line for each case and write the file.
 
     Cases in the file are not run again. If `place` is given, the workers at this place run the cases.
     """
@@ -211,7 +213,7 @@ def command(
     cluster: str | None, json_file: Path | None, spp: int | None, missing: bool, directions: int | None,
     folder: Path | None,
 ) -> int:  # fmt: skip
-    """Compare the gradients of every parameter of CONFIG with references, at its initial values.
+    """Compare the gradients of every parameter of CONFIG with references. The parameters have their initial values.
 
     Each estimator is compared with naive AD of the same paths (walk_ad), with a valid stock integrator (ptracer, else
     prb), with finite differences, with forward mode, and with the exact value if it is known. Without CONFIG, the scene
@@ -289,7 +291,7 @@ def _exit_code(records: Iterable[GradcheckRecord]) -> int:
 def _run(
     check: Gradcheck, variant: str, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
 ) -> tuple[list[GradcheckRecord], bool]:
-    """Measure, print and write; return all records, and whether the user interrupted."""
+    """Measure, print and write. Return all records, and True if the user interrupted."""
     from reslrb_cli.report.tables import cells, gradcheck_columns
 
     records: list[GradcheckRecord] = []

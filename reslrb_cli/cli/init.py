@@ -1,6 +1,6 @@
 """`reslrb init`: write a first configuration for a scene.
 
-Its text, with comments on the settings, is `templates/first_config.yaml.j2`.
+The template `templates/first_config.yaml.j2` holds the configuration's text, with comments on the settings.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _first_config(
     proposals: Sequence[Proposal],
     **known: Any,
 ) -> str:
-    """Return the YAML of a configuration in the file `path`, from the template `first_config.yaml.j2`.
+    """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
 
     `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
     as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `known` are other
@@ -127,7 +127,7 @@ def _path(path: Path, folder: Path) -> str:
 
 
 def _word(text: str) -> str:
-    """Quote a name or a value of the scene file for a comment, if needed, so that it cannot end the line."""
+    """Quote a name or value of the scene file, if needed, so that the text cannot end a comment."""
     return text if _PLAIN.fullmatch(text) or _NUMBER.fullmatch(text) else json.dumps(text)
 
 
@@ -188,11 +188,11 @@ def command(
     """Write a commented configuration for the scene in the file SCENE, to use with `reslrb optimize`.
 
     The configuration recovers the colours of the materials that are largest in view, the roughness of metals, and the
-    brightness of visible lamps. Lamps are left out for a photograph of 8 or 16 bits, in which they are clipped. All
-    other recoverable parameters are listed as comments with bounds and current values. --recover selects other
-    parameters.
+    brightness of visible lamps. Lamps are left out if the photograph has 8 or 16 bits, because such a photograph clips
+    the lamps. All other recoverable parameters are listed as comments with bounds and current values. --recover selects
+    other parameters.
 
-    With --target, the film gets the aspect ratio of the photograph, at a size at which a run takes minutes. If the
+    With --target, the film gets the photograph's aspect ratio. The film's size is such that a run takes minutes. If the
     photograph has another size than the film, the command writes a resized copy beside the configuration. If there are
     several sensors, the first one is used, unless --sensor names another.
     """
@@ -256,7 +256,7 @@ def command(
 
 def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Size:
     """Return the (width, height) of a film that is small enough for a run of minutes. The film has the photograph's
-    aspect ratio, or without a photograph its own.
+    aspect ratio. Without a photograph, the film keeps its own aspect ratio.
 
     A `fixed` film, which is a crop of a larger one, keeps its size. Raises ConfigError if the ratios of the photograph
     and the film differ.
@@ -290,7 +290,7 @@ def _read_options(scene_file: Path, overrides: tuple[str, ...]) -> Mapping[str, 
 
 
 def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
-    """Print which of several sensors is used. Raises ConfigError if the scene has no such sensor."""
+    """Print which of several sensors is used. Raises ConfigError if the scene has no sensor with this index."""
     named = [f"{number} ({name})" for number, name in enumerate(sensors)]
     if index >= len(sensors):
         more = "" if len(named) <= LISTED_SENSORS else " ..."
@@ -316,9 +316,10 @@ def _propose(scene_file: Path, scene: mi.Scene, index: int, wanted: tuple[str, .
 
 
 def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> str | None:
-    """Return the reason if only camera paths can render the scene, or None if light paths can, too.
+    """Return the reason if only camera paths can render the scene. Return None if light paths can render the scene,
+    too.
 
-    Raises ConfigError, located in the scene's `file`, if no paths can render it.
+    Raises ConfigError, located in the scene's `file`, if no paths can render the scene.
     """
     from reslrb_cli.scene.needs import check_paths, paths_obstacle
 

@@ -1,7 +1,7 @@
 """`reslrb inspect`: list the contents of a scene, and the parameters that can be recovered.
 
-The argument is a scene file, a configuration, complete or not, or the folder of a run (`read_subject`). The output
-lists the scene, its sensors, the plan of a step and the parameters (`templates/inspect.txt.j2`).
+The argument is a scene file, a possibly incomplete configuration, or a run folder (`read_subject`). The output lists
+the scene, its sensors, the plan of a step and the parameters (`templates/inspect.txt.j2`).
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _STAND_INS = {"target": "{render: {spp: 1}}", "parameters": "[{key: '*'}]"}
 
 @dataclass(frozen=True)
 class Subject:
-    """Configuration with placeholders for the sections in `missing`.
+    """Configuration in which placeholders replace the sections listed in `missing`.
 
-    `path` is the user's argument, and `run` the manifest if the configuration belongs to a run, otherwise None.
+    `path` is the user's argument. `run` is the manifest if the configuration belongs to a run, otherwise None.
     """
 
     path: Path
@@ -81,7 +81,7 @@ def _keys(data: Any, section: str) -> set[str]:
 
 
 def _is_scene(file: Path) -> bool:
-    """Whether a file is a scene rather than a configuration."""
+    """True if the file is a scene rather than a configuration."""
     if file.suffix.lower() == ".xml":
         return True
     try:
@@ -113,7 +113,7 @@ def _needed(needs: SceneNeeds) -> str:
 
 
 def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
-    """Format the plan as a table, with the features that it contains first."""
+    """Format the plan as a table. The features that the plan contains come first."""
     ordered = sorted(rows, key=lambda row: not row.needed)
     return table([("needed" if row.needed else "left out", row.feature, row.reason) for row in ordered])
 
@@ -122,7 +122,7 @@ def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
 
 
 def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], everything: bool) -> list[str]:
-    """List the recoverable parameters with their values, then the number of others, with reasons.
+    """List the recoverable parameters with their values. Then print the number of other parameters, with reasons.
 
     Parameters that match a key or glob in `wanted` are marked. `everything` also lists the others.
     """
@@ -169,7 +169,7 @@ def _reasons(others: Sequence[ParameterInfo]) -> list[str]:
 
 
 def _value(info: ParameterInfo) -> str:
-    """Format a value: a few numbers in the form of `initial`, more numbers as count, mean and range."""
+    """Format a value. A few numbers have the form of `initial`. More numbers appear as count, mean and range."""
     value = info.value
     if value is not None and value.numbers is not None:
         words = [f"{number:.4g}" for number in value.numbers]
@@ -226,15 +226,15 @@ def command(
 ) -> int | None:
     """List the parameters of a scene that can be recovered, with their current values, and the contents of the scene.
 
-    PATH is a scene file (XML), a configuration or a run folder. The configuration may be incomplete. The parameter keys
-    listed first may be used in `parameters` of a configuration. For all other keys, the command gives the reason why a
-    configuration cannot use the key. If the configuration has `parameters`, the plan of a step lists the features that
-    its kernels contain or leave out, and why.
+    PATH is a scene file (XML), a configuration or a run folder. The configuration may be incomplete. The command first
+    lists the parameter keys that `parameters` of a configuration may use. For all other keys, the command gives the
+    reason why a configuration cannot use the key. If the configuration has `parameters`, the plan of a step lists the
+    features that its kernels contain or leave out, and why.
 
     --conditioning measures how different the sensitivities of the parameters are at their initial values: for each
     parameter the root mean square of its values, its gradient and the noise of one step's gradient, the relative change
     of the image and the curvature of the loss per unit, and the length by which it would have to change to explain the
-    image. `optimizer.scale: auto` compensates for the differences.
+    image. `optimizer.scale: auto` compensates for the parameters' different sensitivities.
     """
     if samples is not None and not conditioning:
         raise click.UsageError("--samples has no effect without --conditioning")
@@ -352,7 +352,7 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
 
 
 def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[PlanRow] | str:
-    """Plan a step for the first sensor in use; return the reason if there is no plan.
+    """Plan a step for the first sensor in use. Return the plan's rows, or the reason if there is no plan.
 
     Afterwards the selected parameters of `scene` track derivatives.
     """
@@ -417,7 +417,9 @@ def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str])
 
 
 def sampling_of(subject: Subject, option: str) -> tuple[str, str]:
-    """Return the value of `guiding`, `sequence` or `pixels`, and the reason if a run chooses it (otherwise empty)."""
+    """Return the value of `guiding`, `sequence` or `pixels`. Also return the reason if a run chooses this value,
+    otherwise an empty text.
+    """
     from reslrb_cli.config.integrators import UNDECIDED
     from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, PixelsRecord, SequenceRecord
 

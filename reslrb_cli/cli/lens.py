@@ -28,7 +28,8 @@ _OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distanc
 def read_luminance(path: Path) -> np.ndarray:
     """Return the linear luminance (H, W) of an image file, upright. Raises ConfigError.
 
-    Transparent parts are white, as in image viewers, or black if the whole image would be white otherwise.
+    Transparent parts are white, as in image viewers. If the whole image would then be white, transparent parts are
+    black.
     """
     import numpy as np
 

@@ -94,8 +94,9 @@ def command(
 ) -> int:
     """Recover the parameters of CONFIG from its target images.
 
-    Writes a run folder, which the last line names. Ctrl-C, SIGTERM and SIGHUP end the run after the current iteration,
-    with a complete folder; a second signal ends it at once. --resume RUN continues any run that has ended.
+    Writes a run folder. The last line of the output names the folder. Ctrl-C, SIGTERM and SIGHUP end the run after the
+    current iteration, with a complete folder. A second signal ends the run at once. --resume RUN continues any run that
+    has ended.
     """
     if quiet or verbose:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)

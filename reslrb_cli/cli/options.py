@@ -51,7 +51,7 @@ def origin_of(variant: str) -> Origin:
 
 
 class Keeper:
-    """Writer of a JSON file and of a file of samples, so that a killed process loses only seconds of work.
+    """Writer of a JSON file and of a file of samples. If the process is killed, only seconds of work are lost.
 
     `origin` is the first line. `final` returns the lines that will not change. `provisional` returns the current state
     of all other lines. `kept` returns the data for a later session, or None if there is none yet. Without a file, the
@@ -93,7 +93,7 @@ class Keeper:
             self._file.close()
 
     def _write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
-        """Write both files; return whether the samples were small enough to save."""
+        """Write both files. Return True if the samples were small enough to save."""
         assert self._file is not None
         kept = None if self._samples is None else self._kept()
         fits = kept is None or are_kept(kept[1])
@@ -117,8 +117,8 @@ def measuring(
     """Yield a session that measures `plan`, and the session's `Interrupts`. Removes the session's folder and workers at
     the end.
 
-    The session continues from the samples of `json_file`, if any. `began` is the `monotonic` time of the command's
-    call. `of` names the unit of `plan.rounds` in the message. Raises ConfigError.
+    The session continues from the samples of `json_file`, if any. `began` is the `monotonic` time at which the command
+    was called. `of` names the unit of `plan.rounds` in the message. Raises ConfigError.
     """
     from reslrb_cli.measure.processes import abandon_all
 
@@ -137,7 +137,7 @@ def measuring(
 
 
 def read_earlier(kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
-    """Return the saved samples (`Earlier.read`), and print that they are used."""
+    """Return the saved samples (`Earlier.read`), and print that the command uses the samples."""
     from reslrb_cli.measure.resume_store import Earlier
 
     earlier = Earlier.read(kind, json_file, now)
@@ -167,7 +167,7 @@ def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
 
 
 class FolderPath(click.Path):
-    """Path for which a shell completes folders; the code that opens it checks its type."""
+    """Path for which a shell completes folders. The code that opens the path checks its type."""
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         return [CompletionItem(incomplete, type="dir")]
@@ -184,7 +184,9 @@ def complete_setting(_context: click.Context, _parameter: click.Parameter, start
 
 
 def setting_keys() -> list[str]:
-    """Return every key of the configuration's schema. Lists have one key, of index 0: `parameters[0].bounds`."""
+    """Return every key of the configuration's schema. Each list has only one key, with index 0:
+    `parameters[0].bounds`.
+    """
     schema = Config.model_json_schema()
     return list(dict.fromkeys(_keys(schema, schema["$defs"], "")))
 
@@ -323,7 +325,7 @@ def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[...,
 
 
 def is_given(name: str) -> bool:
-    """Whether the user gave the option with this parameter name to the current command."""
+    """True if the user gave the option with the parameter name `name` to the current command."""
     return click.get_current_context().get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
 
 
@@ -351,7 +353,9 @@ def start_variant(config: Config) -> str:
 
 
 def check_writable(option: str, path: Path | None) -> None:
-    """Raise ConfigError, located by the option, if the file `path` cannot be written; leave the file unchanged."""
+    """Raise ConfigError, located by the option, if the file `path` cannot be written. The check leaves the file
+    unchanged.
+    """
     if path is None:
         return
     existed = os.path.lexists(path)

@@ -37,8 +37,8 @@ LEAST_FRAME = "{percentage:3.0f}%|{bar}|"
 
 
 class Progress:
-    """Progress bar on standard error for a run with `total` iterations. As a context manager, it closes the bar at the
-    end.
+    """Progress bar on standard error for a run with `total` iterations. As a context manager, `Progress` closes the bar
+    at the end.
 
     `done` iterations were finished before the run was resumed. `meter` measures the errors of the parameters.
     """
@@ -109,9 +109,9 @@ class Progress:
 
 
 class Reading:
-    """Progress bar on standard error for reading long files, which can be called like `records.reading.Tell`.
+    """Progress bar on standard error for reading long files. The bar can be called like `records.reading.Tell`.
 
-    As a context manager, it closes the bar. If reading took long, the exit of the context prints `drawing`, because the
+    As a context manager, it closes the bar. If reading took long, the end of the context prints `drawing`, because the
     page is drawn next.
     """
 
@@ -122,7 +122,7 @@ class Reading:
         self._began = self._said = time.monotonic()
 
     def __call__(self, path: Path, done: int, size: int) -> None:
-        """Show that `done` of the `size` bytes of `path` are read."""
+        """Show that `done` of `size` bytes in the file `path` are read."""
         now, name = time.monotonic(), shorten(str(path), BESIDE_A_BAR)
         if not self._stream.isatty():
             if now - self._said >= SECONDS_PER_LINE:

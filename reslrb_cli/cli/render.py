@@ -148,7 +148,7 @@ def _suiting(image: Any, scene: Any, sensor: Any) -> float:
 
 
 def _read(config_file: Path | None, run: Path | None, overrides: tuple[str, ...]) -> Config:
-    """Return the configuration to render: that of a file, or of a run with its recovered values."""
+    """Return the configuration to render, from a file or from a run with its recovered values."""
     if config_file is not None and run is not None:
         raise click.UsageError("give CONFIG or --run RUN, not both")
     if run is not None:
@@ -159,7 +159,7 @@ def _read(config_file: Path | None, run: Path | None, overrides: tuple[str, ...]
 
 
 def _of_sensor(config: Config, sensor: int) -> Config:
-    """Return the experiment with one sensor only, whether its view is held out or not."""
+    """Return the experiment with only the sensor `sensor`, even if the sensor's view is held out."""
     return config.model_copy(
         update={
             "views": [ViewSpec(sensor=sensor)],

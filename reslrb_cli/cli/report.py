@@ -23,9 +23,9 @@ MOST_SOURCES = 100
 def command(paths: tuple[Path, ...], output: Path | None) -> int:
     """Write one self-contained page about runs and measurements.
 
-    RUN is the folder of a run of `optimize` or of a `sweep`, a file that `bench`, `gradcheck` or `convergence` wrote
-    with --json, or a folder of maps that `gradcheck` wrote with --images. The page shows losses and errors of several
-    runs in one picture, and their images, times and memory side by side. Unfinished runs are shown up to their last
+    RUN is a run folder of `optimize`, a folder of a `sweep`, a file that `bench`, `gradcheck` or `convergence` wrote
+    with --json, or a folder of maps from `gradcheck --images`. The page shows losses and errors of several runs in one
+    picture. Images, times and memory of the runs appear side by side. Unfinished runs are shown up to their last
     iteration.
     """
     from reslrb_cli.backend.installation import load_packages

@@ -127,12 +127,12 @@ def command(
     quiet: bool,
     verbose: bool,
 ) -> int:
-    """Run the experiment of CONFIG with every combination of settings, with several seeds, one run after the other.
+    """Run the experiment of CONFIG with several seeds for every combination of settings, one run after the other.
 
-    Each run has its folder in FOLDER, named by its settings. FOLDER/sweep.html has the table, curves and pictures. All
-    combinations are checked before the first run starts. If a run fails, its row says so, and the others continue.
-    Ctrl-C ends the sweep after the current iteration. To continue a sweep, even after a kill, repeat the command or use
-    --resume FOLDER.
+    Each run has a folder in FOLDER. The folder's name shows the run's settings. FOLDER/sweep.html has the table, curves
+    and pictures. All combinations are checked before the first run starts. If a run fails, the run's table row shows
+    the failure, and the other runs continue. Ctrl-C ends the sweep after the current iteration. To continue a sweep,
+    even after a kill, repeat the command or use --resume FOLDER.
     """
     from reslrb_cli.runs.sweep import make_plan, opened
 
@@ -225,7 +225,9 @@ def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbos
 
 
 def _json_lines(source: SweepRuns) -> list[Line]:
-    """Return the lines of the JSON file: the device, the results of runs and combinations, and the best of them."""
+    """Return the lines of the JSON file: the device, the results of runs and combinations, and the best
+    combinations.
+    """
     from reslrb_cli.records.measurement_files import Origin
     from reslrb_cli.report.sweep import best_records, row_records, run_records
 
@@ -244,8 +246,9 @@ def call(
     """Run `reslrb` with these arguments in its own process. Returns its exit code and its last line.
 
     The first signal in `interrupts` is passed on to the process. A second signal ends the run's process together with
-    this process. `verbose` shows the output of the process; otherwise its warnings are in its folder. A `fresh` process
-    has no cached kernels or decisions. Runs of equal time therefore start under equal conditions.
+    this process. `verbose` shows the output of the process. Otherwise, the run folder contains the warnings of the
+    process. A `fresh` process has no cached kernels or decisions. Runs with equal time limits therefore start under
+    equal conditions.
     """
     if fresh:
         with tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder:
@@ -307,14 +310,14 @@ def _call(
 
 
 def _show(line: str) -> None:
-    """Replace the last line of the terminal, if there is one, by the progress of a run."""
+    """Show the progress of a run in place of the terminal's last line. Without a terminal, show nothing."""
     if sys.stderr.isatty():
         text = shorten(f"  {line}" if line else "", shutil.get_terminal_size().columns - 1)
         click.echo(f"\r\x1b[K{text}", err=True, nl=False)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a run's process at once by a repeated signal. The run's manifest then records the end."""
+    """End a run's process at once with a repeated signal. The run's manifest then records the end."""
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):
         process.send_signal(signal.SIGTERM)
         process.send_signal(signal.SIGTERM)
@@ -337,8 +340,8 @@ def follow(parent: int) -> None:
 
 
 def _end_with_input() -> None:
-    """End this process when the parent process ends, which closes this process's standard input. Used on systems
-    without PR_SET_PDEATHSIG.
+    """End this process when its standard input closes, because the parent process has ended. Used on systems without
+    PR_SET_PDEATHSIG.
     """
     os.read(0, 1)
     os._exit(ExitCode.INTERRUPTED)

@@ -41,9 +41,9 @@ _LEAVE = b"\0"  # no signal has the number 0
 
 
 class Interrupts:
-    """Context manager in which `requested` tells whether a signal came.
+    """Context manager in which `requested` is True after a signal.
 
-    Signals after `tolerated` ones end the process: a thread calls `last_act`, removes unfinished files, prints
+    More signals than `tolerated` end the process. A thread calls `last_act`, removes unfinished files, prints
     `interrupted`, and exits with 130. The context prints `notice` at the first tolerated signal. Signals that were
     ignored at the start of the program (`nohup`) stay ignored. An inner context replaces an outer one. Outside of the
     main thread, the context does nothing.
@@ -126,7 +126,7 @@ class Interrupts:
 
 
 def _say(line: str) -> None:
-    """Print a line on standard error without Python's buffers and locks, unless this would block."""
+    """Print a line on standard error without Python's buffers and locks. If writing would block, print nothing."""
     with contextlib.suppress(OSError, ValueError):
         if select.select([], [2], [], 0)[1]:
             start = "\n" if os.isatty(2) else ""  # after a progress bar or the terminal's ^C
@@ -152,7 +152,9 @@ def fill(template: str, filters: Mapping[str, Callable[..., object]], **values: 
 
 
 class LogLines(logging.Handler):
-    """Handler that writes messages on the current standard error, above a progress bar, with escapes as in `echo`."""
+    """Handler that writes messages above a progress bar on the current standard error. Messages are escaped as in
+    `echo`.
+    """
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
@@ -166,7 +168,7 @@ class LogLines(logging.Handler):
 
 
 def tell(error: BaseException) -> tuple[str, int] | None:
-    """Return the line and the exit code for `error`, or None for a bug in reslrb, which needs a traceback."""
+    """Return the line and the exit code for `error`. Return None for a bug in reslrb, which needs a traceback."""
     if isinstance(error, click.Abort):
         return "interrupted", ExitCode.INTERRUPTED
     if isinstance(error, click.ClickException):

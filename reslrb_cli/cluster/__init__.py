@@ -1,1 +1,1 @@
-"""Steps computed by several processes: the shards of `optimization/shards.py` on workers of dask.distributed."""
+"""Steps computed by several processes: workers of dask.distributed compute the shards of `optimization/shards.py`."""

@@ -1,5 +1,5 @@
-"""The files of an experiment, for processes on machines without them: the configuration, the scene, and all other
-files.
+"""The files of an experiment, for processes on machines that lack the files: the configuration, the scene, and all
+other files.
 
 The scene is one file, without includes.
 
@@ -36,13 +36,15 @@ Values = Mapping[str, np.ndarray[Any, Any]]
 
 @dataclass
 class Bundle:
-    """The contents of files, by their paths below the folder to which they are written, with `/`."""
+    """The contents of files by path. Paths start at the folder to which the files are written, and use `/`."""
 
     files: dict[str, bytes] = field(default_factory=dict)
     _names: dict[Path, str] = field(default_factory=dict)
 
     def add(self, path: Path) -> str:
-        """Add a file, once, and return its path with the same suffix. Raises ConfigError if it cannot be read."""
+        """Add a file once, and return the file's path in the bundle. The suffix stays the same. Raises ConfigError if
+        it cannot be read.
+        """
         path = path.absolute()
         if path not in self._names:
             name = self._names[path] = f"{FILES}/{len(self._names)}-{path.name}"

@@ -51,7 +51,9 @@ class Steps:
 def participants_in(
     folder: Path, threads: int, variant: str, allows_code: bool, settings: Mapping[str, Any]
 ) -> tuple[Participants, dict[str, float]]:
-    """Return the participants of the experiment in `folder`, with further `CheckSettings`. No kernels are warm."""
+    """Return the participants of the experiment in `folder`. `settings` holds further `CheckSettings`. No kernels are
+    warm.
+    """
     set_variant(variant)
     listed = [_with_file(case, lambda file: f"{folder / file}") for case in settings["integrators"]]
     config, initial = _read(folder)
@@ -92,7 +94,7 @@ def _with_file(case: Listed, put: Callable[[str], str]) -> Listed:
 
 
 def check_shareable(settings: CheckSettings) -> None:
-    """Raise ConfigError if samples depend on the process that takes them, or on time."""
+    """Raise ConfigError if samples depend on time or on the process that takes the samples."""
     if settings.seeds is None:
         reason = "a budget of seconds has no meaning on other machines; give the number of seeds with --seeds"
         raise ConfigError("--cluster", "", reason)
@@ -106,7 +108,7 @@ def check_shareable(settings: CheckSettings) -> None:
 def samples_at(
     settings: CheckSettings, participants: Participants, place: Place, variant: str, threads: int | None = None
 ) -> Iterator[Callable[..., Any]]:
-    """Take samples of `participants` (`sampling.Engine`) on the workers at a place. Raises as `Crew.start` does."""
+    """Take samples of `participants` on the workers at a place, as a `sampling.Engine`. Raises as `Crew.start` does."""
     opening, bundle = _opening_of(settings, participants, variant, own=place.address is None)
     with _crew_at(place, opening, bundle.files, threads) as crew:
 
@@ -122,7 +124,9 @@ def samples_at(
 
 
 def _opening_of(settings: CheckSettings, participants: Participants, variant: str, own: bool) -> tuple[Opening, Bundle]:
-    """Return the data from which every worker builds equal participants. `own`: the workers belong to this command."""
+    """Return the data from which every worker builds equal participants. `own` is true if the workers belong to this
+    command.
+    """
     config = settings.config
     built_in = config.scene.file == small.FILE
     values = {key: participants.selection.array(key) for key in participants.selection.keys}
@@ -140,8 +144,8 @@ def _opening_of(settings: CheckSettings, participants: Participants, variant: st
 
 @contextlib.contextmanager
 def cases_at(place: Place, variant: str, threads: int | None = None) -> Iterator[Callable[..., Any]]:
-    """Run cases (`extreme.case_records`, as `shards.serially`) on the workers at a place. Raises as `Crew.start`
-    does.
+    """Run cases (`extreme.case_records`) on the workers at a place, as `shards.serially` does in this process. Raises
+    as `Crew.start` does.
     """
     with _crew_at(place, Opening(Bundle().digest(), nothing_in, (variant,)), {}, threads) as crew:
 

@@ -1,9 +1,9 @@
 """Connections to workers for `--cluster`. The workers are processes of this machine that dask starts, or workers that
 have joined an existing scheduler.
 
-All connections use TLS. For `local:N`, dask makes certificates for this run, which are never stored. For
-`tls://HOST:PORT`, the certificates are those of dask's settings `distributed.comm.tls`, with which scheduler and
-workers were started. The holder of such a certificate can run any code on the workers.
+All connections use TLS. For `local:N`, dask makes certificates for this run. These certificates are never stored. For
+`tls://HOST:PORT`, the certificates come from dask's settings `distributed.comm.tls`. The scheduler and the workers were
+started with these certificates. Anyone who holds one of these certificates can run any code on the workers.
 """
 
 from __future__ import annotations
@@ -70,7 +70,9 @@ class Place:
 
     @classmethod
     def parse(cls, text: str) -> Place:
-        """Parse `local:N` or `tls://HOST:PORT`. Raises ConfigError for other text, or if dask is not installed."""
+        """Parse `local:N` or `tls://HOST:PORT`. Raises ConfigError if the text has another form, or if dask is not
+        installed.
+        """
         kind, _, count = text.partition(":")
         address = _ADDRESS.fullmatch(text)
         if address and 0 < int(address[2]) < 2**16:
@@ -98,7 +100,7 @@ class Place:
 def connected(place: Place) -> Iterator[tuple[Client, Path]]:
     """Connect to the workers at a place. Yields a client, and a folder that is removed at the end.
 
-    Raises MachineError if no worker can be started or the scheduler does not answer, and ConfigError without
+    Raises MachineError if no worker can be started or the scheduler does not answer. Raises ConfigError without
     certificates.
     """
     import dask
@@ -132,9 +134,7 @@ def connected(place: Place) -> Iterator[tuple[Client, Path]]:
 
 @contextlib.contextmanager
 def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
-    """Start a scheduler in this process, and this many workers in processes of their own. Yields address and
-    security.
-    """
+    """Start a scheduler in this process, and `workers` worker processes. Yields address and security."""
     from distributed import LocalCluster
 
     from reslrb_cli.backend.memory import free_bytes

@@ -61,14 +61,14 @@ LOSSES = 100
 
 @dataclass
 class Spent:
-    """Time in seconds that one worker, or all rounds of calls, have spent.
+    """Time that one worker, or all rounds of calls, have spent, in seconds.
 
     - `standing`: time to set the context of calls, as a mean over a round's workers.
     - `computing`: time to compute, as a mean over a round's workers.
     - `waiting`: time in which these workers waited for the slowest one.
     - `wall`: time from the first question to the last answer. The rest of it is communication.
 
-    `calls` is the number of answered calls, and `again` the number of repeated ones.
+    `calls` is the number of answered calls. `again` is the number of repeated calls.
     """
 
     wall: float = 0.0
@@ -83,8 +83,8 @@ class Spent:
 class _Round:
     """The calls of a round.
 
-    `left` holds the arguments of the calls without an answer, by index. For each future, `flying` holds its index and
-    the workers that may answer.
+    `left` maps the index of each unanswered call to the call's arguments. `flying` maps each future to the call's index
+    and to the workers that may answer.
     """
 
     function: Callable[..., Any]
@@ -111,7 +111,7 @@ class _Round:
 class Crew:
     """The workers of a dask client that have loaded `opening`. `files` are sent to workers that lack them.
 
-    `threads` is the thread count of each worker. None: each worker gets its share of its allowed cores.
+    `threads` is the thread count of each worker. If `threads` is None, each worker gets its share of its allowed cores.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class Crew:
                 first_s = time.monotonic() - begin
 
     def _next(self, seconds: float) -> Future | None:
-        """Return the next finished future, or None if none finishes within this many seconds."""
+        """Return the next finished future, or None if none finishes within `seconds`."""
         try:
             return self._done.get(timeout=seconds)
         except queue.Empty:
@@ -234,8 +234,8 @@ class Crew:
         return self._names.get(worker, "a worker")
 
     def _take_opened(self, future: Future) -> bool:
-        """Record that a worker has loaded the opening, or why the worker has not loaded the opening. Returns False if
-        the future does not belong to loading an opening.
+        """Record that a worker has loaded the opening, or why loading failed. Returns False if the future does not load
+        an opening.
         """
         worker = next((worker for worker, (own, _) in self._opening.items() if own is future), None)
         if worker is None:
@@ -286,11 +286,11 @@ class Crew:
     def run(
         self, function: Callable[..., Any], work: Sequence[Sequence[Any]], context: Context, cold: str | None = None
     ) -> Iterator[tuple[int, Any]]:
-        """Yield index and value of each call as they arrive. Raises the errors of calls.
+        """Yield the index and the value of each call as soon as the answer arrives. Raises the errors of calls.
 
         `cold` names functions whose kernels no worker has compiled. The first calls of these functions include
         compilation, so a slow first call does not count as hanging. Raises MachineError or OutOfMemory if workers fail
-        repeatedly, or if there are none.
+        repeatedly, or if there are no workers.
         """
         begin = time.monotonic()
         todo = _Round(function, context, dict(enumerate(work)), cold=cold, size=len(work))
@@ -330,7 +330,7 @@ class Crew:
             future.add_done_callback(self._done.put)
 
     def _take(self, todo: _Round, future: Future, beside: list[Future]) -> Iterator[tuple[int, Any]]:
-        """Yield the value of a call, or nothing, from a future. A call without an answer is repeated."""
+        """Yield the value of the call that `future` holds, or nothing. A call without an answer is repeated."""
         if self._take_opened(future):
             return
         place = todo.flying.pop(future, (None, None))[0]
@@ -397,7 +397,7 @@ class Crew:
     # ---------------------------------------------------------------------------------------------------
 
     def _limit(self, todo: _Round, times: float, beside_s: float) -> float:
-        """Return the seconds within which a worker must answer."""
+        """Return the time limit for a worker's answer, in seconds."""
         known = self._seconds.get(todo.name)
         return times * statistics.median(known) + beside_s if known else OPENING_S
 
@@ -430,7 +430,7 @@ class Crew:
 
 
 def _reply(future: Future) -> Reply | None:
-    """Return the answer, or None if it was lost with a worker. Raises the error of a call.
+    """Return the answer, or None if the answer was lost with a worker. Raises the error of a call.
 
     If a worker ends before its answer arrives in this process, the answer is lost. Dask then computes the call again.
     """

@@ -1,4 +1,4 @@
-"""The shards of a run's steps on workers (`crew.Crew`), and the data that workers need for them.
+"""The shards of a run's steps on workers (`crew.Crew`), and the data that workers need to compute the shards.
 
 A call depends only on the experiment (files by digest), on parameter values and tables (`Standing`), on the shard, and
 on the shard's dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions, or on the
@@ -45,7 +45,8 @@ TARGETS_FILE = "targets.npz"
 
 @dataclass(frozen=True)
 class Standing:
-    """Parameters and tables of a step: values as in the optimiser, and the guide's learned state (`Guiding.state`).
+    """Parameters and tables of a step. The values are those of the optimiser. The tables are the guide's learned state
+    (`Guiding.state`).
 
     `digest` covers both.
     """
@@ -87,9 +88,9 @@ def _digest(text: str, *mappings: Mapping[str, Array]) -> str:
 
 
 def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, dict[str, float]]:
-    """Load the run's problem with its targets and decisions from the experiment's files, and compile its kernels.
+    """Load the run's problem with targets and decisions from the experiment's files, and compile the problem's kernels.
 
-    Also returns the seconds that a shard's functions take after compilation.
+    Also returns the time of each shard function after compilation, in seconds.
     """
     stored = Stored(folder / STATE_FILE)
     with np.load(folder / TARGETS_FILE) as targets:
@@ -105,7 +106,9 @@ def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, d
 
 
 def _warmed(problem: Problem) -> dict[str, float]:
-    """Compile and record the kernels of a step's shards. Returns the seconds of each function without compilation."""
+    """Compile and record the kernels of a step's shards. Returns the time of each function without compilation, in
+    seconds.
+    """
     task = make_tasks(problem, 0)[0]
     calls: list[tuple[Callable[..., Any], tuple[Task | Array, ...]]] = [(shard_gradient, (task,))]
     if problem.config.in_rounds:
@@ -127,7 +130,7 @@ def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, B
     """Return the data that workers need for a run. `own`: the workers belong to this run. `folder` is for temporary
     files.
 
-    Raises OSError, and ConfigError if a file has changed since the run began.
+    Raises OSError. Raises ConfigError if a file has changed since the run began.
     """
     config, selection = course.problem.config, course.problem.selection
     bundle, here = bundle_of(config, {key: selection.array(key) for key in selection.keys}), digests(config)
@@ -143,7 +146,7 @@ def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, B
 
 
 class Engine:
-    """Computes shards on workers (`shards.Engine`); `where` is the name of their place."""
+    """Computes shards on workers (`shards.Engine`). `where` names the workers' place."""
 
     def __init__(self, crew: Crew, where: str) -> None:
         self.crew, self.where = crew, where
@@ -151,7 +154,7 @@ class Engine:
     def __call__(
         self, problem: Problem, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield index and result of each call as they arrive. Raises the errors of calls."""
+        """Yield the index and the result of each call as soon as the answer arrives. Raises the errors of calls."""
         return self.crew.run(function, work, self.standing(problem))
 
     @staticmethod
@@ -172,7 +175,7 @@ def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> 
     """Load a run's experiment on the workers at `place`, and provide the workers as an `Engine`. Each worker has
     `threads` threads. If `threads` is None, each worker gets its share of the cores.
 
-    Raises MachineError if there are no workers, or none that can be used.
+    Raises MachineError if there are no usable workers.
     """
     with connected(place) as (client, folder):
         opening, bundle = opening_of(course, folder, own=place.address is None)

@@ -55,9 +55,9 @@ class Opening:
     """The data from which a worker builds its state. `function(folder, threads, *arguments)` builds the state from the
     files in a folder.
 
-    The function returns the state, and the seconds per call of each function whose kernels it has compiled, by name.
-    `digest` is the digest of the files. `asks_for_code` is true if users' own code must run and the workers do not
-    belong to this run.
+    The function returns the state. The function also returns the seconds per call, by name, for each function with
+    compiled kernels. `digest` is the digest of the files. `asks_for_code` is true if users' own code must run and the
+    workers do not belong to this run.
     """
 
     digest: str
@@ -143,9 +143,7 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
 
 
 def _take_device(name: object) -> None:
-    """Make a worker with a number as its name see only one GPU of its machine. Consecutive numbers use the GPUs in
-    turn.
-    """
+    """Limit a worker whose name is a number to one GPU of its machine. Consecutive numbers use the GPUs in turn."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES")
     found = listed.split(",") if listed else [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]
     if isinstance(name, int) and len(found) > 1:
@@ -168,7 +166,7 @@ def stand(opening: str, context: Context) -> Reply:
 
 
 def perform(opening: str, context: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Reply:
-    """Call `function` with the state, after setting `context`, and with `arguments`; return its value."""
+    """Set `context`, call `function` with the state and `arguments`, and return the function's value."""
     begin, me = time.perf_counter(), get_worker().address
     if _state is None or _state.opening != opening:
         return Lacks(me, "opening")

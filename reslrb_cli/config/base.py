@@ -29,7 +29,7 @@ SEED_END = 2**32
 class Section(BaseModel):
     """A mapping of the file. Unknown keys are errors, values are not converted, and NaN and infinity are refused.
 
-    The meaning of a setting is in its `description`, or in the docstring below it.
+    A setting's `description`, or the docstring below the setting, explains the meaning.
     """
 
     model_config = ConfigDict(
@@ -157,7 +157,7 @@ class ByType(Discriminator):
 
 
 def by_kind(expected: str, word: str | None = None) -> Discriminator:
-    """Discriminate the members of a union by the kind of the value. `expected` describes valid values in errors.
+    """Select the member of a union by the kind of the value. `expected` describes valid values in errors.
 
     The tags are `mapping`, `list`, `number`, and `text`. The tag `text` applies only to the value `word`, which is the
     only text in the union.
@@ -202,7 +202,7 @@ Size = Annotated[tuple[Count, Count], Field(strict=False)]
 
 
 def few(what: str, reason: str = "") -> AfterValidator:
-    """Return a validator for sizes whose product is limited; `what` names their unit in errors."""
+    """Return a validator that limits the product of the two numbers in a size. `what` names the unit in errors."""
     return must(
         lambda size: size[0] * size[1] <= PIXELS,
         lambda size: f"must have at most {PIXELS} {what}, not {size[0] * size[1]}{reason}",

@@ -1,4 +1,4 @@
-"""Conversion of pydantic's errors to one located line that also says what would be right."""
+"""Conversion of pydantic's errors to one located line that also describes a correct value or key."""
 
 from __future__ import annotations
 
@@ -61,7 +61,9 @@ REMOVED = {
 
 
 def _removed(location: Location, value: Any = None) -> str | None:
-    """Return a replacement for a removed key, or for a removed `value` of a key, or None if nothing was removed."""
+    """Return the replacement for a removed key, or for a removed `value` of a key. Return None if nothing was
+    removed.
+    """
     names = ".".join([part for part in location if isinstance(part, str)][-2:])
     advice = REMOVED.get(names if value is None else f"{names}: {value}")
     return None if advice is None else f"was removed; {advice}"
@@ -85,8 +87,8 @@ class Problem:
 
 
 def problems(error: ValidationError, data: Any) -> list[Problem]:
-    """Return the errors that `error` reports for `data`, each once. Unknown keys come first, since they explain missing
-    ones.
+    """Return the errors that `error` reports for `data`, each once. Unknown keys come first, because unknown keys
+    explain missing keys.
     """
     found = dict.fromkeys(_problem(detail, data) for detail in error.errors(include_url=False))
     return sorted(found, key=lambda problem: problem.unknown is None)
@@ -161,7 +163,7 @@ def _sections(annotation: Any) -> list[type[Section]]:
 
 
 def _candidates(loc: tuple[int | str, ...]) -> tuple[list[type[Section]], type[Section]]:
-    """Return all sections that are possible at `loc`, and the one that was chosen there."""
+    """Return all sections that are possible at `loc`, and the section that was chosen."""
     union: list[type[Section]] = [Config]
     chosen: type[Section] = Config
     for part in loc:

@@ -38,8 +38,8 @@ PIXELS = 2**27
 
 
 def as_path(given: object, name: str, what: str) -> Path:
-    """Return the path in the argument `name` of a call. Raises ConfigError for objects that are no path. `what`
-    describes valid arguments in the error message.
+    """Return the argument `name` of a call as a path. Raises ConfigError for objects that are no path. `what` describes
+    valid arguments in the error message.
     """
     if isinstance(given, (str, os.PathLike)):
         return Path(given)

@@ -214,7 +214,7 @@ class Reslrb(AttachingTracer):
         return self.model_copy(update=undecided) if undecided else self
 
     def _foreign(self) -> set[str]:
-        """Return the options of the other estimators."""
+        """Return the options that belong only to other estimators."""
         return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS[self.estimator]}
 
 
@@ -225,7 +225,9 @@ class Ptracer(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
 
 
 class Prb(Integrator, json_schema_extra=NEEDS_TYPE):
-    """Mitsuba's path replay backpropagation. It traces paths from the sensor, and misses caustics of small lamps."""
+    """Mitsuba's path replay backpropagation. The integrator traces paths from the sensor, and misses caustics of small
+    lamps.
+    """
 
     type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
@@ -261,8 +263,7 @@ class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
 
 
 class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
-    """The light paths of `reslrb`, reversed by Dr.Jit, which records the loop state of each path in thread-local
-    memory."""
+    """The light paths of `reslrb`, reversed by Dr.Jit. Dr.Jit records each path's loop state in thread-local memory."""
 
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
     max_depth: Annotated[int, _RECORD] = Field(default=8, ge=0, json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES})
@@ -300,7 +301,8 @@ def _check_share(paths: str, light_share: float | str) -> None:
 
 
 def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:
-    """Return why `spp` samples per pixel of a film with `pixels` pixels cannot be traced, and a remedy; or None.
+    """Return why a film of `pixels` pixels cannot be traced with `spp` samples per pixel, and a remedy. Otherwise,
+    return None.
 
     `per_pass` is the integrator's `samples_per_pass`. It divides `spp`, or is larger. `splits` is true for integrators
     that split their samples themselves. Other integrators have no `samples_per_pass`.

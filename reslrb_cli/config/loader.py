@@ -1,6 +1,6 @@
 """Reader of configurations from files, `--set` and scripts. It also writes resolved configurations.
 
-`--set a.b=value` sets a value, typed as in YAML, at a location of the configuration.
+`--set a.b=value` sets the value at a location of the configuration. The value is typed as in YAML.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def apply(data: dict[str, Any], override: Override) -> dict[str, Any]:
 
 
 def _put(at: Any, override: Override, depth: int) -> Any:
-    """Apply an override to the value at the first `depth` parts of its location."""
+    """Apply an override to `at`, the value at the first `depth` parts of the override's location."""
     if depth == len(override.location):
         return override.value
     part, name = override.location[depth], format_location(override.location[:depth])
@@ -106,7 +106,7 @@ def _put(at: Any, override: Override, depth: int) -> Any:
 def load(path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
     """Return the configuration in the YAML file `path`, with `overrides` such as "run.spp=32" applied in their order.
 
-    Raises ConfigError with the key and the file, or the wrong override.
+    Raises ConfigError. The error names the key, and either the file or the wrong override.
     """
     return loads(read_text(Path(path), str(path)), path, overrides)
 
@@ -126,7 +126,7 @@ def replaces(location: Location, earlier: Mapping[str, Location]) -> str | None:
 
 
 def overrides_of(given: Mapping[str, object] | None) -> list[Override]:
-    """Return the overrides of a script: keys as for `--set`, and Python values.
+    """Return the overrides of a script. Keys are as for `--set`, and values are Python values.
 
     Raises ConfigError for invalid overrides. An override that replaces an earlier override is invalid, too.
     """
@@ -167,8 +167,8 @@ def plain(value: Any, source: object, key: str = "") -> Any:
 
 
 def changed(config: Config, overrides: Sequence[str | Override]) -> Config:
-    """Return the experiment with overrides applied. The returned experiment keeps the loss function and the permission
-    to run code of `config`.
+    """Return the experiment with overrides applied. The returned experiment keeps the loss function of `config` and the
+    permission to run code.
 
     Raises ConfigError.
     """
@@ -181,7 +181,7 @@ def changed(config: Config, overrides: Sequence[str | Override]) -> Config:
 def resolve(data: Any, path: Path | str, parsed: Sequence[Override] = ()) -> Config:
     """Validate settings with overrides applied. `path` names their origin.
 
-    Raises ConfigError with the key and the file, or the wrong override.
+    Raises ConfigError. The error names the key, and either the file or the wrong override.
     """
     source = str(path)
     if data is None and not parsed:
@@ -209,7 +209,8 @@ def told(first: Mapping[str, Any]) -> Config:
 def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) -> None:
     """Raise ConfigError, located by the key, if users' code must not run. Loads nothing.
 
-    `codes` maps keys to the settings that name users' code. None: all code settings of the experiment.
+    `codes` maps keys to the settings that name users' code. If `codes` is None, check all the experiment's code
+    settings.
     """
     for key, one in (config.codes if codes is None else codes).items():
         if one.file is None and config.own_loss is None:
@@ -224,7 +225,7 @@ def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem:
     """Return the origin of `problem`: the override that causes it, or the file.
 
     `stages` holds several versions of the settings: first the settings of the file, then the settings after each
-    override. Uses bisection, since a check takes time.
+    override. The function uses bisection, because each check takes time.
     """
     without, having = 0, len(stages) - 1
     if having == 0 or problem in _validate(stages[0], path)[1]:
@@ -241,8 +242,8 @@ def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem:
 def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: dict[str, Any]) -> Config:
     """Return the experiment with the integrator in `values`, and with other settings of `run.adjoint`.
 
-    `adjoint` has the key `adjoint` and its related settings, or is empty for no change. Raises ConfigError that names
-    `blame`.
+    `adjoint` has the key `adjoint` and its related settings. An empty `adjoint` changes nothing. Raises ConfigError
+    that names `blame`.
     """
     data = config.model_dump(mode="json", exclude_none=True) | {"integrator": values}
     if "adjoint" in adjoint:

@@ -138,12 +138,12 @@ Losses = Annotated[
 
 
 def losses_of(given: Loss | Sequence[Loss]) -> list[Loss]:
-    """Return the entries of `loss` as a list, also if it is a single loss."""
+    """Return the entries of `loss` as a list. A single loss becomes a list with one entry."""
     return [given] if isinstance(given, Loss) else list(given)
 
 
 def loss_keys(name: str, given: Loss | Sequence[Loss]) -> list[tuple[str, Loss]]:
-    """Return the entries of `loss`, each with the key of its option `name`."""
+    """Return the entries of `loss`. Each entry comes with the key of its option `name`."""
     if isinstance(given, Loss):
         return [(f"loss.{name}", given)]
     return [(f"loss[{number}].{name}", one) for number, one in enumerate(given)]
@@ -253,7 +253,7 @@ _Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class Stage(Section):
-    """A coarser stage at the start of a run. Settings that a stage leaves out are those of the run."""
+    """A coarser stage at the start of a run. If a stage leaves out a setting, the run's setting applies."""
 
     until: Annotated[float, Field(gt=0, lt=1)]
     """Fraction of the run's iterations at which the stage ends. The next stage follows; after the last stage, the run

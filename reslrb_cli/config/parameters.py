@@ -54,12 +54,14 @@ class ByWord(Section):
     TAG: ClassVar[str] = "words"
 
     def words(self) -> dict[str, Any]:
-        """Return the settings that are given, by part."""
+        """Return the given settings as a mapping from part to setting."""
         return {word: value for word in WORDS if (value := getattr(self, word)) is not None}
 
 
 def or_words(plain: str) -> Discriminator:
-    """Return a discriminator that tags a mapping by parts of a motion as `words`, and any other value as `plain`."""
+    """Return a discriminator. The discriminator tags a mapping by parts of a motion as `words`, and any other value as
+    `plain`.
+    """
     return Discriminator(lambda value: MARK + (ByWord.TAG if isinstance(value, (dict, ByWord)) else plain))
 
 
@@ -139,7 +141,7 @@ _GRID = must(
 
 
 def size_of(grid: int | tuple[int, int]) -> tuple[int, int]:
-    """Return [width, height] of a grid that may be given as one number for both."""
+    """Return [width, height] of a grid. One number stands for both width and height."""
     return (grid, grid) if isinstance(grid, int) else grid
 
 
@@ -170,7 +172,7 @@ _POINT = must(
 
 
 class MotionSpec(Section):
-    """Common motion of shapes and emitters. They are scaled, then rotated, then translated."""
+    """Common motion of shapes and emitters. Shapes and emitters are scaled, then rotated, then translated."""
 
     of: Names = Field(description="Ids of the shapes and emitters that move together. The first id names the motion.")
     pivot: Annotated[list[float], _POINT] | None = None
@@ -265,7 +267,7 @@ class Regularizer(Choice):
 
 class Curvature(Regularizer, json_schema_extra={"required": ["type", "radius"]}):
     """Hollows of a heightmap that are too narrow for a tool: integral of max(0, k - 1/radius)². Here k is the larger
-    principal curvature. It is positive in hollows, seen from outside.
+    principal curvature. The curvature k is positive in hollows, seen from outside.
     """
 
     type: Literal["curvature"] = "curvature"
@@ -298,12 +300,12 @@ class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness"
 
     @property
     def thinnest(self) -> float:
-        """The thickness at which the plate is clamped."""
+        """The smallest thickness of the plate after clamping."""
         return _HELD * self.least
 
     @property
     def lowest(self) -> float:
-        """The height at which the plate is clamped, over a flat back."""
+        """The smallest height of the plate after clamping, if the back is flat."""
         return self.thinnest - self.thickness
 
 
@@ -323,7 +325,9 @@ class TotalVariation(Regularizer, json_schema_extra=NEEDS_TYPE):
 
 class Laplacian(Regularizer, json_schema_extra=NEEDS_TYPE):
     """Roughness of a heightmap, a bitmap or the vertex positions of a mesh: integral of the squared Laplacian. For
-    vertex positions, it is the cotangent Laplacian of the initial mesh, without the vertices on the mesh's boundary."""
+    vertex positions, the Laplacian is the cotangent Laplacian of the initial mesh, without the mesh's boundary
+    vertices.
+    """
 
     type: Literal["laplacian"] = "laplacian"
     """For a heightmap, a bitmap or the vertex positions of a mesh: integral of the squared Laplacian."""
@@ -357,8 +361,9 @@ class Settings:
 
 
 class Precondition(Section):
-    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021). The optimizer moves v; the parameter is
-    (1 - l² Δ)⁻¹ v."""
+    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021). The optimizer moves v. The parameter is (1 - l²
+    Δ)⁻¹ v.
+    """
 
     laplacian: Annotated[float, Field(gt=0, le=10)]
     """Length l, as a fraction of the longer side of a map, a texture or a mesh. Its effect does not depend on the
@@ -367,7 +372,7 @@ class Precondition(Section):
 
 
 class ParameterSpec(Section):
-    """A parameter to recover, given by exactly one of `key`, `heightmap` and `motion`."""
+    """A parameter to recover. Exactly one of `key`, `heightmap` and `motion` must be given."""
 
     key: _Key | None = None
     """Key as `reslrb inspect` lists it. Keys are the names of `mi.traverse`. An object without an id is named after its
@@ -404,8 +409,8 @@ class ParameterSpec(Section):
 
     @property
     def names(self) -> list[str]:
-        """The keys and globs of the parameters. For a heightmap or a motion, the names under which the run records its
-        values.
+        """The keys and globs of the parameters. For a heightmap or a motion, the property gives the names under which
+        the run records its values.
         """
         if self.heightmap is not None:
             return [f"{self.heightmap.mesh[0]}.{HEIGHTMAP}"]
@@ -435,11 +440,11 @@ class ParameterSpec(Section):
 
     @property
     def _plates(self) -> list[Thickness]:
-        """The plates with a flat back: their thickness bounds the heights."""
+        """The thickness regularizers of plates with a flat back. A plate's thickness bounds the heights."""
         return [each for each in self.regularizers if isinstance(each, Thickness) and each.opposite is None]
 
     def at(self, option: str, word: str) -> str:
-        """Return the key, within this section, that sets `option` for the part `word`."""
+        """Return the key that sets `option` for the part `word`, relative to this section."""
         return f"{option}.{word}" if isinstance(getattr(self, option, None), ByWord) else option
 
     def settings(self, word: str = "") -> Settings:

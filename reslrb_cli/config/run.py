@@ -90,7 +90,7 @@ Memory = Annotated[
 
 
 class CheckpointEvery(Section):
-    """Time between two checkpoints: exactly one of `iterations` and `seconds`."""
+    """Time between two checkpoints, set by exactly one of `iterations` and `seconds`."""
 
     iterations: Count | None = Field(default=None, description="Iterations between two checkpoints.")
     seconds: Positive | None = Field(default=None, description="Smallest number of seconds between two checkpoints.")

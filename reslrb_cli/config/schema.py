@@ -131,9 +131,9 @@ class Config(Section):
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
-        """`run.adjoint` of a single step or shard, with `auto` resolved. `auto` becomes `batched` if `run.batches`
-        divides the sample count and the passes divide each batch. For a shard of a view's samples, `others` becomes
-        `independent`.
+        """Value of `run.adjoint` for a single step or shard, after `auto` is resolved. `auto` becomes `batched` if
+        `run.batches` divides the sample count and the passes divide each batch. For a shard of a view's samples,
+        `others` becomes `independent`.
         """
         if self.in_rounds:
             return "independent"
@@ -142,7 +142,7 @@ class Config(Section):
         return "batched" if self._splits(self.run.spp, self.run.batches) else "independent"
 
     def _splits(self, spp: int, sets: int) -> bool:
-        """Whether `spp` samples per pixel can be split into this many sets, with halves and passes."""
+        """True if `spp` samples per pixel can be split into `sets` sets, their halves and the passes."""
         parts = sets * self.halves
         return spp % parts == 0 and _passes_divide(self.integrator, spp // parts)
 
@@ -181,7 +181,7 @@ class Config(Section):
 
     @property
     def share_spp(self) -> int:
-        """Samples per pixel of a view in one shard."""
+        """Samples per pixel that one shard traces for a view."""
         return self.run.spp // self.shares
 
     @property
@@ -191,7 +191,7 @@ class Config(Section):
 
     @property
     def losses(self) -> list[Loss]:
-        """The entries of `loss` as a list, also if it is a single loss."""
+        """The entries of `loss` as a list, even if `loss` is a single loss."""
         return losses_of(self.loss)
 
     @property
@@ -205,7 +205,7 @@ class Config(Section):
         return self._own_loss
 
     def with_code(self, allowed: bool = True) -> Config:
-        """Return the same experiment, with or without permission to run the Python files that it names."""
+        """Return a copy of the experiment. If `allowed` is True, the copy may run the Python files that it names."""
         config = self.model_copy()
         config._allows_code = allowed
         return config
@@ -228,7 +228,7 @@ class Config(Section):
 
     @property
     def codes(self) -> dict[str, Custom | Own]:
-        """The user's own losses and integrators, by the key that names their file."""
+        """The user's own losses and integrators, as a mapping from the key that names each file."""
         integrators: dict[str, Integrator | None] = {"integrator": self.integrator}
         if self.target.render is not None:
             integrators["target.render.integrator"] = self.target.render.integrator
@@ -260,8 +260,8 @@ class Config(Section):
         return None if obstacle is None else f"{run.spp} {obstacle}"
 
     def with_exposures_fixed(self) -> Config:
-        """Return the experiment with exposures of 1 in place of recovered exposures. The result serves uses of the
-        scene alone.
+        """Return the experiment with exposures of 1 in place of recovered exposures. For callers that need only the
+        scene.
         """
         target = self.target
         if isinstance(target.exposure, str):
@@ -350,7 +350,7 @@ class Config(Section):
         return self
 
     def _check_standing(self) -> None:
-        """Raise a located error if the settings of `run.stop` or `run.max_seconds` contradict others."""
+        """Raise an error that names the key if `run.stop` or `run.max_seconds` contradicts other settings."""
         stop = self.run.stop
         if stop is not None and self.run.held_out and stop.patience < 20:
             reason = f"must be at least 20, not {stop.patience}: held-out views are rendered every 10 iterations"
@@ -360,7 +360,7 @@ class Config(Section):
             raise located("run.max_seconds", reason)
 
     def _check_samples(self) -> None:
-        """Raise a located error if the samples of a step cannot be split as configured."""
+        """Raise an error that names the key if the samples of a step cannot be split as configured."""
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
         self._check_shards()
         if self.scene.size is not None:
@@ -379,7 +379,7 @@ class Config(Section):
             self._check_halves()
 
     def _check_shards(self) -> None:
-        """Raise a located error if shards are neither whole views nor equal parts of one view."""
+        """Raise an error that names the key if shards are neither whole views nor equal parts of one view."""
         asked, views, spp = self.run.shards, self.drawn_views, self.run.spp
         if asked == "auto" or views is None:
             return
@@ -393,7 +393,9 @@ class Config(Section):
         _check_passes(self.integrator, self.share_spp, "integrator", "the samples of a shard")
 
     def _check_halves(self) -> None:
-        """Raise a located error if samples cannot be halved, or two settings scale the brightness of a view."""
+        """Raise an error that names the key if samples cannot be halved, or if two settings scale a view's
+        brightness.
+        """
         sets = (self.run.batches if self.adjoint == "batched" else 1) * self.shares
         if self.run.spp % (2 * sets):
             reason = f"must be a multiple of {2 * sets}, not {self.run.spp}: loss.scale: fitted halves the samples"

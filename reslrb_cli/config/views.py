@@ -29,9 +29,10 @@ class Mask(Section):
     """The pixels of a target that the loss leaves out, and the weights of all other pixels.
 
     `specular`, `border`, `clipped` and `alpha` apply to targets that are read from files. `specular` and `border` leave
-    out pixels that light tracing cannot render. They matter only if either the run's integrator or the target's
-    integrator traces from the lights, but not both. If exactly one of the two integrators traces from the lights,
-    `specular` and `border` also apply to rendered targets. Pixels of a file that are not finite are always left out.
+    out pixels that light tracing cannot render. `specular` and `border` matter only if exactly one of the run's
+    integrator and the target's integrator traces from the lights. If exactly one of the two integrators traces from the
+    lights, `specular` and `border` also apply to rendered targets. Pixels of a file that are not finite are always left
+    out.
     """
 
     file: ConfigPath | None = None
@@ -62,7 +63,7 @@ def _mask(value: Any) -> Any:
 
 
 class _OrText:
-    """For JSON Schema: a section, or text as its short form."""
+    """JSON Schema annotation for a section that may also be text, its short form."""
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         return {"anyOf": [handler(core), {"type": "string"}]}
@@ -193,7 +194,7 @@ class ViewSpec(Section):
 
 
 def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:
-    """Raise a located error if views contradict each other or `target`."""
+    """Raise an error that names the key if views contradict each other or `target`."""
     places: dict[int, int] = {}
     for number, view in enumerate(views):
         if places.setdefault(view.sensor, number) < number:

@@ -99,7 +99,7 @@ _ALIAS = re.compile(r"\*[^\s,\]}]*")
 
 
 def format_location(location: Location) -> str:
-    """Return a location as in messages and `--set`: `parameters[0].bounds`."""
+    """Return a location as written in messages and in `--set`, for example `parameters[0].bounds`."""
     text = ""
     for part in location:
         if isinstance(part, int):
@@ -114,8 +114,8 @@ def parse(text: str, source: str, name_line: bool = True, example: Callable[[str
     also give the line number.
 
     The keys of all mappings are text without control characters. `example` is a function that shows how to write a
-    corrected text in its original form, for example in a shell command. Raises ConfigError if the text is not YAML, has
-    tags other than plain data, duplicate keys, or keys that are not text, or is nested too deeply.
+    corrected text in its original form, for example in a shell command. Raises ConfigError if the text is not YAML or
+    is nested too deeply. Tags other than plain data, duplicate keys and keys that are not text also raise ConfigError.
     """
 
     def at(line: int) -> str:
@@ -146,7 +146,7 @@ def parse(text: str, source: str, name_line: bool = True, example: Callable[[str
 
 
 def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], str] | None) -> str:
-    """Describe the error in one line. If text must be quoted, show it with quotes."""
+    """Describe the error in one line. If text must be quoted, show the quoted text."""
     problem = ", ".join(part for part in (error.context, error.problem) if part)
     mark = error.context_mark or error.problem_mark
     word = None if mark is None else _ALIAS.match(text, mark.index)
@@ -203,5 +203,5 @@ _Dumper.add_representer(list, _represent_list)
 
 
 def write(data: Any) -> str:
-    """Return YAML for plain `data`: mappings in block style in their own order, lists of scalars on one line."""
+    """Return YAML for plain `data`. Mappings keep their order in block style, and lists of scalars take one line."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False)

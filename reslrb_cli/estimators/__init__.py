@@ -24,7 +24,7 @@ ATTACHED: dict[str, type[Estimator]] = {"reservoir": AttachedReservoir, "stack":
 
 
 def options_of(name: str) -> dict[str, Any]:
-    """Return the options of the estimators of this name, with their defaults."""
+    """Return the options of the estimators called `name`, with their defaults."""
     return {option: default for kind in _kinds(name) for option, default in kind.OPTIONS.items()}
 
 

@@ -1,8 +1,8 @@
 """Attached derivatives by `stack`: the walk back over the stack evaluates each segment again, in its own AD scope.
 
 Segment i maps the ray v_i that reaches vertex i to the next ray v_{i+1}, to a factor s_i and to a connection (c_i,
-u_i). P_i is the path's throughput before vertex i, and r_i the weight of its roulette. B_i is the contribution of all
-later connections to the objective, per unit of throughput behind the vertex. P_i, r_i and B_i are detached. The
+u_i). P_i is the path's throughput before vertex i. r_i is the roulette weight at vertex i. B_i is the contribution of
+all later connections to the objective, per unit of throughput behind the vertex. P_i, r_i and B_i are detached. The
 recursion starts at the last vertex.
 
     S_i     = <P_i, delta(u_i) c_i + r_i s_i B_i> + <a_{i+1}, v_{i+1}>
@@ -149,7 +149,7 @@ class Adjoint:
 
     @staticmethod
     def where(mask: mi.Bool, origin: mi.Point3f, direction: mi.Vector3f, B: mi.Spectrum) -> Adjoint:
-        """Return these values in the lanes of the mask, and zero in the others."""
+        """Return the given values in the lanes of the mask, and zero in all other lanes."""
         values = mi.Vector3f(origin), direction, B
         return Adjoint(*(dr.select(mask, value, 0) for value in values))
 
@@ -161,7 +161,7 @@ class Adjoint:
 
 @dataclass
 class AttachedFrame:
-    """Vertex on the stack, with the data to evaluate its segment again, and with P_i and r_{i-1}.
+    """Vertex on the stack, with P_i, r_{i-1} and the data to evaluate the vertex's segment again.
 
     `connected` is 1 if the sensor was visible. `aperture` holds the sample of the aperture if the sensor has one. If
     vertices can stay at their places, `before` holds the previous vertex.
@@ -219,7 +219,7 @@ class AttachedState:
 
 
 class AttachedSweep(VertexHooks):
-    """Forward pass: it splats the image and pushes the vertices before number `end`, where paths end.
+    """Forward pass. The pass splats the image and pushes the vertices before number `end`. Paths end at this number.
 
     If `end` is None, the pass pushes all vertices.
     """

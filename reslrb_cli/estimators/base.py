@@ -46,7 +46,7 @@ class Pass:
         return self.samples.scale
 
     def walk(self, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
-        """Trace the paths, the same ones each time, and return the final state of the hooks."""
+        """Trace the paths and return the hooks' final state. Every call traces the same paths."""
         return walk(self.samples, hooks, active)
 
     def emission(self) -> Emission:
@@ -54,7 +54,7 @@ class Pass:
         return sample_emission(self.samples, self.samples.sampler())
 
     def delta(self, u: mi.Point2f, active: mi.Bool) -> mi.Spectrum:
-        """Return the adjoint (C,) at film position `u`; dL/dI must be known."""
+        """Return the adjoint (C,) at film position `u`. dL/dI must be known."""
         assert self.adjoint is not None
         return self.adjoint.lookup(u, active)
 
@@ -86,20 +86,20 @@ class Estimator(ABC):
 
     @abstractmethod
     def forward(self, p: Pass) -> Any:
-        """Splat the image and return the state to store, a PyTree of arrays with one entry per path. Does not evaluate
-        the state.
+        """Splat the image and return the state to store. The state is a PyTree of arrays with one entry per path. Does
+        not evaluate the state.
         """
 
     @abstractmethod
     def backward(self, p: Pass, state: Any) -> None:
-        """Add the derivatives to the parameters' gradients; `p.adjoint` is known, and `p.block` is not used."""
+        """Add the derivatives to the parameters' gradients. `p.adjoint` is known, and `p.block` is not used."""
 
     @abstractmethod
     def kept(self, plan: Plan) -> Any:
         """Return a PyTree with the types of all data that are stored for a path at the same time."""
 
     def scratch_bytes(self, plan: Plan) -> int:
-        """Return the thread-local bytes of each traced path, which the allocator does not count."""
+        """Return the thread-local bytes that each traced path uses. The allocator does not count these bytes."""
         return 0
 
 
@@ -111,7 +111,7 @@ def arrays(tree: Any) -> list[dr.ArrayBase]:
 
 
 def like(form: T, values: Iterator[dr.ArrayBase]) -> T:
-    """Return a PyTree of the same form, filled with the next of the given arrays."""
+    """Return a PyTree of the same form as `form`, filled with the next arrays from `values`."""
     made: Any = type(form)
     if isinstance(form, list):
         return made(like(part, values) for part in form)
@@ -121,14 +121,14 @@ def like(form: T, values: Iterator[dr.ArrayBase]) -> T:
 
 
 def entry_bytes(tree: Any) -> list[int]:
-    """Return the bytes of one entry of each array in a PyTree."""
+    """Return the entry size in bytes for each array in a PyTree."""
     found = arrays(tree)
     parts = [list(array) if dr.depth_v(array) > 1 else [] for array in found]
     return [n for array, own in zip(found, parts, strict=True) for n in (entry_bytes(own) or [dr.itemsize_v(array)])]
 
 
 def allocate(form: Any, size: int) -> list[dr.Local]:
-    """Return thread-local memory for `size` PyTrees of this form, and one more place for discarded values.
+    """Return thread-local memory for `size` PyTrees like `form`, plus one place for discarded values.
 
     No place may be written twice, even if the first write is masked. Otherwise the second write is lost (Dr.Jit 1.5,
     LLVM).
@@ -137,7 +137,7 @@ def allocate(form: Any, size: int) -> list[dr.Local]:
 
 
 def write(stack: list[dr.Local], value: Any, place: mi.UInt32, active: mi.Bool) -> None:
-    """Write a PyTree to a place of this memory."""
+    """Write a PyTree to one place of the thread-local memory."""
     for array, member in zip(stack, arrays(value), strict=True):
         array.write(member, place, active)
 
@@ -160,7 +160,7 @@ class PathAdjoint:
     """Sensitivity of the objective to one connection of a path.
 
     `value` (C,) is delta times the product of the nonzero factors, including the estimator's weight. It is 0 in lanes
-    without a connection. `product` tells which factor is zero, if any.
+    without a connection. `product` identifies the zero factor, if there is one.
     """
 
     value: mi.Spectrum
@@ -252,7 +252,7 @@ def places(plan: Plan, stack_size: int) -> int:
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    """Raise ValueError if an option has another value than the allowed ones."""
+    """Raise ValueError if an option's value is not one of the allowed values."""
     if value not in allowed:
         raise ValueError(f'"{name}" must be one of {", ".join(allowed)}, not "{value}"')
 

@@ -1,8 +1,9 @@
-"""Camera paths: their image, and its derivative in one traversal, for a film with known dL/dI.
+"""Camera paths: the image, and the image's derivative in one traversal. dL/dI of the film must be known.
 
 All light of a camera path arrives at one place of the film. Therefore delta is one number per channel, which is known
-before the path is traced. The walk back is that of `stack.py`, where c_j is the contribution of next event estimation
-at vertex j. The emission of a hit emitter does not depend on the BSDF there, so it belongs to the earlier vertices.
+before the path is traced. The walk back works as in `stack.py`. Here, c_j is the contribution of next event estimation
+at vertex j. The emission of a hit emitter does not depend on the BSDF at the hit point. The emission therefore belongs
+to the earlier vertices.
 
 The radiance of an emitter is the last factor of a contribution. The derivative with respect to an emitter's radiance
 needs no later data. The forward pass therefore adds this derivative. The weights of combined paths have no derivative.
@@ -64,9 +65,9 @@ class CameraState:
 
 
 class CameraSweep(CameraHooks):
-    """Forward pass of camera paths: it sums the image, differentiates radiances, and pushes vertices.
+    """Forward pass of camera paths. The pass sums the image, differentiates radiances, and pushes vertices.
 
-    With `end`, it traces paths again, pushes only vertices before number `end`, and ends the paths there.
+    With `end`, the pass traces paths again, pushes only vertices before number `end`, and ends paths at this number.
     """
 
     def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
@@ -110,7 +111,7 @@ class CameraSweep(CameraHooks):
         return CameraState(state.stack.scaled(weight), state.L)
 
     def _differentiate_emission(self, vertex: Vertex, met: MetLight | None, event: NextEvent | None) -> None:
-        """Add the derivatives with respect to the radiance of emitters at a vertex."""
+        """Add the derivatives at a vertex with respect to the radiance of emitters."""
         weight = self.delta * vertex.product.value()
         with dr.resume_grad():
             objective = mi.Spectrum(0)

@@ -11,10 +11,11 @@ adjoint a_0 of the first ray, up to the factor W / (m w_I).
 
     a_0 = <d delta/du, C_I> du_I/dp_I J_{0->I} + delta C_I (dlog c_I/dp_I J_{0->I} + G_I)
 
-Damping (`segment_jacobian`) makes singular Jacobians invertible, but costs digits at every vertex that is not specular.
-Paths are therefore divided into blocks of BLOCK such vertices. A chain starts with one block, chosen with equal
-probability among the blocks before the connection. The replay takes the adjoint only through this block, multiplied by
-the number of blocks. Radiometric derivatives need no chain, and are added at every vertex.
+Damping (`segment_jacobian`) makes singular Jacobians invertible. Damping reduces the precision at every nonspecular
+vertex. Paths are therefore divided into blocks of BLOCK nonspecular vertices. A chain starts with one of the blocks
+before the connection. All these blocks are equally probable. The replay propagates the adjoint only through the chosen
+block, and multiplies the adjoint by the block count. Radiometric derivatives need no chain, and are added at every
+vertex.
 
 Replay: the replay carries a_0 to every vertex. At each vertex, the adjoint is multiplied by the inverse of the passed
 Jacobian, and the segment is differentiated.
@@ -22,11 +23,11 @@ Jacobian, and the segment is differentiated.
     a_{j+1} = (a_j - delta C_I dlog s_j/dp_j) J_j^{-1}
     dS     += a_{j+1} dp_{j+1}/dtheta + delta C_I ds_j/s_j          at I:   d<delta(u_I), C_I> by c_I and u_I
 
-The product of the inverses is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the ResLRB paper. Chain and replay compute
+The product of the inverses is the ResLRB paper's J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1}. Chain and replay compute
 bitwise equal J_j. The inverse therefore cancels the Jacobian for any conditioning.
 
-Source: the ResLRB paper, Section 2.5. The paper has neither G nor blocks, and regularises the inverse at vertices that
-are not specular. Here, a random sign of the regularisation avoids its bias.
+Source: the ResLRB paper, Section 2.5. The paper uses neither G nor blocks. The paper regularises the inverse at
+nonspecular vertices. Here, the regularisation has a random sign, which avoids a bias.
 """
 
 from __future__ import annotations
@@ -73,10 +74,10 @@ JACOBIAN_DAMPING = 0.1
 class ChainSlot:
     """Selected connection.
 
-    `number` is the vertex of the selected connection. `last` is the last differentiated vertex up to this vertex, or 0
-    if there is none. `prefix` (C,) is the path's throughput before this vertex. `u_rows` and `C_rows` are du_I/dp_I
-    J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I. If there may be several blocks, `block` holds two numbers: the block with
-    which J starts, and the block count so far.
+    `number` is the vertex of the selected connection. `last` is the last differentiated vertex up to vertex `number`,
+    or 0 if there is none. `prefix` (C,) is the path's throughput before vertex `number`. `u_rows` and `C_rows` are
+    du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I. If there may be several blocks, `block` holds two numbers: the
+    block with which J starts, and the block count so far.
     """
 
     w: mi.Float
@@ -111,7 +112,7 @@ class ChainBlocks:
         return self.passed // BLOCK
 
     def past(self, damped: mi.Bool) -> tuple[ChainBlocks, mi.Bool]:
-        """Return the position behind a vertex, and whether a block starts with it."""
+        """Return the position behind a vertex, and True if a block starts at this position."""
         passed = self.passed + dr.select(damped, mi.UInt32(1), 0)
         return ChainBlocks(passed, self.chosen), damped & (passed % BLOCK == 0)
 
@@ -214,7 +215,7 @@ class ChainSelection(VertexHooks):
         return replace(self._begun_anew(after, jacobian.damped, numbers[-1]), before=before)
 
     def _begun_anew(self, state: ChainState, damped: mi.Bool, number: mi.Float) -> ChainState:
-        """Restart the chain at a block, with probability one over the number of blocks."""
+        """Where a block begins, restart the chain with probability 1 / (number of blocks so far)."""
         if not state.blocks:
             return state
         blocks, begins = state.blocks[0].past(damped)
@@ -241,7 +242,7 @@ class KeptConnection:
 
     @staticmethod
     def of(p: Pass, slot: ChainSlot, share: mi.Float) -> KeptConnection:
-        """Return the connection of a slot; dL/dI must be known."""
+        """Return the connection of a slot. dL/dI must be known."""
         assert p.adjoint is not None
         C = slot.C.value() * share
         with dr.resume_grad():
@@ -342,7 +343,7 @@ class AttachedReservoir(Estimator):
     OPTIONS: ClassVar[dict[str, Any]] = Reservoir.OPTIONS | {"jacobian_damping": JACOBIAN_DAMPING}
 
     def __init__(self, jacobian_damping: float = JACOBIAN_DAMPING, **options: Any) -> None:
-        """Make the estimator; `options` are those of `Reservoir`."""
+        """Make the estimator. `options` are the options of `Reservoir`."""
         if not jacobian_damping > 0:
             raise ValueError(f'"jacobian_damping" must be positive, not {jacobian_damping}')
         checked = Reservoir(**options)
@@ -385,7 +386,7 @@ class SegmentJacobian:
     inverted.
 
     `ray` is dp_{i+1}/dp_i. `damped` is True in lanes whose Jacobian `ray` contains `damping`. `log_s` and `log_c` have
-    a row for each channel, or zeros if the factor is 0. `u` has a row for each film coordinate, in pixels.
+    one row for each channel. The rows are zero if the factor is 0. `u` has a row for each film coordinate, in pixels.
     """
 
     ray: mi.Matrix4d
@@ -429,10 +430,10 @@ def segment_jacobian(
 
     Behind a diffuse scattering event, the next ray does not depend on the previous direction, so the Jacobian is
     singular. The Jacobian is also singular for a vertex that stays at its place on its surface. `damping` makes the
-    Jacobian invertible. Behind a vertex that is not specular, the next ray also rotates with the previous ray, by the
-    fraction `damping`. Behind a vertex that stays, the next ray is also shifted with the previous ray. The sign of each
-    damping term is random, with probability 1/2. The chain before the inverse is linear in each term, so the expected
-    value does not change.
+    Jacobian invertible. Behind a nonspecular vertex, damping adds the fraction `damping` of the previous ray's rotation
+    to the next ray. Behind a vertex that stays at its place, damping also shifts the next ray with the previous ray.
+    The sign of each damping term is random, with probability 1/2. Before the inversion, the chain is linear in each
+    damping term. Damping therefore does not change the expected value.
     """
     p = [mi.Float(0) for _ in range(AXES)]
     frame, stays = mi.Frame3f(vertex.ray.d), is_staying(before)
@@ -477,7 +478,7 @@ def segment_jacobian(
 
 
 def sign(numbers: Numbers) -> mi.Float:
-    """Return 1 or -1 with probability 1/2 each, from the last bit of the BSDF's random number.
+    """Return 1 or -1 with probability 1/2 each. The last bit of the BSDF's random number decides.
 
     The last bit does not affect the sampled direction. A replay reads an equal bit.
     """

@@ -1,9 +1,9 @@
 """Select single scattering events of each path by two nested reservoirs, and differentiate them without a replay.
 
 The gradient of a path is a double sum over its connections i and over the events of each connection. The events are
-emission, the scattering events j < i, and the connection's own BSDF (j = i). The inner reservoir selects one event with
-weight q_j = 1, or 0 if the event has no parameter. The outer reservoir selects a connection with weight w_i Q_i, where
-Q_i is the sum of the q_j.
+emission, the scattering events j < i, and the connection's own BSDF (j = i). The inner reservoir selects one event. An
+event has weight q_j = 1, or 0 if the event has no parameter. The outer reservoir selects a connection with weight w_i
+Q_i, where Q_i is the sum of the q_j.
 
     the pair (i, j) is kept with probability w_i q_j / W,   W = sum_i w_i Q_i
     dS ~ 1/m sum_slots W / (w_i q_j) delta_i C_i df_j/f_j
@@ -64,8 +64,8 @@ class EventSlot:
 
 @dataclass
 class EventState:
-    """Loop state: Q and W. For each slot also the event selected from the path prefix, and the selected pair of
-    connection and event.
+    """Loop state: Q and W. For each slot, the state also holds the event selected from the path prefix and the selected
+    pair of connection and event.
     """
 
     Q: mi.Float

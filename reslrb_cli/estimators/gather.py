@@ -71,12 +71,12 @@ class Visibility:
 
 @dataclass
 class AdjointSum:
-    """Sum of delta_i C_i over connections of a path, (C,), as `value` + `rest`.
+    """Sum (C,) of delta_i C_i over a path's connections, stored as `value` + `rest`.
 
     `rest` is the rounding error (Knuth's two-sum). With `rest`, subtracting all terms leaves exactly zero, even after a
-    thousand vertices. `behind_zero` is a second sum, of contributions whose prefix has exactly one zero factor.
-    `behind_zero` leaves out the zero factor, so `behind_zero` is the derivative with respect to the zero factor. It is
-    empty if zeros are not tracked.
+    thousand vertices. `behind_zero` is a second sum. The sum covers contributions whose prefix has exactly one zero
+    factor. `behind_zero` leaves out the zero factor, so `behind_zero` is the derivative with respect to the zero
+    factor. It is empty if zeros are not tracked.
     """
 
     value: mi.Spectrum
@@ -106,7 +106,7 @@ class AdjointSum:
         return self.plus(-delta, C, index, active)
 
     def adjoint_of_factor(self, f: mi.Spectrum, prefix: Product, rest: mi.Float | float) -> mi.Spectrum:
-        """Return the derivative (C,) of the sum with respect to a factor `f * rest` of the path with this prefix.
+        """Return the sum's derivative (C,) with respect to a factor `f * rest` that follows the path prefix `prefix`.
 
         The factor must come before all connections in the sum.
         """
@@ -124,7 +124,9 @@ class AdjointSum:
 
     @staticmethod
     def _add(value: mi.Spectrum, rest: mi.Spectrum, term: mi.Spectrum) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """Return value + rest + term as a rounded sum and its error (Knuth 1969, 4.2.2, theorem B)."""
+        """Return value + rest + term as two numbers, the rounded sum and its rounding error (Knuth 1969, 4.2.2, theorem
+        B).
+        """
         total = value + term
         part = total - value
         return total, rest + ((value - (total - part)) + (term - part))
@@ -171,7 +173,9 @@ class Gathering(VertexHooks):
 
 
 class Revisiting(VertexHooks):
-    """Walk along paths that were traced before, as far as necessary, without shadow rays."""
+    """Walk again along paths that were already traced. The walk goes only as far as necessary and traces no shadow
+    rays.
+    """
 
     def __init__(self, p: Pass, visibility: Visibility) -> None:
         super().__init__(p)
@@ -233,9 +237,9 @@ def adjoint_of_connection(
 def needed(latest: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:
     """Return the last vertex that a replay must visit for a connection from vertex `depth`, or 0 if there is none.
 
-    The result is the vertex after the latest differentiated vertex, because the path samples the scattering of the
-    latest differentiated vertex there. If the connection starts at the latest differentiated vertex, the result is this
-    vertex.
+    The result is the vertex after the latest differentiated vertex, because the replay must also sample the scattering
+    of the latest differentiated vertex. If the connection starts at the latest differentiated vertex, the result is
+    this vertex.
     """
     return dr.select(latest > 0, dr.minimum(latest + 1, depth), 0)
 

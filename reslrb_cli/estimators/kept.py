@@ -1,4 +1,4 @@
-"""Stored data of a vertex and of a sampled event, for another evaluation of the BSDF."""
+"""Stored data of vertices and sampled events, from which the BSDF can be evaluated again."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from reslrb_cli.transport.walk import Vertex
 
 @dataclass
 class SurfacePoint:
-    """Data of a vertex that its BSDF reads, as plain numbers. Pointers are stored as indices.
+    """Vertex data that the BSDF reads, as plain numbers. Pointers are stored as indices.
 
-    If BSDFs read only texture coordinates and directions, the data are `[uv, wi, bsdf]`, without `bsdf` if just one
-    BSDF is differentiated. Otherwise the data identify the interaction: `[t, prim_uv, prim_index, shape, instance, o,
-    d]`.
+    If BSDFs read only texture coordinates and directions, the data are `[uv, wi, bsdf]`. If just one BSDF is
+    differentiated, `bsdf` is left out. Otherwise the data identify the interaction: `[t, prim_uv, prim_index, shape,
+    instance, o, d]`.
     """
 
     numbers: list[dr.ArrayBase]
@@ -47,7 +47,7 @@ class SurfacePoint:
         return mi.Ray3f(*self.numbers[-2:])
 
     def hit(self) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
-        """Return the intersection and its ray; stored in scenes whose BSDFs read geometry."""
+        """Return the intersection and its ray. Both are stored only in scenes whose BSDFs read geometry."""
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to local memory crashes the process
         pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
@@ -68,7 +68,7 @@ class SurfacePoint:
 
 
 def event(wo: mi.Vector3f, lobe: list[mi.UInt32 | mi.Float | mi.Point2f]) -> Scattering:
-    """Return a sampled event from its stored direction and `lobe`, with all data that its factor needs."""
+    """Return a sampled event from its stored direction and `lobe`. The event has all data that its factor needs."""
     kind, sample_1, sample_2 = lobe or [mi.UInt32(0), None, None]
     return Scattering(
         weight=None, f=None, wo=wo, d=None, pdf=None, eta=None, correction=None,
@@ -81,8 +81,8 @@ def _index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
 
 
 def lobe(plan: Plan, scattering: Scattering | None) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
-    """Return the sampled lobe (1: delta, 2: null) with its random numbers. The result is empty if only smooth lobes
-    matter.
+    """Return the kind of the sampled lobe (1: delta, 2: null) and its random numbers. The result is empty if only
+    smooth lobes matter.
 
     Without an event (None), the function returns zeros of the same form.
     """

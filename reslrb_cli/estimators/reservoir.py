@@ -6,12 +6,12 @@
 Source: the ResLRB paper, Sections 2.2 to 2.4, for m = 1 and w = luminance(C). Its conclusion proposes m > 1. Here, m
 independent slots share one replay. Reservoir sampling: Chao 1982.
 
-If delta is known before the paths are traced, w = sum_c |delta_c C_c| has less variance. With zero factors, the weight
-uses only the nonzero factors. A connection with a zero value and a nonzero derivative can then be selected. Every
-weight is at least SHARE of the sum of the weights before it.
+If delta is known before the paths are traced, w = sum_c |delta_c C_c| has less variance. If a contribution has zero
+factors, its weight uses only the nonzero factors. A connection with a zero value and a nonzero derivative can then be
+selected. Every weight is at least SHARE times the sum of all earlier weights.
 
 The surface point of the selected connection is stored, too, so c_I is differentiated without a replay. The replay ends
-at x_{I-1}, or at the last differentiated vertex before it. A connection of a path without differentiated vertices is no
+at x_{I-1}, or earlier at the last differentiated vertex. On a path without differentiated vertices, no connection is a
 candidate.
 """
 

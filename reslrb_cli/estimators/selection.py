@@ -47,7 +47,7 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
 
 
 def is_taken(number: mi.Float, w: mi.Float, W: mi.Float) -> mi.Bool:
-    """Return whether a candidate of weight `w` takes the slot, with probability w / W. The sum `W` includes `w`.
+    """Return True if a candidate of weight `w` takes the slot. The probability is w / W. The sum `W` includes `w`.
 
     If the weight sum is not finite, the current candidate and all later candidates are taken. Errors are therefore not
     lost.
@@ -112,9 +112,9 @@ class Event:
     """One factor of a path: the BSDF value f towards the local direction `wo`. `index` is the vertex of the factor.
     `index` is 0 for emission.
 
-    The whole factor is `rest` times f, without the transmittance of masks. `rest` is stored only if zero factors are
-    tracked. Needed if masks may stand between vertex and sensor: `own` holds True for an event of a connection, and the
-    sample of the sensor's aperture.
+    Apart from the transmittance of masks, the whole factor is `rest` times f. `rest` is stored only if zero factors are
+    tracked. `own` is stored only if masks may stand between vertex and sensor. `own` holds True for a connection's
+    event, and the sample of the sensor's aperture.
     """
 
     index: mi.UInt32
@@ -127,13 +127,15 @@ class Event:
 
     @staticmethod
     def emission(plan: Plan) -> Event:
-        """Return the event before the first vertex."""
+        """Return the emission event, which precedes the first vertex."""
         rest, wo, f = [mi.Float(0)] if plan.track_zeros else [], mi.Vector3f(0), mi.Spectrum(0)
         return Event(mi.UInt32(0), SurfacePoint.blank(plan), wo, f, rest, lobe(plan, None), _own(plan, None))
 
     @staticmethod
     def of_connection(plan: Plan, vertex: Vertex, connection: Connection) -> Event:
-        """Return the vertex's BSDF towards the sensor as an event. Its index is 0 if nothing is differentiated."""
+        """Return an event for the vertex's BSDF towards the sensor. The event's index is 0 if nothing is
+        differentiated.
+        """
         useful = mi.Bool(True) if plan.passage_in_gradient else plan.differentiates(vertex.bsdf)
         index, point = dr.select(useful, mi.UInt32(vertex.depth), 0), SurfacePoint.of(plan, vertex)
         rest = [dr.rcp(stand_in(connection)[0])] if plan.track_zeros else []
@@ -141,21 +143,23 @@ class Event:
 
     @staticmethod
     def of_scattering(plan: Plan, vertex: Vertex, scattering: Scattering) -> Event:
-        """Return the BSDF of the vertex along the path as an event."""
+        """Return an event for the vertex's BSDF along the path."""
         rest = [scattering.correction / scattering.pdf] if plan.track_zeros else []
         index, point, wo = mi.UInt32(vertex.depth), SurfacePoint.of(plan, vertex), scattering.wo
         return Event(index, point, wo, scattering.f, rest, lobe(plan, scattering), _own(plan, None))
 
 
 def _own(plan: Plan, connection: Connection | None) -> list[mi.Bool | mi.Point2f]:
-    """Return the value of `Event.own` for a connection, or for scattering (None)."""
+    """Return `Event.own` for a connection. None stands for a scattering event."""
     if not plan.passage_in_gradient:
         return []
     return [mi.Bool(False), mi.Point2f(0)] if connection is None else [mi.Bool(True), connection.sample]
 
 
 def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.Bool) -> None:
-    """Add the derivative of an event, given the adjoint of its connection, in `active` lanes that hold an event."""
+    """Add an event's derivative in `active` lanes that hold an event. `adjoint` is the adjoint of the event's
+    connection.
+    """
     plan, active = p.plan, active & (kept.index > 0)
     si, bsdf = kept.point.interaction(plan, active)
     rest = mi.Spectrum(kept.rest[0] if kept.rest else 0)

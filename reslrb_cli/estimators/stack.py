@@ -1,10 +1,10 @@
 """Use every connection of a path without additional variance, in one traversal. The forward pass pushes vertices on a
 stack. The walk back then visits the vertices in reverse order.
 
-P_j is the throughput before vertex j. s_j is the scattering factor at vertex j, and c_j is the connection factor. s_j
-and c_j are f = bsdf * cos times numbers without a derivative. B_j is the contribution of all later connections to the
-objective, per unit of throughput behind s_j. delta_j is dL/dI at the film position of c_j. The recursion starts at the
-last vertex.
+P_j is the throughput before vertex j. s_j is the scattering factor and c_j the connection factor at vertex j. Each of
+s_j and c_j is f = bsdf * cos times numbers without a derivative. B_j is the contribution of all later connections to
+the objective, per unit of throughput behind s_j. delta_j is dL/dI at the film position of c_j. The recursion starts at
+the last vertex.
 
     dS     += P_j [ delta_j dc_j + B_j ds_j ]
     B_{j-1} = delta_j c_j + s_j B_j                      B = 0 behind the last vertex
@@ -18,12 +18,12 @@ pushed vertex. Vertex k stores both when it is pushed.
 
     B = (D + T delta_k c_k) + (T s_k) B_k                of the vertex that was pushed before k
 
-The stack is a ring of `stack_size` places in thread-local memory, about 95 bytes each, and holds the last vertices. For
-the earlier vertices of longer paths, the path is traced again, block by block, from the last block to the first. If
-delta is known before the paths are traced, image and gradient are one kernel. Otherwise, paths are traced again for the
+The stack is a ring of `stack_size` places in thread-local memory. The ring holds the last vertices, in about 95 bytes
+each. A longer path is traced again for its earlier vertices, block by block from the last block to the first. If delta
+is known before the paths are traced, image and gradient are one kernel. Otherwise, paths are traced again for the
 gradient, without shadow rays.
 
-`attached.py` has the same recursion for parameters that move light, and `camera.py` for camera paths.
+`attached.py` uses this recursion for parameters that move light. `camera.py` uses the recursion for camera paths.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class Differentiable(Protocol[A]):
 
 @dataclass(frozen=True)
 class Ring:
-    """Places of vertices on the stack, by vertex number. The ring has one extra place with number `size`, which
-    receives discarded values.
+    """Map from vertex numbers to places on the stack. The ring has one extra place with number `size`, which receives
+    discarded values.
     """
 
     size: int
@@ -103,9 +103,9 @@ class Ring:
 class StackState:
     """Loop state of the forward pass.
 
-    `count` vertices have been pushed, and `needed` of them come before the last contribution. `throughput` is T at the
-    current vertex. If the stack leaves out no vertex, `throughput` contains only the roulette weight. `since` is the
-    contribution D since vertex number `needed`. `stack` has an array for each member of a frame.
+    `count` vertices have been pushed. The first `needed` vertices come before the last contribution. `throughput` is T
+    at the current vertex. If the stack leaves out no vertex, `throughput` contains only the roulette weight. `since` is
+    the contribution D since vertex number `needed`. `stack` has an array for each member of a frame.
     """
 
     stack: list[dr.Local]
@@ -116,7 +116,7 @@ class StackState:
 
     @staticmethod
     def begin(form: Any, ring: Ring, throughput: mi.Float | mi.Spectrum) -> StackState:
-        """Return an empty stack of frames of this form. `form` is None if no vertex is ever pushed. `throughput`
+        """Return an empty stack for frames like `form`. `form` is None if no vertex is ever pushed. `throughput`
         is 1.
         """
         stack = [] if form is None else allocate(form, ring.size)
@@ -132,7 +132,7 @@ class StackState:
         return replace(self, needed=dr.select(active, self.count, self.needed), since=since)
 
     def scaled(self, weight: mi.Float | mi.Spectrum) -> StackState:
-        """Return the state behind a factor of the path, with the throughput multiplied by `weight`."""
+        """Return the state behind a factor of the path. The throughput is multiplied by `weight`."""
         return replace(self, throughput=self.throughput * weight)
 
     def pushed(self, frame: Any, ring: Ring, here: mi.Bool, contributes: mi.Bool) -> StackState:
@@ -157,7 +157,7 @@ def walk_back(
     """Differentiate all vertices, from the last to the first. Returns the adjoint before the first vertex.
 
     `adjoint` is the adjoint behind the last contribution. `again(end)` traces the paths again, and pushes the vertices
-    before number `end`. It is called only if paths may be longer than the stack.
+    before number `end`. `again` is called only if paths may be longer than the stack.
     """
     if not state.stack:
         return adjoint
@@ -202,7 +202,7 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
 
 @dataclass
 class Frame:
-    """Vertex on the stack, whose BSDF is evaluated again towards the sensor and along the path.
+    """Vertex on the stack. The vertex's BSDF is evaluated again towards the sensor and along the path.
 
     `weight_c` (C,) is P_k delta_k c_k / f_c, the weight of the derivative of f_c. `weight_s` (C,) is P_k s_k / f_s. The
     product of `weight_s` and B_k is the weight of the derivative of f_s. B of the previously pushed vertex is `own` +

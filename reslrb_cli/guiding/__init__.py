@@ -1,1 +1,3 @@
-"""Guided emission: contributions of light paths by their starting cells, and tables learned from them."""
+"""Guided emission: recorded contributions for each starting cell of light paths, and tables learned from these
+contributions.
+"""

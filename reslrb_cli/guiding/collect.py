@@ -1,8 +1,8 @@
-"""Light-path contributions from which guiding learns, for each cell in which paths start, and for each cell through
-which paths pass.
+"""Light-path contributions from which guiding learns. The contributions are recorded for each cell in which paths
+start, and for each cell through which paths pass.
 
-Trail: the vertices of a path are stored until the path ends, because the contribution behind each vertex is known only
-then. The first PLACES vertices are stored in thread-local memory. A walk back sums over all later vertices, as in
+Trail: the vertices of a path are stored until the path ends. Only then is the contribution behind each vertex known.
+The first PLACES vertices are stored in thread-local memory. A walk back sums over all later vertices, as in
 `estimators/stack.py`.
 
 `Onward`: contributions of later vertices, for each cell of ray position and ray direction. Roulette uses these
@@ -15,11 +15,11 @@ variance times work.
 
 Source: Rath et al. 2022, "EARS: efficiency-aware Russian roulette and splitting". Here s is SURE times larger. Few
 paths carry nearly all of a cell's contribution, so most cells are underestimated. Ending a path too early adds much
-more noise than following a path too long adds work.
+noise. Following a path too long adds comparatively little work.
 
 Because most cells are underestimated, each cell is averaged with the larger cube around the cell. The cube has the
-weight of LEAN rays. Each cube is in turn averaged with the next larger cube, up to the whole scene. No cell has less
-than FLOOR of the scene's m / c.
+weight of LEAN rays. Each cube is in turn averaged with the next larger cube, up to the whole scene. Every cell's m / c
+is at least FLOOR times the scene's m / c.
 
 `Hearing`: contributions of light paths to gradient and image, for each cell in which paths start. A separate walk with
 its own random numbers computes the contributions, for each path and each differentiated BSDF.
@@ -27,8 +27,8 @@ its own random numbers computes the contributions, for each path and each differ
     G = sum_i delta_i C_i n_i        n_i: number of factors of C_i from this BSDF
 
 G is a derivative with respect to the logarithm of a factor. The factor scales all values of the BSDF. For emission, n =
-1. If light moves, G is the sum of |delta_i C_i|. The tables sum the squares of G p / v. G p / v is a path's
-contribution if all paths started uniformly. These squares determine the variance of the sum over all paths.
+1. If light moves, G is the sum of |delta_i C_i|. The tables sum the squares of G p / v. If all paths started uniformly,
+a path's contribution would be G p / v. The squares of G p / v determine the variance of the sum over all paths.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Trail:
 
     @staticmethod
     def begin(voices: int) -> Trail:
-        """Return an empty trail for this number of quantities besides the image."""
+        """Return an empty trail for `voices` quantities and the image."""
         later = [*(mi.Spectrum(0) for _ in range(voices)), mi.Float(0)]
         said, left = allocate(later, PLACES), allocate([mi.UInt32(0), mi.Float(0)], PLACES)
         return Trail(said, left, allocate([mi.Float(0)], PLACES), mi.UInt32(0), later)
@@ -166,8 +166,8 @@ class Walked:
 class Onward:
     """Sums (4, CELLS) as float32: squared contributions to gradient and image, later vertices, and rays.
 
-    Squared contributions are divided by those of whole paths, and multiplied by the square of `light`. The box `box`
-    (2, 3) is divided into cubes. Arrays are never modified.
+    Squared contributions are divided by the squared contributions of whole paths, and multiplied by the square of
+    `light`. The box `box` (2, 3) is divided into cubes. Arrays are never modified.
     """
 
     box: Array
@@ -243,7 +243,7 @@ def _leaning(sums: Array, counts: Array) -> Array:
 
 
 def _cubes(values: Array, level: int) -> Array:
-    """Return sums over the cubes of a level, per octant: (K, 2^level, 2^level, 2^level, 8)."""
+    """Return the sum for each cube of a level and each octant: (K, 2^level, 2^level, 2^level, 8)."""
     few, each = 1 << level, 1 << (BITS - level)
     return np.asarray(values.reshape(len(values), few, each, few, each, few, each, SHAPE[-1]).sum((2, 4, 6)))
 
@@ -253,7 +253,7 @@ BINS = 1024  # of sums over all paths, so that small terms are not lost
 
 
 def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
-    """Return the groups of BSDFs whose derivatives are recorded separately; an empty group means all BSDFs of the
+    """Return the groups of BSDFs whose derivatives are recorded separately. An empty group means all BSDFs of the
     scene.
     """
     if not plan.differentiate_bsdfs:
@@ -275,8 +275,8 @@ def meets(group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
 
 
 def voices(plan: Plan) -> int:
-    """Return the number of separate quantities: groups of BSDFs, emission, moving parameters, and the image as the last
-    one.
+    """Return the number of separate quantities: groups of BSDFs, emission, moving parameters, and the image. The image
+    comes last.
     """
     return len(bsdf_groups(plan)) + plan.differentiate_emission + plan.attached + 1
 
@@ -286,7 +286,7 @@ class Heard:
     """Loop state of the hooks.
 
     `counts` tells how often the path met each group's BSDFs. `sums` are G (C,) of groups, emission and moving
-    parameters. `image` is sum_i |C_i|^2, and `light` the weight of the path at the emitter.
+    parameters. `image` is sum_i |C_i|^2. `light` is the path's weight at the emitter.
     """
 
     counts: list[mi.UInt32]
@@ -391,7 +391,7 @@ class Said:
 
 
 def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
-    """Return the contributions of guided samples with dL/dI `gradient` (H, W, C). Values that are not finite are left
+    """Return the contributions of guided samples. `gradient` (H, W, C) is dL/dI. Values that are not finite are left
     out.
     """
     plan, adjoint = samples.plan, samples.film.adjoint(gradient)
@@ -420,7 +420,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
 
 
 def _sums(values: list[mi.Float], width: int) -> mi.Float:
-    """Return sums (len(values) * BINS) over paths. Values that are not finite are left out."""
+    """Return sums over paths. The result has len(values) * BINS entries. Values that are not finite are left out."""
     result, lane = dr.zeros(mi.Float, len(values) * BINS), dr.arange(mi.UInt32, width) % BINS
     for number, value in enumerate(values):
         dr.scatter_reduce(dr.ReduceOp.Add, result, value, lane + number * BINS, dr.isfinite(value))

@@ -1,4 +1,4 @@
-"""Distribution of camera paths over the pixels by the effect of their noise on the gradient.
+"""Distribution of camera paths over the pixels, according to how much each pixel's noise affects the gradient.
 
 In some scenes, only a few pixels matter. For example, a wall may be visible to camera paths only in the pixels of a
 mirror, while other pixels show nothing that is differentiated. Before the first iteration, a few camera paths are
@@ -7,7 +7,7 @@ gradient, as in `collect.py`. The loss of this gradient has dL/dI = 1.
 
     G = sum_i C_i n_i        n_i: number of factors of contribution C_i from this BSDF;  n = 1 for emission
 
-Near the end of a run, dL/dI is mostly noise: it is w_j times the noise of the pixel I_j. The weight w_j is the
+Near the end of a run, dL/dI is mostly noise. In pixel j, dL/dI is w_j times the noise of I_j. The weight w_j is the
 curvature of the loss, and 0 in an excluded pixel. With n_j paths in pixel j, the variance of the gradient is a sum over
 the pixels.
 
@@ -97,7 +97,7 @@ def note(samples: Samples) -> NDArray[np.float64]:
 
 
 def noted_part(paths: float, spp: float) -> float | None:
-    """Return the share of the recorded paths in a run, or None if the run has no time for the measurement.
+    """Return the share of a run's paths that is recorded, or None if the run has no time for the measurement.
 
     `paths` is the run's path count. `spp` is the path count per pixel over all iterations.
     """

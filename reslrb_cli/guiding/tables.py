@@ -1,16 +1,16 @@
 """Tables that guide where light paths start, for each sensor. The contributions of earlier steps update the tables for
 later steps.
 
-Cells are sampled by the contributions of the paths that started in them. `collect.py` defines these contributions. The
-variance of a sum over paths depends on the mean square contribution in each cell. The variance is smallest if each cell
-is sampled in proportion to the square root of its mean square contribution. Each quantity is scaled to a total of 1, so
-that no parameter dominates another.
+Each cell is sampled according to the contributions of the paths that started in the cell. `collect.py` defines these
+contributions. The variance of a sum over paths depends on the mean square contribution in each cell. The variance is
+smallest if each cell is sampled in proportion to the square root of its mean square contribution. Each quantity is
+scaled to a total of 1, so that no parameter dominates another.
 
 The resolution of the cells depends on the number of recorded paths. After a few thousand paths, hundreds of cells are
-merged. With more recorded paths, merged cells are divided again, until they are the cells of the grid.
+merged. As more paths are recorded, merged cells are divided again, down to the cells of the grid.
 
-`Guiding` holds the tables of one scene. If samples serve image and gradient, half of the samples are drawn for the
-image and half for the gradient.
+`Guiding` holds the tables of one scene. If samples are used for both image and gradient, half of the samples are drawn
+for the image and half for the gradient.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ class Learned:
         return Learned(sums, started, self.calls, onward, self._places(film), worse)
 
     def _places(self, heard: Array | None) -> Array:
-        """Return `film` after an update with the newer contributions to each block (voices, blocks). The last row
-        belongs to the image.
+        """Return `film`, updated with the newer contributions to each block (voices, blocks). The last row belongs to
+        the image.
         """
         if heard is None:
             return self.film
@@ -108,7 +108,7 @@ class Learned:
         return film
 
     def on(self, grid: Grid, before: Grid) -> Learned:
-        """Return the same contributions on the cells of another grid, distributed evenly."""
+        """Return the contributions, distributed evenly over the cells of another grid."""
         sums = np.stack([grid.shared_out(row, before) for row in self.sums])
         draws = grid.shared_out(self.draws, before).astype(np.float32)
         return Learned(sums.astype(np.float32), draws, self.calls, self.onward, self.film)
@@ -125,7 +125,7 @@ class Learned:
         return grid.shared_out(np.float32(share) * gradient + np.float32(1 - share) * image, coarser)
 
     def _both(self, grid: Grid) -> tuple[Grid, list[Array]]:
-        """Return the densities for gradient and image, float32, and their grid."""
+        """Return a grid, and the float32 densities on this grid for gradient and image."""
         coarser = grid.coarser(FINE * self.draws.sum(dtype=np.float64))
         measures, found = coarser.measures().astype(np.float32), []
         draws = _blurred(coarser, grid.summed(self.draws, coarser))
@@ -156,7 +156,7 @@ def _add(sums: Array, heard: Array, means: Array) -> list[float]:
 
 
 def _blurred(grid: Grid, values: Array) -> Array:
-    """Return weighted sums over neighbouring cells; cells of different emitters are not neighbours."""
+    """Return weighted sums over neighbouring cells. Cells of different emitters are not neighbours."""
     from scipy import ndimage  # imported here: few commands learn, and all import this module
 
     result = values.reshape(grid.shape)
@@ -197,8 +197,7 @@ def sensor_bytes(grid: Grid, aims: bool = True) -> int:
 
 
 def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:
-    """Return a grid whose tables fit into memory for this number of sensors. If there are more sensors, they share
-    tables.
+    """Return a grid whose tables fit into memory for `sensors` sensors. Additional sensors share tables.
 
     The grid is not finer than walks of `paths` paths can resolve. `paths` is None if the number of paths is unknown.
     """
@@ -269,7 +268,7 @@ class Guiding:
         return replace(table, aim=self._aim(number, purpose, self.learned.get(number), delta))
 
     def counts(self, number: int, purpose: Purpose) -> Array:
-        """Return the slots of each cell of this table."""
+        """Return the table's slot count for each cell."""
         return self._table(number, purpose)[1]
 
     def _table(self, number: int, purpose: Purpose) -> tuple[Table, Array]:
@@ -327,12 +326,14 @@ class Guiding:
         return max(MOST_BYTES // sensor_bytes(self.grid), 1)
 
     def bytes(self, sensors: int) -> int:
-        """Return the bytes of the tables for this number of sensors."""
+        """Return the bytes of the tables for `sensors` sensors."""
         assert self.grid is not None
         return min(sensors, self._apart) * sensor_bytes(self.grid)
 
     def state(self) -> tuple[dict[str, int], dict[str, Array]]:
-        """Return the learned state: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
+        """Return the learned state: the gradient count of each sensor, and a mapping from `<sensor>/<what>` to
+        arrays.
+        """
         arrays: dict[str, Array] = {}
         for number, learned in self.learned.items():
             found = {name: getattr(learned, name) for name in ("sums", "draws", "film")}
@@ -340,9 +341,9 @@ class Guiding:
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
     def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
-        """Restore the result of `state`. `take(name)` returns the array of a name.
+        """Restore the result of `state`. `take(name)` returns the array that is called `name`.
 
-        If an array does not fit this scene's grid, returns its name and leaves the state unchanged.
+        If an array does not fit this scene's grid, the method returns the array's name and leaves the state unchanged.
         """
         assert self.grid is not None
         found = {}
@@ -398,7 +399,7 @@ def _shares(row: Array, even: Array) -> Array:
 
 
 def learns_after(gradients: int) -> bool:
-    """True if a table learns from the gradient with this number. Gradients are counted from 1.
+    """True if a table learns from gradient number `gradients`. Gradients are counted from 1.
 
     At first, the number of recorded paths doubles each time. Later, the table must check regularly whether the scene
     has changed. After a change, counting starts again.
@@ -407,7 +408,7 @@ def learns_after(gradients: int) -> bool:
 
 
 def learnings(gradients: int) -> int:
-    """Return how many updates a table has had after its sensor's first `gradients` gradients."""
+    """Return the number of table updates after the sensor's first `gradients` gradients."""
     return min(gradients, EVERY - 1).bit_length() + gradients // EVERY
 
 

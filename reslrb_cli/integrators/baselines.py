@@ -43,11 +43,11 @@ class Reversed:
         raise NotImplementedError
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Add the gradient of the objective with dL/dI `gradient` (H, W, C)."""
+        """Add the gradient of the objective. `gradient` (H, W, C) is dL/dI."""
         raise NotImplementedError
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image. Adds the gradient of the image's own samples, with dL/dI = `derivative(image)`."""
+        """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
         image = self.image(job)
         self.backward(job, derivative(image))
         return image
@@ -86,7 +86,9 @@ class Replayed(Reversed):
 
 
 class Projective(Replayed):
-    """Mitsuba's projective integrators, such as `prb_projective`, made independent of earlier calls."""
+    """Adapter for Mitsuba's projective integrators, such as `prb_projective`. Results do not depend on earlier
+    calls.
+    """
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         given = {name: getattr(self.plugin, name) for name in ("sppc", "sppp", "sppi")}
@@ -118,7 +120,7 @@ class Projective(Replayed):
 
 
 class NaiveAD(Replayed):
-    """Integrator that is differentiated with the whole graph of its image, such as `ptracer`.
+    """Integrator, such as `ptracer`, that is differentiated through the whole computation graph of its image.
 
     Mitsuba's light tracer is differentiable only in evaluated loops.
     """
@@ -159,7 +161,7 @@ class WalkAd(LightTracer, Reversed):
         self, attached: bool = False, filter_normalization: str = "attached", paths: str = "light",
         light_share: float = 0.5, **common: Any,
     ) -> None:  # fmt: skip
-        """Make the integrator. With `attached`, rays and film positions have derivatives, too."""
+        """Make the integrator. If `attached`, rays and film positions also have derivatives."""
         super().__init__(motion=Motion(attached, filter_normalization), **common)
         self.have_paths(paths, light_share)
 
@@ -188,7 +190,9 @@ class WalkAd(LightTracer, Reversed):
 
 
 class Trajectory(LightTracer, Reversed):
-    """The same light paths in a loop that Dr.Jit reverses. Dr.Jit records the loop state in thread-local memory."""
+    """The light paths of `reslrb`, traced in a loop that Dr.Jit reverses. Dr.Jit records the loop state in thread-local
+    memory.
+    """
 
     def __init__(self, max_depth: int = -1, **common: Any) -> None:
         super().__init__(max_depth, motion=Motion(attached=False), **common)

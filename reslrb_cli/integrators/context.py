@@ -36,9 +36,9 @@ from reslrb_cli.transport.sobol import make_coordinates
 
 
 def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
-    """Whether a factor that depends on this parameter is at most `least` somewhere.
+    """True if a factor that depends on this parameter is at most `least` for some entry.
 
-    The factor is near 0 if the parameter is near 0. For a parameter x that also enters as the factor 1 - x, 1 - x is
+    The factor is near 0 if the parameter is near 0. If a parameter x also enters as the factor 1 - x, this factor is
     near 0 at x = 1.
     """
     flat = dr.detach(value.array if dr.is_tensor_v(value) else dr.ravel(value))
@@ -95,12 +95,12 @@ def resolve_sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
 
 
 def sensors_in_words(count: int) -> str:
-    """Return the number of sensors of a scene, and their indices, in words."""
+    """Return a text with a scene's sensor count and sensor indices."""
     return "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
 
 
 def sensor_number(scene: mi.Scene, sensor: mi.Sensor) -> int:
-    """Return the number of a sensor of a scene. For any other sensor, return the number of sensors."""
+    """Return a sensor's number in a scene. For a sensor that is not in the scene, return the sensor count."""
     known = [one.ptr for one in scene.sensors()]
     return known.index(sensor.ptr) if sensor.ptr in known else len(known)
 
@@ -220,7 +220,7 @@ class Preparation:
         return plan
 
     def noted(self, params: mi.SceneParameters) -> dict[int, NDArray[np.float32]]:
-        """Return the densities of camera paths for the derivatives of `params`, by sensor. The caller may add
+        """For each sensor, return the density of camera paths for the derivatives of `params`. The caller may add
         densities.
         """
         return self._look_through(params).noted
@@ -264,7 +264,7 @@ class Preparation:
         return made[weights, plan.horizon]
 
     def _first_plan(self, scene: mi.Scene, sensor: mi.Sensor, paths: str, whole: bool) -> Plan:
-        """Return the plan of images for a new sensor, or for new paths of a sensor."""
+        """Return the first image plan for a sensor and a kind of paths."""
         check_paths(scene, sensor, paths, self._hide_emitters)
         needs = scene_needs(scene, sensor)
         renewal = self._found.renewal = self._found.renewal or Renewal(scene)
@@ -279,7 +279,7 @@ class Preparation:
         return self._with_numbers(plan, samples)
 
     def _look_through(self, params: mi.SceneParameters) -> AboutParameters:
-        """Return the facts about the currently differentiated parameters, and whether zeros must be tracked.
+        """Return the facts about the currently differentiated parameters, including whether zeros must be tracked.
 
         The owner of a parameter never changes. A parameter may start or stop tracking derivatives, and may become zero
         or nonzero.
@@ -298,7 +298,7 @@ class Preparation:
         return about
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:
-        """Return the plan with its kind of random numbers set."""
+        """Return the plan after setting its kind of random numbers."""
         grid, aims = None, False
         if self.guiding is not None:
             spp, sensors = self.expected or self._found.met, samples.scene.sensors()

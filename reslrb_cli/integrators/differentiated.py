@@ -1,10 +1,10 @@
 """Differentiated parameters, and the features of a walk that their derivatives need, mainly for moving light.
 
 `Motion` has the options of attached derivatives, and `attach` adds them to a plan. The values `follow` and `stay` of
-`attached_sampling` (`estimators/attached.py`) differ in only one case. A surface that is not specular scatters moving
-light, and the light then reaches another visible surface. `bounces` tests whether moving light reaches a visible
-surface after nonspecular scattering. In a caustic of few segments, moving light does not bounce, because paths end
-where light first lands.
+`attached_sampling` (`estimators/attached.py`) differ in only one case. The case occurs when a nonspecular surface
+scatters moving light to another visible surface. `bounces` tests whether moving light reaches a visible surface after
+nonspecular scattering. In a caustic of few segments, moving light does not bounce, because paths end where light first
+lands.
 """
 
 from __future__ import annotations

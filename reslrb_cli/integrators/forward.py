@@ -73,8 +73,8 @@ class RecordedObjective(Hooks):
 class Tangent:
     """Derivatives along the parameters' tangents.
 
-    The state has the derivative of the product of the factors so far (C,). If light moves, the state also has the
-    derivatives of the ray's origin and direction. `before` is the previous vertex if vertices stay at their places.
+    The state holds the derivative (C,) of the factor product so far. If light moves, the state also has the derivatives
+    of the ray's origin and direction. `before` is the previous vertex if vertices stay at their places.
     """
 
     d_product: mi.Spectrum
@@ -207,8 +207,8 @@ class CameraTangents(CameraHooks):
 def tangent_of_passage(
     samples: Samples, vertex: Vertex, connection: Connection
 ) -> tuple[mi.Bool, mi.Spectrum, mi.Spectrum]:
-    """Return the visibility of a connection's target, the transmittance (C,) of the masks before it, and its
-    derivative.
+    """For a connection, return the target's visibility, the transmittance (C,) of the masks before the target, and the
+    transmittance's derivative.
     """
     plan, active = samples.plan, connection.active
     if not plan.needs.has_null:
@@ -226,7 +226,7 @@ def tangent_of_scattering(scattering: Scattering, df: mi.Spectrum) -> mi.Spectru
 
 
 def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
-    """Add the derivatives by Dr.Jit's reversal of the walk, which records the loop's state on the way."""
+    """Add the derivatives by Dr.Jit's reversal of the walk. Dr.Jit records the loop state during the walk."""
     differentiate_visible_emission(samples, adjoint)
     with dr.resume_grad():
         S = walk(samples, RecordedObjective(samples, adjoint))
@@ -234,7 +234,9 @@ def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
 
 
 def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
-    """Add the forward-mode derivative of the samples' contributions to the block, exactly and in one traversal."""
+    """Add the forward-mode derivative of the samples' contributions to the block. The derivative is exact and needs one
+    traversal.
+    """
     plan, dE = samples.plan, mi.Spectrum(0)
     with dr.resume_grad():
         if plan.differentiate_emission and not plan.camera:
@@ -257,7 +259,7 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
 
 
 def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
-    """Splat the contributions to the block with tracked derivatives: naive AD, with memory proportional to depth."""
+    """Splat the contributions to the block with tracked derivatives, for naive AD. Memory is proportional to depth."""
     with dr.resume_grad():
         splat_visible_emission(samples, block, "evaluated")
         for u, C, active in moving_splats(samples):  # twice, so that the image stays the same

@@ -1,5 +1,5 @@
-"""Recordings of the kernel launches of a step, so that no Python code runs between a seed and its gradient
-(`dr.freeze`).
+"""Recordings of a step's kernel launches (`dr.freeze`). With a recording, no Python code runs between a seed and its
+gradient.
 
 Tracing a step in Python takes milliseconds, whatever the size of the image. There is a recording for each kind of call.
 Dr.Jit makes another recording if inputs differ in more than their values.
@@ -52,13 +52,13 @@ class Recordings:
         self._functions.clear()
 
     def call(self, kind: str, samples: Samples, function: Callable[..., Any], *inputs: Any) -> Any:
-        """Call `function(samples, *inputs)`, from a recording if there is one. Its results are evaluated.
+        """Call `function(samples, *inputs)`. Uses a recording if there is one. Its results are evaluated.
 
-        `function` must depend only on its inputs and, for values that are no Dr.Jit arrays, on `kind`. The derivatives
-        that `function` adds to parameters must be proportional to the first of `inputs`. Calls that cannot be recorded
-        are made directly. For example, a call cannot be recorded while a second scene is alive. The second scene takes
-        part in indirect calls, but is not an input. Calls that were recorded too often are also made directly. Raises
-        UnsupportedScene if a recording no longer fits.
+        `function` must depend only on its inputs. `kind` must determine all values that are no Dr.Jit arrays. The
+        derivatives that `function` adds to parameters must be proportional to the first of `inputs`. Calls that cannot
+        be recorded are made directly. For example, a call cannot be recorded while a second scene is alive. The second
+        scene takes part in indirect calls, but is not an input. Calls that were recorded too often are also made
+        directly. Raises UnsupportedScene if a recording no longer fits.
         """
         s = samples
         # Sensors that share a recording would remake it at every change of sensor. The key holds the sensor, so no
@@ -103,7 +103,7 @@ def _record(
 
     Dr.Jit detects a call that cannot be recorded only after it has computed everything and added derivatives. The first
     trial of a recording therefore uses zeros as first input. Zeros add no derivatives. The trial is repeated until the
-    recording is used. After the trial, all work has the same kernels from the first step on.
+    recording is used. After the trial, every step runs the same kernels, including the first step.
     """
     recorded = dr.freeze(plain, limit=KEPT)
     if inputs:
@@ -139,7 +139,7 @@ def _without_garbage_collection() -> Iterator[None]:
 
 
 def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function` with every input of a recording as a separate argument."""
+    """Return a version of `function` that takes each input of a recording as a separate argument."""
     # Only these: arrays would become constants of the recording, and a scene would never be freed.
     sides = [(side.plan, side.spp, side.width) for side in samples.sides()]
 
@@ -157,6 +157,6 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
 
 
 def _arrays(samples: Samples) -> tuple[Any, ...]:
-    """Return the arrays of samples that are inputs of a recording, in the order of their members."""
+    """Return the arrays in `samples` that a recording takes as inputs, in the order of the members of `Samples`."""
     s = samples
     return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters, s.shares

@@ -20,7 +20,7 @@ from reslrb_cli.integrators.protocol import Job
 
 
 class OwnIntegrator(Reversed):
-    """User's integrator in a step. An exception or a wrong image becomes one line that names the class.
+    """User's integrator in a step. An exception or a wrong image is reported in one line that names the class.
 
     The file runs when an image or a gradient is first needed, or in `ready`.
     """
@@ -32,7 +32,8 @@ class OwnIntegrator(Reversed):
         self, file: str, max_depth: int, rr_depth: int, hide_emitters: bool, arguments: dict[str, Any] | None = None,
         paths: str = "camera", allowed: bool = False,
     ) -> None:  # fmt: skip
-        """Prepare the class FILE.py:CLASS. It is constructed from a `mi.Properties` with these options and `arguments`.
+        """Prepare the class FILE.py:CLASS. The class is constructed from a `mi.Properties` with these options and
+        `arguments`.
 
         Of `max_depth`, `rr_depth` and `hide_emitters`, the class receives only those options that it reads. `paths` are
         for checks (`config.Own`). Code runs only if `allowed`.
@@ -44,8 +45,8 @@ class OwnIntegrator(Reversed):
     def ready(self) -> None:
         """Run the file and make the integrator.
 
-        Raises ConfigError, located by the file, if code is not allowed, if the code fails, or if the class does not
-        read one of the `arguments`.
+        Raises ConfigError, which names the file, if code is not allowed or fails. Also raises ConfigError if the class
+        does not read one of the `arguments`.
         """
         _ = self._work
 
@@ -80,7 +81,7 @@ class OwnIntegrator(Reversed):
             self._work.backward(job, gradient)
 
     def tangent(self, job: Job) -> mi.TensorXf:
-        """Return the derivative of the image along the tangents of the job's parameters, from the class's
+        """Return the image's derivative along the tangents of the job's parameters, computed by the class's
         `render_forward`.
         """
         plugin = self._work.plugin

@@ -1,4 +1,4 @@
-"""Plan of a step, feature by feature: whether the step has it, and why."""
+"""Features of a step's plan: whether the step has each feature, and why."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def plan_rows(plan: Plan) -> list[PlanRow]:
 
 
 def with_reason(rows: Iterable[PlanRow], feature: str, reason: str) -> list[PlanRow]:
-    """Replace the reason of a feature. If the plan has the feature, the reason is added to the existing one."""
+    """Replace the reason of a feature. If the plan has the feature, `reason` is added to the existing reason."""
     return [
         replace(row, reason=f"{row.reason}; {reason}" if row.needed else reason) if row.feature == feature else row
         for row in rows

@@ -22,8 +22,8 @@ _registered_with_callback = False
 def register() -> None:
     """Register the integrators with Mitsuba, for the current variant and for variants that are set later.
 
-    Raises BackendError, with the supported variants, if the current variant is not supported. If an unsupported variant
-    is set later, loading one of the integrators raises an error.
+    Raises BackendError, which lists the supported variants, if the current variant is not supported. If an unsupported
+    variant is set later, loading one of the integrators raises an error.
     """
     global _registered_with_callback
     if not _registered_with_callback:
@@ -57,7 +57,9 @@ def _refuse(type: str, props: mi.Properties) -> NoReturn:
 
 
 def _plugin_class() -> type[mi.CppADIntegrator]:
-    """Return the class of the plugins. It derives from a class of the variant, so there is one for each variant."""
+    """Return the class of the plugins. The class derives from a class of the variant. Each variant therefore needs a
+    separate class.
+    """
 
     class LightTracerPlugin(mi.CppADIntegrator):
         """Light tracer under `mi.render`."""

@@ -1,4 +1,4 @@
-"""Interface of integrators, own or stock, for a step."""
+"""Interface through which a step uses integrators, stock or from this package."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Derivative: TypeAlias = "Callable[[mi.TensorXf], mi.TensorXf]"  # a string: the 
 
 @dataclass(frozen=True)
 class Job:
-    """One set of samples of a scene, through a sensor, with random numbers.
+    """Set of samples: a scene seen through a sensor, with given random numbers.
 
-    `seed` is an opaque UInt32, and `spp` the number of samples per pixel. `params` is the scene's `mi.traverse`, and
-    its entries that track derivatives are differentiated. It is None for an image without derivatives. `plans` stores
-    facts about scene and parameters for one step. Jobs that are derived from one another share `plans`.
+    `seed` is an opaque UInt32, and `spp` the number of samples per pixel. `params` is the scene's `mi.traverse`.
+    Entries of `params` that track derivatives are differentiated. `params` is None for an image without derivatives.
+    `plans` stores facts about scene and parameters for one step. Jobs that are derived from one another share `plans`.
     """
 
     scene: mi.Scene
@@ -48,7 +48,7 @@ class StepIntegrator(Protocol):
         ...
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image. Adds the gradient of the image's own samples, with dL/dI = `derivative(image)`."""
+        """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
         ...
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:

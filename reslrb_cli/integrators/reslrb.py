@@ -1,7 +1,7 @@
 """Light tracers: the common base, and reservoir light replay backpropagation.
 
-`LightTracer` has the options of `ptracer`, a plan, passes, the image and its tangent. `Reslrb` adds gradients by one of
-the estimators. The classes do not depend on Mitsuba's plugins. `plugin.py` makes plugins from them.
+`LightTracer` provides the options of `ptracer`, a plan, passes, the image and the image's tangent. `Reslrb` adds
+gradients by one of the estimators. The classes do not depend on Mitsuba's plugins. `plugin.py` makes plugins from them.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ class LightTracer:
         self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
-        """Return the same tracer with other passes, or without recordings. Both tracers share the facts of a scene."""
+        """Return a copy of the tracer with other values of `samples_per_pass` and `freeze`. Both tracers share the
+        facts of a scene.
+        """
         other = copy.copy(self)
         other.samples_per_pass, other.freeze = samples_per_pass, freeze
         return other
@@ -92,8 +94,8 @@ class LightTracer:
         value.
 
         `guided` turns guiding on or off, and `images` the guiding of images. `low_discrepancy` selects low-discrepancy
-        or independent numbers. `light_share` selects paths from both sides with this share of light paths. Images then
-        have the same film border for any share.
+        or independent numbers. If `light_share` is given, the copy traces light paths and camera paths, with this share
+        of light paths. Images then have the same film border for any share.
         """
         other = copy.copy(self)
         other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
@@ -102,7 +104,8 @@ class LightTracer:
         return other
 
     def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
-        """Return a copy of the tracer with no facts about any scene. The densities `noted` distribute its camera paths.
+        """Return a copy of the tracer with no facts about any scene. The copy distributes its camera paths by the
+        densities `noted`.
 
         The keys of the densities (`note_pixels`) are sensor numbers.
         """
@@ -112,7 +115,7 @@ class LightTracer:
         return other
 
     def to_measure(self) -> Self:
-        """Return this tracer or, if it is guided, a tracer with its own tables.
+        """Return this tracer. If the tracer is guided, return a copy with separate tables instead.
 
         Measurements before a run must not update the tables of the run. Otherwise the run's tables would depend on
         whether an earlier run has made the measurement.
@@ -122,15 +125,15 @@ class LightTracer:
     def expect(self, spp: int) -> None:
         """Set the sample count of the passes that tables learn from. Call this method before the first pass.
 
-        A run calls this method, so that it has the same cells whether it starts or resumes.
+        A run calls this method so that its tables have the same cells after a start and after a resume.
         """
         self.preparation.expected = spp
 
     def have_paths(self, paths: str, light_share: float, whole: bool = False) -> None:
-        """Use light paths, camera paths, or both. `light_share` is the share of light paths; with 0 or 1, only one kind
-        remains.
+        """Use light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
+        only one kind of paths remains.
 
-        With `whole`, light paths alone have the film border of the other kinds of paths.
+        If `whole` is true, images of light paths alone have the same film border as images with camera paths.
         """
         one_of("paths", paths, PATHS)
         if not 0 <= light_share <= 1:
@@ -143,15 +146,15 @@ class LightTracer:
             self.preparation.guiding = None
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
-        """Return the plan of a walk of this scene, with derivatives of `params`, if any. Raises UnsupportedScene."""
+        """Return the plan for tracing this scene, with derivatives of `params` if given. Raises UnsupportedScene."""
         return self.preparation.plan(scene, sensor, params)
 
     def passes(self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
         """Return the samples of a job. If the job's `spp` is 0, the job uses the sensor's own sample count.
 
-        `purpose` selects the table of guided samples. None selects the table for the gradient, or for the image if
-        there is no gradient. If `delta` is given, `delta` also guides the samples. `delta` is dL/dI (H, W, C), and must
-        come from other samples. Raises ValueError for a negative `spp`.
+        `purpose` selects the table of guided samples. If `purpose` is None, the samples use the gradient's table, or
+        the image's table if there is no gradient. If `delta` is given, `delta` also guides the samples. `delta` is
+        dL/dI (H, W, C), and must come from other samples. Raises ValueError for a negative `spp`.
         """
         if job.spp < 0:
             raise ValueError(f'"spp" must be 0 (the sensor\'s own sample count) or more, not {job.spp}')
@@ -169,7 +172,9 @@ class LightTracer:
         return passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
-        """Return the share of light paths, and the densities of the emitters if paths from both sides are weighted."""
+        """Return the share of light paths. Also return the emitters' densities if paths from both sides are
+        weighted.
+        """
         return self.light_share, self.preparation.emitters(plan, scene) if plan.weighs else None
 
     def _shares(self, job: Job, plan: Plan) -> Callable[[int], PixelShares | None] | None:
@@ -200,7 +205,7 @@ class LightTracer:
             return wanted(plan, job.scene, job.sensor, entries, *self._sides(plan, job.scene), curvature)
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Update the tables, if an update is due, with samples other than those of the job. dL/dI is known.
+        """Update the tables, if an update is due. The update uses separate samples and the known dL/dI.
 
         Call this method after a gradient. The next gradient uses the result.
         """
@@ -245,19 +250,21 @@ class LightTracer:
         self, kind: str, parts: list[Samples], work: Callable[..., Any], *inputs: Any,
         params: mi.SceneParameters | None = None,
     ) -> Any:  # fmt: skip
-        """Call `work(parts, *inputs, params)`, or launch a recording of it. With one pass, `params` may be None."""
+        """Call `work(parts, *inputs, params)`, or launch a recording of this call. With one pass, `params` may
+        be None.
+        """
         if self.freezes(parts):
             recordings = self.preparation.recordings
             return recordings.call(kind, parts[0], lambda part, *given: work([part], *given), *inputs)
         return work(parts, *inputs) if params is None else work(parts, *inputs, params=params)
 
     def freezes(self, parts: list[Samples]) -> bool:
-        """Whether these samples are traced from a recording. Large sets of samples gain little from a recording."""
+        """True if a recording traces these samples. Large sets of samples gain little from a recording."""
         return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
 
 
 class Reslrb(LightTracer):
-    """Light tracer with derivatives by a replay of each path. Options that are not in OPTIONS belong to the
+    """Light tracer that differentiates by replaying each path. Options that are not in OPTIONS belong to the
     estimator.
     """
 
@@ -332,7 +339,7 @@ class Reslrb(LightTracer):
         return light if plan.paths == "light" else max(light, stack_bytes(plan, self.estimator.stack_size))
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image. Adds the gradient of the image's own samples, with dL/dI = `derivative(image)`."""
+        """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH)
             traced = Trace(parts, *self.launch("trace", parts, partial(trace_image, self.estimator)))
@@ -392,7 +399,7 @@ def image_of(samples: list[Samples]) -> mi.TensorXf:
 def forward(
     samples: Samples, estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage | None = None
 ) -> Any:
-    """Trace the samples and return the stored data of each path, without evaluating them.
+    """Trace the samples and return the stored data of each path. The returned data are not evaluated.
 
     Contributions are splatted to the block. If the block is None, there is no image.
     """
@@ -443,7 +450,7 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
 def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, done: bool = False) -> None:
     """Add the derivatives of the objective. `adjoint` is the objective's derivative with respect to the film.
 
-    With `done`, the only traversal of the camera paths has already added their derivatives.
+    If `done` is true, the only traversal of the camera paths has already added the camera paths' derivatives.
     """
     differentiate_visible_emission(samples, adjoint)
     for side in samples.sides():
@@ -461,7 +468,7 @@ def replay_all(
     """Add the gradient of the objective to `params`. `gradient` (H, W, C) is dL/dI. With one pass, `params` may be
     None.
 
-    `state` is the stored data of the paths of one pass. If it is None, the paths are traced again.
+    `state` is the data that one pass has stored for each path. If `state` is None, the paths are traced again.
     """
     adjoint = samples[0].film.adjoint(gradient)
     if state is None:

@@ -8,11 +8,11 @@
     (`_batched`).
 
 With `halves`, each set of samples has two halves, and images are (2, H, W, C). A loss that multiplies an image by
-itself takes both halves, because their noise is independent (`Halves`).
+itself uses both halves, because the halves have independent noise (`Halves`).
 
-Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would make the gradients of
-everything on its pixel's paths NaN. Some estimators would lose the NaN. The kernel that computes dL/dI also counts
-these entries, so only readers of the count wait for it.
+Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would turn the gradients of
+all parameters on that pixel's paths into NaN. Some estimators would lose the NaN. The kernel that computes dL/dI also
+counts the non-finite entries. Only code that reads the count waits for the kernel.
 """
 
 from __future__ import annotations
@@ -49,8 +49,7 @@ class Refused:
     """Entries of dL/dI that were not finite.
 
     `count` is the number of entries that are not finite. `first` is the flat index of the first non-finite entry.
-    `count` and `first` are arrays of width 1. It also holds the shape of dL/dI, which is (H, W, C), or (2, H, W, C)
-    with halves.
+    `count` and `first` are arrays of width 1. `shape` is the shape of dL/dI: (H, W, C), or (2, H, W, C) with halves.
     """
 
     count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32, 1))
@@ -58,8 +57,8 @@ class Refused:
     shape: tuple[int, ...] = (0, 0, 0)
 
     def take(self, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return dL/dI with 0 for entries that are not finite, and add them to the count. Does not evaluate either of
-        them.
+        """Return dL/dI with 0 for entries that are not finite. Adds the number of these entries to `count`. Does not
+        evaluate either of them.
         """
         self.shape, flat = gradient.shape, gradient.array
         bad = ~dr.isfinite(flat)
@@ -82,7 +81,7 @@ class Refused:
 
 @dataclass
 class StepResult:
-    """Result of a step besides gradients: the image (H, W, C) and the loss (width 1), both detached.
+    """Result of a step, without gradients: the image (H, W, C) and the loss (width 1), both detached.
 
     Entries of dL/dI that are not finite count as 0. `refused` holds the number of non-finite entries, and the index of
     the first one. `seen` is the image that the objective received, (2, H, W, C) with halves.
@@ -150,7 +149,9 @@ class Halves:
             self.work.backward(half, own)
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the images. Adds the gradient of the images' own samples, with dL/dI = `derivative(images)`."""
+        """Return the images. Adds the gradient from the same samples as the images, with dL/dI =
+        `derivative(images)`.
+        """
         first, second = half_jobs(job)
         images: list[mi.TensorXf] = []
 
@@ -169,7 +170,9 @@ class Halves:
         return images[0]
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the images. Adds the gradient of the images' own samples. dL/dI is known before the images."""
+        """Return the images. Adds the gradient from the same samples as the images. dL/dI is known before the
+        images.
+        """
         parts = zip(half_jobs(job), _apart(gradient), strict=True)
         return _both(*(self.work.known(half, own) for half, own in parts))
 
@@ -276,7 +279,8 @@ def known_step(
     integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, gradient: mi.TensorXf, *,
     seed: int, spp: int, params: mi.SceneParameters | None = None,
 ) -> StepResult:  # fmt: skip
-    """Make a step whose dL/dI, `gradient` (H, W, C), is known before its image. The loss is the sum of dL/dI times I.
+    """Make a step with a dL/dI that is known before the image: `gradient` (H, W, C). The loss is the sum of dL/dI times
+    I.
 
     One set of samples serves both. If the estimator of `reslrb` supports it, one traversal splats and differentiates.
     The other arguments are those of `gradient_step`.
@@ -331,8 +335,8 @@ def _batched(
     """Make a step in batches (dual buffer of Deng et al. 2022). Batch b takes dL/dI from the image of the earlier
     batches.
 
-    No path uses a dL/dI that contains it. The gradient of an L2 loss is therefore unbiased, as with `independent`, with
-    half the paths. The first batch contributes only to the image.
+    No path uses a dL/dI that contains it. The gradient of an L2 loss is therefore unbiased, as with `independent`, but
+    needs only half the paths. The first batch contributes only to the image.
     """
     if job.spp < 1 or job.spp % batches:
         raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches})")
@@ -352,7 +356,7 @@ def _batched(
 def derivative_of(
     objective: Objective, image: mi.TensorXf, refused: Refused, on_image: Callable[[], None] | None = None
 ) -> tuple[mi.Float | mi.TensorXf, mi.TensorXf]:
-    """Return loss and dL/dI, evaluated together. Entries of dL/dI that are not finite are refused."""
+    """Return loss and dL/dI, evaluated together. Entries of dL/dI that are not finite are set to 0 and counted."""
     with dr.resume_grad(), dr.isolate_grad():
         leaf = type(image)(image)
         dr.enable_grad(leaf)
@@ -367,8 +371,8 @@ def derivative_of(
 
 
 def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, mi.UInt32, int]]:
-    """Return the sets of samples of a step with these options (`Config.step_options`): name, seed, and samples per
-    pixel.
+    """Return the sample sets of a step with these `options` (`Config.step_options`). Each set has a name, a seed, and a
+    number of samples per pixel.
     """
     spp, adjoint = options["spp"], options["adjoint"]
     if options.get("halves"):
@@ -394,7 +398,7 @@ def batch_seeds(seed: mi.UInt32 | int, batches: int) -> list[mi.UInt32]:
 
 
 def second_seed(seed: mi.UInt32) -> mi.UInt32:
-    """Return the seed of the gradient's own samples."""
+    """Return the seed of the gradient's separate samples."""
     result = mi.sample_tea_32(seed, mi.UInt32(1))[0]
     dr.make_opaque(result)
     return result

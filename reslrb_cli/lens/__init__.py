@@ -1,1 +1,1 @@
-"""From a picture to the surface whose caustic shows it: optimal transport, rays and heights."""
+"""Computation of a surface whose caustic shows a given picture: optimal transport, rays and heights."""

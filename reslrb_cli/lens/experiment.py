@@ -77,7 +77,7 @@ def at_vertices(surface: Surface, nx: int, ny: int) -> Array:
 
 
 def face_ply(setting: Setting, nx: int, ny: int, back: bool = False) -> bytes:
-    """Return the flat face as a binary PLY: a grid with normals along +z and texture coordinates, v along y.
+    """Return the flat face as a binary PLY. The grid has normals along +z and texture coordinates with v along y.
 
     The `back` is at z = -thickness with normals along -z.
     """
@@ -105,7 +105,8 @@ def film_size(shape: tuple[int, int], margin: float) -> tuple[int, int]:
 
 
 def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array, float]:
-    """Return the target image (H, W), and the irradiance or intensity of the light for a mean of 1 inside the picture.
+    """Return the target image (H, W). Also return the light's irradiance or intensity that gives a mean of 1 inside the
+    picture.
 
     The image shows the luminance of the picture, with row 0 at the top. Pixels darker than the floor are raised to the
     floor. No light is lost.
@@ -116,7 +117,9 @@ def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array
 
 
 def on_film(picture: Array, surface: Surface, margin: float) -> Array:
-    """Return a picture (rows, columns) on the film (H, W), with mean 1 and black around it."""
+    """Return a picture (rows, columns) on the film (H, W). The picture has mean 1, and pixels around the picture are
+    black.
+    """
     width, height = film_size((picture.shape[0], picture.shape[1]), margin)
     film = np.zeros((height, width))
     top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
@@ -125,7 +128,8 @@ def on_film(picture: Array, surface: Surface, margin: float) -> Array:
 
 
 def lamps(surface: Surface, power: float, sun: float) -> str:
-    """Return the XML of the light: parallel, with the sun's diameter (degrees), or a point light.
+    """Return the XML of the light. The light is parallel, parallel with the sun's diameter `sun` (degrees), or a point
+    light.
 
     `power` is its irradiance or intensity.
     """
@@ -185,7 +189,7 @@ def _half_cone(surface: Surface) -> float:
 def scene_xml(
     surface: Surface, film: tuple[int, int], pixels: int, power: float, sun: float = 0.0, both: bool = False
 ) -> str:
-    """Return the XML of a face's scene. `pixels` is the width of the picture on a `film` with a margin.
+    """Return the XML of a face's scene. `pixels` is the picture's width in pixels on `film`, which also has a margin.
 
     `power` and `sun` are as for `lamps`. With `both`, the back is a mesh as well, `back.ply`.
     """
@@ -279,8 +283,8 @@ def scene_xml(
 def lens_yaml(
     surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float = 0.0, both: bool = False
 ) -> str:
-    """Return the configuration. The run starts at these `heights` (ny, nx), which `start.exr` holds. A free back starts
-    flat.
+    """Return the configuration. The run starts at `heights` (ny, nx), which are stored in `start.exr`. A free back
+    starts flat.
     """
     s, (ny, nx) = surface.setting, heights.shape
     least = min(_LEAST * max(s.size), float(heights.min()) + s.thickness)
@@ -340,8 +344,8 @@ def _rectangle(id: str, size: tuple[float, float], middle: Array, normal: Array,
 
 
 def _plane(type: str, id: str, size: tuple[float, float], middle: Array, normal: Array, up: Array, content: str) -> str:
-    """Return the XML of a rectangle or disk that faces along `normal`. Its vertical axis is `up`, projected to its
-    plane.
+    """Return the XML of a rectangle or disk that faces along `normal`. The shape's vertical axis is `up`, projected
+    onto the shape's plane.
     """
     across = np.cross(up, normal) / np.linalg.norm(np.cross(up, normal))
     up = np.cross(normal, across)

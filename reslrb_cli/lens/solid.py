@@ -1,4 +1,4 @@
-"""The solid behind a face of heights: a closed mesh in millimetres, its files, and measurements for its maker.
+"""Solid with a face of heights: a closed mesh in millimetres, its files, and measurements for manufacturing.
 
 The solid has the scene's axes. The face is near z = 0 with its outside towards +z, the back is at z = -thickness, and y
 points up. Front and back consist of the traced triangles, except where a round outline cuts them. A flat rim may
@@ -185,7 +185,7 @@ class _Building:
         return np.arange(self._count - len(points), self._count)
 
     def copy(self, loop: Indices, z: float, scale: Array | float = 1.0) -> Indices:
-        """Add vertices at the x and y of `loop`, multiplied by `scale`, and at `z`."""
+        """Add vertices at the height `z`, with the x and y of `loop` multiplied by `scale`."""
         at = np.concatenate(self.points)[loop]
         return self.add(np.column_stack([at[:, :2] * scale, np.full(len(at), z)]))
 
@@ -234,7 +234,7 @@ class _Building:
 
 
 def edge_loop(triangles: Indices) -> Indices:
-    """Return the vertices around a sheet, counterclockwise. Edges of the loop belong to only one triangle.
+    """Return the vertices around a sheet, counterclockwise. Each edge of the loop belongs to only one triangle.
 
     If there are several loops, one of them is returned.
     """
@@ -250,7 +250,7 @@ def edge_loop(triangles: Indices) -> Indices:
 
 
 def is_closed(triangles: Indices) -> bool:
-    """Whether each edge belongs to two triangles, in opposite directions."""
+    """True if each edge belongs to two triangles, which run along the edge in opposite directions."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     n = int(edges.max()) + 1
     there, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
@@ -258,8 +258,8 @@ def is_closed(triangles: Indices) -> bool:
 
 
 def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
-    """Return vertices and triangles of a face within the ellipse with these half axes. Triangles on the ellipse are
-    cut.
+    """Return vertices and triangles of a face within the ellipse with the half axes `half`. Triangles on the ellipse
+    are cut.
     """
     points, triangles = sheet.points.copy(), sheet.triangles
     axes = np.array(half)
@@ -347,8 +347,8 @@ def _edge_heights(sheet: Sheet, plan: Fabrication) -> Array:
 def hollows(sheet: Sheet, plan: Fabrication, side: int) -> Array:
     """Return the larger principal curvature (1/mm) of each inner vertex inside the outline. It is positive in hollows.
 
-    The function uses central differences of the heights as seen from outside, which is towards +z or -z, depending on
-    `side`.
+    The function uses central differences of the heights as seen from outside. `side` tells whether the outside is
+    towards +z or -z.
     """
     h, dx, dy = side * sheet.z, float(np.diff(sheet.x).mean()), float(np.diff(sheet.y).mean())
     c = h[1:-1, 1:-1]
@@ -363,7 +363,7 @@ def hollows(sheet: Sheet, plan: Fabrication, side: int) -> Array:
 
 
 def steepest(sheet: Sheet, plan: Fabrication) -> float:
-    """Return the largest angle (degrees) between a triangle of the face, inside the outline, and the plane z = 0."""
+    """Return the largest angle (degrees) between the plane z = 0 and a triangle of the face inside the outline."""
     points, triangles = sheet.points, sheet.triangles
     if plan.outline == "round":
         points, triangles = cut_round(sheet, sheet.half)
@@ -373,8 +373,8 @@ def steepest(sheet: Sheet, plan: Fabrication) -> float:
 
 
 def outwards(sheet: Sheet, plan: Fabrication, side: int) -> Array:
-    """Return heights (ny, nx) above the flat face in mm, positive outwards. Row 0 has the greatest y; columns go along
-    x.
+    """Return heights (ny, nx) above the flat face in mm, positive outwards. Row 0 has the greatest y, and columns go
+    along x.
     """
     return (sheet.z if side > 0 else -plan.thickness - sheet.z)[::-1]
 

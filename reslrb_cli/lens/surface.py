@@ -3,13 +3,13 @@ heights.
 
 Lengths are in millimetres. The face is z = h(x, y) near the plane z = 0, with its normal towards the receiver. Light
 reaches a lens from z < 0 through a plane face at z = -thickness, and a mirror from z > 0. The central ray meets the
-centre of the face. A flat face would send this ray to the receiver's centre, at `distance`. The receiver is
-perpendicular to the ray, except for its tilt. On both, y points up.
+centre of the face. A flat face would send the central ray to the receiver's centre, at `distance`. Without tilt, the
+receiver is perpendicular to the central ray. On both, y points up.
 
-The unknown of the transport problem is h itself. T(x, y) is the point where a ray meets the receiver after it meets the
-face at (x, y, h) with the normal (-dh/dx, -dh/dy, 1). All lights, tilts and depths of relief are therefore treated
-exactly and in the same way. Computing normals first would require integrating them to heights, which is not always
-possible.
+The unknown of the transport problem is h itself. T(x, y) is the receiver point that a ray reaches from the face point
+(x, y, h). The face normal at this point is (-dh/dx, -dh/dy, 1). All lights, tilts and depths of relief are therefore
+treated exactly and in the same way. Computing normals first would require integrating them to heights, which is not
+always possible.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Rays:
     def incoming(self, x: Array, y: Array, h: Array) -> tuple[Array, Array]:
         """Return the direction (3, ...) of light that arrives at (x, y, h), and the irradiance on a plane z = h.
 
-        For a lens, this is the direction inside the glass.
+        For a lens, the function returns the direction inside the glass.
         """
         s = self.setting
         if s.kind == "mirror":
@@ -188,8 +188,8 @@ def on_receiver(picture: Array, through: bool) -> Array:
     """Convert `picture` (row 0 at the top) to the receiver's axes, with row 0 at the least y and columns along x. The
     conversion is its own inverse.
 
-    For an observer who looks at the receiver from the light's side, with y up, x points to the left. An observer behind
-    the receiver has x to the right.
+    For an observer who looks at the receiver from the light's side, with y up, x points to the left. For an observer
+    behind the receiver, x points to the right.
     """
     return picture[::-1] if through else picture[::-1, ::-1]
 

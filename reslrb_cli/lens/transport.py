@@ -42,7 +42,7 @@ FADE = 0.7
 
 
 class Optics(Protocol):
-    """The map of light. Lengths of the aperture and of the picture are relative to their own centres."""
+    """The map of light. Coordinates on the aperture and on the picture are relative to their respective centres."""
 
     def hit(self, x: Array, y: Array, h: Array, gx: Array, gy: Array) -> Array:
         """Return T (2, ...) of points (x, y) with potential h and gradient (gx, gy). T is NaN if light does not reach
@@ -86,8 +86,8 @@ class Transport:
 
 
 def sample(values: Array, size: tuple[float, float], x: Array, y: Array) -> Array:
-    """Interpolate `values` (ny, nx) linearly at points (x, y). The values are at the centres of cells of a rectangle of
-    `size` about 0.
+    """Interpolate `values` (ny, nx) linearly at points (x, y). The values are at the cell centres of a rectangle with
+    the given `size`, centred at 0.
     """
     ny, nx = values.shape
     places = np.stack([(y / size[1] + 0.5) * ny - 0.5, (x / size[0] + 0.5) * nx - 0.5])
@@ -202,7 +202,9 @@ class _State:
 
 
 def _padded(h: Array, slopes: list[Array], cell: tuple[float, float]) -> Array:
-    """Return h (ny + 2, nx + 2) with a ring of cells, chosen so that the derivatives at the edges equal `slopes`."""
+    """Return h (ny + 2, nx + 2) with an added ring of cells. The ring makes the derivatives at the edges equal to
+    `slopes`.
+    """
     left, right, bottom, top = slopes
     wide = np.concatenate([(h[:, 0] - left * cell[0])[:, None], h, (h[:, -1] + right * cell[0])[:, None]], axis=1)
     bottom, top = np.pad(bottom, 1, mode="edge"), np.pad(top, 1, mode="edge")
@@ -210,7 +212,7 @@ def _padded(h: Array, slopes: list[Array], cell: tuple[float, float]) -> Array:
 
 
 def _faces(p: Array, cell: tuple[float, float]) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-    """Return (h, gx, gy) at the faces across x (ny, nx + 1) and at those across y (ny + 1, nx), from a padded h."""
+    """Return (h, gx, gy) from a padded h, at the faces across x (ny, nx + 1) and at the faces across y (ny + 1, nx)."""
     dx, dy = cell
     row, column = p[1:-1], p[:, 1:-1]
     along_y, along_x = (p[2:] - p[:-2]) / (2 * dy), (p[:, 2:] - p[:, :-2]) / (2 * dx)
@@ -281,7 +283,7 @@ class _Equation:
         return (T[0][:, :, 1:] + T[0][:, :, :-1] + T[1][:, 1:] + T[1][:, :-1]) / 4
 
     def _over_cells(self, nu: Array, by: tuple[float, float] = (0.0, 0.0)) -> Array:
-        """Return the mean of nu over the image of each cell under T, from four points. The images are shifted by
+        """Return the mean of nu over each cell's image under T, computed from four points. The images are shifted by
         `by`.
         """
         total = np.zeros(self.det.shape)
@@ -472,7 +474,8 @@ def _told(state: _State, optics: Optics, picture: Array, target: tuple[float, fl
 
 
 def pushed(T: Array, light: Array, shape: tuple[int, int], target: tuple[float, float], fine: int = 4) -> Array:
-    """Return the picture (shape) that T makes of the light, with mean 1, filtered by a tent.
+    """Return the picture that T makes of the light. The picture has the given `shape` and mean 1, and is filtered by a
+    tent.
 
     `light` (ny, nx) arrives at T (2, ny, nx). Each cell sends `fine`^2 equal shares of light. T is linear between the
     cell centres. Each share of light is split over the four nearest pixels.

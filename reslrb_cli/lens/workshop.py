@@ -48,7 +48,9 @@ def largest_ball_radius(curvature: Array) -> float | None:
 
 
 def stepover(radius: float, scallop: float = SCALLOP) -> float:
-    """Return the distance (mm) between passes of a ball of this `radius` that leave scallops of this height (mm)."""
+    """Return the distance (mm) between passes of a ball with this `radius`. The passes leave scallops of the height
+    `scallop` (mm).
+    """
     height = min(scallop, radius)
     return float(2 * np.sqrt(2 * radius * height - height**2))
 
@@ -56,7 +58,8 @@ def stepover(radius: float, scallop: float = SCALLOP) -> float:
 def cutter(curvature: Array, radius: float | None) -> dict[str, float | None]:
     """Return the largest radius of a ball cutter for a face, and the step between passes of the cutter, in mm.
 
-    `radius` is the radius of the cutter; for None, the largest one is used. `curvature` is as in `largest_ball_radius`.
+    `radius` is the radius of the cutter. If `radius` is None, the largest radius is used. `curvature` is as in
+    `largest_ball_radius`.
     """
     largest = largest_ball_radius(curvature)
     used = largest if radius is None else radius
@@ -75,8 +78,8 @@ def allowed_errors(
 
     Each entry has the `value`, its `unit` and the stated `tolerance`. `at_least` is true if SSIM falls by less than
     `ALLOWED_LOSS` even at the measured deviation. `passes` tells whether the tolerance is met. `passes` is None if the
-    answer is unknown. In this case, the measured deviation is smaller than the tolerance, and SSIM falls less than
-    `ALLOWED_LOSS`.
+    answer is unknown. The answer is unknown if the measured deviation is below the tolerance and SSIM falls by less
+    than `ALLOWED_LOSS`.
     """
     planned = found.get("as planned")
     if planned is None:
@@ -103,7 +106,8 @@ def allowed_errors(
 def allowed_error(fall: float, deviation: float) -> float:
     """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, at most `deviation`.
 
-    The function assumes a linear fall of SSIM, by `fall` at `deviation`. Nothing larger was measured.
+    The function assumes that SSIM falls linearly, and that SSIM has fallen by `fall` at `deviation`. Nothing larger was
+    measured.
     """
     return deviation * min(1.0, ALLOWED_LOSS / fall) if fall > 0 else deviation
 
@@ -130,8 +134,8 @@ def blacks(image: Array, picture: Array) -> dict[str, float]:
 def unlit_corners(image: Array, picture: Array) -> list[str]:
     """Return the names of the corners in which an `image` (H, W) has less than half the light of the `picture` (H, W).
 
-    A corner is a tenth of the width and of the height. Both images are divided by their means. Black corners of the
-    picture do not count.
+    A corner spans a tenth of the width and a tenth of the height. Both images are divided by their means. Black corners
+    of the picture do not count.
     """
     seen, wanted = (each / max(float(each.mean()), 1e-30) for each in (image, picture))
     height, width = (max(1, round(CORNER * size)) for size in picture.shape)

@@ -1,4 +1,4 @@
-"""Workers that take turns, from start to end. `bench` and `convergence` share this code.
+"""Workers that take turns, from the workers' start to their end. `bench` and `convergence` share this code.
 
 Only one worker computes at a time, so drift of the machine affects all workers alike. An additional worker, the
 referee, can make the common reference. If the referee fails, nothing is measured.
@@ -46,11 +46,11 @@ def start_process(first: dict[str, Any], does: str) -> Process:
 
 
 class Arena(Generic[Measured, Worker]):
-    """Running workers, `members`. Their files go to `folder`, which the caller removes.
+    """Running workers, `members`. The workers write files to `folder`, which the caller removes.
 
     `facts` come from the referee. `spent_s` is the part of the budget that is already spent. Measurements of an
-    `earlier` session count, and are continued. Raises ConfigError if the earlier measurements belong to another
-    measurement.
+    `earlier` session count, and the new session continues them. Raises ConfigError if the earlier measurements belong
+    to another measurement.
     """
 
     #: Maximum number of rounds.
@@ -84,14 +84,15 @@ class Arena(Generic[Measured, Worker]):
         self._end = now() + self._budget_s
 
     def _set_up(self, earlier: Earlier | None) -> int:
-        """Set up the parts that only one kind of session has. The parts start from the data of an earlier session.
+        """Set up the parts that are specific to one kind of session. The parts start from the data of an earlier
+        session.
 
         Returns the number of depths among which the time is divided. Raises ConfigError.
         """
         raise NotImplementedError
 
     def _taking_turns(self, course: Iterator[Item]) -> Iterator[Item]:
-        """Yield the items of `course` until it ends or `stop()` returns true. Then all workers have ended."""
+        """Yield the items of `course` until `course` ends or `stop()` returns true. Then all workers have ended."""
         try:
             yield from course
         except Stopped:
@@ -107,7 +108,7 @@ class Arena(Generic[Measured, Worker]):
         return [member for member in self.members if member.alive]
 
     def _tight(self) -> bool:
-        """Whether workers together use so much memory that they must release it after each step."""
+        """True if workers together use so much memory that each worker must release memory after each step."""
         return sum(member.peak_mib for member in self._alive()) * MIB > MEMORY_SHARE * self.plan.memory
 
     def _take_rounds(self, workers: Callable[[], Sequence[Stepping]], first: int, before: int) -> Iterator[int]:
@@ -123,7 +124,7 @@ class Arena(Generic[Measured, Worker]):
             yield first + done
 
     def _budget_for(self, seconds: float) -> float:
-        """Return the total budget that leaves this number of seconds for measuring."""
+        """Return the total budget that leaves `seconds` seconds for measuring."""
         return (seconds + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
 
     def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
@@ -141,7 +142,7 @@ class Arena(Generic[Measured, Worker]):
         return answer
 
     def _open(self, member: Contestant) -> dict[str, Any] | None:
-        """Return a worker's first message, after it has loaded its scene. Returns None if the worker ended, or if the
+        """Return the first message of a worker that has loaded its scene. Returns None if the worker ended, or if the
         time was up.
         """
         opening = member.answer(self._stop, self._pace.over)
@@ -152,11 +153,13 @@ class Arena(Generic[Measured, Worker]):
     # ---------------------------------------------------------------------------------------------------------
 
     def _first(self, config: Config, arrays: str) -> dict[str, Any]:
-        """Return the first message to a worker, with the file of the referee's arrays under the name `arrays`."""
+        """Return the first message to a worker. The message holds the file of the referee's arrays under the name
+        `arrays`.
+        """
         return self.plan.first(config) | {arrays: str(self.folder / f"{arrays}.npz")}
 
     def _warn(self, opening: dict[str, Any]) -> None:
-        """Print warnings of loading once, because every process loads the same scene."""
+        """Print warnings about loading only once, because every process loads the same scene."""
         for line in opening.get("warnings", ()):
             self._once(line)
 
@@ -194,8 +197,8 @@ class Arena(Generic[Measured, Worker]):
 
 
 def load(does: str) -> Begin:
-    """Return the function that starts a process, by name. `load` and the returned function import their modules
-    themselves.
+    """Return the function, selected by `does`, that starts a process. `load` and the returned function import their
+    modules themselves.
     """
     if does == "measured_steps":
         from reslrb_cli.measure.stepper import begin_steps

@@ -3,7 +3,7 @@
 `sweep` selects the quantity: depth, number of samples, size of the film or of textures. At each value, every case
 (`BenchRun`) has its own process, and all processes exist at once (`Bench`). Each process takes a cold step. Further
 steps follow until no new kernel is compiled. Then rounds follow. In each round, every process takes one step, and the
-order of the processes changes from round to round. The steps of a round share a seed, and ratios are taken within a
+order of the processes changes from round to round. The steps of a round share a seed. Ratios compare steps of the same
 round.
 
 A case that runs out of memory is tried again at greater depths, so every record is an observation. A case of the
@@ -33,10 +33,10 @@ TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
 
 @dataclass(frozen=True)
 class BenchResult:
-    """Record of a case, with its ratios to the baseline and data beyond the record.
+    """Record of a case, its ratios to the baseline, and further data that the record lacks.
 
-    `value` is the value of the varied quantity. `kernel_ratio` and `step_ratio` are times divided by those of the
-    baseline, round by round. They are None if either time is missing.
+    `value` is the value of the varied quantity. `kernel_ratio` and `step_ratio` are the case's times divided by the
+    baseline's times, round by round. They are None if either time is missing.
     """
 
     case: Case
@@ -174,7 +174,7 @@ class Bench(Arena[Sweep, BenchRun]):
         ]
 
     def kept(self) -> Kept | None:
-        """Return the data for a later session, or None if there are none yet."""
+        """Return the data for a later session, or None if no data exist yet."""
         values = [(value, [run.kept() for run in runs if run.done]) for value, runs in self.runs.items()]
         if not any(entries for _, entries in values):
             return None
@@ -182,7 +182,7 @@ class Bench(Arena[Sweep, BenchRun]):
         return resume_store.head(self.plan.KIND, self.settings, values=values, left_out=left_out), {}
 
     def run(self) -> Iterator[list[BenchResult]]:
-        """Measure. Yields an empty list after each round, and the results of a value once it is finished.
+        """Measure. Yields an empty list after each round, and a value's results when the value is finished.
 
         Ends early, with the finished results, after `stop()`. Prints missing measurements and, once, warnings of
         loading. Raises Refused if a required case cannot start.
@@ -251,7 +251,9 @@ class Bench(Arena[Sweep, BenchRun]):
         return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
 
     def _needed(self, left: int) -> str:
-        """Describe the time that the remaining values would have taken. The value that has just ended is included."""
+        """Describe the time that the remaining values would have taken. The time includes the value that has just
+        ended.
+        """
         late, warm = sum(run.late for run in self.members), len(self._alive())
         if warm == 0:
             return "; nothing had compiled by then, so allow several times as much"

@@ -67,8 +67,8 @@ def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -
     """Return a standard normal score of mean(difference) against zero for each entry. The mean is taken along axis 0.
 
     The estimates have equal seeds and share some noise. `difference` is (N, ...). `floor` is the rounding error, and is
-    added to the standard error. `bias` is a known error such as truncation, and is subtracted from the difference of
-    the means.
+    added to the standard error. `bias` is a known error such as truncation. The function subtracts `bias` from the size
+    of the mean difference.
     """
     mean, var, floor = difference.mean(0), difference.var(0, ddof=1) / len(difference), np.square(floor)
     mean = np.sign(mean) * np.maximum(np.abs(mean) - bias, 0.0)
@@ -79,7 +79,7 @@ def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -
 
 
 def _normal_scores(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Return the standard normal z of the same probability as Student's t."""
+    """Return the standard normal z that has the same probability as Student's t."""
     z = -np.sign(t) * stats.norm.ppf(stats.t.sf(np.abs(t), np.minimum(freedom, 1e6)))
     # Beyond the resolution of doubles, the t distribution decides.
     return np.where(np.isfinite(z), z, t)
@@ -130,7 +130,7 @@ PROJECTIONS = 16
 def divisions(shape: tuple[int, ...]) -> list[int]:
     """Return the divisions of a parameter of this shape, the finest first.
 
-    A division is given by its tiles along each side, or by 0 for single entries.
+    A division is given as the number of tiles along each side, or as 0 for single entries.
     """
     size = int(np.prod(shape, dtype=int))
     if size <= 4:
@@ -140,7 +140,9 @@ def divisions(shape: tuple[int, ...]) -> list[int]:
 
 
 def parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray:
-    """Return sums (N, E) over the parts of one division, from gradients (N, P) of a parameter of this shape."""
+    """Return the sums (N, E) of gradients (N, P) over the parts of one division. The parameter has the given
+    `shape`.
+    """
     if tiles == 0:
         return samples
     height, width, channels = shape if len(shape) == 3 else (1, samples.shape[1], 1)
@@ -169,7 +171,7 @@ def overall(samples: np.ndarray) -> np.ndarray:
 
 
 def entry_count(shape: tuple[int, ...]) -> int:
-    """Return the maximum number of entries in which a parameter of this shape is compared."""
+    """Return the largest number of entries that a comparison uses for a parameter of the given `shape`."""
     none = np.zeros((1, int(np.prod(shape, dtype=int))))
     return parts(none, shape, divisions(shape)[0]).shape[1] + overall(none).shape[1]
 
@@ -201,7 +203,7 @@ TAIL_SEEDS = 8
 
 @dataclass(frozen=True)
 class Family:
-    """Comparisons with a common correction: `rows` of a table, with `entries` in total."""
+    """Comparisons that share one correction: a table with `rows` rows and `entries` entries in total."""
 
     rows: int = 1
     entries: int = 1
@@ -223,7 +225,7 @@ def compare_expectations(
     ours: np.ndarray, reference: np.ndarray, family: Family, *, shape: tuple[int, ...] | None = None,
     paired: bool = True, bias: Any = 0.0, rounding: float = ROUNDING,
 ) -> Comparison:  # fmt: skip
-    """Compare the means of (N, P) samples with those of a reference.
+    """Compare the means of (N, P) samples with the means of a reference.
 
     If `paired`, `reference` is (N, P) at the same seeds. Otherwise `reference` is (M, P) at other seeds, or (P,) for
     exact values. If the parameter's `shape` is given, z scores belong to parts of the parameter (`entries`) instead of
@@ -276,7 +278,9 @@ def compare_expectations(
 
 
 def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = ROUNDING) -> Comparison:
-    """Compare (N, P) samples with those of a reference at the same seeds, by relative L2 over all samples together."""
+    """Compare (N, P) samples with reference samples at the same seeds, by the relative L2 distance of all samples
+    together.
+    """
     problem = _problem(ours, reference)
     if problem is not None:
         return problem
@@ -316,9 +320,7 @@ def tail_weight(samples: np.ndarray) -> float:
 def _entries(
     ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...] | None, joined: bool, rounding: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return both sides (N, E) in the finest division of the parameter for which the samples are close enough to
-    normal.
-    """
+    """Return both sides (N, E) in the parameter's finest division whose samples are close enough to normal."""
     if shape is None:
         return ours, reference
     for tiles in divisions(shape):

@@ -1,8 +1,8 @@
 """Check of an experiment's gradients: each estimator is compared with every valid reference.
 
 The objective is sum(G * I) with a fixed random image G, partly negative, so that all integrators estimate the same
-gradient. The configuration's loss would bias each estimate, because each estimate's image has noise. Comparisons are
-made at equal seeds, each as soon as its samples are available.
+gradient. The configuration's loss would bias each estimate, because each estimate's image has noise. Comparisons use
+equal seeds. Each comparison is made as soon as its samples are available.
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class Row:
-    """A comparison of one parameter `key` (None: the image) for the integrator `label` with the paths `way`."""
+    """A comparison for the integrator `label` with the paths `way`. The compared quantity is the parameter `key`, or
+    the image if `key` is None.
+    """
 
     key: str | None
     label: str
@@ -69,7 +71,7 @@ class Row:
 
     @property
     def place(self) -> str:
-        """The parameter's name for these paths, which is the key of its data in `Participants`."""
+        """Name of the parameter for these paths. `Participants` stores the parameter's data under this name."""
         return self.way.named(str(self.key))
 
 
@@ -250,8 +252,8 @@ class Gradcheck:
 
 
 def _draws_plainly(config: Config) -> bool:
-    """True if paths equal those of naive AD at equal seeds. Guiding and a quasi-random sequence make the paths
-    differ.
+    """True if an integrator's paths equal the paths of naive AD at equal seeds. Guiding and a quasi-random sequence
+    make the paths differ.
     """
     options = config.integrator.options()
     usual = {"guiding": "off", "sequence": "independent", "pixels": "even"}

@@ -10,8 +10,8 @@ steps therefore give the truncation error of the smaller step (Richardson 1911).
     D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1)
 
 Paths that change discontinuously cause noise that grows as h shrinks. The noise appears as variation of D(r h) - D(h)
-between seeds. If light moves, rounding errors of the scene can be equal for all seeds. A change that does not shrink
-with h is therefore not truncation, and counts in full. The step with the smallest sum of errors is chosen, and its
+between seeds. If light moves, rounding errors of the scene can be equal for all seeds. If a change does not shrink with
+h, the change is not truncation, and counts in full. The step with the smallest sum of errors is chosen, and its
 truncation error is stored.
 """
 
@@ -48,7 +48,7 @@ WAVES = 1.5
 
 
 def moves_light(params: mi.SceneParameters, key: str) -> bool:
-    """Whether a parameter moves shapes or lights. Motions and heightmaps always move shapes or lights. `params` does
+    """True if a parameter moves shapes or lights. Motions and heightmaps always move shapes or lights. `params` does
     not contain motions or heightmaps.
     """
     if key not in params.properties:
@@ -60,8 +60,8 @@ def moves_light(params: mi.SceneParameters, key: str) -> bool:
 def smooth_weights(height: int, width: int, channels: int = 3) -> np.ndarray:
     """Return a smooth dL/dI of mean 1 that vanishes at the film's border, so that light beyond it has no effect.
 
-    Finite differences of light that moves over the film need a smooth dL/dI. With noise per pixel, steps would have to
-    be much smaller than a pixel.
+    Finite differences of light that moves over the film need a smooth dL/dI. If dL/dI had noise in each pixel, steps
+    would have to be much smaller than a pixel.
     """
     y, x = (np.mgrid[0:height, 0:width] + 0.5) / np.array([height, width]).reshape(2, 1, 1)
     value = np.stack([np.sin(5 * x) * np.cos(4 * y) + 1.5, np.cos(3 * x + 2 * y) + 1.2, x + y], -1)[:, :, :channels]
@@ -71,7 +71,8 @@ def smooth_weights(height: int, width: int, channels: int = 3) -> np.ndarray:
 
 
 def smooth_rows(key: str, value: Any, extent: float, count: int, seed: int = 3) -> list[np.ndarray]:
-    """Return directions in which a parameter moves smoothly, each a row. A step is a fraction of a direction.
+    """Return directions in which a parameter moves smoothly, one direction per row. A step is a fraction of a
+    direction.
 
     Vertices move along random directions, with amplitudes that form a wave over the vertex positions. Heightmap texels
     change by waves over the texel grid. For small parameters (a position, a rotation), all entries move. `extent` is
@@ -105,7 +106,9 @@ def _waves(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
 
 
 class Values(Protocol):
-    """The interface of parameters of a scene, or of values on which they depend. `scene.Selection` implements it."""
+    """Interface to a scene's parameters, or to values on which the parameters depend. `scene.Selection`
+    implements it.
+    """
 
     @property
     def params(self) -> mi.SceneParameters:
@@ -115,13 +118,13 @@ class Values(Protocol):
         """Return the current value of `key` as a Dr.Jit array."""
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Set these values in the scene, with their derivatives, and evaluate everything that depends on them."""
+        """Set `values` and their derivatives in the scene, and evaluate everything that depends on the values."""
 
     def collect(self) -> None:
-        """Propagate gradients from the scene to the values of `hand_over`."""
+        """Propagate gradients from the scene to the values that `hand_over` has set."""
 
     def push(self) -> None:
-        """Propagate tangents from the values of `hand_over` to the scene."""
+        """Propagate tangents from the values that `hand_over` has set to the scene."""
 
 
 #: Candidate steps, as fractions of the direction.
@@ -210,7 +213,7 @@ def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequen
 
 
 def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
-    """Return plausible bounds for a parameter of this kind (`ParameterInfo.kind`) with these values.
+    """Return plausible bounds for a parameter with this `kind` (`ParameterInfo.kind`) and these `values`.
 
     The bounds are 0 to 1 if all values are in this range, except for emitters. Otherwise, the bounds are 0 to infinity
     if no value is negative.
@@ -221,7 +224,7 @@ def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
 
 
 def extrapolated(near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Combine the differences D(h), `near`, and D(2 h), `far`, so that the error of order h^2 cancels.
+    """Combine the differences `near` = D(h) and `far` = D(2 h) so that the error of order h^2 cancels.
 
     E(h) = (4 D(h) - D(2 h)) / 3 (Richardson 1911).
     """
@@ -229,7 +232,7 @@ def extrapolated(near: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 
 def embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
-    """Return a vector (P,) with the row of one parameter, and zeros for the others."""
+    """Return a vector (P,) with the given `row` for one parameter, and zeros for all other parameters."""
     whole = np.zeros(case.size)
     whole[case.places[key]] = row
     return whole
@@ -260,7 +263,7 @@ class Case:
         self.weigh(np.random.default_rng(7).uniform(0.2, 1.8, shape))
 
     def weigh(self, weights: np.ndarray) -> None:
-        """Set the weights of the objective, (H, W, C) without alpha: dL/dI."""
+        """Set the objective's weights dL/dI, (H, W, C) without alpha."""
         self.weights = mi.TensorXf(np.ascontiguousarray(weights, np.float32))
 
     @property
@@ -270,11 +273,11 @@ class Case:
         return mi.TensorXf(np.pad(weights, ((0, 0), (0, 0), (0, self.channels - weights.shape[2]))))
 
     def flat(self, key: str) -> np.ndarray:
-        """Return the parameter's values in a row, in the order of their storage."""
+        """Return the parameter's values as a flat array in storage order."""
         return np.array(self.values.value(key), dtype=np.float64).ravel()
 
     def shaped(self, key: str, row: np.ndarray) -> Any:
-        """Convert a row of values to the parameter's type."""
+        """Convert a flat array of values to the parameter's type."""
         now, array = self.values.value(key), np.asarray(row, np.float32)
         kind = type(now)
         if dr.is_tensor_v(kind):
@@ -293,7 +296,7 @@ class Case:
 
     def gradient(self, integrator: Any, seed: int, spp: int, objective: Callable | None = None,
                  step: Callable = gradient_step, **options: Any) -> np.ndarray:  # fmt: skip
-        """Return the gradient of all parameters as a flat array, from one step with these `options`."""
+        """Return the gradient of all parameters from one step, as a flat array. `options` are the step's options."""
         leaves = self.leaves()
         objective = objective or self.objective
         step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
@@ -303,14 +306,14 @@ class Case:
         return np.concatenate(result)
 
     def known_step(self, integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
-        """Take a step with dL/dI known before the image, for `gradient`."""
+        """Take a step with dL/dI known before the image, as the `step` argument of `gradient`."""
         return known_step(integrator, scene, sensor, self.adjoint, **options)
 
     def leaves(self) -> dict[str, Any]:
         """Create leaves with derivatives for all parameters, and set them in the scene.
 
-        The leaves are separate copies, because the scene may replace its values by derived ones. For example, an
-        environment map pads its columns.
+        The leaves are copies, because the scene may replace values by derived values. For example, an environment map
+        pads its columns.
         """
         leaves = {}
         for key in self.keys:
@@ -344,7 +347,7 @@ class Case:
         return float(np.sum(image[:, :, : self.weights.shape[2]] * np.array(self.weights)))
 
     def along(self, direction: np.ndarray, tangent: Callable[[], Any]) -> np.ndarray:
-        """Return the image of `tangent()` as float64 while the parameters carry the tangent `direction` (P,).
+        """Set the parameters' tangent to `direction` (P,), and return the image of `tangent()` as float64.
 
         For forward mode, `tangent` renders the derivative of the image along this direction.
         """

@@ -120,7 +120,7 @@ class Case:
 
     @property
     def estimator(self) -> str | None:
-        """Name of the estimator with its non-default options, except `capacity`, or None for other integrators."""
+        """Name of a `reslrb` estimator with its non-default options except `capacity`. None for other integrators."""
         if self.type != "reslrb":
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
@@ -137,8 +137,8 @@ class Case:
 def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Case]:
     """Parse a list of cases. Raises ConfigError if a case has a wrong format or is listed twice.
 
-    `source` is the command-line option of the list. `deep` is True if the measurement varies the maximum depth.
-    `Case.at` checks the options of the cases.
+    `source` is the command-line option that contains the list. `deep` is True if the measurement varies the maximum
+    depth. `Case.at` checks the options of the cases.
     """
     return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
 
@@ -295,7 +295,9 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep(Measurement):
-    """The plan of `bench`: times at each of `values` of the `swept` quantity, relative to the `baseline`."""
+    """The plan of `bench`. `bench` measures times relative to `baseline`, at each of the `values` of the `swept`
+    quantity.
+    """
 
     values: Sequence[int]
     swept: str = "depth"
@@ -311,7 +313,7 @@ class Sweep(Measurement):
         return {"values": list(self.values), "objective": self.objective, "sweep": self.swept}
 
     def may_refuse(self, case: Case) -> bool:
-        """True if the measurement continues without `case` when that integrator does not support the scene."""
+        """True if the measurement skips `case` when the case's integrator does not support the scene."""
         return self.default and case != self.baseline
 
     def at(self, case: Case, value: int) -> Config:
@@ -321,7 +323,7 @@ class Sweep(Measurement):
         return case.at(config, depth, known=self.objective == "fixed")
 
     def name(self, *values: int) -> str:
-        """Format values of the swept quantity: `depth 2, 4`."""
+        """Format values of the swept quantity, for example `depth 2, 4`."""
         return f"{SWEPT[self.swept]} {', '.join(map(str, values))}"
 
     def check(self) -> None:
@@ -371,7 +373,7 @@ class Plan(Measurement):
 
     @property
     def known(self) -> bool:
-        """Whether dL/dI is known before the image, or not needed."""
+        """True if dL/dI is known before the image, or is not needed."""
         return self.objective != "loss"
 
     @property
@@ -389,7 +391,7 @@ class Plan(Measurement):
                 "light": not (named and all(sides))}  # fmt: skip
 
     def _has_camera_paths(self, config: Config) -> bool:
-        """Whether an integrator's images are complete at the film's border, judged by its options."""
+        """True if an integrator's options give images that are complete at the film's border."""
         return str(paths_in_records(config)["paths"]) != "light"
 
     @property
@@ -407,7 +409,9 @@ class Plan(Measurement):
         return self.reference.at(self.config, self.config.integrator.max_depth, True, auto=True)
 
     def settled_reference(self, paths: str) -> Case:
-        """Return the reference case. If its option `paths` is `auto`, the argument `paths` replaces `auto`."""
+        """Return the reference case. If the reference's option `paths` is `auto`, the argument `paths` replaces
+        `auto`.
+        """
         if self.reference.options.get("paths") != "auto":
             return self.reference
         own: dict[str, Any] = {} if paths == "light" else {"paths": paths}
@@ -435,7 +439,7 @@ class Plan(Measurement):
         _ = self.reference_config
 
     def method(self, case: Case, config: Config, spp: int, known: bool, reference: bool) -> Method:
-        """Describe a case, or a `reference`, for records."""
+        """Describe a case for records. `reference` is True for the reference."""
         options: dict[str, Any] = config.integrator.options()
         adjoint = None if known else config.adjoint
         own = {name: value for name, value in case.options.items() if name not in ADJOINT}
@@ -446,7 +450,9 @@ class Plan(Measurement):
 
 
 def compared(integrators: str | None, reference: str | None, usual: str) -> dict[str, Any]:
-    """Return cases and reference of a `Plan` from lists as text, or from the defaults `usual`. Raises ConfigError."""
+    """Return a `Plan`'s cases and reference, parsed from text. `usual` is the default list of cases. Raises
+    ConfigError.
+    """
     cases = parse_cases(integrators or usual, deep=False)
     stands = parse_cases(reference or REFERENCE, "--reference", deep=False)
     if len(stands) != 1:
@@ -455,7 +461,9 @@ def compared(integrators: str | None, reference: str | None, usual: str) -> dict
 
 
 def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
-    """Return the machine's fields of a `Measurement`: variant, device, memory, and memory limit. Raises ConfigError."""
+    """Return the fields of a `Measurement` that describe the machine: variant, device, memory, and memory limit. Raises
+    ConfigError.
+    """
     variant, _ = choose(config.variant)
     on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
     if on_gpu and memory_limit is not None:

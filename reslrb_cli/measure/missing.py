@@ -1,15 +1,16 @@
-"""Missing terms of derivatives: attached gradients lack silhouettes, shadow edges, and light that leaves the film.
+"""Terms that attached gradients lack: silhouettes, shadow edges, and light that leaves the film.
 
 Finite differences of the image at common random numbers contain the terms that attached gradients lack (`Missing`). F_k
 is the finite difference along direction k, and g_k is the attached gradient along direction k. There are K directions.
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 
-E(h) (`extrapolated`) combines two steps and cancels the leading error of a difference. Steps are halved, and the step
-around which E changes least is used. Larger steps have truncation errors. Smaller steps have rounding errors, or errors
-of paths that change discontinuously. Rounding errors of the scene's geometry are the same for all seeds. The remaining
-change of E counts as an error if it exceeds the noise. The contribution of noise to the squares is subtracted. The
-reported standard error is the error of the mean over seeds. `MissingCheck` is `gradcheck --missing` on an experiment.
+E(h) (`extrapolated`) combines the differences of two steps, so that their leading errors cancel. Steps are halved
+repeatedly. The measurement uses the step around which E changes least. Larger steps have truncation errors. Smaller
+steps have rounding errors, or errors of paths that change discontinuously. Rounding errors of the scene's geometry are
+the same for all seeds. The remaining change of E counts as an error if it exceeds the noise. The contribution of noise
+to the squares is subtracted. The reported standard error is the error of the mean over seeds. `MissingCheck` implements
+`gradcheck --missing` for an experiment.
 
 `check_missing` measures the missing share before a run's first iteration. The measurement is limited to a part of the
 run's samples, and uses one or two finite-difference steps.
@@ -77,7 +78,7 @@ class Missing:
 
     @staticmethod
     def of(case: Case, differenced: Any, directions: Sequence[Direction], spp: int) -> Missing:
-        """Create an empty collection with a step for each direction."""
+        """Create a collection without samples. Choose a step for each direction."""
         return Missing([_with_step(case, differenced, direction, spp) for direction in directions])
 
     def take(self, case: Case, tracer: Any, differenced: Any, seed: int, spp: int, step: Callable) -> None:
@@ -127,8 +128,8 @@ def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[
 
 
 def _ratio(missing: np.ndarray, whole: np.ndarray) -> float:
-    """Return the ratio of the root mean squares of (N, K) samples, `missing` over `whole`. The part due to noise is
-    subtracted.
+    """Return rms(`missing`) / rms(`whole`) for samples (N, K), where rms is the root mean square. The part due to noise
+    is subtracted.
     """
     squares = [np.square(mean).sum() - np.square(error).sum() for mean, error in (_mean(missing), _mean(whole))]
     return float(np.sqrt(max(squares[0], 0.0) / squares[1]))
@@ -168,8 +169,8 @@ ESTIMATOR = "stack"
 class MissingCheck:
     """The measurement of missing terms on a loaded experiment. A variant must be set.
 
-    dL/dI is that of the experiment's loss at the initial values, and stays fixed. New seeds are added to those of an
-    `earlier` session, and `count` is the total number. Raises ConfigError and UnsupportedScene.
+    dL/dI is that of the experiment's loss at the initial values, and stays fixed. New seeds are added to the seeds of
+    an `earlier` session. `count` is the total number of seeds. Raises ConfigError and UnsupportedScene.
     """
 
     def __init__(
@@ -200,8 +201,8 @@ class MissingCheck:
         return f"{self.source}, film {width}x{height}, {self.spp} spp, dL/dI of the loss at the initial values"
 
     def run(self, stop: Callable[[], bool], between: Callable[[], None] = lambda: None) -> Iterator[MissingRecord]:
-        """Measure the parameters in turn until `stop()`, each in its share of the budget. `between` is called after
-        each seed.
+        """Measure the parameters in turn until `stop()`. Each parameter gets a share of the budget. `between` is called
+        after each seed.
         """
         for place, key in enumerate(self.case.keys):
             if stop():
@@ -212,7 +213,7 @@ class MissingCheck:
             yield self._record(key)
 
     def known(self) -> list[MissingRecord]:
-        """Return the results for all parameters with enough seeds, in their order."""
+        """Return the results of all parameters with enough seeds, in the order of the parameters."""
         least = min(FEWEST, self._count or FEWEST)
         return [self._record(key) for key, found in self._found.items() if found.count >= least]
 
@@ -225,7 +226,7 @@ class MissingCheck:
         return kept(KIND, settings, samples, steps=steps)
 
     def _restore(self, earlier: Earlier) -> dict[str, Missing]:
-        """Return the results of an earlier session, with its own steps."""
+        """Return the results of an earlier session, with the steps of the earlier session."""
         found, samples = {}, earlier.samples
         for key, steps in earlier.head["steps"].items():
             along = [replace(one, step=float(h)) for one, h in zip(self._directions[key], steps, strict=True)]
@@ -291,7 +292,8 @@ def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[Missing
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:
-    """Measure the missing share of each parameter that moves light, with at most `run.measuring` of the run's samples.
+    """Measure the missing share of each parameter that moves light. The measurement takes at most the fraction
+    `run.measuring` of the run's samples.
 
     The parameters keep their values. If the sample limit is too low for a measurement, the parameter's record has no
     share. Heightmaps with an unknown share are left out, because their rims hardly move. The function restores the
@@ -311,7 +313,7 @@ def measure_missing(problem: Problem) -> list[MissingRecord]:
 
 
 class _Short:
-    """Samples of the derivatives of a run's loss along each of `keys`, with the run's own integrator."""
+    """Samples of the loss derivatives along each parameter in `keys`. The run's own integrator takes the samples."""
 
     def __init__(self, problem: Problem, keys: Sequence[str]) -> None:
         self.problem, self.keys, run = problem, keys, problem.config.run

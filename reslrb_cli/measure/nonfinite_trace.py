@@ -1,4 +1,4 @@
-"""Search for the origin of a value that is not finite: the path, its vertex and the factor, or the pixel of the loss.
+"""Search for the origin of a non-finite value. The origin is a path with its vertex and factor, or a pixel of the loss.
 
 `find_offenders` traces the paths of the step again from their seeds, and `SearchHooks` checks every factor. For each
 factor, `SearchHooks` also checks the derivative along one direction. All entries of all parameters grow equally along
@@ -62,7 +62,7 @@ class PathVertex:
 
 @dataclass(frozen=True)
 class Offender:
-    """The first non-finite value of a view, in the order of paths and of their vertices.
+    """The first non-finite value of a view. Values are ordered by path, then by vertex.
 
     `quantity` names the value. `value` has one number per channel. For a derivative of the loss, `value` is empty.
     `pixel` (x, y) is its place on the film. `where` is None if the non-finite value is a derivative of the loss.
@@ -82,8 +82,8 @@ class Witness(Guiding):
     """A wrapper of another guide. The wrapper continues to update the tables, and records the tables from which samples
     are drawn.
 
-    `drawn` has the tables of all samples so far, in order. Tables of samples that were drawn only for learning are left
-    out.
+    `drawn` has the tables of all samples so far, in order. `drawn` excludes tables whose samples were drawn only for
+    learning.
     """
 
     def __init__(self, other: Guiding) -> None:
@@ -143,7 +143,7 @@ _E, _DE, _S, _DS, _PRODUCT, _C, _DC, _CONTRIBUTION, _L, _DL = range(1, len(QUANT
 
 @dataclass
 class Suspect:
-    """A value (C,) that is not finite, its kind (0: none), and its vertex."""
+    """A non-finite value (C,) with its kind and its vertex. Kind 0 means no value."""
 
     kind: Any
     vertex: Any
@@ -182,7 +182,7 @@ class Search:
     """Loop state.
 
     `first` is the first suspect of the path so far. `found` belongs to the first connection that reaches the film and
-    has a non-finite value. `found` is the first non-finite value on that path, and `u` is the connection's film
+    has a non-finite value. `found` is the first non-finite value on the connection's path. `u` is the connection's film
     position. A connection that reaches the wanted pixel (`there`) takes precedence. `largest` is the largest
     contribution, which lands at `largest_u`.
     """
@@ -196,11 +196,13 @@ class Search:
 
 
 class SearchHooks(Hooks):
-    """Checks every factor of a connection, its derivative along the parameters' tangents, and the product of all."""
+    """Checks every factor of a connection, the factor's derivative along the parameters' tangents, and the product of
+    all factors.
+    """
 
     def __init__(self, samples: Samples, emission: Any, derivative: Any, pixel: tuple[int, int] | None) -> None:
-        """Make the hooks. `emission` is a ray of each path with E, and `derivative` is dE (C,). `pixel` is the wanted
-        pixel, or None.
+        """Make the hooks. `emission` has a ray and the emission E for each path. `derivative` is dE (C,). `pixel` is
+        the wanted pixel, or None.
         """
         self.samples, self.emission, self.derivative, self.pixel = samples, emission, derivative, pixel
 
@@ -247,8 +249,8 @@ class SearchHooks(Hooks):
 
 
 class CameraSearch(CameraHooks):
-    """Checks camera paths as `SearchHooks` checks light paths. Checks each factor before an emitter, and the
-    emission.
+    """Checks camera paths as `SearchHooks` checks light paths. Checks the emission, and each factor on the path before
+    an emitter.
     """
 
     def __init__(self, samples: Samples) -> None:
@@ -349,7 +351,7 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
 
 
 def _seen_emission(samples: Samples) -> Iterator[tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]]:
-    """Yield emission that the sensor sees directly: first by primary rays, then for emitters smaller than a pixel.
+    """Yield emission that the sensor sees directly. Primary rays come first, then emitters smaller than a pixel.
 
     Each item has radiance (C,) with its tangent, film positions, and active lanes.
     """
@@ -414,7 +416,7 @@ def _shape_name(scene: Any, index: int) -> str | None:
 
 
 def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
-    """Return the first non-finite value of each view, for views that have one. The parameters are those of
+    """Return the first non-finite value of each view that has a non-finite value. The parameters are those of
     `problem`.
     """
     found: list[Offender] = []
@@ -440,8 +442,8 @@ def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offende
     """Return the first non-finite value of one view, or None. The search covers the view's samples, or the samples of
     the shard named `word`.
 
-    With `adjoint: others`, dL/dI is computed from an image of the shard's own samples instead of the mean image of the
-    other shards.
+    With `adjoint: others`, the shard's own samples give the image for dL/dI. The mean image of the other shards is not
+    used.
     """
     guiding = guiding_of(problem)
     witness = None if guiding is None else Witness(guiding)
@@ -508,7 +510,7 @@ def _parts(
 
 
 def _set_tangents(problem: Problem) -> None:
-    """Set the tangent of every entry of every parameter in the scene to 1."""
+    """Set the tangents of all parameter entries in the scene to 1."""
     params, keys = problem.selection.params, problem.selection.keys
     keys = [key for key in keys if key in params]  # an exposure is not part of any path
     for key in keys:

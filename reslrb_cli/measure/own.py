@@ -1,8 +1,8 @@
-"""Diagnosis of a user's own integrator that `gradcheck` found wrong, derived from measurements.
+"""Measurements that diagnose a user's own integrator after a failed `gradcheck`.
 
-The integrator is compared with `reslrb` with the same kind of paths, as a ratio r with its standard error. For
-gradients, r compares the projections of both gradients on u, the direction of the reference's gradient. For images, r
-is the ratio of their sums.
+The user's integrator is compared with `reslrb` for the same kind of paths. The result is a ratio r with its standard
+error. For gradients, r is the ratio of both gradients' projections on u. u is the direction of the reference gradient.
+For images, r is the ratio of the image sums.
 
     r = E<g, u> / E<G, u>,      u from other seeds of G than the denominator
 
@@ -83,7 +83,8 @@ class Ratio:
 def look_into(
     check: Gradcheck, records: Sequence[GradcheckRecord], stop: Callable[[], bool], say: Callable[[str], None]
 ) -> Iterator[str]:
-    """Yield messages for each of the user's own integrators, after its `records`: noise and time, and likely faults.
+    """Yield messages about the noise, time and likely faults of each of the user's own integrators. `records` are the
+    results of `gradcheck`.
 
     Raises KeyboardInterrupt after `stop()`. `say` receives the name of the current measurement.
     """
@@ -98,7 +99,7 @@ def look_into(
 
 
 def _cost(check: Gradcheck, label: str, stop: Callable[[], bool]) -> str:
-    """Compare a gradient's noise and time with the noise and time of `reslrb`, which uses the same kinds of paths."""
+    """Compare a gradient's noise and time with `reslrb`, for the same kinds of paths."""
     parts = check.participants
     ours = _ours(parts, label)
     figures, measured = [], SEEDS
@@ -134,7 +135,7 @@ def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
 
 
 class Looking:
-    """Measurements that search for the faults of one integrator, `label`, that failed the check."""
+    """Measurements that search for faults of the integrator `label`, which failed the check."""
 
     def __init__(
         self, parts: Participants, label: str, stop: Callable[[], bool], say: Callable[[str], None]
@@ -165,7 +166,7 @@ class Looking:
         return mine, ours
 
     def gradients(self, **other: int) -> dict[str, Ratio]:
-        """Return the ratio for each parameter with a nonzero gradient in the reference."""
+        """Return the ratio for each parameter whose reference gradient is nonzero."""
         self._measure("gradients", other)
         own, ours = self._pair(**other)
         reference = np.stack([self.parts.gradient(ours, seed) for seed in self._each(2 * self._seeds, 6)])
@@ -184,11 +185,12 @@ class Looking:
     def emission(
         self, depth: int | None = None, seen: int | None = None, even: bool = False
     ) -> tuple[Ratio, float] | None:
-        """Return the ratio of sum(dL/dE E) to the image, which must be 1 because images are linear in emission.
+        """Return the ratio of sum(dL/dE E) to the image. The ratio must be 1, because images are linear in emission.
 
         Also returns how much the ratio varies between seeds. At each seed, the image and the derivative sum use the
-        same paths. Returns None if the emission of some emitter is not given by a number (`.value`, `scale`). The paths
-        have `depth` segments, and the image is `seen`. `even` sets dL/dI to 1 in all pixels and channels.
+        same paths. Returns None if the emission of some emitter is not given by a number (`.value`, `scale`). `depth`
+        is the gradient's maximum depth. `seen` is the image's maximum depth. `even` sets dL/dI to 1 in all pixels and
+        channels.
         """
         depth = self.depth if depth is None else depth
         keys = self._lamps()
@@ -237,8 +239,8 @@ class Looking:
         return keys if set(kinds) <= SCALING and len(keys) == kinds.count("SmoothDiffuse") else []
 
     def _of_length(self, at: int, sums: Callable[..., tuple[Array, Array]]) -> Ratio:
-        """Return the ratio of estimate to correct value for paths of exactly `at` segments. `sums` returns the samples
-        of the ratio's two terms for a maximum depth.
+        """Return the ratio of estimate to correct value for paths of exactly `at` segments. For a maximum depth, `sums`
+        returns samples of the ratio's numerator and denominator.
         """
         own, reference = sums(max_depth=at, rr_depth=NEVER)
         if at > 1:
@@ -247,8 +249,8 @@ class Looking:
         return _over(own, reference)
 
     def _limited(self, at: int, sums: Callable[..., tuple[Array, Array]], before: Ratio) -> str:
-        """Describe an upper limit on values. The limit probably exists if darker lamps or surfaces bring the ratio for
-        paths of `at` segments closer to 1 than `before`.
+        """Describe an upper limit on values. If darker lamps or surfaces bring the ratio for paths of `at` segments
+        closer to 1 than `before`, an upper limit probably exists.
         """
         if not np.isfinite(before.value):
             return ""
@@ -341,8 +343,8 @@ class Looking:
         return f"its image holds; it has {_list(wrong)} of the reference's gradient{beside}"
 
     def _narrowed(self, wrong: dict[str, Ratio]) -> list[str]:
-        """Return messages about the faults that the measurements do not rule out. Possible faults are passes that
-        differ, roulette, derivatives from some path length on, and BSDF lobes.
+        """Return messages about the faults that the measurements do not rule out. Possible faults are differing passes,
+        roulette, derivatives from some path length on, and BSDF lobes.
         """
         worst = max(wrong, key=lambda key: abs(wrong[key].value - 1) / max(wrong[key].error, 1e-12))
         passes = self._of_passes(wrong)
@@ -372,7 +374,9 @@ class Looking:
         return [each for each in said if each]
 
     def _of_passes(self, wrong: dict[str, Ratio]) -> str | None:
-        """Return how the differentiated pass differs from the pass of the image, in its terms or its paths, or None."""
+        """Describe a difference between the differentiated pass and the image pass, in terms or in paths. Return None
+        if no difference is found.
+        """
         measured = self.emission()
         if measured is None:
             return None
@@ -416,7 +420,7 @@ class Looking:
         return not 0 <= self.depth <= self._options["rr_depth"]
 
     def _from_depth(self, ratio: Callable[[int], Ratio | None]) -> tuple[int | None, bool]:
-        """Return the shortest path length at which the ratio is wrong, and True if shorter paths were measured as
+        """Return the shortest path length with a wrong ratio. Also return True if shorter paths were measured as
         right.
         """
         seen = False

@@ -95,7 +95,7 @@ class CheckSettings:
         return self.config.adjoint != "correlated"
 
     def configs(self) -> dict[str, Config]:
-        """Return the experiment with each integrator, by label. Raises ConfigError if one is invalid."""
+        """Return one experiment for each integrator, by label. Raises ConfigError if one is invalid."""
         depth = self.config.integrator.max_depth
         return {case.label: case.at(self.config, depth, self.known) for case in self.integrators}
 
@@ -127,7 +127,7 @@ class Way:
 
     @classmethod
     def of(cls, config: Config) -> Way:
-        """Return the paths of an integrator. Integrators without this option use light paths."""
+        """Return the paths of an integrator. Integrators without the option `paths` use light paths."""
         options = config.integrator.options()
         paths, share = options.get("paths", "light"), options.get("light_share", "auto")
         share = 0.5 if share == "auto" else share
@@ -277,7 +277,9 @@ class Participants:
         return listed
 
     def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
-        """Return the integrators by label, with the options that references need if derivatives are attached."""
+        """Return the integrators by label. If derivatives are attached, add variants with the options that references
+        need.
+        """
         made: dict[str, StepIntegrator] = {}
         for label, config in configs.items():
             kind, options = config.integrator.type, config.integrator.options()
@@ -305,20 +307,22 @@ class Participants:
         return {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
 
     def own_with(self, label: str, **other: int) -> StepIntegrator:
-        """Return the user's own integrator with the label `label`. The arguments `other` replace its depths."""
+        """Return the user's own integrator with the label `label`. The arguments `other` replace the integrator's
+        depths.
+        """
         config = self._configs[label]
         return OwnIntegrator(**config.integrator.options() | other, allowed=config.allows_code)
 
     def bsdfs_of(self, key: str) -> list[mi.BSDF]:
-        """Return the BSDFs that a parameter belongs to, nested and enclosing ones. The list is empty if the parameter
-        belongs to no BSDF.
+        """Return all BSDFs that a parameter belongs to, including nested and enclosing BSDFs. The list is empty if the
+        parameter belongs to no BSDF.
         """
         is_bsdf = key in self.case.params.properties and parameter_kind(self.case.params, key) == "bsdf"
         return bsdfs_of(self._situation, key) if is_bsdf else []
 
     def of_own(self, key: str, way: Way) -> list[Reference]:
-        """Return all references that the scene allows for the gradient with respect to `key`, as computed by a user's
-        own integrator.
+        """Return all references that the scene allows for checking a user's own integrator. `key` is the parameter of
+        the checked gradient.
         """
         if self._situation.moved:  # our derivatives of camera paths hold only if nothing moves
             return [Reference.FINITE_DIFFERENCE]
@@ -328,8 +332,8 @@ class Participants:
         return [*found, Reference.WALK_AD, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
 
     def sampled(self, label: str, reference: Reference) -> str:
-        """Return the label of the integrator whose gradients represent the gradients of `label` in comparisons with
-        `reference`. `ALIKE` has the settings that differ.
+        """Return the label of the integrator that replaces `label` in comparisons with `reference`. `ALIKE` has the
+        settings that differ.
         """
         alike = _alike(label, reference)
         return alike if alike in self.integrators else label
@@ -340,7 +344,7 @@ class Participants:
         return len(sides | {divides_by_film(way.paths) for way in self.each_way}) > 1
 
     def _weigh(self, inside: bool) -> None:
-        """Set random weights of mean 1, a sixth of them negative. If light moves, they are smooth.
+        """Set random weights of mean 1. A sixth of the weights is negative. If light moves, they are smooth.
 
         With `inside`, weights are 0 at the border.
         """
@@ -367,10 +371,10 @@ class Participants:
         """Return one sample as a flat array. `kind` is `gradient`, `image`, `differences` or `tangents`.
 
         A `gradient` sample covers all parameters. The sample comes from one gradient step, as in the experiment. Images
-        are black along the film's border if some image references or estimators lose light there, but not all. `of` is
+        are black along the film's border if some, but not all, image references or estimators lose light there. `of` is
         the label of an integrator. For `differences` and `tangents`, the sample has the derivatives along a parameter's
-        directions. `of` is then the parameter's name with its kinds of paths (`Way.named`). Tangents are forward
-        derivatives, which are equal for all estimators of the same paths.
+        directions. For `differences` and `tangents`, `of` names the parameter and the kinds of paths (`Way.named`).
+        Tangents are forward derivatives. All estimators of the same paths have equal tangents.
         """
         if kind == "gradient":
             if of in (_alike(label, Reference.UNGUIDED) for label in self.unguided):
@@ -390,12 +394,14 @@ class Participants:
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
     def gradient(self, integrator: StepIntegrator, seed: int) -> np.ndarray:
-        """Return the gradient of all parameters as a flat array, from a step as in the experiment."""
+        """Take a step as in the experiment, and return the gradient of all parameters as a flat array."""
         options = {"step": self.case.known_step} if self.known else {}
         return self.case.gradient(integrator, seed, self.spp, **options)
 
     def _teach(self, of: str) -> None:
-        """Train the tables of a guided integrator once and keep them, so that each sample depends only on its seed."""
+        """Train the tables of a guided integrator once, then keep the tables. Each sample then depends only on its
+        seed.
+        """
         tracer = self.integrators[of]
         assert isinstance(tracer, LightTracer)
         guiding = tracer.preparation.guiding
@@ -415,7 +421,7 @@ def _alike(label: str, reference: Reference) -> str:
 
 
 def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:
-    """Return the samples per pixel for one gradient. The gradient has about PATHS paths, and at most the samples of a
-    run's step.
+    """Return the samples per pixel for one gradient. The gradient has about PATHS paths, but no more samples than a
+    step of the run.
     """
     return multiple_of(max(min(PATHS // (film[0] * film[1]), most), 1), multiple)

@@ -61,7 +61,7 @@ class Refused(ReslrbError):
 
 
 class Process:
-    """One worker. `first` is its first message, which includes `memory_limit` (bytes, or None)."""
+    """One worker. `first` is the first message to the worker, including `memory_limit` (bytes, or None)."""
 
     def __init__(self, first: dict[str, Any], command: list[str]) -> None:
         self.limit: int | None = first["memory_limit"]
@@ -89,7 +89,7 @@ class Process:
             self._process.stdin.flush()
 
     def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
-        """Wait for the next answer. Raises Ended, Refused, and, after `stop()`, Stopped."""
+        """Wait for the next answer. Raises Ended or Refused. Raises Stopped after `stop()`."""
         assert self._process.stdout is not None
         with selectors.DefaultSelector() as selector:
             selector.register(self._process.stdout, selectors.EVENT_READ)
@@ -264,7 +264,7 @@ class Stepping(Contestant):
         return answer
 
     def turn(self, round: int, release: bool, stop: Callable[[], bool]) -> None:
-        """Take the steps of a round, then `release` memory. Raises Stopped."""
+        """Take the steps of a round. Then free memory if `release` is True. Raises Stopped."""
         answer = self.ask(self.question(round) | {"cold": False, "release": release}, stop)
         if answer is not None:
             self.keep(round, answer)

@@ -31,8 +31,8 @@ CAMERA_PATHS = (Reference.PRB, Reference.PATH)
 
 
 def divides_by_film(paths: str) -> bool:
-    """True if images by paths of the kind `paths` (`loading.paths_of`) lose no light along the film's border, like
-    images by `path`.
+    """True if images by paths of the kind `paths` (`loading.paths_of`) lose no light along the film's border. Images by
+    `path` lose no light there.
     """
     return paths != "light"
 
@@ -85,7 +85,7 @@ class Situation:
 
     `attached` tells whether derivatives are attached. `moved` has the recovered parameters that move light. `paths`
     (`light`, `camera`, `both`) are the kinds of paths that the estimator traces. A valid reference contains exactly the
-    same light.
+    same light as the estimator.
     """
 
     scene: Any
@@ -110,7 +110,7 @@ class Situation:
 
     @classmethod
     def of_problem(cls, problem: Problem, sensor: int) -> Situation:
-        """Return the situation of a problem for the sensor of this index."""
+        """Return the situation of a problem for the sensor with the index `sensor`."""
         params, options = problem.selection.params, problem.config.integrator.options()
         moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
         attached, seen = options.get("attached") is True or bool(moved), problem.scene.sensors()[sensor]
@@ -265,7 +265,7 @@ def prb_gradient(at: Situation, key: str) -> str | None:
 
 
 def bsdfs_of(at: Situation, key: str) -> list[Any]:
-    """Return the BSDFs that a parameter belongs to, nested and enclosing ones."""
+    """Return all BSDFs that a parameter belongs to, including nested and enclosing BSDFs."""
     node = at.params.properties[key][2]
     if isinstance(node, mi.Shape):  # an attribute that a texture of its BSDF reads
         return at.graph.nested_bsdfs(node.bsdf())

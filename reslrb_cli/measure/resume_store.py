@@ -48,7 +48,7 @@ def program() -> dict[str, str]:
 def settings(config: Config, codes: Mapping[str, Path], variant: str, device: str, **options: Any) -> dict[str, Any]:
     """Return the settings that must be the same in all sessions of a measurement, as JSON.
 
-    `codes` are the files of integrators that the command names, and `options` the command's options. Files are compared
+    `codes` are the files of integrators that the command names. `options` are the command's options. Files are compared
     by their contents. The variant and the device are included, because times of all sessions are compared.
     """
     from reslrb_cli.scene.files import file_digests, files_of  # which loads Mitsuba
@@ -64,9 +64,9 @@ def settings(config: Config, codes: Mapping[str, Path], variant: str, device: st
 
 
 class Earlier:
-    """Samples stored beside the file of `--json`, `source`: a `head` as JSON, and `arrays`.
+    """Samples stored beside `source`, the file of `--json`. The samples consist of a `head` as JSON, and `arrays`.
 
-    Raises ConfigError if they belong to another `kind` of measurement, or if another version wrote them.
+    Raises ConfigError if the samples belong to another `kind` of measurement, or if another version wrote the samples.
     """
 
     def __init__(self, kind: str, source: Path, head: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
@@ -77,7 +77,9 @@ class Earlier:
             raise self.other(f"it belongs to `{head.get('kind')}`, this is `{kind}`")
 
     def check(self, now: Mapping[str, Any]) -> None:
-        """Raise ConfigError, with the first difference, if the `settings` differ from those of this session."""
+        """Raise ConfigError if the `settings` differ from the settings of this session. The error names the first
+        difference.
+        """
         found = first_difference(self.head["settings"], now)
         if found is not None:
             raise self.other(found)
@@ -86,8 +88,8 @@ class Earlier:
     def read(cls, kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
         """Return the stored samples beside a JSON file, or None if there are none.
 
-        Raises ConfigError for unreadable samples, and for settings other than `now`. If `now` is None, settings are not
-        compared.
+        Raises ConfigError if samples are unreadable or have settings other than `now`. If `now` is None, settings are
+        not compared.
         """
         if json_file is None or not json_file.is_file() or not samples_file(json_file).exists():
             return None

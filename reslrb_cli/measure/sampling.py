@@ -1,7 +1,7 @@
-"""Samples of the participants of a gradcheck, taken on demand until they suffice or the time is up.
+"""Samples of a gradcheck's participants. Samples are taken on demand until they suffice or the time is up.
 
-A session can continue from the samples of an earlier one, with the following seeds. An `Engine` can take samples in
-another process, because a sample depends only on the participants, the steps of differences, and its seed.
+A session can continue from an earlier session's samples, with the next seeds. An `Engine` can take samples in another
+process. A sample depends only on the participants, the finite-difference steps, and its seed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def take_sample(participants: Participants, kind: str, of: str, seed: int) -> np
 
 
 def steps_of(participants: Participants, keys: Iterable[str]) -> dict[str, list[Step]]:
-    """Return the steps of finite differences of parameters, by way, with one step for each direction."""
+    """Return the finite-difference steps of parameters, by way. Each direction has one step."""
     return {key: [(one.step, one.truncation) for one in participants.directions[key]] for key in keys}
 
 
@@ -76,7 +76,7 @@ MEMORY = 2**30
 
 
 class Sampling:
-    """Samples by kind and name. `now` is the clock for the budget, which starts at the beginning.
+    """Samples by kind and name. `now` is the clock for the budget. The clock starts when the object is created.
 
     The budget includes loading and compilation. The remaining budget is divided among the remaining samples. Time that
     one name leaves unused goes to the other names. A sample that has started is always finished. The first sample of a
@@ -170,8 +170,8 @@ class Sampling:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")
 
     def needed_s(self) -> float | None:
-        """Return the estimated total time for the minimum number of samples of every name. The total includes finished
-        samples. Return None if there are no samples yet.
+        """Return the estimated total time until every name has the minimum number of samples. The total includes
+        finished samples. Return None if there are no samples yet.
         """
         if not self._first_s:
             return None
@@ -186,11 +186,11 @@ class Sampling:
         return self._first_s.get(_kind(name), max(self._first_s.values(), default=0.0))
 
     def _ends(self, name: Name, now: float) -> list[tuple[float, float]]:
-        """Return the times at which sampling of `name` ends. Each time comes with the sample count below which the time
-        applies.
+        """Return the times at which sampling of `name` ends. Each item has a sample count, and the time that applies
+        below this count.
 
         Samples that a comparison needs may use all the remaining time. Samples beyond the minimum for a comparison
-        leave time for the first samples of all remaining names. Samples beyond the minimum get a share of the rest.
+        leave time for the first samples of all remaining names. Samples beyond LEAST_SEEDS get a share of the rest.
         """
         kept = self._end - sum(self._expected_s(other) for other in self._to_do)
         own = self._share(name)

@@ -26,13 +26,13 @@ from reslrb_cli.seeds import seed
 
 
 def multiple_of(spp: int, unit: int | None) -> int:
-    """Return the greatest multiple of `unit` up to `spp`, at least one unit."""
+    """Return the greatest multiple of `unit` that is at most `spp`, but at least `unit`."""
     unit = unit or 1
     return max(spp // unit, 1) * unit
 
 
 def shrink(scene: Any, sensor: int, pixels: int) -> None:
-    """Reduce the film of a sensor, given by its index, to about this number of pixels, with the same view.
+    """Reduce the film of the sensor with the index `sensor` to about `pixels` pixels. The view stays the same.
 
     A crop window shrinks with it.
     """
@@ -60,7 +60,7 @@ def scale(scene: Any, sensor: int, factor: float) -> None:
 
 
 def with_textures(problem: Problem, width: int) -> Config:
-    """Return the experiment of `problem` with textures and heightmaps of this width, with their own aspect ratios.
+    """Return the experiment of `problem` with textures and heightmaps of this width. Aspect ratios stay the same.
 
     Parameters with several keys keep their size. Raises ConfigError if no texture can be resampled.
     """
@@ -83,7 +83,7 @@ def with_textures(problem: Problem, width: int) -> Config:
 
 
 def _shape_of(spec: ParameterSpec, problem: Problem) -> tuple[int, ...] | None:
-    """Return the shape of the first texture that a parameter of the configuration names, alone or by a glob."""
+    """Return the shape of the first texture that `spec` names, directly or by a glob."""
     for key, shape in texture_shapes(problem).items():
         if any(name == key or fnmatchcase(key, name) for name in spec.names):
             return shape
@@ -106,7 +106,9 @@ class Steps:
     def gradient(
         self, seed: int, given: mi.TensorXf | Callable[[mi.TensorXf], mi.Float], spp: int
     ) -> tuple[dict[str, Any], StepTimes]:
-        """Return the gradients by key, and times of the step alone. `given` is dL/dI, or the loss of an image."""
+        """Return the gradients by key, and times of the step alone. `given` is dL/dI, or the loss as a function of the
+        image.
+        """
         problem = self.problem
         problem.apply()
         for key in problem.selection.keys:
@@ -186,7 +188,9 @@ class Stepper(Steps):
 
 
 def begin_steps(first: dict[str, Any]) -> Begun:
-    """Start the process. It first reports the size of film and textures. Each question then asks for a step."""
+    """Start the process. The process first reports the size of film and textures. Each question then asks for a
+    step.
+    """
     config = told(first)
     stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
     size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}

@@ -1,5 +1,5 @@
-"""Images of a finished lens or mirror: where its light goes, and how errors of light, position, glass or tool change
-it.
+"""Images of a finished lens or mirror: where the light goes, and how errors of light, position, glass or tool change
+the images.
 
 For each error, a stock integrator of Mitsuba renders the scene with the changed part. If a rotation shifts the whole
 picture, the shift is reported, and removed before images are compared.
@@ -34,7 +34,8 @@ _DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) 
 
 
 def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Array:
-    """Return heights (ny, nx) as a ball-end cutter of this `radius` leaves them, by their grey closing with the ball.
+    """Return the heights (ny, nx) that a ball-end cutter of this `radius` leaves. The cut is a grey closing with the
+    ball.
 
     `pitch` has the spacing of columns and the spacing of rows, in the unit of the heights.
     """
@@ -214,7 +215,7 @@ class OpticalBench:
         return [*self.plan.faces, *(["back"] if "back" not in self.plan.faces else [])]
 
     def tooled(self, sheets: Sequence[Sheet], radius: float) -> dict[str, Any]:
-        """Return the vertex positions of the faces as a ball-end cutter of this `radius` leaves the faces."""
+        """Return the vertex positions of the faces after cutting with a ball-end cutter of this `radius`."""
         values = {}
         for sheet, side in zip(sheets, (1, -1), strict=False):
             pitch = [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)]
@@ -254,11 +255,13 @@ def tolerances(
     original: Array | None = None,
     keep: Callable[[str, Array], None] = lambda name, image: None,
 ) -> dict[str, dict[str, Any]]:
-    """Return the `figures` of the `planned` scene and of each error, by name, against the luminance `target` (H, W).
+    """Return `figures` by name, for the image `planned` and for the image of each error. `target` (H, W) is the
+    luminance for comparison.
 
-    `shift` (columns, rows; pixels) is the shift of the whole picture due to a rotation, which is removed first.
-    `original` (H, W) is the picture before its dark parts were raised. If `original` is given, `ssim_of_picture` is the
-    SSIM of the image and `original`. `keep` receives the name and the luminance (H, W) of each image.
+    A rotation shifts the whole picture by `shift` (columns, rows) in pixels. The shift is removed before the
+    comparison. `original` (H, W) is the picture before its dark parts were raised. If `original` is given,
+    `ssim_of_picture` is the SSIM of the image and `original`. `keep` receives the name and the luminance (H, W) of each
+    image.
     """
     plan, both = bench.plan, bench.solid_parts()
     found: dict[str, dict[str, Any]] = {}

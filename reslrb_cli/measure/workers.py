@@ -1,4 +1,4 @@
-"""Worker processes as seen from inside: measuring processes that `processes.py` starts and controls.
+"""Code that runs inside a worker process. `processes.py` starts and controls the workers, which take measurements.
 
 A worker (`run`) reads one JSON object per line from standard input, and answers each with one line on standard output.
 The first JSON object describes the case. Each later object asks for one step. Other output goes to standard error.

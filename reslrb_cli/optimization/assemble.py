@@ -58,9 +58,10 @@ def assemble(
     """Load and check the experiment of `config`, make the targets, and decide open settings. A variant must be set.
 
     All checks happen before anything is rendered. `say` is called with lines about slow work. `cache` has measurements
-    of earlier runs, or is None to store nothing. With `to_run`, prepare everything for an optimisation. Then exposures
-    are checked, and the parameter entries that light and sensor reach are found. With `settled`, measure nothing again.
-    The result is the problem of a resumed run before its first iteration. Raises ConfigError and UnsupportedScene.
+    of earlier runs, or is None to store nothing. If `to_run` is True, prepare everything for an optimisation. If
+    `to_run` is True, check exposures, and find the parameter entries that light and sensor reach. With `settled`,
+    measure nothing again. With `settled`, the result is a resumed run's problem before the first iteration. Raises
+    ConfigError and UnsupportedScene.
     """
     if to_run:
         check_code(config)
@@ -106,7 +107,7 @@ def load_for_rendering(
 
 
 def check_passes(source: str, spp: int, multiple: int | None) -> None:
-    """Raise ConfigError, located by `source`, if passes of `multiple` samples do not divide `spp`."""
+    """Raise ConfigError if passes of `multiple` samples do not divide `spp`. `source` locates the error."""
     if spp < 1:
         raise ConfigError(source, "", f"is {spp}; it must be at least 1")
     if multiple is not None and spp % min(multiple, spp):
@@ -117,7 +118,7 @@ def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
     """Return the problem before its first iteration. `values` has arrays for some of the problem's parameters. Each
     array has the parameter's shape.
 
-    Raises ConfigError, located by `values` and the key.
+    Raises ConfigError with `values` and the key as location.
     """
     found = {}
     for key, value in values.items():
@@ -215,11 +216,12 @@ def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
 
 
 def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None = None) -> Problem:
-    """Return the problem of a stage with its own resolution or film: another scene with coarser maps and targets.
+    """Return the problem of a stage with its own resolution or film. The problem has another scene, with coarser maps
+    and targets.
 
     The stage's problem samples like `problem`, but has no learned state. `values` are the values of the stage's
-    parameters, in the stage's resolution. For None, the current values of `problem` are resampled. Raises ValueError
-    for wrong shapes.
+    parameters, in the stage's resolution. If `values` is None, the current values of `problem` are resampled. Raises
+    ValueError for wrong shapes.
     """
     config, film = problem.config.without_stages(), _film_at(problem, number)
     scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
@@ -249,7 +251,7 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
 
 
 def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
-    """Return the (width, height) of all films in a stage, or None if it uses the films of the scene. Raises
+    """Return the (width, height) of all films in a stage, or None if the stage uses the scene's films. Raises
     ConfigError.
     """
     config, share, key = problem.config, problem.config.stage(number).film, f"run.stages[{number}].film"
@@ -306,8 +308,8 @@ def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
 
 
 def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
-    """True if a heightmap's mesh is a flat grid with a vertex at each texel. Then both mesh and heightmap can be made
-    coarser.
+    """True if a heightmap's mesh is a flat grid with a vertex at each texel. If True, both mesh and heightmap can be
+    made coarser.
     """
     assert spec.heightmap is not None
     height, width = problem.selection.array(key).shape[:2]
@@ -324,8 +326,8 @@ def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
 
 
 def resized(problem: Problem, key: str, value: Array) -> Array:
-    """Return another problem's value of a parameter, in the resolution of `problem`. The value may also be a change of
-    a value.
+    """Return `value`, a parameter value of another problem, in the resolution of `problem`. `value` may also be a
+    change of the parameter's value.
 
     Heights are resampled by cubic splines at their positions in space. On a flat grid with a vertex for each height,
     the heights cover the grid from edge to edge. Textures are resampled bilinearly, and smoothed first if they shrink.
@@ -357,8 +359,8 @@ def _places(new: int, old: int, edge_to_edge: bool) -> Array:
 
 
 def _see_coarsely(view: View, whole: View, film: mi.Film) -> None:
-    """Give a view with a smaller film the full film's target. Each coarse pixel is a weighted mean of the full film's
-    pixels that the coarse pixel covers.
+    """Set the target of a view with a smaller film, from the full film's target. Each coarse pixel is a weighted mean
+    of the full film's pixels that the coarse pixel covers.
     """
     target, weights = np.array(whole.target, dtype=np.float64), whole.fixed
     if weights is None:

@@ -1,4 +1,4 @@
-"""Data found before the first iteration of a run, for its record."""
+"""Data for a run's record, determined before the first iteration."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Estimate:
 
 @dataclass
 class MemoryPlan(Jsonable):
-    """Memory budget with the samples per pass, the expected bytes and, after the first iterations, the peak."""
+    """Memory budget, samples per pass and expected bytes. After the first iterations, also the peak."""
 
     budget_bytes: int
     samples_per_pass: int
@@ -61,9 +61,9 @@ class Allowance:
     """The time in seconds that all measurements before the first iteration may take. The limit is the fraction `share`
     of the run's time `run_s`.
 
-    The run consists of the compilation of kernels (`compile_s`, for one step) and iterations of `iteration_s`. Two
-    first steps with few samples determine `compile_s` and `iteration_s`. The run would take the two first steps as
-    well. Therefore, the first steps do not count as `spent_s`.
+    A run's time is `compile_s` for compiling the kernels of one step, plus `iteration_s` for each iteration. Two first
+    steps with few samples determine `compile_s` and `iteration_s`. The run would take the two first steps as well.
+    Therefore, the first steps do not count as `spent_s`.
     """
 
     share: float
@@ -134,8 +134,8 @@ class Sensitivity(Jsonable):
 class Scaled(Sensitivity):
     """Sensitivity of a parameter, and the resulting scale.
 
-    `own_length` is `length` in the optimiser's variable. `first_step` is the initial movement of the value by one
-    learning rate, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled.
+    `own_length` is `length` in the optimiser's variable. `first_step` is how far one learning rate initially moves the
+    value, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled.
     """
 
     own_length: float | None = None

@@ -1,4 +1,4 @@
-"""Errors of parameters relative to true values: root mean square errors, each in the unit of its parameter.
+"""Root mean square errors of parameters relative to true values. Each error has the unit of its parameter.
 
 Only errors with a common unit can be combined. Reflectance and roughness have no unit, but the intensity of a lamp is
 in W/sr, and the radiance of an area light in W/(m² sr). If units differ, errors are divided by the true values.
@@ -81,8 +81,8 @@ class ErrorMeter:
         return found
 
     def total(self, errors: Mapping[str, float]) -> float | None:
-        """Return the root mean square error over the entries of all parameters, or None if units differ or nothing is
-        known.
+        """Return the root mean square error over the entries of all parameters. Return None if units differ or nothing
+        is known.
 
         The argument `errors` is the result of the method `errors`.
         """
@@ -113,7 +113,7 @@ def on_grid(array: Array, grid: tuple[int, ...] | None) -> Array:
 
 
 def nearest(mask: Array, grid: tuple[int, int]) -> Array:
-    """Return a mask (H, W) on a finer grid; each cell has the value of the mask at its centre."""
+    """Return a mask (H, W) on a finer grid. Each cell has the mask's value at the cell's centre."""
     rows, columns = (
         ((np.arange(size) + 0.5) * own / size).astype(int) for size, own in zip(grid, mask.shape, strict=True)
     )

@@ -1,9 +1,8 @@
-"""Forecast of the memory and time of a run. The forecast is measured with a few of the run's steps, and with a target
-of few samples.
+"""Forecast of the memory and time of a run. A few of the run's steps, and a target with few samples, give the forecast.
 
-If a step takes long, two sizes of steps with fewer samples per pixel are measured instead. Time and memory are a
-constant plus a part proportional to the samples, so two sizes determine them. Memory is allocated in powers of two, so
-this line is not exact. If full steps do not take long, the memory is measured with two full steps.
+If a step takes long, steps with two smaller sample counts per pixel are measured instead. Time and memory are a
+constant plus a part proportional to the samples. Two sample counts determine both parts. Memory is allocated in powers
+of two, so the linear model is not exact. If full steps do not take long, the memory is measured with two full steps.
 """
 
 from __future__ import annotations
@@ -47,10 +46,10 @@ WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps of `spp` samples per pixel, one per iteration.
+    """Steps of `spp` samples per pixel. Each iteration takes one step.
 
-    `iteration_s` is the time of one step. `start_s` is the additional time of the first steps with cached kernels, and
-    `compile_s` is the current time for compiling. The peak is in bytes, as `peak_mib` in `metrics.jsonl`.
+    `iteration_s` is the time of one step. `start_s` is the additional time of the first steps with cached kernels.
+    `compile_s` is the current time for compiling. `peak` is in bytes, and corresponds to `peak_mib` in `metrics.jsonl`.
     """
 
     spp: int
@@ -78,7 +77,7 @@ def measure_steps(problem: Problem) -> Steps:
 
 
 def _measure_stage(problem: Problem) -> Steps:
-    """Measure a step of `problem`, or extrapolate from two smaller ones."""
+    """Measure a step of `problem`, or extrapolate from two smaller steps."""
     config = problem.config
     unit, whole = sets_of(config) * (problem.samples_per_pass or 1), config.run.spp
     if unit >= whole:
@@ -96,14 +95,16 @@ def _measure_stage(problem: Problem) -> Steps:
 
 
 def _peak(problem: Problem, spp: int) -> int:
-    """Return the peak bytes of two iterations of `spp` samples per pixel. The second iteration is recorded."""
+    """Return the peak memory in bytes of two iterations with `spp` samples per pixel. The second iteration is
+    recorded.
+    """
     with trial(problem, spp) as tried:
         return _highest(problem, list(islice(optimize(tried), 2)))
 
 
 @contextmanager
 def trial(problem: Problem, spp: int) -> Iterator[Problem]:
-    """Provide the problem as before its first iteration, with `spp` samples per pixel. Restores the scene
+    """Provide the problem in its state before the first iteration, with `spp` samples per pixel. Restores the scene
     afterwards.
     """
     run = problem.config.run
@@ -166,9 +167,9 @@ VERDICTS = 30
 class Forecast(Steps):
     """Measured steps, and the resulting forecast of the run.
 
-    `parts` has bytes by part, which sum to `peak`. `scratch` is thread-local memory, and `free` the free memory. The
-    fields `before_s`, `measuring_s`, `target_s`, `images_s` and `verdicts_s` are seconds outside the iterations. `kept`
-    tells whether a run finds the decisions in the cache. They took `measuring_s` now.
+    `parts` has the bytes of each part. The parts sum to `peak`. `scratch` is thread-local memory, and `free` the free
+    memory. The fields `before_s`, `measuring_s`, `target_s`, `images_s` and `verdicts_s` are seconds outside the
+    iterations. `kept` is true if a run finds the decisions in the cache. They took `measuring_s` now.
     """
 
     parts: dict[str, int]
@@ -200,10 +201,10 @@ def make_forecast(
     cache: PilotCache | None = None,
     before: Callable[[Problem], object] = lambda problem: None,
 ) -> Forecast:
-    """Measure a few steps of the run of `config`. A variant must be set.
+    """Measure a few steps of the run that `config` describes. A variant must be set.
 
-    `say` is called with lines about slow work. Decisions are stored in `cache` for the run. `before` is called with the
-    problem before its first iteration, for measurements that no cache stores. Raises the same errors as the run.
+    `say` is called with lines about slow work. Decisions are stored in `cache` for the run. `before` takes the problem
+    before its first iteration. `before` makes measurements that no cache stores. Raises the same errors as the run.
     """
     # Errors are not part of a step.
     problem = replace(assemble(with_short_target(config), say, cache), truth={})
@@ -253,7 +254,7 @@ def with_short_target(config: Config) -> Config:
 
 
 def _image_seconds(problem: Problem) -> float:
-    """Return the seconds per sample per pixel of a saved image, for the first view."""
+    """Return the render time of a saved image of the first view, in seconds per sample per pixel."""
     view, spp = problem.views[0], saved_spp(problem, between=True)
     problem.render(view.sensor, spp, 0, "forecast")  # compiles, and records small calls: several times as long
     begin = time.perf_counter()

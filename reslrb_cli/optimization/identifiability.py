@@ -1,14 +1,14 @@
 """Identifiability of parameters, checked before the first iteration.
 
-There are two checks: which entries of a parameter affect the images (`find_reached`), and whether the images
-distinguish exposures from parameters (`check_exposures`).
+`find_reached` finds the entries of a parameter that affect the images. `check_exposures` checks whether the images
+distinguish exposures from parameters.
 
-In the second check, D_k is the change of all views' images per change of the logarithm of parameter k. All entries of
-the parameter change together: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. The images include their
-exposure and exclude masked pixels. For an exposure, D_k consists of the images of its views. For example, if all
-emission is unknown, the sum over the lamps equals the D_k of the exposure. In general, some combination has no effect
-if the matrix of cosines has an eigenvalue near 0. The eigenvector of an eigenvalue near 0 shows which exposures and
-parameters form the combination.
+In the second check, D_k is the change of all views' images per change of parameter k's logarithm. All entries of the
+parameter change together: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. The images include their exposure
+and exclude masked pixels. For an exposure, D_k consists of the images of its views. For example, if all emission is
+unknown, the D_k of the lamps sum to the exposure's D_k. In general, some combination has no effect if the cosine matrix
+has an eigenvalue near 0. The eigenvector of an eigenvalue near 0 shows which exposures and parameters form the
+combination.
 
     G_kl = <D_k, D_l> / (|D_k| |D_l|)
 """
@@ -50,12 +50,12 @@ PART = 0.1
 
 
 def find_reached(problem: Problem) -> Problem:
-    """Return the problem with its `masks`, for parameters with known true values.
+    """Return the problem with `masks` for the parameters with known true values.
 
-    An entry counts as reached if light reaches the entry. The test uses the gradient of the image's sum with respect to
-    the entry, over `REACH_SPP` samples per pixel. The gradient must be nonzero in some channel. A texel counts as
-    reached only if some sensor also sees the texel's centre. Interreflection alone determines a texel that only
-    illuminates other surfaces.
+    An entry counts as reached if light reaches the entry. The test differentiates the image's sum with respect to the
+    entry, with `REACH_SPP` samples per pixel. The gradient must be nonzero in some channel. A texel counts as reached
+    only if some sensor also sees the texel's centre. Interreflection alone determines a texel that only illuminates
+    other surfaces.
     """
     if not problem.truth:
         return problem
@@ -82,7 +82,7 @@ def shown_texels(problem: Problem, key: str) -> Array | None:
 
 
 def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) -> Array:
-    """Return the texels that training views show in these pixels, or in any pixel."""
+    """Return the texels that training views show in `pixels`. Without `pixels`, all pixels count."""
     sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
     seen, halo = (
         visible_texels(problem.scene, sensors, key, pixels, problem.paths != "light"),
@@ -163,6 +163,8 @@ def find_ambiguous(problem: Problem) -> tuple[list[str], list[str]] | None:
 
 
 def _row(problem: Problem) -> Array:
-    """Return the images of all views as a flat array, each multiplied by the root of its share of the loss."""
+    """Return all views' images as one flat array. Each image is multiplied by the square root of the view's loss
+    share.
+    """
     pairs = zip(problem.trained, see_images(problem), strict=True)
     return np.concatenate([np.sqrt(view.share) * image.ravel() for view, image in pairs])

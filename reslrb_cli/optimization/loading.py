@@ -98,7 +98,7 @@ def load_configured(
     """Load the scene of `config`. `look` is called with the scene's description before the scene is built. Raises
     ConfigError.
 
-    With `selects`, textures of 8 or 16 bits that the parameters select are read as floating point. With `warn`,
+    With `selects`, the 8-bit and 16-bit textures that parameters select are read as floating point. With `warn`,
     doubtful parts of the scene cause warnings.
     """
     scene = config.scene
@@ -117,7 +117,7 @@ def load_configured(
 
 
 def selected_keys(config: Config) -> list[str]:
-    """Return the keys and globs of parameters that `config` recovers, or whose true values it gives."""
+    """Return the keys and globs of parameters that `config` recovers, or for which `config` gives true values."""
     render = config.target.render
     return [*(key for spec in config.parameters for key in spec.keys), *(render.parameters if render else ())]
 
@@ -145,8 +145,8 @@ def are_upright(config: Config) -> bool:
 
 
 def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False) -> str:
-    """Return which paths render the images of `integrator`: `light`, `camera`, or `both`. If anything `moves`, it is
-    `light`.
+    """Return the kind of paths that render the images of `integrator`: `light`, `camera`, or `both`. If anything
+    `moves`, it is `light`.
 
     If a measurement chooses the kind of paths, the result is `both`. If only one kind can render the scene, the result
     is the usable kind.
@@ -173,7 +173,7 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
 def check_integrator(
     config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False
 ) -> None:
-    """Raise ConfigError, located in the scene's file, if `integrator` cannot render `scene` through `sensors`."""
+    """Raise ConfigError at `scene.file` if `integrator` cannot render `scene` through `sensors`."""
     try:
         paths = paths_of(integrator, scene, sensors, moves)
         for sensor in sensors:
@@ -194,8 +194,7 @@ def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> Non
 
 
 def make_configured(config: Config, integrator: Integrator, paths: str) -> StepIntegrator:
-    """Make the `integrator` of `config`, or of the target in `config`, with the kind of `paths` that `paths_of`
-    returns.
+    """Make `integrator`, which `config` gives for the run or for the target. `paths` is the result of `paths_of`.
 
     Options that a run decides by measurement (`guiding`, `sequence`, ...) are off.
     """
@@ -212,14 +211,14 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
 
 
 def pass_spp(config: Config) -> int:
-    """Return the samples per pixel of each pass of a step's gradient. If `run.memory_budget` chooses passes, return the
-    maximum.
+    """Return the samples per pixel of each pass of a step's gradient. If `run.memory_budget` chooses the passes, the
+    result is the maximum.
     """
     call = config.set_spp
     return min(samples_per_pass(config) or call, call)
 
 
 def samples_per_pass(config: Config) -> int | None:
-    """Return the integrator's own limit for the samples of a pass."""
+    """Return the integrator's own limit for samples per pass."""
     value = config.integrator.options().get("samples_per_pass")
     return None if value is None else int(value)

@@ -1,6 +1,7 @@
 """The optimisation loop, which yields records and opens no file, and its learning-rate schedules.
 
-A schedule gives the factor of iteration i of n, from 1 at the first iteration to `final_fraction` at the last.
+A schedule gives the learning-rate factor for iteration i of n. The factor goes from 1 at the first iteration to
+`final_fraction` at the last.
 """
 
 from __future__ import annotations
@@ -70,12 +71,13 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     """Make the iteration after `state` and return the new state and the record.
 
     An iteration consists of a step and an update. The step computes image, loss and gradient of every sensor, and the
-    loss is the mean over the sensors. Equal states lead to equal states. If the problem has other values than `state`,
-    it is first set to `state`. After the iteration, the problem has the values of the returned state.
+    loss is the mean over the sensors. Equal states lead to equal states. If the problem's values differ from `state`,
+    the function first sets the problem to `state`. After the iteration, the problem has the values of the returned
+    state.
 
-    Values that are not finite reach no parameter. The module `nonfinite` describes how the run reacts to non-finite
-    values, and when a run ends (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged.
-    `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` includes this time. The schedule
+    Non-finite values never reach a parameter. The module `nonfinite` describes how the run reacts to non-finite values,
+    and when a run ends (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged.
+    `optimizer.scale: auto` measures before the first iteration. `elapsed_s` includes the measurement time. The schedule
     follows either the iteration count or the elapsed time (`run.max_seconds`), whichever has progressed further.
     """
     config, optimizer, iteration = problem.config, problem.optimizer, state.iteration
@@ -157,8 +159,8 @@ def iterate(
     """Make all remaining iterations of the run, starting at `state`. `step` makes each iteration, with the problem of
     the iteration's stage.
 
-    `watch` has seen the earlier iterations, and decides which iteration is the last. It is None without such a test.
-    Raises NonFinite if the run fails.
+    `watch` has the losses of the earlier iterations, and decides which iteration is the last. It is None without such a
+    test. Raises NonFinite if the run fails.
     """
     reset_peak()
     watch = Watch(stages.whole.config) if watch is None else watch
@@ -196,8 +198,8 @@ def _findings(
 
 
 class Split:
-    """Clock for the part of a step's time that ends when image and loss are known. Some integrators have no moment at
-    which both are known.
+    """Clock for the part of a step until image and loss are known. Some integrators have no moment at which both image
+    and loss are known.
     """
 
     def __init__(self) -> None:
@@ -230,7 +232,7 @@ def gradient(
 
     Returns arrays of width 1: the loss, two numbers for each parameter, the refused entries by sensor, and the costs of
     regularizers by key and type (None without any). The two numbers are the sum of squares of the gradient's finite
-    entries, and the number of other entries.
+    entries, and the number of non-finite entries.
     """
     config = problem.config
     total: Any = 0.0

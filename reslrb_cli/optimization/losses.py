@@ -4,7 +4,7 @@ Each loss takes the image I and the target T, both (H, W, C) in linear radiance.
 weights have the same shape and a mean of 1. A loss is an array of width 1. A loss is a mean over pixels and channels.
 The value depends neither on the resolution nor on the number of masked pixels.
 
-`weighted` and `fitted` modify losses: a weighted sum, and the loss of the image multiplied by the best factor.
+`weighted` returns a weighted sum of losses. `fitted` returns the loss of the image multiplied by the best factor.
 """
 
 from __future__ import annotations
@@ -42,8 +42,7 @@ def relative_l2(
     """Return mean (I - T)² / (T² + ε), with ε in squared units of radiance.
 
     The denominator uses the target, which is constant. The computed gradient is therefore the gradient of the complete
-    loss. With the detached noisy image in the denominator, a pixel's noise would appear in numerator and denominator at
-    once.
+    loss. A denominator with the detached noisy image would contain the same noise as the numerator.
     """
     return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
 
@@ -61,7 +60,8 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = 
     and a width of 11 pixels. Variances within a window are population variances, without the sample correction. The
     result equals scikit-image's with `gaussian_weights=True, use_sample_covariance=False`. The mean is over the windows
     that lie within the image, each with the weight of its central pixel. A masked pixel must be the same in both
-    images, which `View.judge` ensures. L is the largest value of the target. Raises ValueError for smaller images.
+    images. `View.judge` ensures equal values. L is the largest value of the target. Raises ValueError for smaller
+    images.
     """
     if min(image.shape[:2]) < SSIM_SIDE:
         raise ValueError(f"SSIM needs images of {SSIM_SIDE}x{SSIM_SIDE} pixels, not {image.shape[1]}x{image.shape[0]}")
@@ -85,7 +85,7 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = 
 
 
 def _windows(image: mi.TensorXf) -> mi.TensorXf:
-    """Return the means over SSIM's windows of an image (H, W, C). The result (H - 10, W - 10, C) is attached."""
+    """Return the mean of an image (H, W, C) over each SSIM window. The result (H - 10, W - 10, C) is attached."""
     margin = SSIM_SIDE // 2
     raw = [math.exp(-0.5 * (place / SSIM_SIGMA) ** 2) for place in range(-margin, margin + 1)]
     factors = [each / sum(raw) for each in raw]
@@ -112,7 +112,7 @@ QUADRATIC = ("l2", "relative_l2")
 
 
 def make_loss(type: str, **options: float) -> Loss:
-    """Return the loss of this name with its options. Raises KeyError for an unknown name."""
+    """Return the loss named `type` with its options. Raises KeyError for an unknown name."""
     return functools.partial(LOSSES[type], **options)
 
 
@@ -141,9 +141,10 @@ def best_scale(
     """Return s = <I, T> / <I, I>, of width 1, attached. I is the mean of two images (H, W, C) with the same expected
     value.
 
-    If <I, T> or <I, I> is not positive, as for black images, s is 1 without a derivative. <I, I> is computed as the
-    product of the two images, which have independent noise. The derivative of <I, I> is 2 <I, dI>. The noise of I does
-    not bias the derivative if dI has other samples. With `across`, the derivative is <I_a, dI_b> + <I_b, dI_a>.
+    If <I, T> or <I, I> is not positive, for example for black images, s is 1 and has no derivative. <I, I> is computed
+    as the product of the two images. The two images have independent noise. The derivative of <I, I> is 2 <I, dI>. The
+    noise of I does not bias the derivative if dI comes from other samples. With `across`, the derivative is <I_a, dI_b>
+    + <I_b, dI_a>.
     """
     image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
     if not across:
@@ -165,8 +166,8 @@ def fitted(
     """Return the loss of s I with s = <I, T> / <I, I> (`best_scale`), for an image (H, W, C) or two halves (2, H, W,
     C).
 
-    Its derivative is s l(s I) + L_s ds/dI, where l is the derivative of the loss. L_s = <l(s I), I> contains the image
-    twice. L_s is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. The derivative of a quadratic loss
+    The result's derivative is s l(s I) + L_s ds/dI, where l is the derivative of `loss`. L_s = <l(s I), I> contains the
+    image twice. L_s is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. The derivative of a quadratic loss
     therefore contains no product of noise with itself. If both halves are the same image, the result is the exact
     derivative. With `across`, the derivative with respect to the half I_a uses the half I_b in place of I. The
     derivative with respect to I_b uses I_a. No path of a half then uses a dL/dI to which the path itself contributes.

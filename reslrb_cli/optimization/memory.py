@@ -1,4 +1,4 @@
-"""Memory of a run: the needs of a step, passes that keep a budget, and limits.
+"""Memory of a run: the memory that a step needs, passes that keep within a budget, and limits.
 
 Sizes in the configuration and the scene file are checked before anything is built (`check_announced`,
 `check_described`). Films and textures of a hundred million entries would take a minute to make. The memory estimates
@@ -72,7 +72,9 @@ COARSER = "use a smaller film or coarser textures"
 
 
 def pixels_of(scene: mi.Scene, sensors: Sequence[int]) -> list[int]:
-    """Return the pixels of each film without its crop window, which determine the number of light paths."""
+    """Return each full film's pixel count, without its crop window. The pixel count determines the number of light
+    paths.
+    """
     return [int(dr.prod(scene.sensors()[index].film().size())) for index in sensors]
 
 
@@ -116,7 +118,8 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
 
 
 def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:
-    """Return the largest divisor of `samples` whose memory fits into the budget, and the divisor's memory estimate.
+    """Return the largest divisor of `samples` for which the memory fits into the budget. Also return the divisor's
+    memory estimate.
 
     If no divisor fits, returns 0 and the estimate for the smallest divisor. `samples` is the sample count of a batch,
     or of a step.
@@ -153,7 +156,7 @@ def fit_memory(problem: Problem) -> Problem:
 
 
 def in_passes(problem: Problem, memory: MemoryPlan) -> Problem:
-    """Return `problem` with the passes of this plan."""
+    """Return `problem` with the passes of the plan `memory`."""
     size = memory.samples_per_pass
     integrator = problem.integrator.with_options(
         samples_per_pass=size if memory.passes > 1 else None, freeze=problem.integrator.freeze
@@ -178,7 +181,7 @@ def _replicas(entries: int) -> int:
 
 
 def check_announced(config: Config) -> None:
-    """Raise ConfigError if film or parameters of the configuration need more memory than is free."""
+    """Raise ConfigError if the configured film or a configured parameter needs more memory than is free."""
     if config.scene.size is not None:
         _check_film(config, "scene.size", config.scene.size)
     for key, size in _textures(config).items():
@@ -223,7 +226,7 @@ def check_described(config: Config, description: Description) -> None:
 
 
 def _textures(config: Config) -> dict[str, tuple[int, int]]:
-    """Return the (width, height) of each parameter with a size in the configuration, by the key of this setting."""
+    """Return a mapping from the key of each size setting to the (width, height) of the parameter."""
     found = {}
     for place, spec in enumerate(config.parameters):
         at, size = ("resolution", spec.resolution)
@@ -267,7 +270,7 @@ def _check_samples(config: Config, pixels: int) -> None:
 
 
 def free_for(needed: int) -> int:
-    """Return the free bytes. For small needs, the function does not query the free bytes, because a query of a GPU
+    """Return the free bytes. For small needs, the function skips the query of the free bytes, because querying a GPU
     driver takes a while.
     """
     return needed if needed < SMALL else free_bytes(mi.variant())
@@ -299,7 +302,7 @@ def check_memory(problem: Problem, integrator: Reslrb) -> None:
 
 
 def check_baseline(problem: Problem) -> None:
-    """Raise ConfigError if an integrator other than `reslrb` stores more of its paths than fits into memory."""
+    """Raise ConfigError if an integrator other than `reslrb` stores more path data than fits into memory."""
     config = problem.config
     kind, depth = config.integrator.type, config.integrator.max_depth
     most = local_bytes() // RECORD_BYTES
@@ -320,7 +323,7 @@ def check_baseline(problem: Problem) -> None:
 
 
 def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | None:
-    """Return a line about a run whose light paths take hours or more, or None. Such a run is allowed."""
+    """Return a message line if the run's light paths take hours or more, otherwise None. Such a run is allowed."""
     run = config.run
     each = run.spp * sum(pixels_of(scene, sensors)) * (2 if config.adjoint == "independent" else 1)
     paths = each * run.iterations

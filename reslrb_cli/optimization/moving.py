@@ -1,8 +1,9 @@
-"""Experiments whose parameters move light: losses at the film's border, and checks of unsupported parameters.
+"""Experiments whose parameters move light: derivatives lost at the film's border, and checks of unsupported parameters.
 
 A splat that moves across the film's border leaves or enters the film. No sample records splats that cross the border,
 because nothing outside the film is traced. The missing part of the derivative depends on the share of moving light that
-lands at the border (`border_share`). If it is large, a warning is printed before the optimisation (`warn_of_border`).
+lands at the border (`border_share`). If the border share is large, a warning is printed before the optimisation
+(`warn_of_border`).
 """
 
 from __future__ import annotations
@@ -53,7 +54,9 @@ def border_share(tracer: LightTracer, job: Job) -> float:
 
 @dataclass
 class Sums:
-    """Loop state: whether the path has met anything that moves, and its contributions at the border and in total."""
+    """Loop state: whether the path has met anything that moves, and the path's contributions at the border and in
+    total.
+    """
 
     moved: mi.Bool
     at_border: mi.Float
@@ -66,7 +69,7 @@ class Sums:
 
 
 class BorderLight(Hooks):
-    """Hooks that sum the contributions of light behind moving objects."""
+    """Hooks that sum the contributions of light that has met moving objects."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples, self.plan = samples, samples.plan
@@ -132,7 +135,7 @@ def moves_anything(config: Config, selection: Selection) -> bool:
 
 
 def check_moving(problem: Problem) -> None:
-    """Raise ConfigError, located, if the integrator cannot differentiate a moving parameter."""
+    """Raise ConfigError at the faulty setting if the integrator cannot differentiate a moving parameter."""
     if not is_attached(problem):
         return
     config, moved = problem.config, where_moved(problem.selection.params, problem.selection.scene_keys)

@@ -6,7 +6,7 @@
 - `zero`: such entries of gradients and of the loss's derivative count as 0, and the update continues. A parameter
     without a finite gradient entry is not updated. If the loss is not finite, no parameter is updated.
 
-If something is skipped in `PATIENCE` consecutive iterations, the run ends.
+The run ends if updates are skipped in `PATIENCE` consecutive iterations.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PATIENCE = 10
 
 @dataclass
 class RefusedAt:
-    """Entries of one view's dL/dI that were not finite: their number, and the first one as (x, y, channel)."""
+    """Non-finite entries of one view's dL/dI: the entry count, and the first entry as (x, y, channel)."""
 
     count: int
     first: tuple[int, int, int]
@@ -56,12 +56,14 @@ class Findings:
 
     @property
     def by_parameter(self) -> dict[str, int]:
-        """Number of entries of gradients and updates by parameter."""
+        """Number of non-finite entries in gradients and updates, for each parameter."""
         return {**self.gradients, **self.updates}  # entries without a finite gradient are not updated
 
     @property
     def whose_loss(self) -> str:
-        """Description of the loss for messages, with the user's name for a custom loss."""
+        """Description of the loss for messages. For a custom loss, the description includes the user's name for the
+        loss.
+        """
         return f"the loss (your own {self.own})" if self.own else "the loss"
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""Optimisers behind one interface: Dr.Jit's optimisers, one for each parameter, with transforms, bounds and a clamp.
+"""One interface to Dr.Jit's optimisers. Each parameter has its own optimiser, with transforms, bounds and a clamp.
 
 Transforms (`Transform`, `Variable`): the optimiser moves an unconstrained variable u, and the scene gets x = T(u).
 
@@ -7,8 +7,9 @@ Transforms (`Transform`, `Variable`): the optimiser moves an unconstrained varia
     log       x = exp(u)                                 positive; a step is a relative change
     softplus  x = log(1 + exp(u))                        positive; relative well below 1, absolute well above
 
-By the chain rule, dL/du = dL/dx T'(u). The factor is applied to the accumulated gradient, so the kernels of a step do
-not depend on it. T is increasing in each entry. Smooth steps (`precondition`) come before the transform: x = T(S v).
+By the chain rule, dL/du = dL/dx T'(u). The factor T'(u) is applied to the accumulated gradient, so the kernels of a
+step do not depend on the factor. T is increasing in each entry. The smoother S (`precondition`) acts before the
+transform T: x = T(S v).
 
 Updates (`Optimizer`): each parameter has its own optimiser. A parameter whose gradient is not finite can therefore keep
 its moments and its number of steps.
@@ -18,7 +19,7 @@ its moments and its number of steps.
 
 Parameters must be finite and within their bounds (`clamp`, `count_nonfinite`).
 
-A clamp for outliers in gradients (`clamp_gradients`) reduces variance, and adds a bias, which is measured.
+`clamp_gradients` clamps outliers in gradients. The clamp reduces variance and adds a bias, which is measured.
 
     m_e  running mean of |g_e| over the iterations before (of clamped gradients), decay DECAY
     r_e = max(m_e, mean of m over the parameter's entries)
@@ -57,7 +58,9 @@ SIGMOID_END, EXPONENT_END = 16.0, 80.0
 
 @dataclass(frozen=True)
 class Transform:
-    """T, its inverse and its derivative T'(u), on arrays of any Dr.Jit type, with the smallest and largest u."""
+    """Transform T with its inverse, its derivative T'(u), and the smallest and largest u. The functions accept any
+    Dr.Jit array type.
+    """
 
     forward: Callable[[Any], Any]
     inverse: Callable[[Any], Any]
@@ -67,7 +70,7 @@ class Transform:
 
 
 def make_transform(name: str, bounds: Bounds) -> Transform | None:
-    """Return the transform of this name, or None for `none`. `bounds` are those of x. Raises KeyError for an unknown
+    """Return the transform called `name`, or None for `none`. `bounds` are those of x. Raises KeyError for an unknown
     name.
     """
     low, high = bounds or (-math.inf, math.inf)
@@ -169,9 +172,9 @@ class Optimizer:
     """Optimiser that holds and updates the parameters. Gradients accumulate in the values that the optimiser returns.
 
     `rates`, `bounds`, `transforms` and `smoothers` have the parameters' keys. A rate of None stands for
-    `learning_rate`. Bounds of None set no bounds. Transforms and smoothers may be missing. Values and gradients are
-    those of the scene's parameters, not those of the optimiser's variables. A parameter with a `Variable` is moved
-    through it. Raises KeyError for an unknown `type`.
+    `learning_rate`. Bounds of None set no bounds. Transforms and smoothers may be missing. Values and gradients belong
+    to the scene's parameters, not to the optimiser's variables. The optimiser moves a parameter through its `Variable`,
+    if any. Raises KeyError for an unknown `type`.
     """
 
     def __init__(
@@ -279,11 +282,11 @@ class Optimizer:
         self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
 
     def response(self, key: str) -> np.ndarray[Any, Any]:
-        """Return the movement of each entry of the scene's value per unit of its gradient, as a flat array.
+        """Return how far each entry of the scene's value moves per unit of the entry's gradient, as a flat array.
 
         The movement is that of a step with a learning rate of 1 and the current moments. The movement includes
-        momentum, because the response to a gradient is summed over many steps. The next step is this movement times the
-        schedule's factor and the parameter's rate (`rate`). It is 0 if no step was taken.
+        momentum, because the response to a gradient is summed over many steps. The next step is the returned movement
+        times the schedule's factor and the parameter's rate (`rate`). It is 0 if no step was taken.
         """
         own, extra = self._own[key], self._own[key].state[key][3]
         value = np.array(dr.detach(own[key]), dtype=np.float64).ravel()
@@ -300,14 +303,14 @@ class Optimizer:
         return result if variable.smoother is None else result * variable.smoother.gain
 
     def squares(self, key: str) -> tuple[Any, float] | None:
-        """Return the running mean of the squared gradients, as the optimiser stores the mean, and the mean's decay.
-        Return None if the optimiser stores no such mean.
+        """Return the running mean of the squared gradients as the optimiser stores the mean. Also return the mean's
+        decay. Return None if the optimiser stores no such mean.
         """
         own, extra = self._own[key], self._own[key].state[key][3]
         return (extra[2], own.beta_2) if isinstance(own, dropt.Adam) else None
 
     def slope(self, key: str) -> np.ndarray[Any, Any]:
-        """Return the optimiser's gradient per unit of gradient of the scene's value, as a flat array."""
+        """Return the gradient that the optimiser receives per unit of the scene value's gradient, as a flat array."""
         variable, moved = self.variable(key), dr.detach(self._own[key][key])
         if key not in self._variables:
             return np.ones(int(np.array(moved).size))
@@ -318,11 +321,10 @@ class Optimizer:
         return self._rates[key]
 
     def first_step(self, key: str) -> float | None:
-        """Return the root mean square change of the scene's current value by one step with the parameter's learning
-        rate.
+        """Return the root mean square change of the scene's current value in one step at the parameter's learning rate.
 
-        The larger of the movements upwards and downwards counts. Returns None if the step length depends on the
-        gradient.
+        For each entry, the larger of the upward and downward movements counts. Returns None if the step length depends
+        on the gradient.
         """
         if isinstance(self._own[key], dropt.SGD):
             return None
@@ -338,7 +340,7 @@ class Optimizer:
         return {key: (variable.length, variable.gain) for key, variable in self._variables.items()}
 
     def moments(self) -> dict[str, dict[str, Any]]:
-        """Return the optimiser's data for each parameter besides its value.
+        """Return the optimiser's data for each parameter, without the parameter's value.
 
         The data are arrays in Dr.Jit's order. If a parameter has a `Variable`, the data include the value of the
         optimiser's variable as `variable`. No step changes these arrays, so they are not copied.
@@ -369,7 +371,7 @@ class Optimizer:
 
 
 def _entries(own: Any, key: str) -> tuple[Any, ...]:
-    """Return the data that one of Dr.Jit's optimisers stores for its parameter besides the value."""
+    """Return the data of parameter `key` in the Dr.Jit optimiser `own`, without the parameter's value."""
     extra = own.state[key][3]
     return extra if isinstance(extra, tuple) else (extra,)
 

@@ -22,10 +22,10 @@ from reslrb_cli.errors import ConfigError
 class OwnLoss:
     """A user's loss: `loss(image, target)`, or `loss(image, target, weights)`.
 
-    Both images are (H, W, C). `weights` is None or has the same shape with a mean of 1. If the function has no
+    Both images are (H, W, C). `weights` is None, or has the images' shape and a mean of 1. If the function has no
     parameter `weights`, masked pixels have equal values in both images. The weights of all unmasked pixels must then be
     equal. The function returns an array of width 1, or a tensor of one entry. The file is loaded when the loss is first
-    called or tried. For a function that was passed in Python, errors are located by its name.
+    called or tried. If a function was passed in Python, errors name the function as their location.
     """
 
     def __init__(self, config: Config, key: str, spec: Custom) -> None:
@@ -107,7 +107,7 @@ class OwnLoss:
 
 
 def own_losses(config: Config) -> str:
-    """Return the user's losses of an experiment in words, or "" if there are none."""
+    """Return a text that names the experiment's custom losses, or "" without custom losses."""
     own = dict.fromkeys(one.file for one in config.losses if isinstance(one, Custom))
     handed = "function" if config.own_loss is None else _name_of(config.own_loss)
     return ", ".join(f"`{file or handed}`" for file in own)
@@ -118,7 +118,7 @@ def _name_of(function: Callable[..., Any]) -> str:
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:
-    """Whether this number of positional arguments is accepted."""
+    """True if `function` accepts `count` positional arguments."""
     try:
         inspect.signature(function).bind(*range(count))
     except (TypeError, ValueError):

@@ -3,11 +3,11 @@ Laplacian defines the smoothing.
 
     x = S v,   S = (1 - l^2 Δ)^-1,   dL/dv = S dL/dx            Nicolet, Jacobson and Jakob 2021, eq. 9 to 12
 
-S is symmetric, and a step of gradient descent is S^2 dL/dx. A step therefore moves details finer than l less. The
-reduction is the fourth power of the detail's size divided by l. Refracting surfaces need this. The light from
-refracting surfaces depends on the surface's second derivatives. The curvature of a loss therefore grows with the fourth
-power of the spatial frequency. Without S, the finest ripple of the map limits the step. l is a fraction of the longer
-side, so it does not depend on the resolution.
+S is symmetric, and a step of gradient descent is S^2 dL/dx. A step therefore moves details finer than l by a smaller
+amount. The reduction factor is the fourth power of the ratio of the detail's size to l. Refracting surfaces need this.
+The light from refracting surfaces depends on the surface's second derivatives. The curvature of a loss therefore grows
+with the fourth power of the spatial frequency. Without S, the map's finest ripple limits the step. The length l is a
+fraction of the longer side, so l does not depend on the resolution.
 
     maps, textures      Δ by differences of neighbours, no flow through the edges: diagonal in the cosine transform
     vertices of a mesh  Δ of its graph, in units of its mean edge: a sparse LU decomposition, made once
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Smoother:
-    """S of one parameter and its inverse, on Dr.Jit arrays of the parameter's type.
+    """Smoothing operator S of one parameter, and the inverse of S, on Dr.Jit arrays of the parameter's type.
 
     The diagonal of S^2 is each entry's response to a gradient of the entry alone. `gain` is the mean of this response
     over the entries.
@@ -86,9 +86,10 @@ class MapOperator:
 
 
 class MeshOperator:
-    """S on the vertices' positions (3 n) of a mesh with `faces` (3 m indices), by its graph. `length` is l.
+    """S for the vertex positions (3 n) of a mesh with `faces` (3 m indices), computed from the mesh's graph. `length`
+    is l.
 
-    Vertices with the same position but different indices, as along the seams of textures, count as one.
+    Vertices at one position with different indices count as one vertex, for example along texture seams.
     """
 
     def __init__(self, positions: Array, faces: NDArray[Any], length: float) -> None:
@@ -136,7 +137,7 @@ class MeshOperator:
         return np.asarray(value[self._one]).reshape(like.shape)
 
     def _mean_square(self) -> float:
-        """Return the mean of the diagonal of S^2, by Hutchinson's estimate from 8 fixed vectors of signs."""
+        """Return the mean of the diagonal of S^2, estimated from 8 fixed sign vectors (Hutchinson)."""
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(self._sizes), 8))
         return float(np.mean(self._solve.solve(signs) ** 2))
 

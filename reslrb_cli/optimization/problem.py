@@ -36,9 +36,8 @@ from reslrb_cli.seeds import seed
 def saved_spp(problem: Problem, between: bool) -> int:
     """Return the samples per pixel of the initial and the final image.
 
-    The sample count is `run.final_spp`, or the next larger number that the samples per pass divide. Images between the
-    first and the last iteration (`between`) only show progress. The sample count of these images is a multiple of
-    `run.spp`.
+    The sample count is `run.final_spp`, or the next larger multiple of the samples per pass. Images between the first
+    and the last iteration (`between`) only show progress. The sample count of these images is a multiple of `run.spp`.
     """
     run, unit = problem.config.run, problem.samples_per_pass or 1
     if between:
@@ -51,11 +50,11 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Problem:
-    """Complete problem of `optimize`, as `assemble` makes it.
+    """Complete problem for `optimize`, made by `assemble`.
 
-    `truth` has the known true values, with textures in the resolution of the scene file. `masks` has the entries of
-    these parameters that light and sensor reach, as booleans. A mask is (H, W) for textures, and otherwise has the
-    parameter's shape. `quantities` has the physical quantity of each parameter (`errors.quantity`).
+    `truth` has the known true values, with textures in the resolution of the scene file. For the parameters in `truth`,
+    `masks` has booleans. True entries are those that light and sensor reach. A mask is (H, W) for textures, and
+    otherwise has the parameter's shape. `quantities` has the physical quantity of each parameter (`errors.quantity`).
     """
 
     config: Config
@@ -87,7 +86,7 @@ class Problem:
     engine: Callable[..., Any] | None = None
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
-        """Return the measurements and plans before the first iteration by name, for manifests and checkpoints."""
+        """Return the named measurements and plans from before the first iteration, for manifests and checkpoints."""
         made: dict[str, Jsonable | None] = {"guided": self.guided, "sequence": self.sequence}
         made["memory"] = self.memory
         made |= {name: own for name, own in (("paths", self.sides), ("pixels", self.pixels)) if own is not None}
@@ -103,8 +102,8 @@ class Problem:
             view.follow(self.scene)
 
     def afresh(self, values: Mapping[str, Array]) -> Problem:
-        """Return the problem as before its first iteration, with the given parameter values and without learned state.
-        The argument `values` has the form of the result of the method `values`.
+        """Return the problem in its state before the first iteration, with the given parameter values and without
+        learned state. The argument `values` has the form that the method `values` returns.
 
         The original problem and the returned problem share one scene. The scene then has the given values.
         """
@@ -119,7 +118,7 @@ class Problem:
         return fresh
 
     def gradients(self) -> dict[str, Any]:
-        """Return each parameter's gradient, as steps have accumulated the gradient since the last clearing."""
+        """Return each parameter's gradient, accumulated since the last clearing."""
         self.selection.collect()
         return {key: self.optimizer.gradient(key) for key in self.selection.keys}
 
@@ -132,7 +131,8 @@ class Problem:
         return told
 
     def costs(self, values: Mapping[str, Array]) -> tuple[dict[str, dict[str, float]], dict[str, Array]]:
-        """Return the costs of regularizers at these values, by key and type, and the gradient of their sum by key.
+        """Return the regularizers' costs at `values`, by key and type. Also return the gradient of the summed costs, by
+        key.
 
         `values` has all parameters with `regularizers`, by key.
         """
@@ -150,8 +150,8 @@ class Problem:
         return told, gradients
 
     def stiffness(self, key: str, direction: Array) -> Array:
-        """Return the change of the regularizers' gradient for `key` along a direction, as flat arrays: curvature times
-        direction.
+        """Return the regularizers' curvature for `key` times `direction`, as a flat array. The product is the change of
+        the regularizers' gradient along `direction`.
 
         The result is zero if there are no regularizers for `key`.
         """
@@ -173,7 +173,7 @@ class Problem:
 
     @property
     def plates(self) -> dict[str, Plate]:
-        """Plates between two free faces, by the key of the parameter that defines them."""
+        """Plates between two free faces, each under the key of the parameter that defines the plate."""
         found = {key: costs.get("thickness") for key, costs in self.regularizers.items()}
         return {key: each for key, each in found.items() if isinstance(each, Plate)}
 
@@ -188,7 +188,9 @@ class Problem:
                     self.optimizer.move(each, _handed(self.optimizer[each], np.clip(new, low, high)))
 
     def held(self) -> dict[str, int]:
-        """Return the number of heights at the minimum thickness, by key, for heightmaps that have one."""
+        """Return the number of heights at the minimum thickness for each heightmap that has a minimum thickness, by
+        key.
+        """
         counts = {}
         for key, costs in self.regularizers.items():
             plate = costs.get("thickness")
@@ -216,7 +218,7 @@ class Problem:
 
     @property
     def limit_s(self) -> float | None:
-        """Seconds that the iterations may take, by `run.max_seconds`, or None without a limit."""
+        """Seconds that the iterations may take under `run.max_seconds`, or None without a limit."""
         limit = self.config.run.max_seconds
         return None if limit is None else limit - self.measured_s
 
@@ -240,7 +242,9 @@ class Problem:
         return [(trained[number], len(trained) / count) for number in chosen]
 
     def held_out_loss(self) -> float | None:
-        """Return the mean loss of the held-out views, always with the same samples, or None without such views."""
+        """Return the mean loss of the held-out views, or None without held-out views. Every call uses the same
+        samples.
+        """
         views = [view for view in self.views if view.held_out]
         if not views:
             return None
@@ -269,14 +273,16 @@ class Problem:
         return {key: self.selection.array(key) for key in self.selection.keys}
 
     def render(self, sensor: int, spp: int, iteration: int, purpose: str) -> Array:
-        """Render the current scene with the experiment's integrator; returns (H, W, C) float32."""
+        """Render the current scene with the experiment's integrator. Returns (H, W, C) float32."""
         config = self.config
         return render_in_passes(
             self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
 
     def see(self, view: View, spp: int, iteration: int, purpose: str) -> mi.TensorXf:
-        """Render a view as its loss needs it: (H, W, C), or two halves (2, H, W, C) if the loss fits a scale."""
+        """Render a view in the form that its loss needs. The form is (H, W, C), or two halves (2, H, W, C) if the loss
+        fits a scale.
+        """
         if not view.fits:
             return to_tensor(self.render(view.sensor, spp, iteration, purpose))
         unit = self.samples_per_pass or 1
@@ -310,7 +316,7 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
 
 
 def _handed(value: Any, array: Array) -> Any:
-    """Return an array as a Dr.Jit array like `value`. The Dr.Jit array is the sum of the array and 0, because kernels
+    """Return `array` as a Dr.Jit array of the type of `value`. The function adds 0 to the Dr.Jit array, because kernels
     depend on the alignment of NumPy's memory.
     """
     return type(value)(np.ascontiguousarray(array, dtype=np.float32)) + dr.opaque(mi.Float, 0)

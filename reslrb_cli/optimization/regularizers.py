@@ -1,8 +1,8 @@
 """Regularizers: costs of a parameter's value, and their gradients, in double precision.
 
-Regularizers are integrals over the surface, in the scene's unit, so they hardly depend on the resolution. A map h (H,
-W, C) has texels of dx by dy. Its mesh covers a range of texture coordinates, independent of the texels. Differences are
-between neighbours, and weights sum to the whole surface.
+Regularizers are integrals over the surface, in the scene's unit. Integrals hardly depend on the resolution. A map h (H,
+W, C) has texels of dx by dy. The map's mesh covers a range of texture coordinates, independent of the texels.
+Differences are taken between neighbouring texels. The integration weights sum to the whole surface.
 
     curvature        k = Hm + sqrt(Hm² - K) in the inner texels, by central differences; positive in hollows
                      2 Hm = ((1 + hy²) hxx - 2 hx hy hxy + (1 + hx²) hyy) / w³,  K = (hxx hyy - hxy²) / w⁴,
@@ -37,22 +37,22 @@ Map = tuple[Array, Array, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Span:
-    """One axis of a map: the length of a unit of its texture coordinate, and the surface's range of coordinates."""
+    """One axis of a map: the length per unit of texture coordinate, and the surface's coordinate range."""
 
     unit: float = 1.0
     low: float = 0.0
     high: float = 1.0
 
     def pitch(self, count: int) -> float:
-        """Return the distance between two neighbours of `count` texels."""
+        """Return the distance between neighbouring texels on an axis with `count` texels."""
         return self.unit / count
 
     def weights(self, count: int, first: float, last: float) -> Array:
-        """Return the length that each node represents. The nodes are first, first + 1, ..., last, in texels of an axis
-        with `count` texels.
+        """Return the length that each node represents. The nodes lie at first, first + 1, ..., last, in texels, on an
+        axis with `count` texels.
 
-        Neighbouring nodes share the distance between them evenly, and the outermost nodes get the rest. The sum is the
-        length of the surface.
+        Two neighbouring nodes share their distance evenly. The outermost nodes also get the length up to the surface's
+        ends. The sum is the length of the surface.
         """
         nodes = np.arange(first, last + 0.5) / count
         middles = (nodes[:-1] + nodes[1:]) / 2
@@ -100,7 +100,9 @@ class Plate:
     back: csr_matrix
 
     def cost(self, h: Array, g: Array) -> tuple[float, Array, Array]:
-        """Return the cost of h and g, including the weight, and the derivatives with respect to h and to g."""
+        """Return the cost of h and g, and the cost's derivatives with respect to h and g. The cost includes the
+        weight.
+        """
         value, slope = _hinge(-self.thickness(h, g), -self.settings.least)
         area = self.settings.weight * _area(self.spans, h.shape, 0.5)
         by_h = -area * slope
@@ -177,7 +179,7 @@ def _thin(lowest: float, spans: Spans) -> Cost:
 
 
 def _area(spans: Spans, shape: tuple[int, ...], first: float) -> Array:
-    """Return the area of each node of a map of this shape, (h, w, 1). The first node is `first` texels from the
+    """Return the area of each node of a map with shape `shape`, as (h, w, 1). The first node is `first` texels from the
     edge.
     """
     wide, high = (span.weights(n, first, n - first) for span, n in zip(spans, (shape[1], shape[0]), strict=True))
@@ -185,7 +187,7 @@ def _area(spans: Spans, shape: tuple[int, ...], first: float) -> Array:
 
 
 def _between(of_norm: Callable[[Array], tuple[Array, Array]], spans: Spans) -> Cost:
-    """Return the integral of a function of the gradient's norm, over all channels together."""
+    """Return the integral of a function of the gradient's norm. The norm includes all channels."""
 
     def cost(h: Array) -> tuple[float, Array]:
         dx, dy = spans[0].pitch(h.shape[1]), spans[1].pitch(h.shape[0])
@@ -220,8 +222,8 @@ _STENCILS: tuple[tuple[dict[tuple[int, int], float], int, int], ...] = (
 
 
 def _inner(function: Callable[[list[Array]], tuple[Array, list[Array]]], spans: Spans) -> Cost:
-    """Return the integral of a function of a map's derivatives hx, hy, hxx, hxy and hyy. The function also returns its
-    own derivatives.
+    """Return the integral of a function of a map's derivatives hx, hy, hxx, hxy and hyy. `function` returns the
+    integrand's value and derivatives.
     """
 
     def cost(h: Array) -> tuple[float, Array]:
@@ -282,11 +284,11 @@ def _hollow(d: list[Array], limit: float) -> tuple[Array, list[Array]]:
 
 
 def mesh_laplacian(positions: Array, faces: Array) -> tuple[csr_matrix, Array]:
-    """Return L and 1/A of a mesh with these positions (N, 3) and faces (M, 3). At vertices on the mesh's rim, and at
-    vertices without an area, 1/A is 0.
+    """Return the Laplacian L and inverse vertex areas 1/A for `positions` (N, 3) and `faces` (M, 3) of a mesh. At
+    vertices on the mesh's rim, and at vertices without an area, 1/A is 0.
 
-    Vertices at the same position count as one. A mesh that is cut open along texture seams therefore has no rim there.
-    Vertices at one position use the row and column of the first vertex at the position.
+    Vertices at the same position count as one vertex. A mesh that is cut open along texture seams therefore has no rim
+    along the seams. Vertices at one position use the row and column of the first vertex at the position.
     """
     _, first, same = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     joined = first[same.ravel()][faces]
@@ -324,9 +326,9 @@ def mesh_cost(weight: float, positions: Array, faces: Array) -> Cost:
 
 
 def spans_of(positions: Array, texcoords: Array) -> Spans:
-    """Return the axes of a map over a mesh with these vertex positions (N, 3) and texture coordinates (N, 2).
+    """Return the axes of a map over a mesh with vertex `positions` (N, 3) and texture coordinates `texcoords` (N, 2).
 
-    The best plane map from texture coordinates to positions defines the unit of each axis.
+    The best affine map from texture coordinates to positions defines the unit of each axis.
     """
     slopes, _ = _laid(positions, texcoords)
     low, high = np.clip(texcoords.min(axis=0), 0, 1), np.clip(texcoords.max(axis=0), 0, 1)
@@ -335,7 +337,7 @@ def spans_of(positions: Array, texcoords: Array) -> Spans:
 
 
 def _laid(positions: Array, texcoords: Array) -> tuple[Array, Array]:
-    """Return the best plane map from texture coordinates to positions: uv @ slopes (2, 3) + origin (3,)."""
+    """Return the best affine map from texture coordinates to positions: uv @ slopes (2, 3) + origin (3,)."""
     matrix = np.column_stack([texcoords, np.ones(len(texcoords))]).astype(np.float64)
     found = np.linalg.lstsq(matrix, positions.astype(np.float64), rcond=None)[0]
     return found[:2], found[2]

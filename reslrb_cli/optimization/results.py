@@ -2,13 +2,13 @@
 
 `Best` has the best parameters so far. The loss of an iteration is mostly noise, so the smallest loss would be the
 luckiest one. With held-out views, the best parameters have the smallest held-out loss. The held-out loss always uses
-the same samples. Without held-out views, the best parameters come from the end of WINDOW consecutive iterations. Among
-all windows, the one with the smallest mean loss counts.
+the same samples. Without held-out views, the best parameters come from the end of WINDOW consecutive iterations. The
+window with the smallest mean loss counts.
 
-`got_worse` tells whether an error, which is known exactly, ended above its start. `find_trend` does the same for the
-loss.
+`got_worse` returns true if an error ended above its initial value. Errors are known exactly. `find_trend` does the same
+for the loss.
 
-`Results` combines these with the parameters' values and errors.
+`Results` combines `got_worse` and `find_trend` with the parameters' values and errors.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WINDOW = 10
 
 @dataclass(frozen=True)
 class Least:
-    """Smallest loss so far, and the number of updates before it."""
+    """Smallest loss so far, and the number of updates before this loss."""
 
     iteration: int
     loss: float
@@ -52,7 +52,7 @@ class Best:
         self.recent: deque[float] = deque(maxlen=WINDOW)
 
     def see(self, record: Record, values: Mapping[str, Any]) -> None:
-        """Record one iteration, and the values that it started with, by key. The values are stored without a copy."""
+        """Record one iteration, and its starting values by key. The values are stored without a copy."""
         self.recent.append(record.loss)
         if self.held_out:
             loss = math.inf if record.held_out is None else record.held_out
@@ -74,8 +74,8 @@ WORSE, WORSE_IF_SHORT = 0.01, 0.1
 
 
 def got_worse(errors: Sequence[float], final: float) -> bool:
-    """True if a parameter's error ended above its start. Both the last error, `final`, and all errors of the last tenth
-    before `final` must be above the start.
+    """True if a parameter's error ended above its initial value. The last error `final` and all errors of the last
+    tenth before `final` must exceed the initial error.
 
     Errors are known exactly, but fluctuate with the noise of the gradients. A short run must therefore end well above
     its initial error to count as worse.
@@ -136,8 +136,8 @@ class Results:
         self._take("final")
 
     def see(self, moment: str, view: View, image: Array, scale: float = 1.0) -> None:
-        """Record the saved image of a view at `initial` or `final`, and its fitted `scale`. The image is as in
-        `Problem.see`.
+        """Record a view's saved image and the image's fitted `scale`. `moment` is `initial` or `final`. The image is as
+        in `Problem.see`.
 
         Call this for every view in order.
         """
@@ -205,11 +205,11 @@ class Results:
 
 
 def summary(value: Array, mask: Array | None = None) -> dict[str, Any]:
-    """Return a parameter in a few numbers: all numbers as `value`, or `mean`, `min` and `max` over the entries in
-    `mask`.
+    """Return a summary of a parameter. The summary has all numbers as `value`, or `mean`, `min` and `max` over the
+    entries in `mask`.
 
-    The mean of a texture (H, W, C) has a number for each channel. A mask of another resolution is read at the centres
-    of the texels. An empty mask is ignored.
+    The mean of a texture (H, W, C) has a number for each channel. A mask with another resolution is sampled at the
+    texel centres. An empty mask is ignored.
     """
     if value.ndim < 3 and value.size <= MOST_NUMBERS:
         return {"value": value.tolist()}

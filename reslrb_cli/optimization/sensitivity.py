@@ -9,25 +9,26 @@ first step, for all entries of one parameter x. I(x) is the image at common rand
     change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
     curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
 
-`change` is the relative change of the image per unit of the parameter. `curvature` is the Gauss-Newton curvature, where
-D is scaled up to the resolution of single precision. `length` is the change of the parameter that would explain the
-image or the target. The change is a least-squares fit over the pixels that the parameter affects. For the only light of
-a scene, this is its intensity. For a wall, `length` is the albedo, regardless of the wall's share of the picture. h is
-chosen so that the image changes by about 3 %. With an image change of about 3 %, neither rounding nor curvature
-dominates the differences.
+`change` is the relative change of the image per unit of the parameter. `curvature` is the Gauss-Newton curvature. D is
+scaled up so that single precision resolves the differences. `length` is the change of the parameter that would explain
+the image or the target. A least-squares fit over the pixels that the parameter affects gives the change. For a scene's
+only light, `length` is the light's intensity. For a wall, `length` is the albedo, regardless of the wall's share of the
+picture. h is chosen so that the image changes by about 3 %. With an image change of about 3 %, neither rounding nor
+curvature dominates the differences.
 
-`rescale` measures units for one common learning rate. Step lengths from `Sensitivity.length` make all parameters move
-equally fast. Gradients are divided by the root mean square of a sample, so Adam's absolute epsilon has no effect.
+`rescale` measures units so that all parameters can use one learning rate. Step lengths from `Sensitivity.length` make
+all parameters move equally fast. Gradients are divided by the root mean square of a gradient sample, so Adam's absolute
+epsilon has no effect.
 
 Units for gradient descent (`measure_curvatures`, `scale: curvature`): lambda is the largest curvature of the loss in
-the optimiser's variable v. Power iteration computes it from differences of gradients at common random numbers. h
+the optimiser's variable v. Power iteration computes lambda from differences of gradients at common random numbers. h
 changes the image by about 3 %.
 
     H d = (g(v + h d) - g(v - h d)) / (2 h),   d <- H d / |H d|,   lambda = |H d|
 
 The gradient is divided by lambda and by the number of parameters. If the diagonal blocks of a positive matrix have norm
 1, the matrix norm is at most the number of blocks. A rate of 1 is Newton's step along the steepest direction. Gradient
-descent converges for learning rates below 2, while the curvature stays as at the start.
+descent converges for learning rates below 2, as long as the curvature keeps its initial value.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ from reslrb_cli.statistics import Array, rms
 
 
 def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str, spp: int) -> dict[str, Any]:
-    """Take one step of all views, evaluated, with the seeds of `round` and `purpose`.
+    """Take one step of all views with the seeds of `round` and `purpose`, and evaluate the result.
 
     The gradients are accumulated in `problem.optimizer`. Call `take_gradient` afterwards.
     """
@@ -69,7 +70,9 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
 
 
 def take_gradient(problem: Problem) -> dict[str, Array]:
-    """Return the accumulated gradients as flat arrays, with 0 for values that are not finite, and clear them."""
+    """Return the accumulated gradients as flat arrays, and clear the accumulated gradients. Non-finite values
+    become 0.
+    """
     taken = {}
     for key, value in problem.gradients().items():
         taken[key] = finite(np.array(value, dtype=np.float32)).ravel()
@@ -112,8 +115,8 @@ QUANTITIES = ("gradient", "change", "curvature", "length")
 
 @dataclass(frozen=True)
 class Conditioning:
-    """Measured sensitivities of all parameters. They come from `samples` gradients of `spp` samples per pixel, with the
-    run's `seed`.
+    """Measured sensitivities of all parameters. The sensitivities come from `samples` gradients of `spp` samples per
+    pixel, with the run's `seed`.
     """
 
     rows: list[Sensitivity]
@@ -122,10 +125,11 @@ class Conditioning:
     seed: int
 
     def spread(self, quantity: str) -> float | None:
-        """Return the largest value of one of QUANTITIES divided by its smallest. Returns None for fewer than two
-        positive values.
+        """Return the ratio of the largest to the smallest value of `quantity`, which is one of QUANTITIES. Returns None
+        for fewer than two positive values.
 
-        For `curvature`, this is the condition number of the diagonal of the Gauss-Newton matrix, by parameters.
+        For `curvature`, the result is the condition number of the Gauss-Newton matrix's diagonal, with one entry per
+        parameter.
         """
         values = [getattr(row, quantity) for row in self.rows]
         positive = [value for value in values if value is not None and value > 0]
@@ -147,8 +151,8 @@ def measure_conditioning(problem: Problem, samples: int) -> Conditioning:
 
 
 def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
-    """Measure every parameter of `problem` at its current value, by at least two gradients (`samples`) and a few
-    images.
+    """Measure every parameter of `problem` at its current value. The measurement uses `samples` (at least two)
+    gradients and a few images.
 
     Each gradient and image has the run's samples per pixel.
     """
@@ -180,7 +184,9 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
 def _probe(
     problem: Problem, row: Sensitivity, direction: Any, base: Sequence[Array], reference: Sequence[Array]
 ) -> Sensitivity:
-    """Return `row` with the sensitivity of the image along `direction`, if it changes."""
+    """Return `row` with the image's sensitivity along `direction`. If the image does not change, return `row`
+    unchanged.
+    """
     key, value = row.key, dr.detach(problem.optimizer[row.key])
     low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
     # 1 % of the parameter, in any unit; of its range if it is 0; a guess if it has none.
@@ -298,7 +304,7 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
 
 
 def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequence[Array]) -> float:
-    """Return the largest curvature of the loss in `v`, the optimiser's variable of `key`, or 0 if it has no visible
+    """Return the loss's largest curvature in `v`, the optimiser's variable of `key`. Return 0 if `v` has no visible
     effect.
     """
     size = math.sqrt(sum(float(np.square(image).sum()) for image in base))
@@ -370,7 +376,7 @@ def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
     """Return a line for the user about one parameter. `transform` and `learning_rate` come from the parameter's
     configuration.
 
-    A step is in units of the optimiser's variable. For the first step, the line also has the movement of the parameter.
+    A step is in units of the optimiser's variable. The line also has the parameter's movement in the first step.
     """
     if row.own_length is None:
         lacks = "no effect on the image" if row.length is None else "no gradient"

@@ -1,8 +1,8 @@
 """Step in shards: sets of whole views, or shares of the samples of one view, computed separately.
 
 A `Task` has all data that a shard needs besides the problem. `shard_image` and `shard_gradient` depend only on task and
-problem, return NumPy arrays and leave no changes. The sums therefore do not depend on the place and order of
-computation.
+problem. Both functions return NumPy arrays and leave no changes. The sums therefore do not depend on where and in which
+order shards are computed.
 
 A view has S shares. I_s is the image of share s, w_s its part of the samples (1 / S), and J_s the derivative of I_s
 with respect to the parameters.
@@ -78,8 +78,8 @@ class ShardGradient:
     """Result of a shard.
 
     `gradients` has the gradient of each parameter (float32). For each part, the result has the loss and the refused
-    entries of dL/dI. Refused entries are given by their count, the flat index of the first, and the shape. If
-    requested, the result also has the part's image, (H, W, C) or (2, H, W, C) with halves.
+    entries of dL/dI. A record of refused entries has the entry count, the first entry's flat index, and the array's
+    shape. If requested, the result also has the part's image, (H, W, C) or (2, H, W, C) with halves.
     """
 
     gradients: dict[str, Array]
@@ -129,8 +129,8 @@ def shard_image(problem: Problem, task: Task) -> Array:
 
 
 def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> ShardGradient:
-    """Return the gradient of a shard. The shard computes its own dL/dI, or a shard of one view uses `delta` in the
-    shape of `shard_image`.
+    """Return the gradient of a shard. The shard computes its own dL/dI. A shard of one view can instead use `delta`, in
+    the shape of `shard_image`.
 
     Previously accumulated gradients are lost.
     """
@@ -191,7 +191,7 @@ def _held(problem: Problem) -> Iterator[None]:
 
 
 def serially(state: S, function: Callable[..., T], work: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, T]]:
-    """Compute shards one after the other in this process (an `Engine` of any `state`)."""
+    """Compute shards one after the other in this process. The function is an `Engine` for any `state`."""
     for place, given in enumerate(work):
         yield place, function(state, *given)
 
@@ -220,7 +220,9 @@ class Sum:
             self.total = own if self.total is None else self.total + own
 
     def without(self, array: Array, weight: float) -> Array:
-        """Return the mean of all arrays except one, float32. `weight` is the weight of this array in a total of 1."""
+        """Return the float32 mean of all arrays except `array`. `weight` is the weight of `array` if all weights sum to
+        1.
+        """
         assert self.total is not None
         with np.errstate(invalid="ignore", over="ignore"):
             return np.asarray((self.total - array.astype(np.float64) * weight) / (1 - weight), dtype=np.float32)
@@ -232,7 +234,7 @@ def add_gradient(
     """Set the parameters' gradients to the sum over an iteration's shards.
 
     Returns the loss, and the refused entries of dL/dI by sensor. `on_start` is called when a step of two rounds starts.
-    `on_image` is called when its images and losses are known.
+    `on_image` is called when the step's images and losses are known.
     """
     engine, guiding = problem.engine or serially, guiding_of(problem)
     due = [] if guiding is None else _due(problem, guiding, iteration)

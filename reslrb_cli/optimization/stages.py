@@ -5,7 +5,7 @@ A stage with its own resolution or film has its own problem. The stage's own pro
 problem changes, the optimiser restarts. The old moments belong to other maps, and the suitable step length depends on
 the resolution.
 
-A coarse stage adds the change of the stage's own values c to the run's values x. R converts from the run's resolution
+A coarse stage has its own values c, and adds their change to the run's values x. R converts from the run's resolution
 to the stage's resolution, and P converts back. x0 are the run's values at the start of the stage.
 
     x = x0 + P (c - R x0)
@@ -65,8 +65,8 @@ class Stages:
         return self.whole.config.stage(number).grain == self.whole.config.stage(self.last).grain
 
     def at(self, number: int) -> Problem:
-        """Return the problem of a stage. If the stage's problem was not current before the call, the problem gets the
-        values of `whole`.
+        """Return the problem of a stage. If the stage's problem was not current before, the problem gets the values of
+        `whole`.
         """
         if number == self._number:
             return self._now
@@ -80,7 +80,7 @@ class Stages:
         return self._now
 
     def enter(self, state: State) -> tuple[Problem, State]:
-        """Return the problem of the iteration after `state`, and the state at its start."""
+        """Return the problem of the iteration after `state`, and the state in which the iteration starts."""
         problem, self.begun = self._entered(state)
         return problem, self.begun
 
@@ -105,7 +105,7 @@ class Stages:
         return problem, began
 
     def values(self, state: State) -> dict[str, Array]:
-        """Return the values of a state in the resolution of the run, as `Problem.values` does."""
+        """Return a state's values in the run's resolution, in the form of `Problem.values`."""
         whole, now = self.whole, self.at(state.stage)
         shown = {key: now.selection.shown(key, value) for key, value in state.values.items()}
         for key, before in state.base.items():

@@ -83,10 +83,10 @@ class State:
 
 
 def standing(problem: Problem, state: State | None = None) -> State:
-    """Return the current state of `problem`, with the plain values of `state`. Without `state`, no iteration has been
-    made.
+    """Return the current state of `problem`. Plain values come from `state`. Without `state`, the result precedes the
+    first iteration.
 
-    Nothing is copied, because no iteration changes the arrays of an earlier one.
+    The function copies nothing, because no iteration changes the arrays of an earlier iteration.
     """
     state = State(0, 0.0, 0.0, 0, {}, {}, stage=len(problem.config.run.stages)) if state is None else state
     optimizer, guiding = problem.optimizer, guiding_of(problem)
@@ -136,7 +136,7 @@ def guiding_of(problem: Problem) -> Guiding | None:
 
 
 def noted_of(problem: Problem) -> dict[str, Array]:
-    """Return the recorded densities of camera paths over the pixels (H, W), by the number of the sensor.
+    """Return the recorded pixel densities (H, W) of camera paths, for each sensor number.
 
     The recorded densities are the argument of `LightTracer.shared_out`.
     """
@@ -145,9 +145,9 @@ def noted_of(problem: Problem) -> dict[str, Array]:
 
 
 def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[str, Array]) -> str | None:
-    """Restore the tables of the run's integrator, if it has any, from stored data (`State`).
+    """Restore the tables of the run's integrator from stored data (`State`), if the integrator has tables.
 
-    If an array does not fit this scene, its name is returned and nothing has changed.
+    If an array does not fit this scene, the function returns the array's name and changes nothing.
     """
     guiding = guiding_of(problem)
     if guiding is None:
@@ -166,14 +166,15 @@ def restore_tables(problem: Problem, calls: Mapping[str, int], learned: Mapping[
 def on_file(problem: Problem, values: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, Array]]:
     """Convert values of parameters from the optimiser's form to their displayed form.
 
-    Also returns the complete arrays of parameters that lose data. For example, an environment map loses its halo.
+    Also returns the complete arrays of the parameters that lose data in the conversion. For example, an environment map
+    loses its halo.
     """
     shown = {key: problem.selection.shown(key, value) for key, value in values.items()}
     return shown, {key: own for key, value in values.items() if (own := to_array(value)).size != shown[key].size}
 
 
 def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, Any]:
-    """Return values in the optimiser's form from the result of `on_file`. `prefix` is the prefix of their names."""
+    """Return the values of a stored `on_file` result in the optimiser's form. `prefix` is the prefix of their names."""
     found = {}
     for key in problem.selection.keys:
         now, name, shape = dr.detach(problem.optimizer[key]), f"{prefix}/{key}", problem.selection.array(key).shape
@@ -190,8 +191,8 @@ def _stored_values(problem: Problem, stored: Stored, prefix: str) -> dict[str, A
 class Settled:
     """Data common to all processes of a run.
 
-    It has the settings in the form of a file, `variant`, the digests of the `files`, the decisions by measurement, the
-    initial values of the parameters, and the `masks` of a `Problem`.
+    `Settled` has the settings in the form of a file, `variant`, and the digests of the `files`. `Settled` also has the
+    measured decisions, the parameters' initial values, and the `masks` of a `Problem`.
     """
 
     config: str
@@ -219,7 +220,7 @@ def begin_as(problem: Problem, stored: Stored) -> None:
 
 
 def decide_as(problem: Problem, stored: Stored) -> Problem:
-    """Return `problem` with the decisions of the run: the samples of a pass, and the ways of sampling."""
+    """Return `problem` with the run's decisions about the samples per pass and the sampling methods."""
     settled = stored.read(Settled)
     guided = settled.guided if is_auto(problem.config, "guiding") else None
     sequence = settled.sequence if is_auto(problem.config, "sequence") else None
@@ -236,7 +237,7 @@ def decide_as(problem: Problem, stored: Stored) -> Problem:
 
 
 def reach_as(problem: Problem, stored: Stored) -> Problem:
-    """Restore the masks of the entries that light and sensor reach, for parameters with known true values."""
+    """Restore the masks for parameters with known true values. A mask marks the entries that light and sensor reach."""
     shapes = {key: problem.selection.array(key).shape for key in problem.truth}
     asked = {key: expected(shape[:2] if len(shape) == 3 else shape) for key, shape in shapes.items()}
     return replace(problem, masks={key: stored.take(f"mask/{key}", mask) for key, mask in asked.items()})

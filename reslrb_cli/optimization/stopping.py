@@ -1,11 +1,11 @@
 """Detection of a flat loss, and the time limit of a run (`run.max_seconds`).
 
 A flat loss ends a run early (`run.stop`) or lowers its learning rate (`optimizer.schedule: plateau`). The losses are
-divided into windows of `patience` iterations, and tested at the end of each window. A loss is flat if the test shows
-that it falls by less than `relative` per window (`trend.stands`). If views are held out, the held-out loss is tested.
-The held-out loss has fewer values than the training loss. All held-out values use the same samples. Windows start after
-the stages of `run.stages`, and again after the rate has been lowered. A run with a plateau ends only at its lowest
-rate.
+divided into windows of `patience` iterations, and tested at the end of each window. A loss is flat if the test shows a
+fall of less than `relative` per window (`trend.stands`). If views are held out, the held-out loss is tested. The
+held-out loss has fewer values than the training loss. All held-out values use the same samples. Windows start after the
+stages of `run.stages`, and start again after each reduction of the learning rate. A flat loss ends a `plateau` run only
+at the lowest learning rate.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def time_share(limit_s: float | None, state: State) -> float:
 
 
 def out_of_time(limit_s: float | None, state: State) -> str:
-    """Return a message if one more iteration of mean duration (without the first) would exceed the limit,
-    otherwise "".
+    """Return a message if one more iteration of mean duration would exceed the limit, otherwise "". The mean excludes
+    the first iteration.
     """
     mean_s = (state.elapsed_s - state.first_s) / max(state.iteration - 1, 1)
     if limit_s is None or state.elapsed_s + mean_s <= limit_s:
@@ -92,7 +92,7 @@ class Watch:
 
     def _stands(self, asked: StopRule, began: int, done: int) -> str:
         """Return a message about a flat loss after `done` iterations. The message is "" if the loss is not flat, or if
-        no window ends after `done` iterations.
+        `done` iterations do not end a window.
         """
         span = asked.patience
         if (done - began) % span:

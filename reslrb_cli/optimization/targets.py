@@ -52,8 +52,8 @@ WORDS = {
 def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None, lacking: bool) -> Masked:
     """Find the pixels of a view that its mask excludes.
 
-    `photo` is the file of the target, or None for a rendered target. `lacking` is true if the light that light paths
-    cannot find is in the target or in the image, but not in both. Raises ConfigError for a wrong file of weights.
+    `photo` is the file of the target, or None for a rendered target. `lacking` is true if only the target or only the
+    image contains the light that light paths cannot find. Raises ConfigError for an invalid weights file.
     """
     mask, sensor, found = wanted.mask, scene.sensors()[wanted.sensor], Masked()
     width, height = (int(n) for n in sensor.film().crop_size())
@@ -84,7 +84,7 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
 
 
 def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
-    """Return a line for the user about a view's mask, or None if nothing is excluded, weighted or counted."""
+    """Return a line for the user about a view's mask. Return None if no pixel is excluded, weighted or counted."""
     counts = masked.counts()
     stay = [f"{count} {WORDS[kind]} and are kept" for kind, count in masked.stay.items()]
     if not counts and not stay and masked.weights is None:
@@ -96,7 +96,7 @@ def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
 
 
 def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
-    """Read or render every view's target. Returns the problem with the true values of rendered targets as its `truth`.
+    """Read or render every view's target. Returns the problem with `truth` set to the true values of rendered targets.
 
     `say` is called with lines about slow work and excluded pixels. Raises ConfigError.
     """
@@ -157,7 +157,7 @@ def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
 
 
 def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
-    """Set the target of a view (H, W, C) and its mask. `photo` is the file that was read, if any."""
+    """Set a view's target (H, W, C) and mask. `photo` is the file that was read, if any."""
     wanted, config = view.wanted, problem.config
     colors = color_channels(problem.scene.sensors()[view.sensor].film())
     if colors == 1 and image.shape[2] >= 3:

@@ -1,12 +1,12 @@
-"""Tests of a noisy series of losses: whether it is flat, and whether it fell or rose over a run.
+"""Tests of a noisy series of losses. The tests show whether the series is flat, and whether it fell or rose over a run.
 
 Losses of iterations have heavy tails: one bright path can multiply a loss by ten. No test therefore uses a plain mean.
 
-`stands` proves that a loss is flat. A proof is stronger than a test that merely detects no fall. Each window of
-iterations has one level, which is the interquartile mean of the window's losses (`levels_of`). A line through the
-levels of the last k windows has a slope, whose standard error has k - 2 degrees of freedom. The loss is flat if the
-upper bound for the fall per window is below `relative`. The standard error comes from the spread of the levels. The
-losses may therefore be correlated over less than a window.
+`stands` proves that a loss is flat. A proof is stronger than a test that merely detects no fall. The level of a window
+of iterations is the interquartile mean of the window's losses (`levels_of`). A line through the levels of the last k
+windows has a slope, whose standard error has k - 2 degrees of freedom. The loss is flat if the upper bound for the fall
+per window is below `relative`. The standard error comes from the spread of the levels. The losses may therefore be
+correlated over less than a window.
 
 The test is repeated after every window, for several k, and a run stops at the first success. The j-th test therefore
 uses the share 2 / (j (j - 1)) of `CHANCE`. The tested values of k divide the share equally. The shares sum to 1 from j
@@ -122,11 +122,11 @@ def find_trend(values: Sequence[float]) -> Trend | None:
 
 
 def stands(levels: Array, relative: float, number: int) -> Array:
-    """Return the number of last windows over which each series of levels (..., J) is flat. The number is 0 for a series
-    that is not flat.
+    """For each series of levels (..., J), return the number of last windows over which the series is flat. The number
+    is 0 for a series that is not flat.
 
     There is one level per window. A series is flat if its fall from one window to the next is significantly less than
-    the share `relative`. `number` is the number of windows of the run so far, each of which was tested.
+    the share `relative`. `number` is the number of windows so far in the run. Every window was tested.
     """
     spans = [k for k in SPANS if k <= levels.shape[-1]]
     found = np.zeros(levels.shape[:-1], dtype=int)
@@ -156,7 +156,7 @@ def line(values: Array, at: Array | None = None) -> tuple[Array, Array]:
 
 
 def window(iterations: int) -> int:
-    """Return the number of iterations that are averaged at the start and at the end."""
+    """Return the number of iterations to average at the start and at the end."""
     return max(iterations // 10, LEAST_WINDOW)
 
 
@@ -176,7 +176,7 @@ def _parts(values: Array) -> Array:
 
 
 def _ranks(values: Array) -> Array:
-    """Return ranks; equal values share the mean of their ranks."""
+    """Return the ranks of the values. Equal values share the mean of their ranks."""
     _, place, count = np.unique(values, return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(count) - count / 2)[place])
 
@@ -190,7 +190,7 @@ def _level(values: Array) -> Level:
 
 
 def _quantile(freedom: int, chance: float) -> float:
-    """Return the quantile of Student's t that is exceeded with this probability."""
+    """Return the value that Student's t exceeds with probability `chance`."""
     from scipy.special import stdtrit  # late, because the command line must start fast
 
     return -float(stdtrit(freedom, chance))

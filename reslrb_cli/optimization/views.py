@@ -88,11 +88,11 @@ class Exposure:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Settings of the view through `sensor`: the file of its target (None for a rendered one), and its mask.
+    """Settings of the view through `sensor`: its mask and the file of its target, or None if the target is rendered.
 
-    `file_key` and `mask_key` are their places in the configuration. `exposure` is a number, or names how the run
-    recovers the exposure. `exposure_key` is the key of the recovered exposure. `part` is the view's weight in the loss,
-    relative to the others.
+    `file_key` and `mask_key` are the places of file and mask in the configuration. `exposure` is a number, or the name
+    of a way to recover the exposure. `exposure_key` is the key of the recovered exposure. `part` is the view's weight
+    in the loss, relative to the other views.
     """
 
     sensor: int = 0
@@ -173,8 +173,8 @@ def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
 
 @dataclass
 class Masked:
-    """Masked pixels of one view, boolean (H, W) by kind. `left_out` has the excluded pixels. A pixel may have several
-    kinds.
+    """Masked pixels of one view, as a boolean array (H, W) for each kind. `left_out` has the excluded pixels. A pixel
+    may have several kinds.
 
     `weights` (H, W) come from a weights file. Without such a file, `weights` is None. `stay` counts the pixels of kinds
     that are reported but not excluded.
@@ -200,8 +200,8 @@ class Masked:
 
 @dataclass
 class View:
-    """View through the scene's sensor of index `sensor`. `share` is its weight in the loss. The shares of training
-    views sum to 1.
+    """View through the scene's sensor with the index `sensor`. `share` is its weight in the loss. The shares of
+    training views sum to 1.
 
     - `made` is the target (H, W, C) without alpha. Until it exists, it is None, and `target` raises LookupError.
     - `weights` have the same shape and a mean of 1. They are 0 for entries that `masked` excludes, and None if all are
@@ -260,7 +260,7 @@ class View:
             self.weigh(weights)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
-        """Return the loss of an image, of width 1, attached. Alpha is dropped, and the view's exposure is applied.
+        """Return the attached loss of an image, with width 1. Alpha is dropped, and the view's exposure is applied.
 
         The image has the shape (H, W, C), or (2, H, W, C) for two halves of its samples. `fitted` uses the two halves.
         """
@@ -278,7 +278,7 @@ class View:
         return loss(dr.select(self.weights > 0, image, target), target, self.weights)
 
     def curvature(self, known: bool) -> Array:
-        """Return the curvature (H, W) of the loss in each pixel, with a mean of 1. If it is not `known`, return that of
+        """Return the loss's curvature (H, W) in each pixel, scaled to a mean of 1. If it is not `known`, return that of
         l2.
 
         Excluded pixels have 0. The noise of each channel is assumed to be proportional to the target.
@@ -290,7 +290,9 @@ class View:
         return np.asarray(curvature / curvature.mean())
 
     def scale(self, image: mi.TensorXf) -> float:
-        """Return the factor on an image in `compare`, besides the exposure. It is 1 unless the loss is `fitted`."""
+        """Return the factor by which `compare` multiplies an image in addition to the exposure. It is 1 unless the loss
+        is `fitted`.
+        """
         if not self.fits:
             return 1.0
         exposed = self.exposure.applied(first_channels(image, self.target.shape[2]))
@@ -299,15 +301,15 @@ class View:
         return float(best_scale(halves_of(exposed), self.target, self.weights)[0])
 
     def exposed(self, seen: mi.TensorXf) -> tuple[Array, Array, float]:
-        """Return three results for an image as in `compare`. The results are the image (H, W, C), the image with the
-        exposure of its target, and the image's `scale`.
+        """Return three results for an image in a shape that `compare` accepts. The results are the image (H, W, C), the
+        image with the exposure of its target, and the image's `scale`.
         """
         image, scale = np.array(whole_of(seen)), self.scale(seen)
         exposure = Exposure(self.exposure.fixed * scale) if self.fits else self.exposure
         return image, exposure.of_array(image), scale
 
     def kept(self, image: Array) -> Array:
-        """Return an image with the target's shape, and 0 in excluded pixels."""
+        """Return an image of the target's shape with excluded pixels set to 0."""
         return image if self.weights is None else np.where(np.array(self.weights) > 0, image, 0)
 
     def objective(self, image: mi.TensorXf) -> mi.Float:
@@ -324,7 +326,9 @@ def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:
 
 
 def view_records(views: list[View]) -> list[dict[str, Any]]:
-    """Return the views for a run's manifest: share of the loss, pixels, number and kinds of excluded pixels."""
+    """Return each view's entry for the run's manifest: share of the loss, pixel count, number and kinds of excluded
+    pixels.
+    """
     return [
         {
             "sensor": view.sensor,
@@ -384,7 +388,7 @@ def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
 
 
 def color_channels(film: mi.Film) -> int:
-    """Return the number of channels of an image of `film` without alpha."""
+    """Return how many channels an image of `film` has without alpha."""
     return 1 if int(film.base_channels_count()) <= 2 else 3
 
 
@@ -394,7 +398,7 @@ def to_tensor(array: Array) -> mi.TensorXf:
 
 
 def target_arrays(views: list[View]) -> dict[str, Array]:
-    """Return the views' targets and weights, to send to another process, where `set_targets` sets them."""
+    """Return the views' targets and weights for another process, which sets them with `set_targets`."""
     arrays = {}
     for number, view in enumerate(views):
         arrays[f"target-{number}"] = np.array(view.target)

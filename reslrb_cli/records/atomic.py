@@ -30,7 +30,7 @@ unfinished: set[Path] = set()
 
 
 def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: bool = False) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it, so that no reader sees a partial file.
+    """Let `write` fill a temporary file beside `path`, then rename the file. Readers never see a partial file.
 
     With `durable`, the file also survives a loss of power. Raises OSError, which names `path`.
     """
@@ -111,7 +111,7 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def writing(option: str, path: Path) -> Iterator[None]:
-    """Turn errors of writing `path` into a ConfigError located by `option`; machine faults are unchanged."""
+    """Turn errors of writing `path` into a ConfigError that names `option`. Machine faults are unchanged."""
     try:
         yield
     except (OSError, RuntimeError) as error:

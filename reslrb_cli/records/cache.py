@@ -32,7 +32,7 @@ def key_of(what: dict[str, Any]) -> str:
 class PilotCache:
     """JSON file of entries by key.
 
-    An unreadable file counts as empty. If the file cannot be written, it is unchanged and `keeps` becomes False.
+    An unreadable file counts as empty. If writing fails, the file is unchanged and `keeps` becomes False.
     """
 
     def __init__(self, folder: Path | None = None) -> None:

@@ -28,16 +28,18 @@ Array = np.ndarray[Any, Any]
 
 
 def write_archive(path: Path, arrays: Mapping[str, Array], durable: bool = False) -> None:
-    """Write arrays to `path` atomically, replacing the file. Raises OSError, and then the old file is unchanged."""
+    """Write arrays to `path` atomically, replacing the file. Raises OSError if writing fails. The old file is then
+    unchanged.
+    """
     entries: dict[str, Any] = dict(arrays)
     write_atomically(path, lambda file: np.savez(file, **entries), durable)
 
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[Mapping[str, Array]]:
-    """Open an archive. An array is read, and its checksum verified, when the block accesses it.
+    """Open an archive. When the block accesses an array, the array is read and its checksum verified.
 
-    Raises ConfigError, located in the file, if reading fails inside the block.
+    Raises a ConfigError that names the file if reading fails inside the block.
     """
     try:
         with open_file(path) as file, np.load(file, allow_pickle=False) as arrays:
@@ -68,9 +70,9 @@ def save_checkpoint(
 ) -> None:
     """Write the state after `iteration` updates into `folder`, atomically and durably.
 
-    The entries are `iteration`, `parameter/<key>`, `others` by name, and `values` as JSON. The earlier state becomes
-    `previous.npz`, unless `name` is another file name. Raises OSError if writing fails. Both earlier states then still
-    exist.
+    The entries are `iteration`, `parameter/<key>`, the arrays in `others` under their names, and `values` as JSON. The
+    earlier state becomes `previous.npz`, unless `name` is another file name. Raises OSError if writing fails. Both
+    earlier states then still exist.
     """
     entries: dict[str, Array] = {"iteration": np.array(iteration)}
     entries |= {f"parameter/{key}": value for key, value in parameters.items()}

@@ -18,10 +18,10 @@ MIB = 2.0**20
 class StepTimes:
     """Times of one step in milliseconds, filled in at the end of the step.
 
-    `wall_ms` is the wall time. `kernel_ms` is the execution time of kernels and `codegen_ms` the time of their
-    generation and compilation, both from `dr.kernel_history`. `new_kernels` counts kernels that no earlier step of the
-    same clock launched. The history's `cache_hit` cannot replace `new_kernels`, because `cache_hit` is also true for
-    kernels from the disk cache.
+    `wall_ms` is the wall time. `kernel_ms` is the execution time of kernels. `codegen_ms` is the time to generate and
+    compile kernels. Both come from `dr.kernel_history`. `new_kernels` counts kernels that no earlier step of the same
+    clock launched. The history's `cache_hit` cannot replace `new_kernels`, because `cache_hit` is also true for kernels
+    from the disk cache.
     """
 
     wall_ms: float = 0.0
@@ -89,8 +89,8 @@ class SharedTime:
     """Times in seconds of a computation shared by workers, split into parts. `workers` holds the work of each worker by
     name.
 
-    `wall_s` is the time from the first call of a round to its last answer. `computing_s` is the mean time in which a
-    worker computes, and `waiting_s` the mean time in which it waits for the slowest worker. `sending_s` is the
+    `wall_s` is the time from a round's first call to the round's last answer. `computing_s` is the mean time in which
+    workers compute. `waiting_s` is the mean time in which workers wait for the slowest worker. `sending_s` is the
     remaining time, which includes distributing the calls. `places` are the places of the workers, as given to
     `--cluster`.
     """
@@ -122,7 +122,7 @@ class SharedTime:
 
 
 def summarise(history: list[dict[str, Any]]) -> tuple[float, float]:
-    """Sum a kernel history: milliseconds of execution, and of code generation and compilation.
+    """Sum a kernel history in milliseconds: execution, and code generation with compilation.
 
     Copies and reductions count as execution.
     """
@@ -134,7 +134,7 @@ def summarise(history: list[dict[str, Any]]) -> tuple[float, float]:
 def reset_peak() -> None:
     """Reset the memory peak to the memory in use now.
 
-    The flush is needed because the allocator's statistics count blocks held for reuse as allocated. The garbage
+    The flush is needed because the allocator's statistics also count blocks that are kept for reuse. The garbage
     collection is needed because nothing else frees unused scenes.
     """
     gc.collect()

@@ -1,4 +1,4 @@
-"""Records of the settings that a run chose by measurement, in the manifest, the checkpoints and the cache.
+"""Records of the settings that a run chose by measurement. Manifest, checkpoints and cache contain the records.
 
 PathsRecord     light paths, camera paths or both
 GuidedRecord    guided or unguided emission
@@ -72,7 +72,7 @@ class Finding(Jsonable):
 
 
 def _times(gain: float | None, low: float | None, high: float | None, note: str) -> str:
-    """Return a ratio of efficiencies with its interval in words, or only the note if it was not measured."""
+    """Return a ratio of efficiencies and its interval in words. Return only the note if the ratio was not measured."""
     if gain is None or low is None or high is None:
         return note
     found = f"{gain:.2g} times the efficiency here ({low:.2g} to {high:.2g})"
@@ -84,10 +84,10 @@ class PaidRecord(Finding):
     """Measured gain of an alternative sampling method.
 
     The gradient's efficiency is 1 / (variance * time). `gain` is the efficiency with the method divided by the
-    efficiency without the method. `low` and `high` are the ends of its 95 % interval. `image_gain`, `image_low` and
-    `image_high` are the corresponding values for the image, if the gradient's samples also serve the image. Values that
-    were not measured are None. If the method is off despite its gain, `note` gives the reason. `rounds` is the number
-    of measured steps of each kind. `share` is the cost of measuring, relative to the time of 200 iterations.
+    efficiency without the method. `low` and `high` are the ends of the 95 % interval of `gain`. `image_gain`,
+    `image_low` and `image_high` are the corresponding values for the image, if the image uses the gradient's samples.
+    Values that were not measured are None. If the method is off despite its gain, `note` gives the reason. `rounds` is
+    the number of measured steps of each kind. `share` is the cost of measuring, relative to the time of 200 iterations.
     """
 
     gain: float | None = None
@@ -130,7 +130,7 @@ class PathsRecord(PaidRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class GuidedRecord(PaidRecord):
-    """Choice of guided emission, for gradients (`guided`) and for samples that serve only an image (`images`)."""
+    """Choice of guided emission, for gradients (`guided`) and for samples used only for an image (`images`)."""
 
     guided: bool
     images: bool = False
@@ -148,8 +148,8 @@ class GuidedRecord(PaidRecord):
 class SequenceRecord(PaidRecord):
     """Choice of low-discrepancy numbers, for both gradients and images.
 
-    `alone` is true if low-discrepancy numbers were measured as a replacement for guided emission. An earlier decision
-    had chosen guided emission. If `alone` is true, `gain` is relative to guided emission.
+    `alone` is true if low-discrepancy numbers were measured as a replacement for guided emission. If `alone` is true,
+    an earlier decision had chosen guided emission. If `alone` is true, `gain` is relative to guided emission.
     """
 
     low_discrepancy: bool

@@ -1,8 +1,8 @@
 """Files of images and parameters, in formats that other tools read.
 
 Images are written as EXR (linear, 32-bit) and PNG (8-bit sRGB, for viewing). EXR files with named layers hold several
-arrays of one size, so that a viewer can flip between them. The folder `parameters/` holds the recovered parameters;
-file names are made from parameter keys, which can be of any length.
+arrays of one size, so that a viewer can flip between them. The folder `parameters/` holds the recovered parameters.
+File names are made from parameter keys, which can be of any length.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = np.ndarray[Any, Any]
 
 
 def luminance(image: Array) -> Array:
-    """Return the luminance (H, W) of linear values (H, W, C), with Mitsuba's weights; one channel is unchanged."""
+    """Return the luminance (H, W) of linear values (H, W, C), with Mitsuba's weights. A single channel is unchanged."""
     wide = image.astype(np.float64)
     return wide[:, :, :3] @ [0.212671, 0.715160, 0.072169] if image.shape[2] >= 3 else wide[:, :, 0]
 
@@ -45,7 +45,7 @@ def file_stem(key: str) -> str:
 
 
 def bounded(stem: str) -> str:
-    """Return `stem`, or its beginning and a hash if it is too long for a file name."""
+    """Return `stem`. If `stem` is too long for a file name, return its beginning and a hash."""
     return stem if len(stem.encode()) <= MOST_BYTES else _numbered(stem, stem)
 
 
@@ -63,14 +63,14 @@ def write_image(stem: Path, image: Array, shown: Array | None = None) -> None:
     """Write an (H, W, C) image of linear values as `<stem>.exr`. Write `shown` as `<stem>.png`, or the image if `shown`
     is None.
 
-    The suffix is appended to `stem` and replaces nothing, because parameter keys contain dots.
+    The function appends the suffix to the whole `stem`, because parameter keys contain dots.
     """
     write_file(Path(f"{stem}.exr"), image, linear=True)
     write_file(Path(f"{stem}.png"), image if shown is None else shown, linear=False)
 
 
 def finite_range(arrays: Iterable[Array]) -> tuple[float, float]:
-    """Return the minimum and maximum finite value of all arrays; 0 and 0 if there is none."""
+    """Return the minimum and maximum of all finite values in the arrays. Return 0 and 0 if no value is finite."""
     known = [values for array in arrays if (values := array[np.isfinite(array)]).size]
     if not known:
         return 0.0, 0.0
@@ -81,8 +81,8 @@ def write_file(path: Path, image: Array, linear: bool) -> None:
     """Write an (H, W, C) image of linear values atomically, in the format given by the suffix of `path`.
 
     With `linear`, values are written unchanged. Without `linear`, values are clipped to [0, 1] and converted to 8-bit
-    sRGB. The file gets the first three channels, or only the first channel if there are fewer than three. Raises
-    OSError, and RuntimeError if the format does not support the channels.
+    sRGB. Without `linear`, the file gets the first three channels, or only the first channel if there are fewer than
+    three. Raises OSError if writing fails, and RuntimeError if the format does not support the channels.
     """
     if linear:
         write_bitmap(path, mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)))
@@ -94,7 +94,8 @@ def write_file(path: Path, image: Array, linear: bool) -> None:
 
 
 def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:
-    """Write a bitmap unchanged and atomically, in the format given by the suffix of `path`; raises as `write_file`.
+    """Write a bitmap unchanged and atomically, in the format given by the suffix of `path`. Raises the same errors as
+    `write_file`.
 
     The bitmap is encoded in memory, because Mitsuba would leave a partial file if the process ends.
     """
@@ -104,7 +105,9 @@ def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:
 
 
 def load_image(path: Path) -> Array | None:
-    """Return an image written by `write_image`, (H, W, C) float32, linear, or None if it is missing or damaged."""
+    """Return an image written by `write_image`, as linear float32 (H, W, C). Return None if the file is missing or
+    damaged.
+    """
     if not path.is_file():
         return None
     try:
@@ -138,9 +141,9 @@ def write_layers(path: Path, layers: Mapping[str, Array]) -> None:
 
 
 def read_layers(path: Path) -> dict[str, Array]:
-    """Return the layers of an EXR by name, each (H, W, C) float32; channels without a layer form the layer "".
+    """Return the layers of an EXR by name, each (H, W, C) float32. Channels without a layer form the layer "".
 
-    Raises OSError if there is no file, and ValueError if it is damaged or not an EXR.
+    Raises OSError if there is no file, and ValueError if the file is damaged or not an EXR.
     """
     import OpenEXR
 
@@ -161,15 +164,15 @@ def read_layers(path: Path) -> dict[str, Array]:
 
 
 def _place(letter: str) -> tuple[int, int, str]:
-    """Return a sort key for channels: colours as R, G, B, A, then numbers by value, the rest by name."""
+    """Return a sort key for channels: R, G, B, A in this order, numbers by value, and other channels by name."""
     if letter in "RGBA":
         return 0, "RGBA".index(letter), ""
     return 1, int(letter) if letter.isdecimal() else 0, letter
 
 
 def read_layer_names(path: Path) -> set[str]:
-    """Return the layer names of an EXR, reading only its header. The result is empty if there is no file or it is not
-    an EXR.
+    """Return the layer names of an EXR, reading only its header. The result is empty if the file is missing or not an
+    EXR.
     """
     import OpenEXR
 
@@ -210,9 +213,10 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
 
 
 def write_mask(folder: Path, key: str, mask: Array) -> None:
-    """Write the mask of the entries that light and sensor reach: `<key>.mask.npy`, and for textures `<key>.mask.png`.
+    """Write the mask of the entries that light and sensor reach. The files are `<key>.mask.npy` and, for textures,
+    `<key>.mask.png`.
 
-    `mask` is boolean, (H, W) for a texture and otherwise of the parameter's shape.
+    `mask` is boolean. Its shape is (H, W) for a texture, otherwise the parameter's shape.
     """
     stem = file_stem(key) + ".mask"
     write_atomically(folder / f"{stem}.npy", lambda file: np.save(file, mask))

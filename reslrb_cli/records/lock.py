@@ -1,7 +1,8 @@
 """Locks on run folders, and the identity of the process that uses a folder.
 
 The lock is a kernel lock (`flock`) on the folder itself. The lock leaves no file behind and always ends with its
-process. Some network file systems have no locks, or none that other machines see. There, the recorded process decides.
+process. Some network file systems have no locks, or locks that other machines do not see. There, the recorded process
+decides.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ _own: set[tuple[int, int]] = set()
 
 
 class InUse(Exception):
-    """Error for a lock that another process, or another part of this process, holds."""
+    """Error if another process, or another part of this process, holds the lock."""
 
 
 class FolderLock:
     """Lock on a folder, from its construction until `release` or the end of the process.
 
-    The lock stays on the folder when it is renamed. Several holders can have a `shared` lock if nobody has an exclusive
-    one. `real` is False if the file system has no locks. In this case, nothing is locked. Raises InUse, and OSError if
-    there is no such folder (a link does not count).
+    The lock stays on the folder when the folder is renamed. Several holders can have a `shared` lock if nobody has an
+    exclusive one. `real` is False if the file system has no locks. In this case, nothing is locked. Raises InUse if the
+    lock is taken, and OSError if the folder does not exist. A link does not count as a folder.
     """
 
     def __init__(self, folder: Path, wait_s: float = WAIT_SECONDS, shared: bool = False) -> None:
@@ -140,7 +141,7 @@ class Holder:
 
 
 def is_alive(process: int) -> bool:
-    """Whether a process with this number exists."""
+    """True if a process with the number `process` exists."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

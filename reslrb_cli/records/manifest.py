@@ -1,7 +1,7 @@
 """The manifest of a run, `manifest.json`: what ran, on which machine, and how it ended.
 
-If the process ended without completing the manifest (killed, out of memory, machine switched off), `read_manifest`
-corrects it.
+If the process ended without completing the manifest, `read_manifest` corrects the manifest. Causes are a killed
+process, exhausted memory or a machine switched off.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class Manifest:
         self.write(folder)
 
     def end_for_good(self, folder: Path, status: Status) -> None:
-        """Do the same as `end`, from another thread of a process that is about to exit, and block all later writes."""
+        """Do the same as `end` from another thread of a process that is about to exit. Also block all later writes."""
         _WRITING.acquire(timeout=LAST_WAIT_SECONDS)  # and never released
         self.status, self.error, self.ended = status, None, now()
         _write(folder, self.content())
@@ -131,7 +131,7 @@ _CHECK = TypeAdapter(Manifest)
 def read_content(folder: Path) -> dict[str, Any] | None:
     """Return the content of the manifest in `folder`, or None if there is none written by `reslrb`.
 
-    Manifests of earlier versions may lack fields. Raises ConfigError, located by the first field of a wrong type.
+    Manifests of earlier versions may lack fields. Raises a ConfigError that names the first field of a wrong type.
     """
     try:
         text = read_file(folder / MANIFEST_FILE)

@@ -43,7 +43,7 @@ Tell = Callable[[Path, int, int], None]
 class Lines:
     """Objects in a file, oldest first, and the numbers (from 1) of the damaged lines.
 
-    Numbers that are not finite, which Python writes although JSON does not have them, are None.
+    Non-finite numbers, which Python writes but JSON does not have, become None.
     """
 
     objects: list[dict[str, Any]] = field(default_factory=list)
@@ -51,7 +51,7 @@ class Lines:
 
 
 def read_lines(path: Path, tell: Tell | None = None) -> Lines:
-    """Read a file of JSON lines. Raises ConfigError, located in the file, if it cannot be read.
+    """Read a file of JSON lines. Raises a ConfigError that names the file if the file cannot be read.
 
     A last line without a line end is still being written or was interrupted. An incomplete last line is left out and
     does not count as damaged.
@@ -88,7 +88,9 @@ def _finite(text: str) -> float | None:
 
 @contextmanager
 def _without_collecting() -> Iterator[None]:
-    """Disable garbage collection in the block: it would scan millions of objects without cycles repeatedly."""
+    """Disable garbage collection in the block, because the collector would repeatedly scan millions of objects without
+    cycles.
+    """
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -115,9 +117,9 @@ class LineFile:
             remove_parts_of(self._path)
 
     def write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> None:
-        """Write all lines so far: the final ones, which later calls must repeat, and the provisional ones.
+        """Write all lines so far, final and provisional. Later calls must repeat the final lines.
 
-        Raises OSError, and then the file is unchanged.
+        Raises OSError if writing fails. The file is then unchanged.
         """
         if not self.is_stream:
             text = "".join(line.to_json() + "\n" for line in [*final, *provisional])
@@ -182,7 +184,7 @@ _HEAD = "head"
 
 
 def samples_file(json_file: Path) -> Path:
-    """Return the path of the samples behind a JSON file."""
+    """Return the path of the sample file that belongs to a JSON file."""
     return json_file.with_suffix(".samples.npz")
 
 
@@ -200,7 +202,7 @@ def write_samples(path: Path, head: Mapping[str, Any], arrays: Mapping[str, np.n
 
 
 def read_samples(path: Path) -> Kept:
-    """Read the result of `write_samples`. Raises ConfigError, located in the file, if `write_samples` did not write the
+    """Read the result of `write_samples`. Raises a ConfigError that names the file if `write_samples` did not write the
     file.
     """
     from reslrb_cli.records.checkpoint import open_archive

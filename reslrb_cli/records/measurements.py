@@ -119,8 +119,8 @@ class PointRecord(Line):
     """Error of the average of `steps` steps, which take `elapsed_s` seconds.
 
     `parameter` is a parameter key, `all` (all parameters together) or `image`. Errors are in L2 over all entries,
-    relative to the norm of the estimated quantity. `relative_rmse` is the root mean square over `repeats` averages. The
-    error of the reference, `reference_rmse`, is subtracted. If `reference_rmse` exceeds the measured error,
+    relative to the norm of the estimated quantity. `relative_rmse` is the root mean square error of `repeats` averages.
+    The error of the reference, `reference_rmse`, is subtracted. If `reference_rmse` exceeds the measured error,
     `relative_rmse` is None.
     """
 
@@ -226,8 +226,8 @@ class Reference(str, enum.Enum):
 class Kind(str, enum.Enum):
     """Kind of comparison.
 
-    `equal_seeds` compares by relative L2, for two sides that compute equal numbers except for rounding. `expectation`
-    compares by z scores over many seeds. `image` compares images instead of gradients, by z scores.
+    `equal_seeds` compares by relative L2. Both sides compute equal numbers except for rounding. `expectation` compares
+    by z scores over many seeds. `image` compares images instead of gradients, by z scores.
     """
 
     EQUAL_SEEDS = "equal_seeds"
@@ -236,7 +236,7 @@ class Kind(str, enum.Enum):
 
 
 class Verdict(str, enum.Enum):
-    """Result of a comparison. All values except `holds` and `fails` are undecided, with the reason in `message`.
+    """Result of a comparison. All values except `holds` and `fails` mean undecided. `message` then gives the reason.
 
     - `heavy_tailed`: single seeds dominate the variance, so z scores prove nothing.
     - `unresolved`: noise hides deviations as large as the gradient itself.
@@ -256,7 +256,7 @@ class Verdict(str, enum.Enum):
 
 @dataclass(frozen=True)
 class Compared:
-    """Two sides of a comparison: the gradient of a parameter by an integrator, and a reference.
+    """Two sides of a comparison: an integrator's gradient for a parameter, and a reference.
 
     `case` is the configuration, or a case of a suite. `parameter` is None if all parameters together or the image are
     compared. `estimator` is None if the integrator has none. `seeds` is the number of gradients on each side.
@@ -312,7 +312,7 @@ class GradcheckRecord(Comparison, Compared, Line):
     light_share: float | None = None
 
     def to_json(self) -> str:
-        """Return the record as one line of JSON; numbers that are not finite become null."""
+        """Return the record as one line of JSON. Numbers that are not finite become null."""
         return json.dumps(finite(asdict(self)) | {"holds": self.holds}, allow_nan=False)
 
 
@@ -326,7 +326,7 @@ class Band:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Band | None:
-        """Return the band of some values, or None if there are none."""
+        """Return the band of `values`, or None if there are no values."""
         return cls(statistics.median(values), min(values), max(values)) if values else None
 
 
@@ -364,7 +364,7 @@ class MissingRecord(Line):
 
     @property
     def is_unknown(self) -> bool:
-        """Whether the interval of the missing share includes both 0 and more than half."""
+        """True if the interval of the missing share includes both 0 and a value above one half."""
         if self.share is None or self.standard_error is None:
             return True
         margin = NOTHING * self.standard_error
@@ -423,8 +423,8 @@ R = TypeVar("R", bound=Line)
 
 
 def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
-    """Return the record of class `kind` in `entry`, a line that was read back. Return None if the line holds no such
-    record.
+    """Return the record of class `kind` in `entry`, which is a line read from a file. Return None if the line holds no
+    such record.
     """
     try:
         found: R = _READERS[kind].validate_python(entry)

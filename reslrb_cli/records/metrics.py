@@ -1,7 +1,7 @@
 """The metrics of a run, `metrics.jsonl`: one JSON object per line, one line per iteration.
 
 A resumed run keeps the lines of the iterations that its checkpoint contains. All later lines are dropped. The tallies
-sum over a whole run: non-finite values, clamped gradients, and regularizers.
+sum up non-finite values, clamped gradients and regularizers over a whole run.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ METRICS_FILE = "metrics.jsonl"
 class Line:
     """Base class of dataclasses that become a line of JSON.
 
-    The line has `kind` first if the class has a `KIND`, then the fields of `method`, then the other fields in their
-    order. Numbers that are not finite become null.
+    The line starts with `kind` if the class has a `KIND`. Then come the fields of `method` and the other fields, in
+    their order. Numbers that are not finite become null.
     """
 
     KIND: ClassVar[str] = ""
@@ -42,7 +42,7 @@ class Line:
 
 
 def finite(value: Any, instead: Callable[[float], object] = lambda number: None) -> Any:
-    """Return `value` with numbers that are not finite replaced by None, or by the result of `instead`, for JSON.
+    """Return `value` for JSON. None, or the result of `instead`, replaces numbers that are not finite.
 
     `value` can be a number or nested mappings and lists of numbers.
     """
@@ -66,8 +66,8 @@ class Clamped:
     """Effect of clamping on the gradients of one iteration. `entries` is the number of changed entries. `share` and
     `bias` hold one share for each parameter.
 
-    `share` is the share of the gradient that was removed (sum of absolute values). `bias` is the share removed from the
-    sum of the gradients of all iterations so far.
+    `share` is the share of the gradient that was removed (sum of absolute values). `bias` is the share that was removed
+    from the summed gradients of all iterations so far.
     """
 
     entries: int
@@ -77,9 +77,9 @@ class Clamped:
 
 @dataclass(frozen=True)
 class Regularized:
-    """Weighted regularizer costs of an iteration, by parameter and type; they are not part of the loss.
+    """Weighted regularizer costs of an iteration, by parameter and type. The loss does not include these costs.
 
-    `held` is the number of heights at the minimum thickness after the update, by parameter.
+    For each parameter, `held` is the number of heights at the minimum thickness after the update.
     """
 
     costs: dict[str, dict[str, Figure]]
@@ -131,7 +131,7 @@ class Record(Line):
 
 
 class MetricsWriter:
-    """Writer that appends records to `metrics.jsonl`; when `write` returns, the file contains the complete line."""
+    """Writer that appends records to `metrics.jsonl`. When `write` returns, the file contains the complete line."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / METRICS_FILE
@@ -139,7 +139,7 @@ class MetricsWriter:
         mend(folder)
 
     def write(self, record: Record) -> None:
-        """Append one record. Raises OSError if the disk is full or the file was removed; the file is then unchanged."""
+        """Append one record. Raises OSError if the disk is full or the file was removed. The file is then unchanged."""
         line = record.to_json().encode() + b"\n"
         if self._descriptor is None:
             if not self._path.exists():
@@ -186,8 +186,8 @@ def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Re
     """Return the first `count` records in `folder`, and their size in bytes. A checkpoint contains the iterations of
     the returned records.
 
-    `last` is the last record, stored in the checkpoint. It replaces a line lost to a full disk. Raises ConfigError,
-    located by file and line, if other records are missing or damaged.
+    `last` is the last record as stored in the checkpoint. It replaces a line lost to a full disk. Raises a ConfigError
+    that names file and line if a record other than the last is missing or damaged.
     """
     path = folder / METRICS_FILE
     content = read_file(path) if count and os.path.lexists(path) else b""
@@ -242,7 +242,7 @@ class _Tally:
 
 @dataclass
 class NonFiniteTally(_Tally):
-    """Number of iterations with non-finite values, and the number of these values, in total and by parameter."""
+    """Number of iterations with non-finite values, and the number of non-finite values, in total and by parameter."""
 
     iterations: int = 0
     values: int = 0
@@ -293,7 +293,8 @@ class ClampTally(_Tally):
 class RegularizedTally(_Tally):
     """Regularizer costs of the last iteration, by parameter and type, and heights held at the minimum thickness.
 
-    `held_iterations` counts the iterations that held heights; `held` is the number of heights after the last one.
+    `held_iterations` counts the iterations that held heights. `held` is the number of held heights after the last
+    iteration.
     """
 
     iterations: int = 0

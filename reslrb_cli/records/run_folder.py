@@ -45,7 +45,7 @@ FABRICATION_FILE = "fabrication.json"
 
 
 def workshop_file(name: str) -> str:
-    """Return the file name, without suffix, of a picture of the workshop's sheet. The picture is in `images`."""
+    """Return a picture's file name, without suffix, for the workshop sheet. The picture is in `images`."""
     return "sheet-" + re.sub(r"[^a-z0-9.+-]+", "-", name.lower())
 
 
@@ -53,8 +53,8 @@ def read_value(run: Path, key: str) -> Array:
     """Return the value of `key` in the newest checkpoint of the run folder `run`.
 
     Shapes are as in `parameters.npz`: texture (H, W, C), colour (C,), buffer (N,), number (). The caller must check for
-    values that are not finite. Raises ConfigError, located in the folder or one of its files, if the folder is not a
-    run folder or is damaged, or if the run did not recover `key`.
+    values that are not finite. Raises a ConfigError that names the folder or file if the folder is damaged or not a run
+    folder. Raises the same error if the run did not recover `key`.
     """
     path = checkpoint_of(run)
     with open_archive(path) as archive:
@@ -70,7 +70,7 @@ def read_value(run: Path, key: str) -> Array:
 def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
     """Return the configuration of the run in the folder `run`, with its recovered values as initial values.
 
-    Raises ConfigError, located in the folder, if it is not a run folder or holds no values.
+    Raises a ConfigError that names the folder if the folder is not a run folder or holds no values.
     """
     checkpoint_of(run)
     config = load(run / "config.yaml", overrides)
@@ -123,8 +123,8 @@ LEFT_SECONDS = 60.0
 def check_output(source: object, output: Path, name: str, force: bool) -> None:
     """Raise a ConfigError (key `run.output` or `run.name`) if a run folder cannot be made in `output`.
 
-    The check makes a folder and removes the folder again, because permissions do not apply to root. Raises MachineError
-    for a full disk.
+    The check tries to make a folder, because permissions do not apply to root. The folder is then removed. Raises
+    MachineError for a full disk.
     """
     ancestor = next(path for path in (output, *output.absolute().parents) if os.path.lexists(path))
     if not ancestor.is_dir():
@@ -148,7 +148,7 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
 class RunFolder:
     """Run folder on the disk: the paths of its content, and its lock.
 
-    As a context manager, it releases the lock at the end.
+    As a context manager, a run folder releases its lock at the end.
     """
 
     path: Path
@@ -158,10 +158,10 @@ class RunFolder:
     def create(cls, source: object, output: Path, name: str, force: bool, config: str, manifest: Manifest) -> RunFolder:
         """Create `<output>/<name>/` with its configuration, manifest and empty subfolders, and lock it.
 
-        If the name is taken, the folder is `<name>-2/` and so on. With `force`, it replaces the run of that name, but
-        removes only files that a run writes. The folder appears under its name only when it is complete. Raises
-        ConfigError if `force` would replace a folder that is not a run folder or is in use. Raises MachineError for a
-        full disk.
+        If the name is taken, the folder is `<name>-2/` and so on. With `force`, the new folder replaces the run with
+        that name. Only files that a run writes are removed. The folder appears under its name only when it is complete.
+        Raises ConfigError if `force` would replace a folder that is not a run folder or is in use. Raises MachineError
+        for a full disk.
         """
         try:
             output.mkdir(parents=True, exist_ok=True)
@@ -187,7 +187,7 @@ class RunFolder:
         return replace(self, path=next(path for path in names if self._take_name(path)))
 
     def _take_name(self, path: Path) -> bool:
-        """Rename the folder to `path` unless that exists; return whether it was renamed."""
+        """Rename the folder to `path` unless `path` exists. Return whether the folder was renamed."""
         if os.path.lexists(path):
             return False
         try:
@@ -199,7 +199,7 @@ class RunFolder:
         return True
 
     def _replace(self, source: object, path: Path, manifest: Manifest) -> RunFolder:
-        """Move the content of the folder over the run folder at `path`, holding the lock of `path`."""
+        """Move the folder's content over the run folder at `path`, which is locked meanwhile."""
         while not self._take_name(path):
             _check_replaceable(source, path)
             try:
@@ -327,9 +327,9 @@ def _remove_left(output: Path) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
-    """Yield the run folder `path`, locked while the block runs, and its manifest.
+    """Yield the run folder `path` and its manifest. The folder is locked while the block runs.
 
-    Raises ConfigError, located in the folder, if it is not a run folder or is in use.
+    Raises a ConfigError that names the folder if the folder is not a run folder or is in use.
     """
     content = _manifest_of(path)
     in_use = ConfigError(path, "", f"is in use by a run ({_who_works(content)}); end that first")
@@ -346,7 +346,7 @@ def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
 
 
 def check_writable(folder: RunFolder) -> None:
-    """Raise ConfigError, located in the folder, if it cannot be written to, and MachineError for a full disk.
+    """Raise a ConfigError that names the folder if the folder cannot be written to, and MachineError for a full disk.
 
     Also removes unfinished files of earlier processes.
     """

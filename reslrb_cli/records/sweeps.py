@@ -80,7 +80,7 @@ class Sweep:
         return ((combination, seed) for seed in self.seeds for combination in self.combinations)
 
     def with_failure(self, name: str, failure: Failure | None) -> Sweep:
-        """Return the sweep with the failure of the run `name` set, or removed if it is None."""
+        """Return the sweep with `failure` for the run `name`. If `failure` is None, remove the run's failure."""
         others = {other: each for other, each in self.failures.items() if other != name}
         return replace(self, failures=others if failure is None else {**others, name: failure})
 
@@ -94,7 +94,7 @@ _READER = TypeAdapter(Sweep)
 
 
 def in_words(value: Any) -> str:
-    """Return a value as written on the command line: YAML on one line."""
+    """Return a value as one line of YAML, as on the command line."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {in_words(each)}" for key, each in value.items()) + "}"
     if isinstance(value, list):
@@ -130,7 +130,7 @@ def run_name(combination: Combination, seed: int) -> str:
 
 
 def config_file(folder: Path, combination: Combination) -> Path:
-    """Return the path of the resolved configuration of a combination in the sweep's `folder`."""
+    """Return the path of a combination's resolved configuration in the sweep's `folder`."""
     return folder / CONFIGS / f"{combination.name or 'config'}.yaml"
 
 
@@ -140,7 +140,9 @@ def is_sweep(folder: Path) -> bool:
 
 
 def read_sweep(folder: Path) -> Sweep:
-    """Read the sweep in `folder`. Raises ConfigError, located in its file, if it is missing or damaged."""
+    """Read the sweep in `folder`. Raises a ConfigError that names the sweep's file if the file is missing or
+    damaged.
+    """
     path = folder / SWEEP_FILE
     if folder.is_dir() and not path.exists():
         raise ConfigError(folder, "", f"is no sweep's folder: it has no {SWEEP_FILE}")
@@ -200,8 +202,8 @@ class SweepRowRecord(Line):
     """Result of one combination: median, minimum and maximum over its finished runs. `runs` of its `of` runs are
     finished.
 
-    `loss_ratio` and `error_ratio` are the combination's median divided by the median of the first comparable
-    combination. Their 95 % interval comes from a bootstrap over the seeds. Combinations that differ only in learning
+    `loss_ratio` and `error_ratio` divide the combination's median by the median of the first comparable combination.
+    The 95 % intervals of the ratios come from a bootstrap over the seeds. Combinations that differ only in learning
     rates are compared at their best rate. Only the combination with the best rate has a ratio. Ratios are None for
     fewer than 5 seeds.
     """
@@ -225,14 +227,14 @@ class SweepRowRecord(Line):
 
 @dataclass(frozen=True)
 class SweepBestRecord(Line):
-    """Combination with the lowest median of `of`, which is `loss` or `error`. The median is over the `seeds` seeds that
-    all combinations have.
+    """Combination with the lowest median of the quantity `of`, which is `loss` or `error`. The median is over the
+    `seeds` seeds that all combinations have.
 
     Combinations that differ only in learning rates are compared at their best rate. Wilcoxon's signed-rank test
     compares pairs of runs with equal seeds. The best combination differs significantly from the combinations in
-    `beats`, and not significantly from those in `tied`. `second` has the next median. `ratio` is the best median
-    divided by that of `second`, with the 95 % interval of a bootstrap over the seeds. It is None for fewer than 5
-    seeds. `line` is the record in words.
+    `beats`, but not from the combinations in `tied`. `second` has the next median. `ratio` is the best median divided
+    by the median of `second`. The 95 % interval of `ratio` comes from a bootstrap over the seeds. It is None for fewer
+    than 5 seeds. `line` is the record in words.
     """
 
     KIND: ClassVar[str] = "sweep_best"

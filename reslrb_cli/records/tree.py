@@ -1,7 +1,7 @@
 """Serialisation of dataclass trees as named arrays and JSON.
 
-The fields of a tree are plain values, which are checked by their types. Fields with the metadata `entry` map names to
-arrays. `entries` converts a tree to the entries of an archive, and `Stored` reads them back.
+A tree's fields are plain values, whose types are checked. Fields with the metadata `entry` map names to arrays.
+`entries` converts a tree to the entries of an archive, and `Stored` reads them back.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ PASSING = {_ENTRY: None}
 
 
 def entry(name: str) -> dict[str, Any]:
-    """Return the metadata of a field that maps names to arrays or nested mappings, saved as `<name>/...`."""
+    """Return the metadata of a field that maps names to arrays or nested mappings. Entries are saved as
+    `<name>/...`.
+    """
     return {_ENTRY: name}
 
 
@@ -45,8 +47,8 @@ def to_array(value: Any) -> Array:
 def like(value: Any, array: Array) -> Any:
     """Convert `array` to the type of `value`, in Dr.Jit's own memory.
 
-    `value` and `array` must have the same shape (`to_array`). A literal is part of the kernel code, such as Adam's step
-    count. If `value` is a literal, the result is a literal, too, so the kernel does not change.
+    `value` and `array` must have the same shape (`to_array`). A literal, such as Adam's step count, is part of the
+    kernel code. If `value` is a literal, the result is a literal, too, so the kernel does not change.
     """
     kind = type(value)
     if not dr.is_array_v(value):
@@ -62,7 +64,7 @@ def like(value: Any, array: Array) -> Any:
 
 
 def expected(shape: tuple[int, ...]) -> Array:
-    """Return an array of zeros that takes no memory, to state the expected shape of an array in a file."""
+    """Return an array of zeros that takes no memory. The array states the shape that an array in a file must have."""
     return np.broadcast_to(np.zeros(()), shape)
 
 
@@ -94,7 +96,7 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 class Stored:
     """Arrays and JSON values of a state file.
 
-    Methods raise ConfigError, located by the file and the value, if a value is missing or does not fit.
+    Methods raise a ConfigError that names file and value if a value is missing or does not fit.
     """
 
     def __init__(self, path: Path) -> None:
@@ -120,7 +122,7 @@ class Stored:
     def fill(self, tree: T) -> T:
         """Return the tree with its arrays read from the file.
 
-        Each array must have the type and shape of the one that it replaces; None accepts any shape.
+        Each array must have the type and shape of the array that it replaces. None accepts any shape.
         """
 
         def filled(name: str, other: Any) -> Any:
@@ -132,7 +134,9 @@ class Stored:
         return replace(tree, **found)  # type: ignore[type-var]  # a dataclass
 
     def take(self, name: str, other: Any) -> Any:
-        """Return the array `name`, converted to the type of `other` and of the same shape; None accepts any."""
+        """Return the array `name`, converted to the type of `other`. The shapes must be equal. If `other` is None, any
+        array is accepted.
+        """
         array = self.arrays.get(name)
         if array is None:
             raise self.wrong(name, "is missing")

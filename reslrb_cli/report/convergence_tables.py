@@ -22,7 +22,7 @@ KEY_WIDTH = 28
 
 
 def method_columns(labels: Sequence[str], parameters: Sequence[str]) -> Columns:
-    """Return the columns of the table; the first two fit `labels` and `parameters`."""
+    """Return the columns of the table. The first two columns fit `labels` and `parameters`."""
     figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)")
     titles = ("", "parameter", *figures, *(f"s to {target:.0%}" for target in TARGETS))
     names = max(len(shorten(key, KEY_WIDTH)) for key in ("parameter", *parameters))
@@ -53,7 +53,7 @@ def _deviation(record: MethodRecord) -> str:
 
 
 def _seconds(record: MethodRecord, target: str) -> str:
-    """Return a time, with `~` if it is extrapolated, or a dash if a bias keeps the error above the target."""
+    """Return a time, with `~` if the time is extrapolated. Return a dash if a bias keeps the error above the target."""
     seconds = record.seconds_to[target]
     if seconds is None:
         return "-"
@@ -94,7 +94,7 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
     """Return a sentence that names the best method for this scene, for all parameters together. The sentence also gives
     the method's lead.
 
-    A biased method is always called biased. A lead counts only if the lead exceeds the intervals.
+    A biased method is always called biased. A lead counts only if the interval of the efficiency ratio lies above 1.
     """
     together = [record for record in records if record.parameter in ("all", "image") and record.efficiency is not None]
     if not together:
@@ -131,7 +131,7 @@ def _efficiency(record: MethodRecord) -> float:
 
 
 def _ratio(one: MethodRecord, other: MethodRecord) -> tuple[float, float, float]:
-    """Return the ratio of efficiencies and its interval; half widths of the logarithms add in quadrature."""
+    """Return the ratio of efficiencies and its interval. Half widths of the logarithms add in quadrature."""
     a, b = one.efficiency, other.efficiency
     assert a is not None, "others are left out"
     assert b is not None, "others are left out"

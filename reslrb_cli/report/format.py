@@ -34,7 +34,7 @@ def with_error(value: float, error: float, sign: str = "+-") -> str:
 
 
 def interval(value: float, low: float, high: float, digits: int | str) -> str:
-    """Return a value and its interval; `digits` is the number of significant digits, or a format."""
+    """Return a value and its interval. `digits` is the number of significant digits, or a format."""
     spec = digits if isinstance(digits, str) else f".{digits}g"
     return f"{value:{spec}} [{low:{spec}}, {high:{spec}}]"
 
@@ -58,9 +58,9 @@ def shorten(text: str, width: int) -> str:
 
 
 def line(cells: Sequence[str], widths: Sequence[int], align: str = "<") -> str:
-    """Return a line of cells in columns of `widths`; the last cells may be missing.
+    """Return a line of cells in columns with the given `widths`. The last cells may be missing.
 
-    `align` has one letter per column, `<` for left and `>` for right; the last letter applies to all further columns.
+    `align` has one letter per column, `<` for left and `>` for right. The last letter applies to all further columns.
     """
     sides = align.ljust(len(cells), align[-1])
     return "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(cells, sides, widths, strict=False)).rstrip()
@@ -79,11 +79,11 @@ class Columns:
         return self.line(self.titles)
 
     def line(self, cells: Sequence[str]) -> str:
-        """Return a line of cells; the last cells may be missing."""
+        """Return a line of cells. The last cells may be missing."""
         return line(cells, self.widths, self.align)
 
 
 def table(rows: Sequence[Sequence[str]], align: str = "<") -> list[str]:
-    """Return the lines of a table with columns as wide as their content; `align` is as in `line`."""
+    """Return the lines of a table with columns as wide as their content. `align` is as in `line`."""
     widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
     return [line(row, widths, align) for row in rows]

@@ -81,7 +81,7 @@ def outcome_of(manifest: Mapping[str, Any], results: Mapping[str, Any], folder: 
 
 
 def _loss_fell(results: Mapping[str, Any]) -> bool | None:
-    """Whether the loss fell, by its trend or by the saved images, or None if neither is known."""
+    """Whether the loss fell, according to its trend or the saved images. None if neither is known."""
     change, ratio = (results.get("loss_trend") or {}).get("change"), image_ratio(results)
     if change is None and ratio is None:
         return None
@@ -102,7 +102,7 @@ def _without_verdicts(results: Mapping[str, Any], resume: list[str]) -> Outcome:
 
 
 def _with_remedy(sentence: str, manifest: Mapping[str, Any], results: Mapping[str, Any], resume: list[str]) -> Outcome:
-    """Return an open outcome with the most important proposal of all parameters."""
+    """Return an open outcome with the most important proposal among all parameters."""
     found = (find_remedy(results, key) for key in verdicts_of(results))
     remedies: list[Remedy] = [remedy for remedy in found if remedy is not None]
     if not remedies:

@@ -23,9 +23,9 @@ Array = np.ndarray[Any, Any]
 
 
 def ciede2000(first: Array, second: Array) -> Array:
-    """Return the CIEDE2000 differences between two arrays of colours, clipped to [0, 1] as on a screen.
+    """Return the CIEDE2000 differences between two arrays of colours. Colours are clipped to [0, 1] as on a screen.
 
-    A difference of about 1 is just noticeable side by side, about 10 at a glance.
+    A difference of about 1 is just noticeable side by side, and a difference of about 10 at a glance.
     """
     labs = [to_lab(np.clip(values, 0.0, 1.0)) for values in (first, second)]
     return np.asarray(_colour().delta_E(*labs, method="CIE 2000"))
@@ -45,7 +45,9 @@ def _mean_and_max(differences: Array) -> dict[str, float]:
 
 
 def _colour() -> Any:
-    """Import the package `colour` late, because that takes a second, and hide its warnings about optional packages."""
+    """Import the package `colour` late, because the import takes a second. Hide its warnings about optional
+    packages.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import colour
@@ -91,7 +93,7 @@ def _texture(array: Array) -> Array | None:
 
 
 def _entries(value: Array, true: Array, mask: Array | None) -> tuple[Array, Array]:
-    """Return the colours (N, 3) of both arrays that are compared."""
+    """Return the compared colours (N, 3) of both arrays."""
     grid = comparison_grid(value.shape, true.shape)
     if mask is None or mask.shape != value.shape[:2]:
         mask = np.ones(value.shape[:2], dtype=bool)
@@ -105,12 +107,13 @@ SIGMA, WINDOW = 1.5, 11
 
 
 def image_errors(image: Array, target: Array, exposure: float) -> dict[str, Any]:
-    """Return the errors of an image (H, W, C) of linear values, for the channels shared with `target`, without alpha.
+    """Return the errors of an image (H, W, C) of linear values. Only channels shared with `target` count, without
+    alpha.
 
     Image and target are multiplied by `exposure`, clipped to [0, 1] and encoded in sRGB, as on a screen. `psnr_db` is
     None if both look the same. `ssim` is None for images smaller than its window. `ciede2000` holds the mean and the
-    maximum over the pixels. `not_finite` is the number of pixels of the image that are not finite; they are treated as
-    black.
+    maximum over the pixels. `not_finite` is the number of image pixels that are not finite. Pixels that are not finite
+    are treated as black.
     """
     colors = 3 if min(image.shape[2], target.shape[2]) >= 3 else 1
     bad = int(np.sum(~np.isfinite(image[:, :, :colors]).all(axis=2)))
@@ -124,15 +127,15 @@ def image_errors(image: Array, target: Array, exposure: float) -> dict[str, Any]
 
 
 def psnr(first: Array, second: Array) -> float | None:
-    """Return the peak signal-to-noise ratio in dB of values in [0, 1], or None if it is infinite (equal values)."""
+    """Return the peak signal-to-noise ratio in dB of values in [0, 1], or None if both arrays are equal."""
     from skimage.metrics import peak_signal_noise_ratio
 
     return None if np.array_equal(first, second) else float(peak_signal_noise_ratio(first, second, data_range=1.0))
 
 
 def ssim(first: Array, second: Array) -> float | None:
-    """Return the structural similarity (Wang et al. 2004) of values (H, W, C) in [0, 1], or None below the
-    window size.
+    """Return the structural similarity (Wang et al. 2004) of values (H, W, C) in [0, 1]. Return None for images smaller
+    than the window.
     """
     from skimage.metrics import structural_similarity
 
@@ -149,11 +152,12 @@ MOMENTS = ("initial", "final")
 def seen_errors(
     folder: Path, results: Mapping[str, Any], views: Sequence[Mapping[str, Any]] | None = None
 ) -> dict[str, Any]:
-    """Return `results.seen` of the manifest of the run in `folder`. The result is empty if nothing can be compared.
+    """Return the perceptual errors of the run in `folder`, for `results.seen` in its manifest. The result is empty if
+    nothing can be compared.
 
-    `images` holds, by sensor (`""`, `"-0"`, ...), the `exposure` for viewing the target and the `image_errors` of the
-    `initial` and the `final` image. `colors` holds the `color_errors` of surface colours with known true values, by
-    key. `results` and `views` come from the run's manifest. Missing and damaged files are left out.
+    For each sensor (`""`, `"-0"`, ...), `images` holds the `exposure` for viewing the target. `images` also holds the
+    `image_errors` of the `initial` and the `final` image. `colors` holds, by key, the `color_errors` of surface colours
+    with known true values. `results` and `views` come from the run's manifest. Missing and damaged files are left out.
     """
     images, exposures = {}, shown_exposures(views)
     for path in sorted((folder / "images").glob("target*.exr")):
@@ -186,7 +190,7 @@ def _colors(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_seen_errors(source: Source) -> Source:
-    """Return `source` with the perceptual errors added to its results if it is a run that lacks them."""
+    """Return `source`, with perceptual errors added to the results of a run that lacks them."""
     if not isinstance(source, Run) or "seen" in source.results:
         return source
     try:

@@ -33,7 +33,7 @@ LEAST_LOG, MOST_LABELLED = 5.0, 300.0
 
 @dataclass(frozen=True)
 class Curve:
-    """Curve of points (x, y); points that are None or not finite are left out.
+    """Curve of points (x, y). Points that are None or not finite are left out.
 
     `place` selects the colour and the dashes. `band` holds the ends of each point's interval, if any. `points` adds
     markers.
@@ -56,7 +56,7 @@ def draw(axis: Any, curves: Sequence[Curve], log_x: float | None = None) -> None
     """Draw curves, each with at least one point.
 
     The y axis is logarithmic if positive values span a large factor. The x axis is logarithmic with base `log_x` if
-    that is given and all values are positive.
+    `log_x` is given and all values are positive.
     """
     for curve in curves:
         _draw(axis, curve)
@@ -127,7 +127,7 @@ _MOST_Z = 5.0
 
 def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarray, z: np.ndarray, folder: Path
               ) -> Path:  # fmt: skip
-    """Write a PNG of `gradient` and `reference` (H, W, C), summed over channels, and `z` (H, W); return its path.
+    """Write a PNG of `gradient` and `reference` (H, W, C), summed over channels, and of `z` (H, W). Return its path.
 
     Both gradients share one scale, which 1 % of the texels exceed. An EXR of the same name holds the unchanged values
     as the layers `gradient`, `reference`, `difference` and `z`.

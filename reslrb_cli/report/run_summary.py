@@ -60,7 +60,7 @@ BESIDE_A_BAR = 32
 def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
     """Return the loss and, if known, the parameter error of a record, as texts of decreasing length.
 
-    If the units of the parameters differ, the error is the largest relative one.
+    If the units of the parameters differ, the error is the largest relative error.
     """
     loss = f"loss {record.loss:.4g}"
     if record.parameter_rmse is not None:
@@ -80,7 +80,7 @@ def is_settled(results: Mapping[str, Any], key: str) -> bool:
 
 
 class Remedy(NamedTuple):
-    """Proposal in a few words, and the setting for it."""
+    """Proposal in a few words, and the setting that implements the proposal."""
 
     words: str
     setting: str
@@ -89,7 +89,7 @@ class Remedy(NamedTuple):
 def verdict_words(results: Mapping[str, Any], key: str) -> str:
     """Return the verdict on the parameter `key`, with a proposal. The result is empty if nothing was measured.
 
-    Includes the share of entries with this verdict and the share of entries that no view shows.
+    The result includes the share of entries with this verdict and the share of entries that no view shows.
     """
     about = _about(results, key)
     verdict, shares = about.get("verdict", ""), about.get("shares") or {}
@@ -135,8 +135,8 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
 
 
 def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
-    """Return one standard deviation of each entry of a small parameter, or of a typical entry. The result is empty if
-    unknown.
+    """Return one standard deviation, for each entry of a small parameter or for a typical entry of a large parameter.
+    The result is empty if unknown.
     """
     spread = _about(results, key).get("spread")
     if not spread:
@@ -147,7 +147,7 @@ def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
 
 
 def certainty_lines(results: Mapping[str, Any]) -> list[str]:
-    """Return one line for each verdict except `settled`, with the parameters that have it."""
+    """Return one line for each verdict except `settled`, with the parameters that have this verdict."""
     verdicts = verdicts_of(results)
     lines = []
     for verdict in dict.fromkeys(verdict for verdict in verdicts.values() if verdict != SETTLED):
@@ -238,7 +238,7 @@ def last_line(status: str, results: Mapping[str, Any], tallies: Sequence[str], r
 
 
 def error_line(results: Mapping[str, Any]) -> str | None:
-    """Return the error of all parameters at start and end; if their units differ, the largest relative error.
+    """Return the error of all parameters at start and end, or the largest relative error if the units differ.
 
     `results` is the result of `Results.to_json`. None if no true value is known.
     """
@@ -304,7 +304,7 @@ def image_ratio(results: Mapping[str, Any]) -> float | None:
     """Return the loss of the final saved images divided by the loss of the initial saved images. Return None if either
     loss is unknown.
 
-    Saved images have less noise than those of the iterations.
+    Saved images have less noise than the images of the iterations.
     """
     losses = results.get("image_loss") or {}
     initial, final = losses.get("initial"), losses.get("final")
@@ -335,14 +335,14 @@ MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
 
 
 def terminal_width() -> int:
-    """Return the width of standard output; files and pipes may be wider than most terminals."""
+    """Return the width of standard output. Files and pipes may be wider than most terminals."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else NO_TERMINAL
 
 
 def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
     """Return the values at start and end, true values, errors, spreads and verdicts, in lines of at most `width`.
 
-    Textures are shown as mean and range. The lines form a table if it fits, otherwise one block per parameter.
+    Textures are shown as mean and range. If a table fits, the lines form a table, otherwise one block per parameter.
     `results` is the result of `Results.to_json`.
     """
     parameters = results.get("parameters") or {}
@@ -370,7 +370,9 @@ def units_differ(results: Mapping[str, Any]) -> bool:
 
 
 def error_words(results: Mapping[str, Any], key: str, relative: bool) -> str:
-    """Return the error of one parameter at start and end, `0.189 to 0.222`. The result is empty if unknown."""
+    """Return the error of one parameter at start and end, for example `0.189 to 0.222`. The result is empty if
+    unknown.
+    """
     pair = (results.get("relative_error" if relative else "parameter_rmse") or {}).get(key) or {}
     if pair.get("initial") is None:
         return ""
@@ -402,7 +404,7 @@ def _table(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[s
 
 
 def _blocks(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
-    """Return one line per key and one per value; long values are wrapped with indentation."""
+    """Return one line per key and one per value. Long values are wrapped with indentation."""
     lines, indent = [], max(map(len, titles)) + 2 * len(GAP)
     for key, row in zip(keys, rows, strict=True):
         lines.append(shorten(key, width))

@@ -18,9 +18,9 @@ MOST_LAMP = 1.2
 
 
 def sketch(setup: Mapping[str, Any], thickness: float) -> Markup:
-    """Return the sketch of a `setup` (`runs/setup.py`); lengths are in mm.
+    """Return the sketch of a `setup` (`runs/setup.py`). Lengths are in mm.
 
-    The solid stands at the origin. +z, the direction from its relief to the receiver of a lens, points to the right.
+    The solid stands at the origin. +z points to the right, the direction from a lens's relief to the receiver.
     """
     half = setup["face_size"][0] / 2
     receiver, across = _flat(setup["receiver"]), _flat(setup["picture_right"])
@@ -77,7 +77,7 @@ def sketch(setup: Mapping[str, Any], thickness: float) -> Markup:
 
 
 def _flat(vector: Sequence[float]) -> Array:
-    """Return (z, x) of a vector (x, y, z): the plane of the sketch, seen from +y with z to the right and x upwards."""
+    """Return (z, x) of a vector (x, y, z). The sketch shows this plane from +y, with z to the right and x upwards."""
     return np.array([vector[2], vector[0]], dtype=float)
 
 

@@ -103,7 +103,7 @@ class Maps:
 
 @dataclass(frozen=True)
 class SweepRuns:
-    """Sweep, and those of its runs that have a folder, by name."""
+    """Sweep, and its runs that have a folder, by name."""
 
     path: Path
     name: str
@@ -116,9 +116,9 @@ Source = Run | Measurements | Maps | SweepRuns
 
 
 def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source]:
-    """Read the source at each path; `tell` is called with the reading progress.
+    """Read the source at each path. The function calls `tell` with the reading progress.
 
-    Raises ConfigError, located by the first path that a page cannot show.
+    Raises a ConfigError that names the first path that a page cannot show.
     """
     found: list[Source] = []
     for path, name in zip(paths, _names(paths), strict=True):
@@ -131,7 +131,7 @@ def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source
 
 
 def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) -> Run:
-    """Read the run in `folder` as far as possible; for any other folder, return an empty run."""
+    """Read the run in `folder` as far as possible. For any other folder, return an empty run."""
     try:
         lines = read_lines(folder / metrics.METRICS_FILE, tell)
         damaged = lines.damaged
@@ -190,7 +190,7 @@ def _kind(entry: Mapping[str, Any]) -> str | None:
 
 
 def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
-    """Return a line of `metrics.jsonl` with invalid numbers replaced by None, or None if a required number is
+    """Return a line of `metrics.jsonl` with None in place of invalid numbers. Return None if a required number is
     missing.
     """
     if not all(is_number(entry.get(key)) for key in _FIGURES):
@@ -210,6 +210,6 @@ def is_number(value: object) -> TypeGuard[float]:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return a name for each path, without its folders if that is unique."""
+    """Return a name for each path. The name omits the folders if it is unique without them."""
     short = [path.absolute().name for path in paths]
     return [name if short.count(name) == 1 else one_line(path, 200) for name, path in zip(short, paths, strict=True)]

@@ -48,7 +48,7 @@ FIGURES = {"loss": "final loss", "error": "parameter RMSE", "elapsed_s": "time",
 
 
 def run_records(source: SweepRuns) -> list[SweepRunRecord]:
-    """Return the result of each run, in order; runs that have not started are `waiting`."""
+    """Return the result of each run, in order. Runs that have not started are `waiting`."""
     return [_run_record(source, combination, seed) for combination, seed in source.sweep.runs]
 
 
@@ -74,7 +74,7 @@ def _number(value: Any) -> float | None:
 
 
 def _error(run: Run, relative: bool) -> float | None:
-    """Return the final error of all parameters; if `relative`, the root mean square of their relative errors."""
+    """Return the final error of all parameters. If `relative`, return the root mean square of their relative errors."""
     if not relative:
         return _number((run.results.get("rmse") or {}).get("final"))
     pairs = (run.results.get("relative_error") or {}).values()
@@ -111,8 +111,8 @@ def _row(
 
 
 def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBestRecord]:
-    """Return the best combination by loss and by error, if they can be compared. The result is empty for a single
-    combination.
+    """Return the best combination by loss and the best by error, if the combinations can be compared. The result is
+    empty for a single combination.
 
     Combinations with a run that failed or lacks the value are left out, because their other runs are a biased sample.
     """
@@ -134,8 +134,8 @@ def incomparable(sweep: Sweep, others: Sequence[str]) -> str:
 
 
 def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
-    """Return each combination's values by the combination's name. Each value belongs to one seed. Only seeds that all
-    combinations have count.
+    """Return each combination's values by the combination's name. Each value belongs to one seed. The values use only
+    seeds that all combinations have.
 
     Combinations that failed or lack values are left out. The result is empty if the combinations cannot be compared.
     """
@@ -173,7 +173,7 @@ def is_rate(key: str) -> bool:
 
 
 def _ratios(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, Range]:
-    """Return the ratios to the first group, by the name of the best combination of each other group."""
+    """Return each other group's ratio to the first group, by the name of the group's best combination."""
     groups = _groups(sweep, _paired(sweep, runs, of))
     first = next(iter(groups.values()), [])
     found = {name: ratio(rows, first) for name, rows in list(groups.items())[1:]}
@@ -216,12 +216,13 @@ CONFIDENCE = 0.95
 
 
 def ratio(own: Sequence[Sequence[float]], base: Sequence[Sequence[float]]) -> Range | None:
-    """Return the ratio of `own` to `base` with its interval. `own` and `base` use the median over seeds for each row,
-    and then the best row.
+    """Return the ratio of `own` to `base` with its interval. For each of `own` and `base`, the ratio uses the row with
+    the best median over seeds.
 
-    Rows are learning rates, and columns are seeds, the same for all rows. The 95 % interval comes from a bootstrap. The
-    bootstrap resamples the seeds for all rows together. Each resample selects the best rates anew, so the interval
-    includes the selection effect. Returns None for fewer than LEAST_SEEDS seeds, and if a median is 0 or not finite.
+    Rows are learning rates, and columns are seeds. All rows have the same seeds. The 95 % interval comes from a
+    bootstrap. The bootstrap resamples the same seeds in all rows. Each resample selects the best rates anew, so the
+    interval includes the selection effect. Returns None for fewer than LEAST_SEEDS seeds, and if a median is 0 or not
+    finite.
     """
     seeds = min((len(values) for values in (*own, *base)), default=0)
     if seeds < LEAST_SEEDS or not (own and base):
@@ -246,10 +247,11 @@ ALPHA = 0.05
 
 @dataclass(frozen=True)
 class Verdict:
-    """Combination with the lowest median, the combinations `tied` with the best, and the combinations that the best
+    """Best combination (lowest median), the combinations `tied` with the best, and the combinations that the best
     `beats`. `tied` and `beats` are in order of medians.
 
-    `too_few` is true if the number of seeds is too small for the test to find any difference; `enough` seeds suffice.
+    `too_few` is true if the number of seeds is too small for the test to find any difference. `enough` is a sufficient
+    number.
     """
 
     best: str
@@ -288,7 +290,7 @@ def _signed_ranks(one: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _least_p(pairs: int) -> float:
-    """Return the smallest p-value that the test can reach with this number of pairs."""
+    """Return the smallest p-value that the test can reach with `pairs` pairs."""
     return 2.0 ** (1 - pairs)
 
 
@@ -372,7 +374,7 @@ def lines(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
 
 
 def cell(name: str, band: Band | Range | None) -> str:
-    """Return a median or a ratio, with the ends of its band or interval if they differ."""
+    """Return a median or a ratio as text. The ends of its band or interval follow if the ends differ."""
     if band is None:
         return ""
     write = {"elapsed_s": duration, "peak_mib": lambda size: f"{number(size)} MiB"}.get(name, lambda v: number(v, 4))

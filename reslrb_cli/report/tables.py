@@ -40,7 +40,9 @@ def _ratio(ratio: Spread | None) -> str:
 
 
 def conditioning_lines(measured: Conditioning) -> list[str]:
-    """Return one line per parameter, in its units, and the spread between parameters; `-` for unknown values."""
+    """Return one line per parameter, in the parameter's units, and a line with the spread between parameters. Unknown
+    values are `-`.
+    """
     rows: list[tuple[str, ...]] = [
         ("parameter", "entries", "value", "gradient", "noise", "image / unit", "curvature", "length")
     ]
@@ -82,7 +84,7 @@ def cells(record: GradcheckRecord) -> tuple[str, ...]:
 
 
 def parameter_name(record: GradcheckRecord) -> str:
-    """Return the parameter, or `image` or `all` if there is none."""
+    """Return the parameter's name, or `image` or `all` for a record without a parameter."""
     return record.parameter or ("image" if record.kind is Kind.IMAGE else "all")
 
 
@@ -96,12 +98,12 @@ def integrator_name(record: GradcheckRecord) -> str:
 
 
 def reference_name(record: GradcheckRecord) -> str:
-    """Return the reference, and the kind of comparison if it uses equal seeds."""
+    """Return the reference, with a note if the comparison uses equal seeds."""
     return _REFERENCES.get(record.reference, record.reference.value) + _KINDS.get(record.kind, "")
 
 
 def failure_line(record: GradcheckRecord) -> str:
-    """Return a line about a failed comparison: its sides and the size of the deviation."""
+    """Return a line about a failed comparison, with both sides and the size of the deviation."""
     parts = []
     for name, value, limit in (
         ("relative L2", record.relative_l2, record.relative_l2_limit),
@@ -118,7 +120,9 @@ def failure_line(record: GradcheckRecord) -> str:
 
 
 def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
-    """Return a summary: the number of comparisons that hold, the undecided ones with reasons, and the failed ones."""
+    """Return a summary with the number of comparisons that hold, the undecided comparisons with reasons, and the failed
+    comparisons.
+    """
     count = {verdict: sum(record.verdict is verdict for record in records) for verdict in Verdict}
     open_ = [record for record in records if record.holds is None]
     held = f"{count[Verdict.HOLDS]} of {len(records)} comparisons hold, {count[Verdict.FAILS]} fail"
@@ -137,7 +141,7 @@ def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
 
 
 def gradcheck_columns(records: Iterable[GradcheckRecord]) -> Columns:
-    """Return the columns of a table of these records; text columns are as wide as their content."""
+    """Return the columns of a table of `records`. Text columns are as wide as their content."""
     texts = zip(*(cells(record)[:3] for record in records), strict=True)
     widths = [max(map(len, (title, *column))) for title, column in zip(HEAD, texts, strict=False)]
     return Columns(HEAD, (*widths, 5, 17, 11, 11, 8, 8, 10, 0), "<<<>")

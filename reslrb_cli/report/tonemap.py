@@ -39,9 +39,9 @@ def exposure_for(image: Array | None, lamps: Array | None = None) -> float:
     """Return the exposure, rounded to two digits, that makes an image (H, W, C) visible, or 1 if none is needed.
 
     `lamps` (H, W), boolean, marks the pixels that see a lamp. Pixels that see a lamp can be thousands of times brighter
-    than the rest of the image, and are clipped. Without clipping, the rest of the image would be nearly black. The
-    level has two criteria. The pixel share alone would clip a caustic, because a caustic concentrates much of the light
-    in few pixels. The share of light alone, including fireflies, would darken a noisy image.
+    than the rest of the image. The exposure clips these pixels. Without clipping, the rest of the image would be nearly
+    black. The level has two criteria. The pixel share alone would clip a caustic, because a caustic concentrates much
+    of the light in few pixels. The share of light alone, with fireflies included, would make a noisy image too dark.
     """
     level = 0.0 if image is None else _level(image)
     if image is not None and lamps is not None and lamps.shape == image.shape[:2] and (~lamps).mean() >= LEAST_OTHERS:
@@ -69,8 +69,8 @@ def _brightest(image: Array) -> Array:
 
 
 def shown_exposures(views: Sequence[Mapping[str, Any]] | None) -> dict[str, float]:
-    """Return the exposures of a manifest's `views`, by the suffix of their image names. The result is empty for older
-    runs.
+    """Return the exposure of each of a manifest's `views`. The keys are the suffixes of the image names. The result is
+    empty for older runs.
     """
     found = {}
     for view in views or ():
@@ -154,13 +154,15 @@ def signed_end(values: Array) -> float:
 
 
 def colored(values: Array, signed: bool = False) -> bytes:
-    """Return a PNG of values (H, W) in [0, 1], or [-1, 1] if `signed`, in the colours of their scale."""
+    """Return a PNG of values (H, W) in the colours of their scale. The values are in [0, 1], or in [-1, 1] if
+    `signed`.
+    """
     places = np.nan_to_num(values)
     return as_png(color_map(signed)(np.clip((places + 1) / 2 if signed else places, 0.0, 1.0), bytes=True))
 
 
 def as_png(pixels: Array) -> bytes:
-    """Return a PNG of `pixels` (H, W, C), which are bytes."""
+    """Return a PNG of the bytes `pixels` (H, W, C)."""
     from matplotlib.image import imsave
 
     buffer = io.BytesIO()

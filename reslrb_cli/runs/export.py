@@ -156,10 +156,10 @@ def exposure_line(run: Path) -> str:
 def keep_solid(
     config: Config, scene: mi.Scene, params: mi.SceneParameters, sensor: int, run: Path, image: Array, target: Array
 ) -> None:
-    """Write the fabrication data of a run's solid (`fabrication.json`) and its picture into the run folder.
+    """Write the fabrication data (`fabrication.json`) and the pictures of a run's solid into the run folder.
 
-    `params` are the current scene parameters. `image` and `target` (H, W, C) are the image of sensor number `sensor`
-    and its target. Raises ConfigError if there is no solid between the faces.
+    `params` are the current scene parameters. `image` and `target` (H, W, C) are the image and the target of sensor
+    number `sensor`. Raises ConfigError if there is no solid between the faces.
     """
     assert config.fabrication is not None
     sheets, solid = read_solid(config, config.fabrication, params)
@@ -308,7 +308,8 @@ def bench_of(
 def measure_loss(
     config: Config, scene: mi.Scene, sensor: int, integrator: dict[str, object], target: Array
 ) -> tuple[Array, dict[str, Any]]:
-    """Return the scene's image and its mean squared difference from `target`, reproducible from the exported scene.
+    """Return the scene's image and the image's mean squared difference from `target`. The exported scene reproduces
+    both.
 
     The image is rendered by Mitsuba's own `integrator` with independent samples. A run may render its images with
     low-discrepancy samples. Low-discrepancy samples have less noise, so the run's loss for the same face is lower.
@@ -327,8 +328,8 @@ def solid_files(
     numbers: dict[str, Any],
     pictures: dict[str, Array],
 ) -> dict[str, Callable[[Path], object]]:
-    """Return a writer for each file of a solid in an exported folder, by file name. If lib3mf is missing, there is no
-    3MF file.
+    """Return a writer for each file of a solid. The keys are the file names in the exported folder. If lib3mf is
+    missing, there is no 3MF file.
 
     `numbers` and `pictures` are the content of the sheet for the workshop.
     """

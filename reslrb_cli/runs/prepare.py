@@ -100,7 +100,7 @@ def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], r
     """Return the changed settings. Settings that only determine the run's place do not count as changes.
 
     Raises ConfigError if a setting must not change. The error names the first few such settings. The error is located
-    at the first such setting, in the source that `blame` returns for this setting.
+    at the first such setting. `blame` returns the source of this setting.
     """
     wrong = [key for key in found if not MAY_CHANGE.fullmatch(key)]
     if wrong:
@@ -199,7 +199,7 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class SavedResults:
-    """Results in a checkpoint, in addition to the records of the iterations; `last` is the newest record."""
+    """Results in a checkpoint, in addition to the records of the iterations. `last` is the newest record."""
 
     images: Images
     certainty: Noted
@@ -212,7 +212,7 @@ class SavedResults:
 
 
 class RunProgress:
-    """State and results of a run of `problem`, whose parameters must have their initial values at construction.
+    """State and results of a run. The parameters of `problem` must have their initial values at construction.
 
     `state` is the state after the last complete iteration, without any part of the current one.
     """
@@ -240,8 +240,8 @@ class RunProgress:
 
     @property
     def shared(self) -> SharedTime | None:
-        """Time of shards that workers computed, including the time before the run was resumed, or None without
-        workers.
+        """Time that workers have spent on shards, or None without workers. The time before the run was resumed counts
+        too.
         """
         if self._spent is None:
             return self._shared
@@ -249,7 +249,7 @@ class RunProgress:
 
     @property
     def files(self) -> dict[str, str]:
-        """Digests of the experiment's files when the run started, by the keys that name the files."""
+        """Digests of the experiment's files at the start of the run. The keys are the settings that name the files."""
         return self._settled.files
 
     @property
@@ -267,8 +267,8 @@ class RunProgress:
         self.state = state
 
     def _counts(self, iteration: int) -> bool:
-        """True if this iteration and the previous one both used the run's own problem. The previous iteration set the
-        values of this one.
+        """True if the current iteration and the previous iteration both used the run's own problem. The values of the
+        current iteration come from the previous iteration.
         """
         config = self.problem.config
         begun = (max(iteration - 1, 0), iteration)
@@ -320,7 +320,9 @@ class RunProgress:
     # --- checkpoints --------------------------------------------------------------------------------------------------
 
     def save(self, folder: Path) -> int:
-        """Save the state after the last complete iteration in `folder`; return the iteration count. Raises OSError."""
+        """Save the state after the last complete iteration in `folder`, and return the iteration count. Raises
+        OSError.
+        """
         save_checkpoint(folder, self.done, {}, *self._entries(self.state.on_file(self.stages.at(self.state.stage))))
         return self.done
 
@@ -332,7 +334,9 @@ class RunProgress:
         save_checkpoint(folder, begun.iteration, {}, *found, name=NONFINITE_FILE_NAME)
 
     def _entries(self, state: State) -> tuple[Arrays, dict[str, Any]]:
-        """Return the arrays and the other values of a checkpoint of `state`, in the form of `tree.entries`."""
+        """Return the arrays and the other values that a checkpoint stores for `state`, in the form of
+        `tree.entries`.
+        """
         met = SavedResults(
             self.results.images["initial"], self.certainty.noted, self.best.least, self.last, self.shared,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
@@ -342,7 +346,7 @@ class RunProgress:
     def restore(self, stored: Stored, records: Sequence[Record]) -> None:
         """Restore the state from a checkpoint and the records of all iterations before it.
 
-        Raises ConfigError, located in the file, if the content does not fit this run.
+        Raises a ConfigError that names the file if the content does not fit the run.
         """
         problem, met = self.problem, stored.read(SavedResults)
         self.state = load(self.stages.at(stored.read(State).stage), stored, problem)

@@ -96,10 +96,10 @@ class Recording:
     def records(self, stop: Callable[[], bool] = lambda: False) -> Generator[Record, None, None]:
         """Yield the record of each iteration, then complete the folder and set `status`.
 
-        Iteration stops at the last iteration, when `stop()` is true, or when the generator is closed. In all cases the
-        folder then has a checkpoint, the parameters, the report, and a manifest with the outcome. If the run did not
-        fail, it also has the final images. Raises the error that ended the run. If the folder could not be written to,
-        this is a MachineError.
+        Iteration stops at the last iteration, when `stop()` is true, or when the generator is closed. In all cases, the
+        folder finally has a checkpoint, the parameters, the report, and a manifest with the outcome. If the run did not
+        fail, the folder also has the final images. Raises the error that ended the run. The error is a MachineError if
+        the run could not write to the folder.
         """
         self._stop = stop
         status: Status = Status.FAILED
@@ -192,14 +192,14 @@ class Recording:
             logger.log(level, f"scale {scale}: {line}")
 
     def _note_memory(self, peak: float) -> None:
-        """Record the memory use if there is a budget; warn the first time it exceeds the budget."""
+        """Record the memory use if there is a budget. Warn when the memory use first exceeds the budget."""
         if (plan := self.problem.memory) is not None:
             if (warning := plan.check(peak)) is not None:
                 logger.warning(warning)
             self.manifest.memory = plan.to_json()
 
     def _on_nonfinite(self, found: Findings) -> None:
-        """Save the state before the first step with a non-finite value, and explain how to inspect it."""
+        """Save the state before the first step with a non-finite value, and explain how to inspect the state."""
         if self._saved_nonfinite:
             return
         self.course.save_begun(self.folder.checkpoint)
@@ -360,7 +360,9 @@ class Recording:
         return f"saved: the state after {self._saved} of {self.done} iterations, in {self.folder.checkpoint}"
 
     def _save_last_checkpoint(self) -> None:
-        """Save the state unless it is saved already, so that `previous.npz` remains an earlier state."""
+        """Save the state unless it is already saved. A second save would replace the earlier state in
+        `previous.npz`.
+        """
         if self._saved != self.done or not (self.folder.checkpoint / STATE_FILE).exists():
             self._save_checkpoint()
 

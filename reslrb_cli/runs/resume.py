@@ -49,8 +49,8 @@ class OpenedRun:
     """Run to be resumed: its locked folder, its manifest, its stored state and the new configuration.
 
     `changed` holds the settings that differ from those at the start of the run. If `elsewhere` is true, the run
-    continues in a new folder and this one stays unchanged. `records` are the records of the iterations, which take
-    `size` bytes. `said` collects warnings.
+    continues in a new folder, and the old folder stays unchanged. `records` are the records of the iterations, which
+    take `size` bytes. `said` collects warnings.
     """
 
     folder: RunFolder
@@ -71,7 +71,7 @@ class OpenedRun:
 
     @property
     def is_done(self) -> bool:
-        """Whether the run is complete under the new configuration."""
+        """True if the run is complete under the new configuration."""
         is_finished = self.manifest.get("status") == Status.FINISHED
         return is_finished and (self.config.run.iterations == self.iteration or self.has_stopped)
 
@@ -82,9 +82,9 @@ class OpenedRun:
         return bool(self.stored.read(State).stopped) and not any(key.startswith(ends) for key in self.changed)
 
     def done_line(self, option: str, equals: str) -> str:
-        """Return a line that says that the run is complete and which setting would continue it.
+        """Return a line that the run is complete. The line names the setting that would continue the run.
 
-        `option` and `equals` are the parts of the syntax with which the user changes a setting.
+        `option` and `equals` are parts of the syntax for changing a setting.
         """
         iterations = self.config.run.iterations
         stopped = iterations > self.iteration and self.stored.read(State).stopped
@@ -135,7 +135,8 @@ class OpenedRun:
 
     @contextlib.contextmanager
     def _take_over(self, manifest: Manifest) -> Iterator[RunFolder]:
-        """Yield the locked folder in which the run continues, with `manifest` and the metrics up to its state.
+        """Yield the locked folder in which the run continues. The folder has `manifest` and the metrics up to the run's
+        state.
 
         Raises ConfigError and MachineError if the folder cannot be written to.
         """
@@ -236,7 +237,9 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
 def _read_config(
     run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override], text: str
 ) -> tuple[Config, Config]:
-    """Return the configuration for resuming, with and without overrides. `text` is the configuration in the state."""
+    """Return two configurations for resuming, one with and one without overrides. `text` is the configuration in the
+    state.
+    """
     if isinstance(wanted, Config):
         return changed(wanted, overrides), wanted
     own = run / "config.yaml"

@@ -25,7 +25,7 @@ def setup_of(
 ) -> dict[str, Any] | None:
     """Return the set-up of the solid in `scene`, or None if no light reaches the solid, or `sensor` sees no receiver.
 
-    `sheet` is the front face, and `target` (H, W) the luminance that `sensor` should see. The result has these entries.
+    `sheet` is the front face. `target` (H, W) is the luminance that `sensor` should see. The result has these entries.
 
     - `kind` is `lens` or `mirror`. `face_size` and `picture_size` are widths and heights.
     - `receiver_distance` is the distance from the centre of the face (x = y = z = 0) to the centre of the receiver.
@@ -83,7 +83,7 @@ def _normal(scene: mi.Scene, sensor: mi.Sensor, receiver: mi.Shape) -> Array | N
 
 
 def _middles(sensor: mi.Sensor, target: Array, center: Array, normal: Array) -> list[Array]:
-    """Return the points (3,) on the plane of the receiver that show the middles of the picture's four edges.
+    """Return the points (3,) on the receiver's plane that appear at the middles of the picture's four edges.
 
     The order is left, top, right, bottom, as on the film. The picture consists of the nonzero pixels of `target` (H,
     W).
@@ -119,8 +119,8 @@ def _light(scene: mi.Scene, solid: list[mi.Shape]) -> tuple[Array, Array] | None
 
 
 def beam(points: Array, directions: Array, size: float) -> tuple[Array, Array | None]:
-    """Return the mean direction (3,) of rays, and the position (3,) of the lamp that they leave, or None for parallel
-    light.
+    """Return the mean direction (3,) of the rays, and the position (3,) of their lamp. For parallel light, the position
+    is None.
 
     Rays go through `points` (n, 3) along unit `directions` (n, 3). `size` (mm) is the size of the face. The light of a
     wide and distant lamp, such as the sun, counts as parallel, because the mean direction is the same all over the

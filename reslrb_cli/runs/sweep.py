@@ -70,7 +70,7 @@ class Varied:
 
 @dataclass(frozen=True)
 class Plan:
-    """Checked sweep. `configs` maps the names of the combinations to their configurations with the first seed."""
+    """Checked sweep. `configs` maps each combination's name to its configuration with the first seed."""
 
     sweep: Sweep
     configs: dict[str, Config]
@@ -98,7 +98,7 @@ def parse_vary(text: str) -> Varied:
 def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[str], allow_code: bool = False) -> Plan:
     """Make every combination of the varied settings, check its configuration, and plan `seeds` seeds for each.
 
-    The seeds start at the configuration's `run.seed`. Raises ConfigError, located by the first wrong setting, or by the
+    The seeds start at the configuration's `run.seed`. Raises a ConfigError that names the first wrong setting, or the
     first setting with code that is not allowed. Also raises it for a missing scene file.
     """
     varied = [parse_vary(text) for text in vary]
@@ -141,8 +141,8 @@ def _with_chosen(
 ) -> Config:
     """Return the experiment with one value of each varied setting. Raises ConfigError.
 
-    If the value of `integrator` is a string, the string names a method, as in `convergence --integrators`. It keeps the
-    depth and the shared options of the experiment's own integrator.
+    If the value of `integrator` is a string, the string names a method, as in `convergence --integrators`. The named
+    method keeps the depth and the shared options of the experiment's own integrator.
     """
     methods = [each for each in chosen if each.location == ("integrator",) and isinstance(each.value, str)]
     others = [each for each in chosen if each not in methods]
@@ -156,7 +156,9 @@ def _with_chosen(
 
 
 def _names(varied: Sequence[Varied]) -> list[str]:
-    """Return the name of each combination, in the order of the product. Names are unique regardless of case."""
+    """Return the name of each combination, in the order of the Cartesian product. Names are unique regardless of
+    case.
+    """
     short = short_keys([each.key for each in varied])
     names: list[str] = []
     taken: set[str] = set()
@@ -250,7 +252,7 @@ def _unwritable(folder: Path, error: OSError) -> ConfigError | MachineError:
 
 
 def _begin(folder: Path, plan: Plan) -> None:
-    """Write the configurations, then the plan. A written plan therefore implies that all configurations exist."""
+    """Write the configurations, then the plan. If the plan is written, all configurations therefore exist."""
     # a sweep that was killed at its start has written only configurations
     if others := sorted(path.name for path in folder.iterdir() if path.name != "configs"):
         reason = f"{folder} contains {one_line(others[0], 60)!r}, but no sweep; give a new or empty folder"
@@ -269,7 +271,7 @@ def _put(text: bytes, file: IO[bytes]) -> None:
 
 
 def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
-    """Raise ConfigError, which names the first difference, if the sweep in `folder` differs from the plan."""
+    """Raise ConfigError if the sweep in `folder` differs from the plan. The error names the first difference."""
     advice = "give another folder with -o, or continue that sweep with --resume"
     there = [(each.name, each.settings) for each in kept.combinations]
     here = [(each.name, each.settings) for each in plan.sweep.combinations]
@@ -295,7 +297,7 @@ def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
 
 
 def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
-    """Raise ConfigError if a file of the sweep has changed, or if it would run code that is not allowed."""
+    """Raise ConfigError if a file of the sweep has changed, or if the sweep would run code that is not allowed."""
     for file, digest in (kept.codes | kept.files).items():
         if file in kept.codes and not allowed:
             reason = f"would run the code of {file} with all your rights; --allow-code permits it"
@@ -324,15 +326,15 @@ def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Swe
 
 
 def is_left(folder: Path, sweep: Sweep, name: str) -> bool:
-    """Whether a run of the sweep must still be started or resumed."""
+    """True if a run of the sweep must still be started or resumed."""
     return name not in sweep.failures and (read_manifest(folder / name) or {}).get("status") != Status.FINISHED
 
 
 def command(folder: Path, sweep: Sweep, combination: Combination, seed: int) -> list[str]:
-    """Return the arguments for `reslrb` that start one run, or resume it if it was interrupted.
+    """Return the arguments for `reslrb` that start one run, or that resume an interrupted run.
 
     User code is allowed, because `opened` has checked the permission. Waits for a killed process that still holds the
-    run folder. Raises ConfigError, located in the run folder, if a process keeps using the folder.
+    run folder. Raises a ConfigError that names the run folder if a process keeps using the folder.
     """
     folder, name = folder.absolute(), run_name(combination, seed)
     allowed = ["--allow-code"] if sweep.codes else []

@@ -85,7 +85,7 @@ def add_tolerances(
 
 
 def original_of(plan: Fabrication, wanted: Array) -> Array | None:
-    """Return the luminance (H, W) of the picture before its dark parts were raised, or None if it is unknown."""
+    """Return the luminance (H, W) of the picture before its dark parts were raised, or None for an unknown picture."""
     if plan.picture is None:
         return None
     picture = luminance(read_image(plan.picture))
@@ -94,7 +94,7 @@ def original_of(plan: Fabrication, wanted: Array) -> Array | None:
 
 
 def as_picture(image: Array, original: Array, inside: tuple[slice, slice]) -> Array:
-    """Return an image (H, W) cropped to the picture, as (H, W, 1), with the mean brightness of the `original`.
+    """Crop an image (H, W) to the picture. Return the crop (H, W, 1), scaled to the mean brightness of the `original`.
 
     A value of 1 is the brightest part of the original.
     """

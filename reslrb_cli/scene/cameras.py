@@ -41,7 +41,7 @@ _NERF, _COLMAP = np.diag([-1.0, 1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0]
 
 @dataclass(frozen=True)
 class Camera:
-    """Camera as a Mitsuba sensor: `focal` and `center` (x, y) are in pixels, `to_world` is (4, 4)."""
+    """Camera as a Mitsuba sensor. `focal` and `center` (x, y) are in pixels, and `to_world` is (4, 4)."""
 
     name: str
     image: Path
@@ -52,7 +52,7 @@ class Camera:
 
 
 def read_cameras(file: Path) -> list[Camera]:
-    """Return the cameras of a file, in order. Raises ConfigError, located in the file, if entries are missing or
+    """Return the cameras of a file, in order. Raises a ConfigError that names the file if entries are missing or
     unsupported.
     """
     cameras = _nerf(file) if file.suffix.lower() == ".json" else _colmap(file)
@@ -62,7 +62,9 @@ def read_cameras(file: Path) -> list[Camera]:
 
 
 def replace_sensors(description: Description, cameras: list[Camera]) -> None:
-    """Replace the sensors of a scene by cameras, with the filter and the sampler of its first sensor."""
+    """Replace the sensors of a scene by cameras. The cameras get the filter and the sampler of the scene's first
+    sensor.
+    """
     root = description.root
     own = [child for child in root.children if child.tag == "sensor"]
     root.children = [child for child in root.children if child.tag != "sensor"]
@@ -145,7 +147,7 @@ def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
 
 
 def _image(path: Path) -> Path:
-    """Return the path of an image; Blender's files omit its suffix."""
+    """Return the path of an image. Blender's files omit the suffix of the path."""
     if path.suffix or path.exists():
         return path
     names = [path.with_suffix(f".{name.strip().lower()}") for name in re.split(r",| or ", FORMATS)]

@@ -36,7 +36,7 @@ _FEW = 4
 
 @dataclass(frozen=True)
 class Value:
-    """Current value of a parameter: its `numbers`, if there are few, and their `mean`, minimum and maximum."""
+    """Current value of a parameter: its `mean`, its minimum, its maximum, and its `numbers` if there are few."""
 
     numbers: list[float] | None
     mean: float
@@ -114,8 +114,8 @@ def halo(node: Any, value: Any) -> int:
 
 
 def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
-    """Return the shape of a parameter as a NumPy array, without its `halo`. A single number, or a missing value, has
-    shape ().
+    """Return the shape that a parameter has as a NumPy array, without its `halo`. A single number, or a missing value,
+    has shape ().
     """
     if value is None or not dr.is_array_v(value):
         return ()
@@ -126,7 +126,7 @@ def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
 
 
 def _current_value(params: Any, key: str) -> Value | None:
-    """Return the value of one entry of a `mi.traverse` result, or None if it is no number."""
+    """Return the value of one `mi.traverse` entry, or None if the value is no number."""
     value = entry_value(params, key)
     array = as_numbers(value)
     if array is None or array.size == 0:
@@ -163,7 +163,7 @@ def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
 
 
 def entry_value(params: Any, key: str) -> Any:
-    """Return the value of an entry of a `mi.traverse` result, or None if there is none, as for an optional texture.
+    """Return the value of a `mi.traverse` entry, or None for a missing value such as an optional texture.
 
     `params[key]` cannot replace the function. `params[key]` would mark every entry as changed for `update()`, and fails
     for missing values.
@@ -173,7 +173,7 @@ def entry_value(params: Any, key: str) -> Any:
 
 
 def parameter_kind(params: Any, key: str) -> str:
-    """Return the type of the owner of a `mi.traverse` entry (`ParameterInfo.kind`)."""
+    """Return the owner type of a `mi.traverse` entry (`ParameterInfo.kind`)."""
     node, name = params.properties[key][2], key.rpartition(".")[2]
     is_attribute = name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
     while node is not None:
@@ -214,7 +214,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
 
 
 def _storage_bits(value: Any) -> int | None:
-    """Return the bits of one entry of a JIT array that could be a parameter. For other values, return None."""
+    """Return the number of bits per entry of a JIT array that could be a parameter. For other values, return None."""
     bits = {dr.VarType.UInt8: 8, dr.VarType.Float16: 16, dr.VarType.Float32: 32, dr.VarType.Float64: 64}
     is_number = dr.is_jit_v(value) and dr.is_arithmetic_v(value) and not dr.is_matrix_v(value)
     return bits.get(dr.type_v(value)) if is_number else None
@@ -222,11 +222,11 @@ def _storage_bits(value: Any) -> int | None:
 
 @dataclass(frozen=True)
 class SensorSummary:
-    """Sensor: its film in pixels (`crop` is offset and size), its view, and the needs of light tracing.
+    """Sensor with its film in pixels, its view, and the needs of light tracing. `crop` is offset and size.
 
     `obstacle` is the reason why light tracing cannot render the scene for the sensor, or None. `camera_obstacle` is the
-    reason why camera paths (`prb`) cannot render the scene for the sensor, or None. `view` is None if the reason is a
-    part of the scene instead of the view.
+    reason why camera paths (`prb`) cannot render the scene for the sensor, or None. `view` is None if an unsupported
+    part of the scene is the reason.
     """
 
     index: int
@@ -245,7 +245,7 @@ class SensorSummary:
 
 @dataclass(frozen=True)
 class MovableSummary:
-    """Shape or emitter by its id, and the parameters that can move it: `motion`, `heightmap`."""
+    """Id of a shape or emitter, and the parameters that can move the object: `motion`, `heightmap`."""
 
     id: str
     by: list[str]

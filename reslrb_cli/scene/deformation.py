@@ -1,8 +1,8 @@
 """Scene parameters as functions of recovered values: motions of shapes and emitters, and heightmaps on meshes.
 
-Obstacles and movables: some shapes and emitters have derivatives with respect to their position. For all others, a
-reason explains the missing derivatives. Objects of a motion or a heightmap are found by id, together with the scene
-parameter of their position.
+Obstacles and movables: some shapes and emitters have derivatives with respect to their position. For all other shapes
+and emitters, a reason explains the missing derivatives. Objects of a motion or a heightmap are found by id, together
+with the scene parameter of their position.
 
 Surroundings: emitters without a position (a constant sky, parallel light) send their rays through a sphere around the
 scene. Mitsuba sets this sphere when the scene is loaded. Shapes that later leave the sphere would be dark. The sphere
@@ -14,10 +14,10 @@ and s the scale.
 
     M(p) = c + t + Rz Ry Rx s (p - c)
 
-M is applied after the own `to_world` of an analytic shape, or of an emitter without a surface. For emitters, s scales
-only the position. The scene gets values without a graph (leaves). A step adds its gradient to the leaves. `collect`
-propagates the sum to the recovered values once, for any number of views, batches and passes. In forward mode, `push`
-propagates tangents the other way.
+M is applied after the original `to_world` of an analytic shape, or of an emitter without a surface. For emitters, s
+scales only the position. The scene parameters get values without a graph (leaves). A step adds its gradient to the
+leaves. `collect` propagates the summed gradient to the recovered values once, for any number of views, batches and
+passes. In forward mode, `push` propagates tangents from the recovered values to the scene.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ _PLACED = ("to_world", "vertex_positions", "position")
 
 
 def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
-    """Return why the parameter `key` of a shape, or of an emitter without a surface, has no derivative, or None if it
-    has one.
+    """Return the reason why the parameter `key` of a shape or a surfaceless emitter has no derivative. Return None if
+    there is a derivative.
 
     The parameter determines the position or the direction of the object.
     """
@@ -213,13 +213,13 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion about the point `pivot`. `names` are the names of its values, by part."""
+    """Motion about the point `pivot`. `names` maps each part of the motion to the name of its value."""
 
     pivot: Sequence[float]
     names: Mapping[str, str]
 
     def matrix(self, values: Mapping[str, Any], scaled: bool = True) -> mi.AffineTransform4f:
-        """Return M, or only its rotation if not `scaled`."""
+        """Return M, or only the rotation of M if `scaled` is false."""
         transform = mi.AffineTransform4f
         pivot = mi.Vector3f(self.pivot)
         if "translation" in self.names:
@@ -238,7 +238,8 @@ class Motion:
 
 @dataclass
 class _Moved:
-    """Scene parameter that is a function: its initial value, its motion, and its value with and without graph.
+    """Scene parameter that depends on recovered values: its initial value, its motion, and its current value with and
+    without graph.
 
     `heightmap` is the name of the texture (height, width, 1) that displaces a mesh along its own `normals`.
     """
@@ -254,7 +255,7 @@ class _Moved:
 
 
 def _corners(uv: mi.Point2f, width: int, height: int) -> tuple[list[mi.UInt32], list[mi.Float]]:
-    """Return indices and weights of the four texels around each of `uv`. Row 0 is at v = 0, as in Mitsuba's
+    """Return indices and weights of the four texels around each point of `uv`. Row 0 is at v = 0, as in Mitsuba's
     textures.
     """
     x = dr.clip(uv.x * width - 0.5, 0, width - 1)
@@ -314,8 +315,8 @@ class Deformation:
         self.quantities[name] = "length"
 
     def laid_over(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions (N, 3) and texture coordinates (N, 2) of the undeformed first mesh of the heightmap
-        `name`.
+        """Return positions (N, 3) and texture coordinates (N, 2) of the first mesh with the heightmap `name`, without
+        deformation.
         """
         moved = next(each for each in self._moved.values() if each.heightmap == name)
         return np.array(moved.base).T, np.array(moved.texcoords).T
@@ -391,7 +392,7 @@ class Deformation:
         return to().translate(there) @ turned @ to().translate(-place) @ base
 
     def _heights(self, moved: _Moved, values: mi.TensorXf) -> mi.Float:
-        """Return h at each vertex, bilinear between the centres of the texels."""
+        """Return h at each vertex, interpolated bilinearly between the centres of the texels."""
         height, width = values.shape[:2]
         place = (moved.item.key, width, height)
         if place not in self._corners:
@@ -428,7 +429,7 @@ class _Lookup(dr.CustomOp):
 
 
 def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
-    """Return the normals of a mesh's vertices: its own, or the area-weighted means of adjacent faces."""
+    """Return a mesh's vertex normals. A mesh without vertex normals gets area-weighted means over adjacent faces."""
     if mesh.has_vertex_normals():
         return dr.normalize(dr.unravel(mi.Normal3f, mesh.vertex_normals_buffer()))
     faces = np.array(mesh.faces_buffer()).reshape(-1, 3)

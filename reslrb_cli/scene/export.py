@@ -1,7 +1,7 @@
 """Export of a scene with the current values of its parameters into a new folder.
 
-The values are written into the description that the scene was built from, with meshes and images in files beside it.
-Other files are copied. Finally, Mitsuba must read the same values back.
+The values go into the description that the scene was built from. Meshes and images go into files beside the
+description. Other files are copied. Finally, Mitsuba must read the same values back.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def number(owner: Element, name: str, value: float) -> Element:
 
 
 def colour(owner: Element, name: str, value: Array, bounded: bool) -> Element:
-    """Return an element for a colour (3,) or a grey. If `bounded`, Mitsuba's <rgb> must be from 0 to 1."""
+    """Return an element for a colour (3,) or a grey. If `bounded`, Mitsuba's <rgb> accepts only values from 0 to 1."""
     if value.size == 1:
         return number(owner, name, float(value.ravel()[0]))
     if not bounded or bool(((value >= 0) & (value <= 1)).all()):
@@ -57,7 +57,7 @@ def colour(owner: Element, name: str, value: Array, bounded: bool) -> Element:
 
 
 def triple(owner: Element, tag: str, name: str, value: Array) -> Element:
-    """Return an element for three numbers: a <point> or a <vector>, by `tag`."""
+    """Return an element for three numbers. `tag` selects a <point> or a <vector>."""
     x, y, z = numbers(value).split()
     return owner.new(tag, name=name, x=x, y=y, z=z)
 
@@ -84,10 +84,10 @@ _CONDUCTORS = ("conductor", "roughconductor")
 
 
 class Replacing:
-    """Description of a scene that gets the values of `params`.
+    """Scene description that gets the values of `params`.
 
-    `writers` map paths in the exported folder, with `/`, to functions that write the file to a new path. Errors name
-    `source`.
+    `writers` maps paths in the exported folder (with `/`) to functions. Each function writes its file to a new path.
+    Errors name `source`.
     """
 
     def __init__(self, description: Description, params: mi.SceneParameters, source: object) -> None:
@@ -249,12 +249,12 @@ def export_scene(
     beside: Mapping[str, Callable[[Path], object]] | None = None,
     note: str = "",
 ) -> None:
-    """Write `description`, with the values of `params` for `keys`, and an integrator, to `folder`.
+    """Write `description` and an integrator to `folder`. The description gets the values of `params` for `keys`.
 
-    `params` belong to a scene that was built from the description, which is modified. `integrator` has its type and
-    options. `beside` maps names of further files to their writers. `note` is a comment at the top of the scene. The
-    folder appears once it is complete and Mitsuba has read the same values back. Raises ConfigError, located in
-    `source` and the key, if a value cannot be expressed. Raises OSError.
+    `params` belong to a scene that was built from `description`. The function modifies `description`. `integrator` has
+    its type and options. `beside` maps names of further files to their writers. `note` is a comment at the top of the
+    scene. The folder appears once it is complete and Mitsuba has read the same values back. Raises a ConfigError that
+    names `source` and the key if a value cannot be expressed. Raises OSError.
     """
     replacing, root = Replacing(description, params, source), description.root
     for key in keys:

@@ -1,4 +1,4 @@
-"""Position and size of a scene and its parts, which can cause a loss of light by single precision or clip planes."""
+"""Checks for scenes or parts whose position or size loses light through single precision or clip planes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _NAMED = 2
 
 
 def doubts(scene: Any) -> list[str]:
-    """Return problems with the place or the size of a scene or its parts, in words."""
+    """Return descriptions of problems with the place or the size of a scene or its parts."""
     return [loss for loss in (_lost_light(scene), _thin_glass(scene), _coincident(scene)) if loss is not None]
 
 
@@ -61,7 +61,8 @@ def _lost_light(scene: Any) -> str | None:
 
 
 def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
-    """Return whether any object may be between a sensor and its near clip plane, and beyond its far clip plane.
+    """Return whether objects may lie between a sensor and its near clip plane, and whether objects may lie beyond its
+    far clip plane.
 
     The sensor is perspective or thin-lens. Between the sensor and its near plane, only objects in the sensor's view
     count. The test uses bounding boxes, and triangles near the sensor. A result of false is certain, and a result of
@@ -87,8 +88,8 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
 
 
 def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, half: np.ndarray) -> bool:
-    """Whether a shape may touch a box. The box has its middle and half sizes in the coordinates of `axes` (columns) and
-    `eye`.
+    """Whether a shape may touch a box. `middle` and `half` are the box's centre and half sizes in the coordinates of
+    `axes` (columns) and `eye`.
     """
     low, high = bounds(shape)
     centre, extent = (low + high) / 2, (high - low) / 2
@@ -135,7 +136,7 @@ _Twins = dict[tuple[int, int], tuple[int, int]]
 
 
 def _twin_faces(shapes: Sequence[Any]) -> _Twins:
-    """Return the coincident mesh triangles for which the choice of the triangle that a ray meets matters."""
+    """Return the coincident mesh triangles where it matters which triangle a ray meets."""
     meshes = [index for index, shape in enumerate(shapes) if shape.is_mesh() and shape.face_count()]
     if not meshes:
         return {}
@@ -172,7 +173,7 @@ def _twin_faces(shapes: Sequence[Any]) -> _Twins:
 
 
 def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
-    """Return the coincident disks and spheres for which the choice of the shape that a ray meets matters."""
+    """Return the coincident disks and spheres where it matters which shape a ray meets."""
     before: dict[tuple[str, bytes], list[int]] = {}
     found: _Twins = {}
     for index, shape in enumerate(shapes):
@@ -194,9 +195,9 @@ def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
 
 
 def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
-    """True if the choice of the face that a ray meets matters, for two coincident faces.
+    """True if it matters which of two coincident faces a ray meets.
 
-    `turned` tells whether their normals are opposite, and `bent` whether their shading normals differ from their
+    `turned` tells whether the faces' normals are opposite. `bent` tells whether their shading normals differ from their
     normals.
     """
     if one.is_emitter() or other.is_emitter() or one.bsdf() != other.bsdf():
@@ -240,7 +241,7 @@ def _thin_glass(scene: mi.Scene) -> str | None:
     """Return the problem of a scene in which light passes two surfaces that nearly touch, or None.
 
     Rays from the lights go straight through transparent surfaces. The distance of two surfaces is measured from both
-    sides, because a ray that leaves the first may miss the second.
+    sides. A ray that leaves the first surface may miss the second surface.
     """
     passing = int(mi.BSDFFlags.Transmission)
     if not any(int(bsdf.flags()) & passing for bsdf in SceneGraph.of(scene).surface_bsdfs()):

@@ -1,7 +1,7 @@
 """Files that an experiment reads, and digests of their contents.
 
-Stored results of an experiment (decisions, measurements, the state of a run) are valid only for these contents. Each
-digest reads its whole file, because times and sizes could hide a change.
+Stored results, such as decisions, measurements or a run's state, are valid only for these file contents. Each digest
+reads its whole file, because times and sizes could hide a change.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _PART = 2**20
 
 
 def option_texts(options: Mapping[str, Any]) -> dict[str, str]:
-    """Return the values of a scene's variables as its file spells them."""
+    """Return the values of a scene's variables, spelled as in the scene file."""
     return {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in options.items()}
 
 
 def files_of(config: Config) -> dict[str, Path]:
     """Return every file that an experiment reads. The keys are the settings that lead to the files.
 
-    A setting may lead to more than one file: `scene.file (images/wood.png)`. Missing files are left out; loading the
-    experiment reports them. Raises ConfigError if a scene, cameras or a run cannot be read.
+    A setting may lead to several files, with keys such as `scene.file (images/wood.png)`. Missing files are left out.
+    Loading the experiment reports missing files. Raises ConfigError if a scene, cameras or a run cannot be read.
     """
     settings = config.model_dump(exclude={"run"})
     found = {key: path for key, path in _paths(settings, "") if path.exists()}
@@ -69,7 +69,7 @@ def _paths(value: Any, key: str) -> Iterator[tuple[str, Path]]:
 
 
 def file_digests(files: Mapping[str, Path]) -> dict[str, str]:
-    """Return a digest of the contents of each file, by the same keys. Raises ConfigError."""
+    """Return a digest of the contents of each file, with the keys of `files`. Raises ConfigError."""
     return {key: digest_of(path) for key, path in files.items()}
 
 

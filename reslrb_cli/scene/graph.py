@@ -18,7 +18,7 @@ from reslrb_cli.errors import UnsupportedScene, is_machine_fault
 class SceneGraph:
     """All objects below a scene, each once, in order of traversal.
 
-    `mi.traverse` lists an object only below its first user; this graph knows all users.
+    `mi.traverse` lists an object only below the object's first user. The graph contains all users.
     """
 
     objects: list[Any] = field(default_factory=list)
@@ -85,7 +85,7 @@ class SceneGraph:
         return list(dict.fromkeys(shape.bsdf() for shape in self.shapes() if shape.bsdf() is not None))
 
     def bsdfs_above(self, item: Any) -> list[Any]:
-        """Return the BSDFs that use `item` (a texture, or a BSDF, which is included) at any depth."""
+        """Return the BSDFs that use the texture or BSDF `item` at any depth. A BSDF `item` is included."""
         found: dict[Any, None] = {}
         waiting = [item]
         while waiting:
@@ -96,7 +96,7 @@ class SceneGraph:
         return list(found)
 
     def owning_bsdfs(self, item: Any) -> list[Any]:
-        """Return the outermost BSDFs that use this object. An outermost BSDF has a user that is neither a BSDF nor a
+        """Return the outermost BSDFs that use `item`. An outermost BSDF has a user that is neither a BSDF nor a
         texture.
         """
         found = ((bsdf, self.parents.get(bsdf, [])) for bsdf in self.bsdfs_above(item))
@@ -112,7 +112,7 @@ class SceneGraph:
 
 @dataclass(frozen=True)
 class Lamp:
-    """Emitting shape. `emitter` is the shape's emitter, and `index` its place in `scene.emitters()`.
+    """Emitting shape. `emitter` is the shape's emitter, and `index` is the emitter's place in `scene.emitters()`.
 
     `parallel` tells whether light leaves only along the normal (`directionalarea`). `texture` is the texture from which
     points on the shape are sampled. `texture` is None if points are uniform over the shape's area.
@@ -133,14 +133,14 @@ class Lamp:
     def surrounds(self) -> bool:
         """True if the shape is a sphere that emits inwards with constant radiance.
 
-        Mitsuba samples points of such a sphere uniformly. If rounding puts the vertex outside of the sphere, it uses
-        the density of a cone instead. Rounding can affect all vertices on the sphere.
+        Mitsuba samples points of such a sphere uniformly. If rounding puts the vertex outside of the sphere, Mitsuba
+        uses the density of a cone instead. Rounding can affect all vertices on the sphere.
         """
         return self.is_sphere and self.texture is None and not self.parallel and self.shape.has_flipped_normals()
 
     @cached_property
     def faces_by_area(self) -> bool:
-        """Whether Mitsuba samples its faces in proportion to their current areas."""
+        """True if Mitsuba samples the shape's faces in proportion to the faces' current areas."""
         return self.has_faces and self.texture is None
 
     @cached_property
@@ -160,8 +160,8 @@ def emitted_rays(
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
     """Return rays from all emitters, and their weights, from random numbers in [0, 1).
 
-    Raises UnsupportedScene, which names the emitter, if Mitsuba cannot sample one, such as a lamp or a spot with a
-    checkerboard.
+    Raises UnsupportedScene if Mitsuba cannot sample an emitter, such as a lamp or a spot with a checkerboard. The error
+    names the emitter.
     """
     try:
         ray, weight, _ = scene.sample_emitter_ray(0, wavelength, place, direction, True)
@@ -180,16 +180,16 @@ def emitted_rays(
 def sensor_rays(
     sensor: mi.Sensor, time: float | mi.Float, place: mi.Point2f, aperture: mi.Point2f
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """Return rays from a sensor, and their weights, from places on its film and in its aperture, in [0, 1)^2.
+    """Return rays from a sensor, and their weights. `place` on the film and `aperture` are in [0, 1)^2.
 
-    It uses the call that every sensor has, because an irradiance meter has no `sample_ray`.
+    The function uses the call that every sensor has, because an irradiance meter has no `sample_ray`.
     """
     ray, weight = sensor.sample_ray_differential(time, 0.5, place, aperture, True)
     return mi.Ray3f(ray), weight
 
 
 def failure(call: Callable[[], object]) -> str | None:
-    """Return Mitsuba's reason, in one line, why `call` fails, or None if it succeeds."""
+    """Return, in one line, Mitsuba's reason for the failure of `call`, or None if the call succeeds."""
     try:
         with dr.suspend_grad():
             call()
@@ -235,7 +235,7 @@ def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
 
 
 def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
-    """Whether any of a grid of points on the shape is in front of the lens, without occlusion."""
+    """True if a grid point on the shape is in front of the lens, without occlusion."""
     with dr.suspend_grad():
         si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), grid(POINTS)), mi.Color0f())
         ds, _ = sensor.sample_direction(si, mi.Point2f(0.5), True)
@@ -255,7 +255,7 @@ def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def interpolates_normals(shape: mi.Shape) -> bool:
-    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric normals."""
+    """True if the shape is a mesh whose shading normals differ from its geometric normals as soon as the mesh bends."""
     return shape.is_mesh() and shape.has_vertex_normals() and not shape.has_face_normals()
 
 
@@ -270,9 +270,7 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def bent_faces(mesh: mi.Mesh, cosine: float) -> np.ndarray:
-    """Return for each face (F,) of a mesh whether the cosine between a vertex normal and the face normal is below
-    `cosine`.
-    """
+    """Return booleans (F,) that mark faces with a vertex normal whose cosine to the face normal is below `cosine`."""
     if not interpolates_normals(mesh):
         return np.zeros(mesh.face_count(), bool)
     flat, shading = face_normals(triangles(mesh))[:, None], _at_corners(mesh, mesh.vertex_normals_buffer())

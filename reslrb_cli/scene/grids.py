@@ -20,7 +20,7 @@ def make_grid(description: Description, id: str, size: tuple[int, int], place: P
     along the rectangle's edges.
 
     The shape is a `rectangle`, a mesh of four vertices that form a parallelogram, or a mesh that is a flat grid over a
-    parallelogram. Its position and its material do not change. Raises ConfigError at `place` for any other shape.
+    parallelogram. The shape's position and material do not change. Raises ConfigError at `place` for any other shape.
     """
     element = description.root.by_id().get(id)
     if element is None or element.tag != "shape":
@@ -55,11 +55,11 @@ Corners = tuple[np.ndarray, np.ndarray, np.ndarray, bool]
 
 
 def _corners_of(element: Element, description: Description) -> Corners | None:
-    """Return the parallelogram of a mesh's file, or None for other meshes.
+    """Return the parallelogram that a mesh file describes, or None for other meshes.
 
     The result contains a corner, and the ends of the corner's edges along u and along v. The result also tells whether
-    v is to the right of u, seen from outside. If four vertices have no texture coordinates, u is chosen so that the
-    mesh is to its left.
+    the v edge is to the right of the u edge, seen from outside. If four vertices have no texture coordinates, u is
+    chosen so that the mesh is to the left of u.
     """
     name = element.find("filename")
     path = None if name is None else description.find_file(name.value)

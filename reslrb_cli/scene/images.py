@@ -55,7 +55,7 @@ class DamagedImage(ConfigError):
 
 @dataclass(frozen=True)
 class _Header:
-    """Header of an image: (width, height) of the stored pixels, and EXIF's orientation."""
+    """Header of an image, with the (width, height) of the stored pixels and the EXIF orientation."""
 
     size: Size
     orientation: int = 1
@@ -65,8 +65,8 @@ class _Header:
 def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> mi.Bitmap:
     """Decode the image file `path`. `size` is the required (width, height), or None for any.
 
-    Pixels are as stored. If `upright`, pixels and size are rotated by EXIF (`TURNS`). Raises ConfigError, located in
-    the file, if it cannot be read, or is no image, too large, of another size, damaged or truncated. The header is
+    Pixels are as stored. If `upright`, pixels and size are rotated by EXIF (`TURNS`). Raises a ConfigError that names
+    the file if the file is unreadable, no image, too large, of another size, damaged or truncated. The header is
     checked first.
     """
     header = _examine(path)
@@ -106,7 +106,7 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Return a view of an image (H, W, ...) with this EXIF orientation, rotated upright."""
+    """Return a view of an image (H, W, ...), rotated upright according to its EXIF `orientation`."""
     if orientation >= 5:  # rows of the file are columns of the view
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -117,12 +117,14 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def orientation_of(path: Path) -> int:
-    """Return EXIF's orientation of an image file (1 to 8), or 1 without one. Raises ConfigError if it is no image."""
+    """Return the EXIF orientation (1 to 8) of an image file, or 1 if the file has none. Raises ConfigError if it is no
+    image.
+    """
     return _examine(path).orientation
 
 
 def image_size(path: Path) -> Size:
-    """Return the stored (width, height) of an image. Raises ConfigError, located in the file, if the file is not an
+    """Return the stored (width, height) of an image. Raises a ConfigError that names the file if the file is not an
     image.
     """
     width, height = _examine(path).size
@@ -134,7 +136,7 @@ def image_size(path: Path) -> Size:
 def _examine(path: Path) -> _Header:
     """Return the header of an image.
 
-    Raises ConfigError, located in the file, if the file is not an image. Raises ConfigError also for a PNG or JPEG file
+    Raises a ConfigError that names the file if the file is not an image. Raises ConfigError also for a PNG or JPEG file
     that lacks its end. For other formats, readers detect a missing end.
     """
     header: _Header | None = None
@@ -204,9 +206,10 @@ def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
 
 
 def _orientation(exif: bytes) -> int:
-    """Return the orientation (1 to 8) in EXIF data, which start like a TIFF file, or 1 if it cannot be read.
+    """Return the orientation (1 to 8) in EXIF data, or 1 if the orientation is unreadable. EXIF data start like a TIFF
+    file.
 
-    Only the entries of the first directory are read, each once.
+    The function reads only the entries of the first directory, each entry once.
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
     with suppress(struct.error):  # offsets outside the data
@@ -248,10 +251,10 @@ def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
 
 
 def _are_whole(data: bytes, width: int, height: int) -> bool:
-    """Whether the lines of a Radiance image fit its header.
+    """True if the lines of a Radiance image fit the image's header.
 
-    Runs must fill each of a line's four parts exactly. Either all lines consist of runs, or none. Mitsuba's reader does
-    not check the lines, and would write out of bounds.
+    Runs must fill each of a line's four parts exactly. Either all lines consist of runs, or no line does. Mitsuba's
+    reader does not check the lines, and would write out of bounds.
     """
     start = bytes((2, 2, width >> 8, width & 255)) if 8 <= width <= 0x7FFF else b""
     if not start or data[:2] != start[:2] or data[2:3] >= b"\x80":
@@ -299,7 +302,7 @@ _READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Header | None]] = {
 def _heard(lines: list[str]) -> Iterator[None]:
     """Append the process's standard error to `lines` instead of printing it.
 
-    Standard error is the only channel on which libjpeg, inside Mitsuba, reports missing data if a file looks complete.
+    If a file looks complete, libjpeg (inside Mitsuba) reports missing data only on standard error.
     """
     try:
         before = os.dup(2)
@@ -326,9 +329,9 @@ Image = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Photo:
-    """Image file as linear Rec. 709, (H, W, 3) float32, with the defects of its pixels as booleans (H, W).
+    """Image file as linear Rec. 709, (H, W, 3) float32. Booleans (H, W) mark the defects of the pixels.
 
-    `clipped` pixels are at the maximum of a file of 8 or 16 bits in any channel. `transparent` pixels have alpha 0.
+    `clipped` pixels have a channel at the maximum value of an 8-bit or 16-bit file. `transparent` pixels have alpha 0.
     `nonfinite` pixels have a non-finite channel.
     """
 
@@ -355,8 +358,8 @@ def read_image(path: Path, color_space: str = "auto", size: Size | None = None, 
     Alpha is dropped. A single channel is copied into three channels. `size` is the required (width, height). Pixels are
     as stored, as in Mitsuba's textures. If EXIF metadata would rotate the pixels, the function prints a warning.
 
-    Raises ConfigError, located in the file, if it is missing, no image, damaged, truncated, too large or of another
-    size. Raises ConfigError also for non-finite values, and for negative values unless `signed` is true.
+    Raises a ConfigError that names the file if the file is missing, no image, damaged, truncated, too large or of
+    another size. Raises ConfigError also for non-finite values, and for negative values unless `signed` is true.
     """
     image = read_photo(path, color_space, size, upright=False, signed=signed).image
     orientation = orientation_of(path)
@@ -410,14 +413,14 @@ def read_weights(path: Path, size: Size, upright: bool = True) -> Image:
     """Read an image of weights as float32 (H, W). A weight is the value in the file, or the mean if there are several
     channels.
 
-    Values of 8 and 16 bits are divided by their maximum. Alpha is dropped. `upright` rotates the image by its own EXIF
-    orientation. Raises ConfigError, located in the file, like `read_image`.
+    Values of 8 or 16 bits are divided by the largest 8-bit or 16-bit value. Alpha is dropped. `upright` rotates the
+    image by its own EXIF orientation. Like `read_image`, raises a ConfigError that names the file.
     """
     return read_photo(path, "linear", size, upright=upright).image.mean(axis=2)
 
 
 def decode_srgb(encoded: Image) -> Image:
-    """Return the linear values of sRGB-encoded values (IEC 61966-2-1), with the same precision."""
+    """Return the linear values of sRGB-encoded values (IEC 61966-2-1), with the precision of the input."""
     wide = encoded.astype(np.float64)
     curve = ((np.maximum(wide, 0) + 0.055) / 1.055) ** 2.4
     return np.where(wide <= 0.04045, wide / 12.92, curve).astype(encoded.dtype)

@@ -1,4 +1,4 @@
-"""Loading of Mitsuba scene files, with located errors."""
+"""Loading of Mitsuba scene files. Errors name their location."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def load_scene(
         point.
     - Without `warn`, the scene is not checked for doubtful parts.
 
-    Shapes are not merged, so all parameters keep their names. An object without an id is named by its kind and its
-    number among all objects of this kind in the file, such as `Sphere_3`. Elements of other versions or exporters that
-    Mitsuba's parser would refuse are repaired or left out, with a warning in the log. Mitsuba must use every remaining
-    element. The function does not load the scene's integrator, because an experiment has its own integrator. Plugins
-    are loaded only from Mitsuba's own folder.
+    Shapes are not merged, so all parameters keep their names. An object without an id is named by its kind and a
+    number, such as `Sphere_3`. The number counts the file's objects of this kind. Elements of other versions or
+    exporters that Mitsuba's parser would refuse are repaired or left out. The log gets a warning. Mitsuba must use
+    every remaining element. The function does not load the scene's integrator, because an experiment has its own
+    integrator. Plugins are loaded only from Mitsuba's own folder.
 
-    Raises ConfigError, located in the scene file, if the file is missing or wrong. Raises ConfigError also for a scene
+    Raises a ConfigError that names the scene file if the file is missing or wrong. Raises ConfigError also for a scene
     without shapes or light. Warns of a scene that is too far from the origin or too small, of glass that is too thin,
     and of coincident faces.
     """
@@ -94,16 +94,16 @@ def load_scene(
 
 
 def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, **options: Any) -> mi.Scene:
-    """Load a Mitsuba scene file as the command line does: its parameters have the names that `reslrb inspect` lists.
+    """Load a Mitsuba scene file as the command line does. The parameters have the names that `reslrb inspect` lists.
 
     `load_for_script` replaces `mi.load_file(file, optimize=False, **options)`. `mi.load_file` refuses files of other
     versions and exporters, and names objects without an id differently. `options` are the values of the file's `$name`
-    variables, which messages call `scene.options.NAME`. `keys` are parameters, or globs, that need gradients: their
-    textures of 8 or 16 bits are read as floating point. A variant must be set; the scene's own integrator is not
-    loaded.
+    variables. Messages call these variables `scene.options.NAME`. `keys` are parameters, or globs, that need gradients.
+    Textures of 8 or 16 bits among `keys` are read as floating point. A variant must be set. The function does not load
+    the scene's own integrator.
 
-    Raises `reslrb_cli.errors.ConfigError`, in one line with a location, if a file is missing or wrong. Raises
-    BackendError under an unsupported variant.
+    Raises a one-line `reslrb_cli.errors.ConfigError` with a location if a file is missing or wrong. Raises BackendError
+    under an unsupported variant.
     """
     check_variant(mi.variant())
     path = as_path(file, "file", "the path of a scene file")
@@ -111,16 +111,17 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
 
 
 def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
-    """Return the scene, with 8-bit and 16-bit bitmaps among `keys` read as floating point. `keys` may contain globs.
+    """Return the scene. The 8-bit and 16-bit bitmaps that `keys` name are read as floating point. `keys` may contain
+    globs.
 
-    If `keys` name no such bitmaps, the result is `scene` itself. Otherwise the scene is built again from `description`,
-    which is modified.
+    If `keys` name no 8-bit or 16-bit bitmaps, the result is `scene` itself. Otherwise the scene is built again from
+    `description`, which is modified.
     """
     return build(description)[0] if _mark_floats(scene, description, keys) else scene
 
 
 def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
-    """Mark 8-bit and 16-bit bitmaps among `keys` as floats in the description. Returns whether there are any.
+    """Mark the 8-bit and 16-bit bitmaps that `keys` name as floats in the description. Returns whether there are any.
 
     Other bitmaps keep their format, because floats take four times the memory of bytes. The values stay the same. The
     bitmaps are decoded from sRGB when they are read, instead of at each lookup.

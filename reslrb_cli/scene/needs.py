@@ -1,4 +1,4 @@
-"""Needs of a scene for light tracing, and parts of it that light paths, or camera paths, do not support."""
+"""Features that light tracing of a scene needs, and scene parts that light paths or camera paths do not support."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ class SceneNeeds:
 
     `emitters` holds class names in the order of `scene.emitters()`. `environment` is the index of the surrounding
     emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
-    is true if a thin lens may see objects outside of its clip planes. `lens_clip` is also true if the lens has a focus
-    at which Mitsuba sees nothing.
+    is true if a thin lens may see objects outside of its clip planes. `lens_clip` is also true if Mitsuba sees nothing
+    because of the lens's focus.
     """
 
     emitters: tuple[str, ...]
@@ -90,8 +90,8 @@ class SceneNeeds:
 
 @dataclass(frozen=True)
 class PrimaryHits:
-    """Surfaces that primary rays meet behind see-through surfaces. `smooth`, `specular` and `nothing` are fractions of
-    the film that sum to 1.
+    """Surfaces that primary rays meet after they pass see-through surfaces. `smooth`, `specular` and `nothing` are
+    fractions of the film that sum to 1.
 
     `smooth` surfaces can be connected to the sensor by light paths. `specular` surfaces are only smooth specular
     (glass, mirrors), and stay black. `nothing` is no surface. `emission` is the fraction of the film with a directly
@@ -151,7 +151,7 @@ def is_bent(mesh: Any) -> bool:
 
 
 def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> None:
-    """Raise UnsupportedScene, with the reason and the remedy, if these paths cannot render `scene`.
+    """Raise UnsupportedScene if the `paths` cannot render `scene`. The error gives the reason and the remedy.
 
     `paths` is as in `paths_obstacle`.
     """
@@ -209,10 +209,11 @@ DIRECT = 2
 
 
 def camera_finds_all(scene: Any, max_depth: int) -> bool:
-    """Whether camera paths of up to `max_depth` segments (-1: any number) find all light with good probability.
+    """True if camera paths of up to `max_depth` segments find all light with good probability. A `max_depth` of -1
+    means any number.
 
     Camera paths find all light if no surface is specular or glossy, or if all light comes straight from the emitters.
-    No emitter may emit only along its normal.
+    An emitter that emits only along its normal is not allowed.
     """
     if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
         return False
@@ -225,7 +226,7 @@ def camera_finds_all(scene: Any, max_depth: int) -> bool:
 def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> bool:
     """Whether light paths find all light for these sensors.
 
-    This holds if no sensor sees a mirror or clear glass, and no hidden lamp blocks connections.
+    Light paths find all light if no sensor sees a mirror or clear glass, and no hidden lamp blocks connections.
     """
     if hide_emitters and any(shape.is_emitter() for shape in scene.shapes()):
         return False
@@ -271,8 +272,8 @@ def _film_obstacle(sensor: Any) -> str | None:
 
 
 def stock_clip(needs: SceneNeeds) -> str | None:
-    """Return the error that Mitsuba's own light tracing makes with a sensor's clip planes, as text. Return None if
-    there is no error.
+    """Return the error, as text, that a sensor's clip planes cause in Mitsuba's own light tracing. Return None if there
+    is no error.
     """
     if needs.lens_clip:
         return "does not clip the view of a `thinlens`, and loses light if it focuses on a clip plane or beyond"
@@ -284,7 +285,7 @@ def stock_clip(needs: SceneNeeds) -> str | None:
 def _camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str | None:
     """Return the reason why camera paths cannot render `scene` for `sensor`, or None if they can. Traces no ray.
 
-    With `beside_light`, light paths are traced as well, and add the light that camera paths cannot find.
+    With `beside_light`, light paths are also traced. The light paths add the light that camera paths cannot find.
     """
     graph = SceneGraph.of(scene)
     if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
@@ -347,13 +348,13 @@ def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
 
 
 def _first_failure(calls: Iterable[tuple[str, Callable[[], object]]]) -> str | None:
-    """Return the purpose of the first call in `calls` that Mitsuba refuses, with the reason for the refusal."""
+    """Find the first call in `calls` that Mitsuba refuses. Return the call's purpose and the reason for the refusal."""
     found = ((what, failure(call)) for what, call in calls)
     return next((f"Mitsuba cannot {what}: {reason}" for what, reason in found if reason is not None), None)
 
 
 def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
-    """Return the first emitter on a shape of one of these classes, and the shape. Some emitters do not know their
+    """Return the first emitter on a shape with a class in `plugins`, and the shape. Some emitters do not know their
     shape.
     """
     for shape in graph.shapes():
@@ -396,8 +397,8 @@ def look(scene: Any, sensor: Any) -> PrimaryHits:
 
 
 def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None = None) -> tuple[Any, Any, Any]:
-    """Return which rays through a grid of LOOK^2 cells meet smooth surfaces, specular surfaces, and emission, row by
-    row.
+    """Return masks of the rays that meet smooth surfaces, specular surfaces, and emission. A grid of LOOK^2 cells has
+    one ray per cell, row by row.
 
     `PrimaryHits` defines the three kinds. The rays start at a point of the `aperture`, by default its middle.
     """
@@ -417,10 +418,11 @@ def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None =
 
 
 def surfaces_met(scene: Any, ray: Any, active: Any, random: Any = None) -> Iterator[tuple[Any, Any]]:
-    """Follow rays through see-through surfaces. Yields each interaction and the mask of its rays.
+    """Follow rays through see-through surfaces. Yields each interaction with the mask of its rays.
 
     If a ray leaves the scene, its last interaction is invalid. With a generator of `random` numbers, rays also follow
-    mirrors and clear glass. Schedule the collected results, so that one kernel evaluates them with the next rays.
+    mirrors and clear glass. Callers schedule the collected results, so that one kernel evaluates the results with the
+    next rays.
     """
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, active)
@@ -450,7 +452,7 @@ def _read_geometry(graph: SceneGraph) -> bool:
 
 
 def _focuses_outside(params: mi.SceneParameters) -> bool:
-    """Whether a thin lens with these `params` may see nothing in Mitsuba because of its focus.
+    """True if a thin lens with these `params` may see nothing in Mitsuba because of the lens's focus.
 
     The focus may be so far away that `sample_direction`, in single precision, considers it outside of the clip planes.
     By default, the lens focuses on the far plane.

@@ -1,6 +1,7 @@
-"""Parameters that are recovered: selected by key or glob, checked, and set to their initial values.
+"""Parameters that are recovered. Keys or globs select the parameters, which are checked and set to their initial
+values.
 
-A `Selection` has their settings, and transfers values to and from the scene.
+A `Selection` has the parameters' settings, and transfers values to and from the scene.
 """
 
 from __future__ import annotations
@@ -25,12 +26,13 @@ from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_t
 
 @dataclass(frozen=True)
 class Selection:
-    """Recovered parameters, by the keys of their records.
+    """Recovered parameters by key. Records use the same keys.
 
-    `params` is all of the scene's `mi.traverse`. `specs` maps each key to its settings. Keys follow the order of the
-    configuration. Keys that match one glob follow the order of the scene. A key is one of `params`, or a value of
-    `deformation`: a motion's `ID.translation`, or a heightmap. `tied` maps a key of `params` to the other keys of
-    `params` that share its value. `factors` are values outside of the scene that multiply its images (`add_factor`).
+    `params` is the complete result of `mi.traverse` for the scene. `specs` maps each key to its settings. Keys follow
+    the order of the configuration. Keys that match one glob follow the order of the scene. A key is an entry of
+    `params` or a value of `deformation`, for example a motion's `ID.translation` or a heightmap. `tied` maps a key of
+    `params` to the other keys of `params` that share its value. `factors` are values outside of the scene that multiply
+    its images (`add_factor`).
     """
 
     params: mi.SceneParameters
@@ -84,7 +86,7 @@ class Selection:
                 self._check_opposite(key, each.opposite, place, f"regularizers[{number}].opposite")
 
     def _check_opposite(self, key: str, mesh: str, place: Place, at: str) -> None:
-        """Raise ConfigError if no heightmap of the mesh `mesh` faces away from the heightmap `key`."""
+        """Raise ConfigError if the mesh `mesh` has no heightmap that faces away from the heightmap `key`."""
         name = f"{mesh}.{HEIGHTMAP}"
         maps = [each for each in self.deformation.values if each.endswith(f".{HEIGHTMAP}") and each != key]
         if name not in maps:
@@ -114,7 +116,8 @@ class Selection:
         return self.slot(key).get()
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Write values by key, as Dr.Jit values, to the scene, so that the gradients of a step reach them.
+        """Write `values`, which maps keys to Dr.Jit values, to the scene. The gradients of a step then reach the
+        values.
 
         The method evaluates all values, so that the first step and all later steps use the same kernels.
         """
@@ -131,19 +134,19 @@ class Selection:
         dr.eval([self.params[key] for key in own], moved, settled, self.factors)
 
     def collect(self) -> None:
-        """Propagate the gradients at moved objects to the values that move them."""
+        """Propagate the gradients at moved objects back to the values that move the objects."""
         self.deformation.collect()
 
     def push(self) -> None:
-        """Propagate tangents of the values that move objects to the scene."""
+        """Propagate tangents to the scene from the values that move objects."""
         self.deformation.push()
 
     def shown(self, key: str, value: Any) -> np.ndarray[Any, Any]:
-        """Convert another value of `key` from a Dr.Jit value to the form of `array`."""
+        """Convert `value`, a Dr.Jit value of the parameter `key`, to the form that `array` returns."""
         return self.slot(key).shown(value)
 
     def set_arrays(self, values: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Set parameters in the scene, from arrays in the form of `array`."""
+        """Set parameters in the scene. The arrays have the form that `array` returns."""
         for key, value in values.items():
             self.slot(key).set(value)
         self.update()
@@ -157,21 +160,21 @@ class Selection:
         self.params.update()
 
     def is_map(self, key: str) -> bool:
-        """Whether `key` is a texture or a heightmap with at least two texels. Environment maps, whose sides meet, do
-        not count.
+        """True if `key` is a texture or a heightmap with at least two texels along each axis. Environment maps, whose
+        sides meet, do not count.
         """
         slot = self.slot(key)
         return slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
 
     def faces(self, key: str) -> np.ndarray[Any, Any] | None:
-        """Return the triangles (3 m indices) of the mesh with the vertex positions `key`. For other keys, return
-        None.
+        """Return the triangles (3 m indices) of the mesh whose vertex positions are `key`. For other keys,
+        return None.
         """
         mesh, _, name = key.rpartition(".")
         return np.array(self.params[f"{mesh}.faces"]) if name == "vertex_positions" else None
 
     def slot(self, key: str) -> ParameterValue:
-        """Return the value of `key`, to read and set. Call `update` afterwards."""
+        """Return an object that reads and sets the value of `key`. Call `update` afterwards."""
         return ParameterValue(self._holder(key), key)
 
     def _holder(self, key: str) -> Any:
@@ -187,7 +190,8 @@ def select_parameters(
     source: object,
     values: Mapping[str, np.ndarray[Any, Any]] | None = None,
 ) -> Selection:
-    """Select the parameters of `scene` in `specs`, and set their initial values, or `values`, in the scene.
+    """Select the parameters of `scene` that `specs` describes. Set them in the scene to their initial values, or to
+    `values`.
 
     A glob selects the matching parameters that can be recovered. `source` names the configuration in errors. Raises
     ConfigError for:
@@ -222,10 +226,10 @@ def select_parameters(
 def set_values(
     scene: mi.Scene, specs: Sequence[ParameterSpec], values: Mapping[str, Any], source: object, option: str
 ) -> Selection:
-    """Select the same parameters in another load of the scene, and set `values`. Any of their keys can be used.
+    """Select the parameters of `specs` in another load of the scene, and set `values`. Any of their keys can be used.
 
-    Other parameters keep the values of the scene. Values are checked like initial values. Errors are located at
-    `option` and the key. A heightmap may have the resolution of its image file.
+    Other parameters keep the values of the scene. Values are checked like initial values. Errors name `option` and the
+    key. A heightmap may have the resolution of its image file.
     """
     selection, _ = _choose(mi.traverse(scene), specs, source)
     names = selection.deformation.values
@@ -250,7 +254,7 @@ def set_values(
 
 def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: object
             ) -> tuple[Selection, dict[str, int]]:  # fmt: skip
-    """Return the selection of `specs` in an unchanged scene, and the index of the spec of each key."""
+    """Return the selection for `specs` in an unchanged scene, and the index of each key's spec."""
     chosen: dict[str, Settings] = {}
     tied: dict[str, list[str]] = {}
     origin: dict[str, int] = {}  # of recovered parameters, and of all scene parameters that they determine
@@ -282,7 +286,9 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
 
 
 def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
-    """Warn, once, of a map with more texels than its meshes have vertices. Texels between vertices have no effect."""
+    """Warn once about a heightmap with more texels than its meshes have vertices. Texels between vertices have no
+    effect.
+    """
     vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
     if width * height > vertices:
         hint = f"; `grid: [{width}, {height}]` makes such a mesh from a rectangle" if vertices == 4 * len(items) else ""
@@ -370,8 +376,8 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
 
 
 def _obstacle(info: ParameterInfo) -> str | None:
-    """Return the reason why a parameter cannot be recovered. One reason is a texture with few bits per channel that
-    loading has not converted.
+    """Return the reason why a parameter cannot be recovered. For example, a texture has few bits per channel, and
+    loading has not converted the texture.
     """
     if info.bits is None:
         return info.obstacle

@@ -30,8 +30,8 @@ Image = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Photograph:
-    """Image file with its (width, height) in pixels, upright by EXIF. `is_integer` is true if the file holds integers,
-    which clip bright parts.
+    """Image file, rotated upright by EXIF, with its (width, height) in pixels. `is_integer` is true if the file holds
+    integers, which clip bright parts.
     """
 
     path: Path
@@ -41,7 +41,7 @@ class Photograph:
 
 
 def open_photograph(path: Path) -> Photograph:
-    """Read an image file. Raises ConfigError, located in the file, if the file is not an image."""
+    """Read an image file. Raises a ConfigError that names the file if the file is not an image."""
     bitmap = read_bitmap(path, upright=True)
     width, height = (int(n) for n in bitmap.size())
     return Photograph(path, (width, height), np.array(bitmap).dtype.kind in "ui", bitmap)
@@ -77,7 +77,7 @@ def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
 
 
 def _means(image: Image, size: tuple[int, int]) -> Image:
-    """Return the area-weighted means of an (H, W, C) image over the pixels of an image of `size` (width, height)."""
+    """Resample an (H, W, C) image to `size` (width, height) by area-weighted means."""
     values = image.astype(np.float32)
     known = np.isfinite(values)
     if not known.all():  # otherwise NaN would spread over whole rows
@@ -132,7 +132,7 @@ class Proposal:
 
     @property
     def is_bounded(self) -> bool:
-        """Whether the bounds determine the size of the parameter, and so the size of a step."""
+        """True if the bounds determine the parameter's size, and therefore the size of a step."""
         return self.bounds is not None and "inf" not in self.bounds
 
 
@@ -141,9 +141,9 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[
     excluded.
 
     They are sorted by their shares. `wanted` has globs that select the parameters recovered by default. Without globs,
-    the parameters recovered by default are those that are large in view. Lamps are among the parameters recovered by
-    default if the photograph shows the lamps' brightness (`lamps`). At least one parameter is recovered by default if
-    the scene has any recoverable parameter. Raises LookupError, with the glob, if a glob matches nothing.
+    the parameters recovered by default are those that are large in view. By default, lamps are also recovered if the
+    photograph shows the lamps' brightness (`lamps`). At least one parameter is recovered by default if the scene has
+    any recoverable parameter. Raises LookupError with the glob if a glob matches nothing.
     """
     params = mi.traverse(scene)
     shares = _shares(scene, sensor)
@@ -176,7 +176,7 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[
 
 
 def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
-    """Whether a surface parameter is the most visible one: its colour, or a metal's roughness."""
+    """True if a surface parameter is the surface's most visible parameter: its colour, or a metal's roughness."""
     bsdf = next((item for item in _above(params, info.key) if isinstance(item, mi.BSDF)), None)
     diffuse = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
     is_glossy = bsdf is not None and int(bsdf.flags()) & diffuse == 0
@@ -188,14 +188,14 @@ def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
 
 
 def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
-    """Whether Mitsuba has left out the lobe of a parameter, so that its value has no effect."""
+    """True if Mitsuba has left out the lobe of a parameter, so that the parameter's value has no effect."""
     owner, name = params.hierarchy[params.properties[info.key][2]][0], info.key.split(".")[-2]
     is_principled = owner is not None and owner.class_name().startswith("Principled")
     return is_principled and name in LOBES and info.value is not None and info.value.high == 0
 
 
 def _above(params: mi.SceneParameters, key: str) -> list[Any]:
-    """Return the object that has the parameter `key`, and the objects above this object, without the scene."""
+    """Return the object that has the parameter `key`, and all objects above that object except the scene."""
     node: Any = params.properties[key][2]
     chain: list[Any] = []
     kinds = (mi.BSDF, mi.Emitter)

@@ -20,9 +20,9 @@ Array = np.ndarray[Any, Any]
 
 
 class Place:
-    """Place of a value in the configuration, for errors of `fail`.
+    """Place of a value in the configuration. `fail` names the place in errors.
 
-    `at` maps the name of an option to its name in the configuration, or to "" if the value has no options there.
+    `at` maps an option's name to its name in the configuration, or to "" if the value has no options there.
     """
 
     def __init__(self, source: object, key: str, at: Callable[[str], str] = str) -> None:
@@ -59,7 +59,7 @@ class ParameterValue:
         return self.shown(self.holder[self.key])
 
     def shown(self, value: Any) -> Array:
-        """Convert another value of this parameter from a Dr.Jit value to an array with the shape of `get`."""
+        """Convert `value`, a Dr.Jit value of this parameter, to an array with the shape that `get` returns."""
         array = np.array(dr.detach(value), dtype=np.float32)
         if not self.is_tensor and array.ndim and array.shape[-1] == 1:
             array = array[..., 0]
@@ -83,8 +83,8 @@ def initial_array(
 ) -> Array:
     """Return the initial value of the parameter in `slot` from "scene", a number, a list, an image file or a run.
 
-    `resolution` is the (width, height) to which a texture is resampled, or None. With `any_size`, the resolution of the
-    file is kept. Raises ConfigError at `place`.
+    `resolution` is the (width, height) to which a texture is resampled, or None. With `any_size`, the value keeps the
+    resolution of the file. Raises ConfigError at `place`.
     """
     current, resizable = slot.get(), any_size or resolution is not None
     if resolution is not None:
@@ -135,7 +135,9 @@ def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: P
 
 
 def resample(array: Array, resolution: tuple[int, int]) -> Array:
-    """Resample an (H, W, C) image to `resolution` (width, height), by means over areas, or linearly if it grows."""
+    """Resample an (H, W, C) image to `resolution` (width, height) by means over areas. An image that grows is
+    interpolated linearly.
+    """
     from reslrb_cli.lens.transport import resized  # late, because SciPy takes a while to load
 
     return np.asarray(resized(array, resolution[::-1], between=True), dtype=np.float32)
@@ -201,7 +203,7 @@ def _size(image: Array) -> str:
 
 
 def _first(array: Array, mask: Array) -> str | None:
-    """Return the first entry of `array` in `mask` and its index in words, or None if there is none."""
+    """Return, in words, the first entry of `array` in `mask` with its index, or None if there is none."""
     if not mask.any():
         return None
     value, index = f"{float(array[mask].flat[0]):g}", [int(n) for n in np.argwhere(mask)[0]]
@@ -211,11 +213,11 @@ def _first(array: Array, mask: Array) -> str | None:
 
 
 def settle(params: mi.SceneParameters, keys: Iterable[str]) -> list[Any]:
-    """Compute data that depend on newly set parameters now. Returns the arrays to evaluate.
+    """Compute data that depend on newly set parameters at once. Returns the arrays to evaluate.
 
-    A texture pads its storage at its first lookup, and unpads it when it is read. The normals of a mesh depend on its
-    vertices. If a step computed derived data of textures or meshes, Dr.Jit would split the step's kernels. The split
-    would differ between the first and the second step.
+    A texture pads its storage at its first lookup, and removes the padding when the texture is read. The normals of a
+    mesh depend on its vertices. If a step computed data derived from textures or meshes, Dr.Jit would split the step's
+    kernels. The split would differ between the first and the second step.
     """
     normals = []
     for key in keys:

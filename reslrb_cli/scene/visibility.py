@@ -1,9 +1,9 @@
-"""View of sensors: useful pixels and texels for light tracing, and the necessary length of paths.
+"""Pixels and texels that light tracing can use for sensors, and the necessary length of paths.
 
 Light tracing lacks light at the film's border (`interior`). Light tracing also lacks light where the sensor sees glass,
 mirrors, or coats (`sees_specular`), because smooth specular lobes cannot be connected to the sensor. A photograph
-contains light of any number of bounces. An image of paths of at most d segments is darker, and an exposure or a colour
-would compensate for this (`find_depth`).
+contains light of any number of bounces. An image of paths of at most d segments is darker. An exposure or a colour
+would compensate for the missing light (`find_depth`).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
     """Return the pixels, boolean (H, W), that lose no light at the film's border under light tracing. `shape` starts
     with the (H, W) of the film of `sensor`.
 
-    Samples just outside of the film are lost, so pixels within the filter's radius of its border are too dark. Camera
-    paths do not lose light there.
+    Samples just outside of the film are lost, so pixels within the filter's radius of the film's border are too dark.
+    Camera paths do not lose light there.
     """
     margin = _margin(sensor)
     inside = np.zeros(shape[:2], dtype=bool)
@@ -55,7 +55,7 @@ def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SeenSpecular:
-    """Pixels (H, W) of a sensor's crop window that smooth specular lobes reach, including the reconstruction filter.
+    """Pixels (H, W) of a sensor's crop window whose reconstruction filter reaches smooth specular lobes.
 
     `alone` marks surfaces that have only smooth specular lobes (glass, mirrors). Surfaces without other lobes stay
     black under light tracing. `mixed` marks surfaces that have smooth specular lobes and other lobes (coats, blends,
@@ -67,7 +67,8 @@ class SeenSpecular:
 
 
 def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
-    """Trace CELLS^2 primary rays per pixel through see-through surfaces, and mark the pixels that their filter reaches.
+    """Trace CELLS^2 primary rays per pixel through see-through surfaces. Mark the pixels whose filter reaches smooth
+    specular lobes.
 
     The function may miss objects smaller than a cell. The rays are the same at every call.
     """
@@ -113,9 +114,9 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
 
 
 def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:
-    """Return whether surfaces have only delta lobes, and whether some have delta lobes.
+    """Return whether a surface has only delta lobes, and whether a surface has delta lobes beside other lobes.
 
-    The surfaces are those along a ray up to the first one that is not see-through.
+    The surfaces lie along a ray, up to the first surface that is not see-through.
     """
     lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
     alone, mixed = dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
@@ -138,8 +139,8 @@ def visible_texels(
 ) -> np.ndarray[Any, Any]:  # fmt: skip
     """Return the texels of the texture `key` that some sensor sees: boolean (H, W).
 
-    `pixels` (H, W) selects the pixels of each sensor that count, or is None if all do. With `mirrored`, texels seen
-    through mirrors and clear glass count as well. Camera paths find these texels.
+    `pixels` has a mask (H, W) of the pixels that count for each sensor, or None if all pixels count. With `mirrored`,
+    texels seen through mirrors and clear glass count as well. Camera paths find these texels.
 
     A texel counts if a primary ray hits the inner quarter of its cell. Rays pass see-through surfaces (masks). Without
     `mirrored`, rays do not pass glass or mirrors, because light paths cannot connect to the sensor through glass or
@@ -167,14 +168,16 @@ def visible_texels(
 
 @dataclass(frozen=True)
 class _Texels:
-    """Texels of a texture of `size` (width, height), on surfaces of the BSDFs `owners`; `transform` is its `to_uv`."""
+    """Texels of a texture of `size` (width, height) on surfaces with the BSDFs `owners`. `transform` is the texture's
+    `to_uv`.
+    """
 
     owners: Sequence[Any]
     transform: list[list[float]]
     size: tuple[int, int]
 
     def met(self, si: Any) -> tuple[Any, Any]:
-        """Return the texel at each surface point, and whether the point is in the inner quarter of its cell."""
+        """Return the texel at each surface point, and whether the point is in the inner quarter of the texel's cell."""
         is_owner = mi.Mask(False)
         for owner in self.owners:
             is_owner |= si.bsdf() == mi.BSDFPtr(owner)
@@ -190,8 +193,8 @@ class _Texels:
 def _mark_seen(
     scene: Any, sensor: Any, texels: _Texels, random: Any, seen: Any, kept: np.ndarray[Any, Any] | None, mirrored: bool,
 ) -> None:  # fmt: skip
-    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark the texels that it meets in
-    `seen`.
+    """Cast one primary ray per lane through the pixels marked in `kept` (H, W). In `seen`, mark the texels that the
+    rays meet.
 
     With `mirrored`, rays also pass mirrors and clear glass.
     """
@@ -222,7 +225,7 @@ _RAYS, _PATHS = 48, 32
 class Depth:
     """Path depth in segments, and the mean share of a pixel's light that longer paths would add.
 
-    For the greatest depth, `missing` is None, because the greatest depth was not compared with a greater one.
+    For the greatest depth, `missing` is None, because there is no greater depth to compare with.
     """
 
     segments: int
@@ -248,7 +251,7 @@ def find_depth(scene: mi.Scene, sensor: int) -> Depth:
 
 
 def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:
-    """Return the light (N,) of paths of at most `segments` segments, by ray, as float64."""
+    """Return the light (N,) of each ray, as float64. The light comes from paths of at most `segments` segments."""
     sensor, count = scene.sensors()[index], _RAYS**2 * _PATHS
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, count)

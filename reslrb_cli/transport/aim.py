@@ -1,27 +1,27 @@
-"""Scattering towards visible points, mixed with the directions of the BSDF.
+"""Scattering towards points that the sensor sees, mixed with BSDF sampling.
 
 A glossy surface reflects light to the sensor from few directions. Few paths arrive from the directions that a glossy
 surface reflects to the sensor. The weights of these few paths are so large that they dominate the noise. At each
 surface, a share SHARE of the paths is therefore aimed at a point that the sensor sees. A position on the film is
 sampled, the first surface there is found, and the path continues to it. The next vertex z can be found by BSDF sampling
-or by aiming. Both ways form a mixture (Veach's thesis, ch. 9) with the one-sample model and the balance heuristic. The
+or by aiming. Both ways form a mixture in the one-sample model with the balance heuristic (Veach's thesis, ch. 9). The
 following weight replaces f cos / p_b.
 
     f cos / ((1 - SHARE) p_b + SHARE p_a)        p_a = p_film |cos_z| W / d^2 * |x - z|^2 / |cos|
 
-p_b is the density of the BSDF's directions at x. W / d^2 is the sensor's importance and geometry at z, cos_z the cosine
-at z towards the sensor, and cos the cosine at z towards x. If the sensor does not see z, p_a is 0. The visibility of z
-is known only when the path reaches z. A path therefore leaves x with the weight f cos / p_b, whether the sensor sees z
-or not. At z, the path's weight is multiplied by r, which is at most 1 / (1 - SHARE).
+p_b is the density of the BSDF's directions at x. W / d^2 is the sensor's importance and geometry at z. cos_z is the
+cosine at z towards the sensor, and cos is the cosine at z towards x. If the sensor does not see z, p_a is 0. The
+visibility of z is known only when the path reaches z. A path therefore leaves x with the weight f cos / p_b, whether
+the sensor sees z or not. At z, the path's weight is multiplied by r, which is at most 1 / (1 - SHARE).
 
     r = 1 / ((1 - SHARE) + SHARE p_a / p_b)
 
 An aimed path ends if it meets another surface on its way, or a point that the sensor does not see. Like the weight of
 roulette, r has no derivative.
 
-Positions on the film are sampled by blocks of pixels (`Aim`). A share AIM_UNIFORM is uniform. The remaining share of
-film positions follows the contributions found in earlier steps. The remaining share also follows the step's own dL/dI
-if dL/dI is known before the samples are drawn.
+A film position is sampled as a block of pixels (`Aim`) and a position in the block. A share AIM_UNIFORM is uniform. The
+remaining share of film positions follows the contributions found in earlier steps. The remaining share also follows the
+step's own dL/dI if dL/dI is known before the samples are drawn.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ class Aim:
 
 @dataclass
 class Pending:
-    """Loop state: the data of the last scattering event that the next vertex needs.
+    """Loop state: data of the last scattering event, needed at the next vertex.
 
-    `share` is the share of aimed paths at the last scattering event. `pdf` is p_b, and infinite for discrete
-    directions, which aimed paths never take. `distance` is the distance to the point that the path is aimed at, or
-    negative if it is not aimed.
+    `share` is the share of aimed paths at the last scattering event. `pdf` is p_b, or infinity for discrete directions.
+    Aimed paths never take discrete directions. `distance` is the distance to the target point, or negative if the path
+    is not aimed.
     """
 
     share: mi.Float
@@ -105,10 +105,10 @@ class Pending:
         self, aim: Aim, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, connection: Connection,
         visible: mi.Bool,
     ) -> mi.Float:  # fmt: skip
-        """Return r at the vertex `si` that `ray` reaches. It is 0 if the path ends there.
+        """Return the factor r at the vertex `si` that `ray` reaches. It is 0 if the path ends there.
 
-        `visible` tells whether the sensor sees the vertex. `connection` is a connection as from an emitter, without the
-        correction for shading normals.
+        `visible` tells whether the sensor sees the vertex. `connection` has no correction for shading normals, like a
+        connection from an emitter.
         """
         film = film_blocks(sensor)
         p_film = dr.gather(mi.Float, aim.density, film.block(connection.u), visible)
@@ -130,7 +130,9 @@ def worthwhile(needs: SceneNeeds, max_depth: int) -> bool:
 
 
 def aims_from(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Return the lanes whose BSDF allows aiming. Paths are also aimed only at surfaces whose BSDF allows aiming."""
+    """Return the lanes whose BSDF allows aiming. The surface at the target point must also have a BSDF that allows
+    aiming.
+    """
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
 

@@ -1,6 +1,6 @@
 """BSDFs along a light path: sampling of scattering events, evaluation, and the derivatives of both.
 
-A path has BSDF factors of two kinds: s_j (along the path) and c_i (towards the sensor). Sampling is detached:
+A path has BSDF factors of two kinds: s_j (along the path) and c_i (towards the sensor). Sampling is detached, so
 directions and densities do not depend on the parameters. A factor is f / pdf, where only f has a derivative
 (`tracked_factor`, `tracked_factors`).
 
@@ -74,7 +74,7 @@ def tracked_factors(
 def _singular_factor(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool, f: mi.Spectrum
 ) -> mi.Spectrum:
-    """Return `f`, replaced by differentiable values for sampled delta lobes and null events."""
+    """Return `f`. For sampled delta lobes and null events, differentiable values replace `f`."""
     if plan.differentiate_delta:
         delta = active & scattering.is_delta
         sample_1 = _defensive(scattering.sample_1)[1] if mixes(plan) else scattering.sample_1
@@ -127,8 +127,8 @@ class Aimed:
 class Scattering:
     """Scattering event at a vertex.
 
-    `weight` is s_j (C,), with Veach's correction. `f` (C,) is its differentiable part: weight = f correction / pdf.
-    `wo` is the local direction, and `d` the direction in world space.
+    `weight` is s_j (C,), with Veach's correction. `f` (C,) is the differentiable part of `weight`: weight = f
+    correction / pdf. `wo` is the local direction, and `d` the direction in world space.
     """
 
     weight: mi.Spectrum
@@ -147,19 +147,20 @@ class Scattering:
 
     @property
     def ways(self) -> Ways:
-        """Densities for the weights of combined paths, in walks that need them."""
+        """Densities for the weights of combined paths, in walks that need these densities."""
         assert self.own_ways is not None
         return self.own_ways
 
 
 @dataclass
 class Ways:
-    """Densities of directions at a vertex per solid angle, for the weights of combined paths (`weights.py`).
+    """Densities per solid angle of directions at a vertex. The weights of combined paths use these densities
+    (`weights.py`).
 
-    `p` is the density of the sampled direction. `back` is the density of the reverse direction in the walk from the
-    path's other end. `ahead` and `ahead_back` are the corresponding densities for the direction of the connection or of
-    the next event. Densities that are not requested are 0. `valid` and `ahead_valid` tell whether both directions lie
-    on consistent sides, as light paths require.
+    `p` is the density of the sampled direction. `back` is the density with which the walk from the path's other end
+    samples the reverse direction. `ahead` and `ahead_back` are the corresponding densities for the direction of the
+    connection or of the next event. Densities that are not requested are 0. `valid` and `ahead_valid` are true if both
+    directions lie on consistent sides, as light paths require.
     """
 
     p: mi.Float
@@ -226,7 +227,8 @@ def shading_correction(
     Without shading normals, the factor is 1 and the sides are always consistent. The function then computes neither the
     factor nor the sides. With perturbed normals the factor is |n . wo| / |n . wi|. The exchanged BSDF contains the rest
     of the correction. The geometric normal n is taken on the side of the shading normal. A transform that mirrors a
-    mesh reverses the winding of its faces, but camera paths use only the shading normal and do not notice this.
+    mesh reverses the winding of its faces. Camera paths use only the shading normal, so the winding does not affect
+    them.
     """
     if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
         return mi.Float(1), mi.Bool(True)
@@ -251,9 +253,10 @@ def scatter(
 ) -> tuple[Scattering, mi.Spectrum | None]:  # fmt: skip
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
-    The results are detached, unless `attached`. Sampling and evaluation share one indirect call and common work, for
-    example texture lookups. `aimed` lanes use the direction to their target point. Their density is the BSDF's density
-    of this direction. In `weighed` lanes, the function also computes the densities of `Ways` for `connection_wo`.
+    The results are detached unless `attached` is true. Sampling and evaluation share one indirect call and common work,
+    for example texture lookups. `aimed` lanes use the direction to their target point. The density in `aimed` lanes is
+    the BSDF's density of the target direction. In `weighed` lanes, the function also computes the densities of `Ways`
+    for `connection_wo`.
     """
     si, bsdf, context, drawn = hit.si, hit.bsdf, context_of(plan), sample_1
     ways_asked = plan.camera or plan.weighs
@@ -329,11 +332,11 @@ def following(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active:
     """Return a sample whose derivative is the derivative of the integral that the sample estimates.
 
     For some BSDFs, the sample's own derivative is correct. The sampled direction then follows the surface and the
-    roughness. The sampling of these BSDFs is smooth, or the choice of a lobe is weighted accordingly, as in Mitsuba's
-    dielectrics. Other BSDFs choose a lobe by a probability that depends on their parameters and on the incident
-    direction. The derivative of a sample ignores this choice. Smooth lobes of BSDFs in `plan.needs.unfollowed`
-    therefore keep their direction in the local frame. The derivative of f / pdf then comes from f alone. Their delta
-    lobes keep the probability.
+    roughness. These BSDFs sample smoothly, or weight the choice of a lobe accordingly, like Mitsuba's dielectrics.
+    Other BSDFs choose a lobe by a probability that depends on their parameters and on the incident direction. The
+    derivative of a sample ignores this choice. Smooth lobes of BSDFs in `plan.needs.unfollowed` therefore keep their
+    direction in the local frame. The derivative of f / pdf then comes from f alone. Their delta lobes keep the
+    probability.
     """
     if not plan.needs.unfollowed:
         return sample
@@ -379,8 +382,8 @@ def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: m
 
 
 def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Return the lanes in which a perturbed BSDF does not sample itself. Also returns the random number `sample_1`,
-    rescaled for the lanes in which the BSDF samples itself.
+    """Return the lanes in which a perturbed BSDF does not sample the direction itself. Also returns the random number
+    `sample_1`, rescaled for the lanes in which the BSDF samples the direction.
     """
     defensive = sample_1 < DEFENSIVE
     return defensive, dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
@@ -393,9 +396,9 @@ def _mixed(
     """Return a BSDF's sample with the density of the mixture. In `defensive` lanes, the sample is a cosine-weighted
     direction.
 
-    A BSDF with a perturbed normal samples directions around the normal that faces wi. The exchanged evaluation of this
-    BSDF uses the normal that faces wo. Some directions therefore have a nonzero value, although the BSDF never samples
-    them.
+    A BSDF with a perturbed normal samples directions around the normal that faces wi. The evaluation with exchanged
+    directions uses the normal that faces wo. Some directions therefore have a nonzero value, although the BSDF never
+    samples them.
     """
     hemisphere = mi.warp.square_to_cosine_hemisphere(sample_2)
     hemisphere.z = dr.mulsign(hemisphere.z, mi.Frame3f.cos_theta(si.wi))
@@ -421,12 +424,12 @@ def _to_point(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: 
 
 
 def _glossy(mask: mi.Bool, lobe: mi.UInt32) -> mi.UInt32:
-    """Return the type of the sample, set to glossy reflection in these lanes."""
+    """Return the sample's lobe type. In the lanes of `mask`, the type is glossy reflection."""
     return dr.select(mask, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
 
 
 def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
-    """Return cos_p wi / cos_p wo of a mirror or refraction, whose normal p is along wi + eta wo."""
+    """Return cos_p wi / cos_p wo of a mirror or refraction. The normal p is along wi + eta wo."""
     h = dr.fma(eta, wo, wi)
     return dr.abs(dr.dot(h, wi) / dr.dot(h, wo))
 

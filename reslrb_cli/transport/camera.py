@@ -42,8 +42,7 @@ class FilmRay:
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
-    """Return a ray for each lane, distributed over the pixels of the crop window, evenly or by the weights of the
-    pixels.
+    """Return a ray for each lane. The rays are distributed over the crop window's pixels, evenly or by pixel weights.
 
     If there are fewer rays than pixels, each ray goes to a random pixel of its own group of pixels.
     """
@@ -75,8 +74,8 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
 def _within_pixel(samples: Samples, number: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
     """Return positions in [0, 1)^2 within pixels, distributed evenly over the numbered samples of each pixel.
 
-    They are Hammersley points, shifted by a random offset for each pixel. Independent positions within a pixel would
-    add noise through the reconstruction filter.
+    The positions are Hammersley points, shifted by a random offset for each pixel. Independent positions within a pixel
+    would add noise through the reconstruction filter.
     """
     x, y = (mi.Float(word) * 2**-32 for word in mi.sample_tea_32(pixel, samples.seed))
     inverse = mi.Float(dr.brev(number)) * 2**-32
@@ -110,7 +109,7 @@ class MetLight:
 
 @dataclass(kw_only=True)
 class NextEvent(Connection):
-    """Connection of a vertex of a camera path to a point on an emitter, or to a direction.
+    """Connection of a camera path's vertex to a point on an emitter, or to a direction.
 
     `weight` (C,) is the contribution without BSDF and transmittance: Le w_N / density. `scale` is `weight` without the
     radiance. `Le` (C,) is the detached radiance, `through` (C,) the transmittance, and `target` the point on the
@@ -147,7 +146,7 @@ class CameraHooks:
     tracked: bool = False
 
     def start(self, first: FilmRay) -> Any:
-        """Return the state before the first vertex, any PyTree."""
+        """Return the state before the first vertex. The state can be any PyTree."""
         return []
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
@@ -172,9 +171,8 @@ class CameraHooks:
 class CameraPath:
     """Loop state of one camera path.
 
-    `before` is the last vertex that is not a null event. `events` counts the vertices that are not null events. If no
-    light paths compete, `M` is 1 / p of the last event that is not a null event. After the sensor or a delta event, `M`
-    is 0.
+    `before` is the last vertex that is not a null event. `events` counts the vertices that are not null events. Without
+    light paths, `M` is 1 / p of the last event that is not a null event. After the sensor or a delta event, `M` is 0.
     """
 
     active: mi.Bool
@@ -295,7 +293,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
 
 
 def _behind_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
-    """Return the rays, moved behind the hidden lamps that they meet first."""
+    """Return the rays. Each origin is moved behind any hidden lamps that the ray meets first."""
 
     def body(active: mi.Bool, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Ray3f]:
         si = scene.ray_intersect(ray, active)
@@ -426,7 +424,7 @@ def _weigh(
 def _behind(
     plan: Plan, path: CameraPath, arrived: list[Rivals], si: mi.SurfaceInteraction3f, scattering: Scattering
 ) -> CameraPath:  # fmt: skip
-    """Return the path with its weights updated by the event of a vertex."""
+    """Return the path after the event of a vertex, with updated weights."""
     ways = scattering.ways
     renewed = dr.rcp(ways.p)
     null = scattering.is_null

@@ -51,11 +51,11 @@ def transmittance(
 ) -> Passage:  # fmt: skip
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
-    Each crossing counts as a vertex, as for `path`. `on_crossing(transmission, active)` is called at each crossing with
-    its transmission (C,), which is tracked if gradients are enabled. `on_crossing` can therefore differentiate the
-    transmission. With `tangents`, the derivative along the parameters' tangents is computed (forward mode). With
-    `tangents`, gradients must be suspended, because the loop itself must not track any gradients. With `past_lamps`,
-    lamps do not block the way.
+    Each crossing counts as a vertex, as in Mitsuba's `path`. At each crossing, `on_crossing(transmission, active)` gets
+    the crossing's transmission (C,). `transmission` is tracked if gradients are enabled. `on_crossing` can therefore
+    differentiate the transmission. With `tangents`, the derivative along the parameters' tangents is computed (forward
+    mode). With `tangents`, gradients must be suspended, because the loop itself must not track any gradients. With
+    `past_lamps`, lamps do not block the way.
     """
 
     def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, mi.Ray3f]:
@@ -105,8 +105,9 @@ class Connection:
 
     `weight` (C,) is c_i without BSDF and transmittance: sensor importance, geometry and Veach's correction. `u` is the
     film position in pixels relative to the crop window. `target` is the point on the aperture, or on the near clip
-    plane if anything stands before that plane. A walk that evaluates connections sets `f` (C,) to bsdf * cos, `through`
-    (C,) to the transmittance, `c` to c_i (C,), and `active` to the lanes that the sensor sees.
+    plane if anything stands before that plane. A walk that evaluates connections sets `f` (C,) to bsdf * cos, and
+    `through` (C,) to the transmittance. The walk also sets `c` to c_i (C,), and `active` to the lanes that the sensor
+    sees.
     """
 
     weight: mi.Spectrum
@@ -149,9 +150,11 @@ def connect(
 
 
 def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.Bool, mi.Point3f]:
-    """Return whether the point is within the sensor's clip planes, and where its camera ray crosses the near plane.
+    """Return whether the point is within the sensor's clip planes. Also return where the point's camera ray crosses the
+    near plane.
 
-    For thin lenses, Mitsuba ignores the planes, and sees nothing if the lens focuses outside of them.
+    For thin lenses, Mitsuba ignores the clip planes. If the lens focuses outside of the clip planes, Mitsuba's sensor
+    sees nothing.
     """
     params = mi.traverse(sensor)
     near, far = mi.Float(params["near_clip"]), mi.Float(params["far_clip"])
@@ -164,7 +167,7 @@ def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.B
 
 
 def _importance(sensor: mi.Sensor, ds: mi.DirectionSample3f, sees: mi.Bool) -> mi.Spectrum:
-    """Return importance and geometry of a camera if it sees the point.
+    """Return a camera's importance and geometry if the camera sees the point, otherwise 0.
 
     Mitsuba's own importance ignores a shift of the principal point, and is zero outside of the unshifted film.
     Mitsuba's own importance is also zero if a thin lens focuses outside of the clip planes.
@@ -175,8 +178,8 @@ def _importance(sensor: mi.Sensor, ds: mi.DirectionSample3f, sees: mi.Bool) -> m
 
 
 def film_density(sensor: mi.Sensor, cos: mi.Float) -> mi.Float:
-    """Return the density of directions of camera rays through one pixel. `cos` is the cosine between the direction and
-    the sensor's axis.
+    """Return the density of camera ray directions through one pixel. `cos` is the cosine between the direction and the
+    sensor's axis.
     """
     size = sensor.film().size()
     half = dr.tan(dr.deg2rad(mi.Float(mi.traverse(sensor)["x_fov"])) / 2)
@@ -186,15 +189,17 @@ def film_density(sensor: mi.Sensor, cos: mi.Float) -> mi.Float:
 
 @dataclass
 class Seen:
-    """Visibility of the sensor from an earlier walk: `visible`, in the lanes that are `known` (None: in all lanes)."""
+    """Visibility of the sensor, found in an earlier walk. `visible` is valid in `known` lanes, or in all lanes if
+    `known` is None.
+    """
 
     visible: mi.Bool
     known: mi.Bool | None = None
 
 
 def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
-    """Return replacements for bsdf * cos and for c_i (C,) if they are zero (`Product.times`). They are those of a white
-    surface.
+    """Return replacements for zero values of bsdf * cos and of c_i (C,), used by `Product.times`. They are those of a
+    white surface.
     """
     f = dr.maximum(dr.abs(mi.Frame3f.cos_theta(connection.wo)), 1e-3) * dr.inv_pi
     return f, connection.weight * f

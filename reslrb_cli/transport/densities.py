@@ -28,8 +28,8 @@ EVEN, TEXTURED, ENVIRONMENT, PROJECTOR, UNSEEN = range(5)  # method for the dens
 
 @dataclass
 class EmitterDensities:
-    """Densities of a scene's emitters, (R,) each, opaque. The index is the emitter's number in Dr.Jit's registry, as in
-    pointers.
+    """Densities of a scene's emitters, as opaque arrays (R,). The index is the emitter's number in Dr.Jit's registry,
+    which emitter pointers also contain.
 
     `choice` is the probability of selecting an emitter. `emitted` is e, without a factor that depends on a texture.
     `kind` tells which factor this is.
@@ -102,8 +102,8 @@ class Place:
     """Place where light leaves an emitter, as input for `density_of_rays`.
 
     `own` is the density of the place or direction in next event estimation. For a lamp, `own` is the density of the
-    place per area. For environments, `own` is the density of the direction. The choice of the emitter is not included.
-    `uv` are texture coordinates, and `d` is the direction of the light.
+    place per area. For environments, `own` is the density of the direction. `own` does not include the probability of
+    choosing the emitter. `uv` are texture coordinates, and `d` is the direction of the light.
     """
 
     emitter: mi.EmitterPtr
@@ -113,8 +113,8 @@ class Place:
 
 
 def density_of_rays(plan: Plan, table: EmitterDensities, at: Place, active: mi.Bool) -> mi.Float:
-    """Return e, the density of the rays that leave these places, divided by the cosine at the emitter's surface if the
-    emitter has one.
+    """Return e, the density of the rays that leave these places. If the emitter has a surface, e is divided by the
+    cosine at the surface.
     """
     number = dr.reinterpret_array(mi.UInt32, at.emitter)
     e = dr.gather(mi.Float, table.emitted, number, active)

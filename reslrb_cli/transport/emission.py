@@ -1,6 +1,6 @@
 """Start of light paths: rays from the emitters, sampled by Mitsuba or by `lamps.py`.
 
-`used_numbers` tells which of the random numbers of emission the emitters of a scene use.
+`used_numbers` returns which random numbers of emission a scene's emitters use.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def used_numbers(samples: Samples) -> list[bool]:
 
 @dataclass
 class Emission:
-    """Ray that leaves an emitter, with the weight E (C,), which is radiance divided by the density of the ray.
+    """Ray that leaves an emitter, and its weight E (C,). The weight is the radiance divided by the ray's density.
 
     If derivatives are enabled, `weight` tracks the derivatives of emission. If emitters move, ray and density track
     derivatives as well. `guided` is the factor of `weight` from a guide, or None without a guide. `position` contains
@@ -55,7 +55,9 @@ class Emission:
 
 
 def sample_time(plan: Plan, sensor: mi.Sensor, sampler: mi.Sampler | NumberStream) -> mi.Float:
-    """Return a time within the shutter interval. A number is drawn only if this interval has a length."""
+    """Return a time within the shutter interval. A random number is drawn only if the shutter interval is longer than
+    0.
+    """
     time = mi.Float(sensor.shutter_open())
     if plan.needs.moving_shutter:
         time += sampler.next_1d() * sensor.shutter_open_time()
@@ -63,8 +65,8 @@ def sample_time(plan: Plan, sensor: mi.Sensor, sampler: mi.Sampler | NumberStrea
 
 
 def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
-    """Sample a ray from a random emitter of the scene. It uses the same random numbers, in the same order, as
-    `ptracer`.
+    """Sample a ray from a random emitter of the scene. The function uses the same random numbers as `ptracer`, in the
+    same order.
     """
     time = sample_time(samples.plan, samples.sensor, sampler)
     wavelength_sample, sample_2, sample_3 = samples.emission_numbers(sampler)
@@ -102,7 +104,7 @@ def _emitter_ray(
     samples: Samples, emitter: mi.EmitterPtr, time: mi.Float, number: mi.Float, position: mi.Point2f,
     direction: mi.Point2f, active: mi.Bool,
 ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
-    """Return a ray that leaves each lane's emitter, by `lamp_ray` or by Mitsuba."""
+    """Return a ray that leaves each lane's emitter. `lamp_ray` or Mitsuba samples the ray."""
     placed = samples.plan.placed_lamps
     lamps = {lamp.emitter: (lamp, samples.areas(lamp), lamp in samples.plan.evened_lamps) for lamp in placed}
     if samples.plan.moving_emission:

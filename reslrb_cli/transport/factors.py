@@ -1,4 +1,4 @@
-"""Products of path factors that count zeros, so that the derivative at a zero factor is not lost.
+"""Products of path factors. The products count zero factors, so that the derivative at a zero factor is not lost.
 
 The contribution of a path is a product of factors, f_0 f_1 ... f_k, per channel. The derivative of the contribution
 with respect to factor f_j is the product of all other factors. Dividing the product by f_j fails if f_j = 0. Therefore
@@ -38,10 +38,10 @@ class Product:
     """Product of factors, one value per channel, as part of the loop state.
 
     If zeros are not tracked, `nonzero` is the product of all factors. If zeros are tracked, replacements take the place
-    of zero factors in `nonzero`. `zero` is, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS. `tracked`
-    is the plain product with derivatives, for naive AD only. `raised` is the product of the factors after each factor
-    is raised to at least DIM times its replacement. `zero` and `raised` are empty if zeros are not tracked, and
-    `tracked` is empty without naive AD.
+    of zero factors in `nonzero`. For each channel, `zero` is the index of the zero factor, or NO_ZERO or MANY_ZEROS.
+    `tracked` is the plain product with derivatives, for naive AD only. `raised` is the product of the factors after
+    each factor is raised to at least DIM times its replacement. `zero` and `raised` are empty if zeros are not tracked,
+    and `tracked` is empty without naive AD.
     """
 
     nonzero: mi.Spectrum

@@ -6,8 +6,8 @@ The weights sum to 1 over the pixels.
     splat:   I_p += filter_p(u) C
     lookup:  delta = sum_p filter_p(u) dL/dI_p
 
-`Blocks` divides a film into blocks of pixels, for learning by position. `PixelShares` distributes camera paths over its
-pixels.
+`Blocks` divides a film into blocks of pixels, for learning by position. `PixelShares` distributes camera paths over a
+film's pixels.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class Film:
     ) -> None:
         """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
 
-        Under naive AD, the weights of the pixels move with `u`. Mitsuba divides the filter weights by their sum, and
-        detaches this sum. With `normalization`, the sum is differentiated as well. If the film is `whole`, the filter
-        weights are not divided by their sum.
+        Under naive AD, the pixels' weights have derivatives with respect to `u`. Mitsuba divides the filter weights by
+        their sum, and detaches this sum. With `normalization`, the sum is differentiated as well. If the film is
+        `whole`, the filter weights are not divided by their sum.
         """
         if normalization and not self.whole:
             total = filter_weights(self.film.rfilter(), u)[2]
@@ -92,7 +92,7 @@ class Film:
     def develop(self, block: mi.ImageBlock, tangent: bool = False) -> mi.TensorXf:
         """Return the image (H, W, channels) in the film's own pixel format, differentiable with respect to the block.
 
-        With `tangent`, the block is a derivative, and the opaque alpha channel has none.
+        With `tangent`, the block is a derivative. The opaque alpha channel has no derivative.
         """
         self.film.prepare([])
         if block.channel_count() == len("RGBAW") and not tangent:
@@ -143,8 +143,8 @@ class AdjointImage:
         self.filter = film.film.rfilter()
 
     def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> mi.Spectrum:
-        """Return delta (C,) at film position `u` (pixels, relative to the crop window), with its derivative by `u` if
-        enabled.
+        """Return delta (C,) at film position `u` (pixels, relative to the crop window). If gradients are enabled, delta
+        has a derivative with respect to `u`.
 
         Without `normalization`, the sum that divides the filter's weights has no derivative, as in Mitsuba.
         """
@@ -197,8 +197,8 @@ def filter_weights(
 ) -> tuple[mi.Point2i, tuple[list[mi.Float], list[mi.Float]], mi.Float]:
     """Return the filter weights that `ImageBlock.put` uses at film position `u`.
 
-    The result has the first touched pixel, the weights by column and by row, and their sum over all pixels, including
-    pixels off the film.
+    The result contains the first touched pixel, the column weights, the row weights, and the sum over all pixels. The
+    sum includes pixels off the film.
     """
     radius = rfilter.radius()
     taps = int(dr.ceil(2 * radius))
@@ -256,7 +256,7 @@ class Blocks:
         """Return the root mean square of an image (height, width, C) in each block (rows * columns), times the block's
         area.
 
-        The unit is the largest value of the image. Values that are not finite count as 0.
+        All values are divided by the image's largest absolute value. Values that are not finite count as 0.
         """
         channels, values = image.shape[2], dr.abs(image.array)
         values = dr.select(dr.isfinite(values), values, 0)
@@ -284,12 +284,12 @@ MOST_SLOTS = 4  # per pixel
 
 @dataclass
 class PixelShares:
-    """Distribution of the camera paths of a pass over the n pixels of a film. Each pixel has some paths.
+    """Distribution of a pass's camera paths over the n pixels of a film. Each pixel has some paths.
 
-    The first `even` paths (width 1) are distributed evenly, with at most one more in some pixels. The paths after the
-    first `even` paths go through all `slots` (S,) `rounds` times (width 1). `slots` holds the pixels in order. Pixel i
-    has `each[i]` (n,) consecutive slots. Slot number `first[i]` (n,) is the first of them. The number of paths of a
-    pixel is therefore not random, and dividing by it adds no noise.
+    The first `even` paths (width 1) are distributed evenly. Their numbers per pixel differ by at most one. All later
+    paths go through the array `slots` (S,) `rounds` times (width 1). `slots` holds the pixels in order. Pixel i has
+    `each[i]` (n,) consecutive slots. The first slot of pixel i has the number `first[i]` (n,). The number of paths per
+    pixel is therefore not random, and dividing by this number adds no noise.
     """
 
     slots: mi.UInt32
@@ -325,7 +325,7 @@ class PixelShares:
 
     @staticmethod
     def bytes(pixels: int) -> int:
-        """Return the size in bytes of the distribution for one film and one number of paths."""
+        """Return the distribution's size in bytes for a film with `pixels` pixels and one number of paths."""
         return (MOST_SLOTS + 2) * 4 * pixels
 
     def count(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:

@@ -7,10 +7,10 @@ uniform within the cell k, and the path's weight is multiplied by v_k / p_k. Gui
 contribution of a path under two conditions. Every cell can be sampled, and p does not depend on the random numbers with
 which p is used.
 
-Sampling takes one lookup. Of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes are stratified: the slots are
-divided into n equal parts for n lanes, and lane i samples from part i. Only the noise within cells remains, and similar
-paths are traced side by side. At least a share GUIDE_UNIFORM of all slots is distributed evenly, so no table makes a
-weight larger than 1 / GUIDE_UNIFORM.
+Sampling takes one lookup. Cell k has m_k of the M slots, and p_k is exactly m_k / M. Lanes are stratified. The slots
+are divided into n equal parts for n lanes, and lane i samples from part i. Only the noise within cells remains, and
+similar paths are traced side by side. At least a share GUIDE_UNIFORM of all slots is distributed evenly. Therefore no
+weight is larger than 1 / GUIDE_UNIFORM.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Drawn:
 
 @dataclass
 class Guide:
-    """Table with the number of lanes that share it. The number is opaque."""
+    """Table, and the number of lanes that share the table. The number is opaque."""
 
     table: Table
     lanes: mi.UInt64
@@ -122,8 +122,8 @@ class Guide:
     def draw(
         self, grid: Grid, width: int, stream: mi.PCG32, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f,
     ) -> Drawn:  # fmt: skip
-        """Draw the start of each of `width` lanes. `choice`, `position` and `direction` determine the place within its
-        cell.
+        """Draw the start of each of `width` lanes. The random numbers `choice`, `position` and `direction` determine
+        the start's place within its cell.
         """
         lane, jitter = mi.UInt64(dr.arange(mi.UInt32, width)), mi.UInt64(stream.next_uint32())
         slot = ((lane << 32) | jitter) // self.lanes >> (32 - (grid.slots.bit_length() - 1))

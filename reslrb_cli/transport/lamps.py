@@ -31,8 +31,8 @@ def lamp_ray(
     """Return a ray that leaves the lamp, and radiance / density (C,). The function uses the same random numbers as
     Mitsuba.
 
-    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, otherwise None. With `evened`, black texels of
-    a lamp's texture are sampled, too.
+    `areas` are the cumulative areas from `sums_of_areas` for a mesh with moving faces, otherwise None. With `evened`,
+    black texels of a lamp's texture are sampled, too.
     """
     si, weight = lamp_point(lamp, areas, time, position, active, evened)
     _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
@@ -85,7 +85,7 @@ def _textured_point(
 def _any_point(
     shape: mi.Shape, texture: mi.Texture, time: mi.Float, sample: mi.Point2f, active: mi.Bool
 ) -> tuple[mi.PositionSample3f, mi.Float]:
-    """Return a point on a textured lamp. It is sampled partly as in Mitsuba's emitter, and partly uniformly."""
+    """Return a point on a textured lamp. The point is sampled partly as in Mitsuba's emitter, and partly uniformly."""
     uv, density = _any_uv(texture, sample, active)
     there = shape.eval_parameterization(uv, mi.RayFlags.All, active)
     there.time = time
@@ -113,14 +113,14 @@ def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[m
 
 
 def drawn_face(areas: mi.Float, sample: mi.Float) -> mi.UInt32:
-    """Return the face that Mitsuba samples with this number, given the cumulative areas."""
+    """Return the face that Mitsuba selects with the random number `sample`. `areas` are the faces' cumulative areas."""
     last = dr.width(areas) - 1
     value = sample * dr.gather(mi.Float, areas, mi.UInt32(last))
     return dr.binary_search(0, last, lambda index: dr.gather(mi.Float, areas, index) < value)
 
 
 def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
-    """Return the cumulative areas (F,) of the faces of each lamp, which is a mesh. The result is evaluated and
+    """Return the cumulative face areas (F,) of each lamp. All lamps must be meshes. The result is evaluated and
     detached.
     """
     with dr.suspend_grad():

@@ -1,4 +1,4 @@
-"""Plan of a walk, made before tracing: features that a scene does not need are not compiled."""
+"""Plan of a walk, made before tracing. Features that a scene does not need are not compiled."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Grid:
         return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
     def summed(self, values: Array, coarser: Grid) -> Array:
-        """Return the sums of `values` (cells,) over the cells in each coarser cell. The sums have the type of
+        """Return the sum of `values` (cells,) in each cell of the grid `coarser`. The sums have the type of
         `values`.
         """
         result = values.reshape(self.shape)
@@ -82,7 +82,9 @@ class Grid:
         return result.ravel()
 
     def shared_out(self, values: Array, coarser: Grid) -> Array:
-        """Return the values of coarser cells, distributed evenly over their cells. This is the inverse of `summed`."""
+        """Return the `values` of the grid `coarser`, each distributed evenly over the cells in its coarser cell. This
+        is the inverse of `summed`.
+        """
         result = values.reshape(coarser.shape) * (coarser.cells / self.cells)
         for axis, (fine, few) in enumerate(zip(self.shape, coarser.shape, strict=True)):
             result = result.repeat(fine // few, axis)
@@ -173,7 +175,7 @@ class Plan:
 
     @property
     def passes_lamps(self) -> bool:
-        """Whether connections to the sensor pass through lamps, which are hidden from its rays."""
+        """Whether connections to the sensor pass through lamps, because lamps are hidden from the sensor's rays."""
         return self.weighs and self.hide_emitters and not self.camera and bool(self.needs.lamps)
 
     @property
@@ -262,7 +264,7 @@ class Plan:
 
     @property
     def sole_bsdf(self) -> mi.BSDFPtr | None:
-        """The only differentiated BSDF (a pointer) if there is just one, or otherwise None."""
+        """Pointer to the differentiated BSDF if there is exactly one, otherwise None."""
         return mi.BSDFPtr(self.only_bsdfs[0]) if len(self.only_bsdfs) == 1 else None
 
     def differentiates(self, bsdf: mi.BSDFPtr) -> mi.Bool:

@@ -2,9 +2,9 @@
 path.
 
 The learned roulette ends paths in directions where earlier paths contributed little. The bounding box of the scene is
-divided into cubes, and the directions in each cube into octants. A path that leaves a vertex with throughput w survives
-with probability q, and its weight is divided by q. w is the largest channel, including emission and earlier roulette. s
-is the value of the cell of the vertex and the new direction.
+divided into cubes, and the directions in each cube into octants. A path leaves a vertex with throughput w, the largest
+channel including emission and earlier roulette. The path survives with probability q, and its weight is then divided by
+q. The vertex and the new direction select a cell, and s is this cell's value.
 
     q = min(1, max(LEAST, w s))
 
@@ -107,8 +107,8 @@ def play(
     plan: Plan, survival: Survival | None, depth: mi.UInt32, throughput: mi.Float, eta: mi.Float, o: mi.Point3f,
     d: mi.Vector3f, number: mi.Float,
 ) -> tuple[mi.Bool, mi.Float]:  # fmt: skip
-    """Return whether a path survives at vertex `depth`, and its weight. The path leaves the vertex with the ray
-    (o, d).
+    """Return whether a path survives at vertex `depth`, and the path's roulette weight. The path leaves the vertex with
+    the ray (o, d).
     """
     q, playing = mi.Float(1), mi.Bool(False)
     if plan.roulette:

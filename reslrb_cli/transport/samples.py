@@ -137,10 +137,11 @@ class Early:
 
 @dataclass
 class Samples:
-    """Samples of one pass: `width` light paths, or camera paths if the plan says so. `seed` is an opaque UInt32.
+    """Samples of one pass: `width` light paths, or `width` camera paths if `plan.camera` is true. `seed` is an opaque
+    UInt32.
 
-    `scale` (width 1) normalises a sum over paths to an image. The pass contains the part `fraction` (width 1) of all
-    samples of this image. With a `guide`, emission is sampled from its table. With a `net`, the first numbers are
+    `scale` (width 1) normalises a sum over paths to an image. The pass contains a share `fraction` (width 1) of the
+    image's samples. With a `guide`, emission is sampled from its table. With a `net`, the first numbers are
     low-discrepancy numbers.
     """
 
@@ -171,7 +172,7 @@ class Samples:
         self._areas = sums_of_areas(lamps) if lamps else []
 
     def areas(self, lamp: Lamp) -> mi.Float | None:
-        """Return the cumulative areas of a lamp's faces if these move, otherwise None."""
+        """Return the cumulative areas of a lamp's faces if the faces move, otherwise None."""
         reshaped = self.plan.reshaped_lamps
         return self._areas[reshaped.index(lamp)] if lamp in reshaped else None
 
@@ -225,8 +226,8 @@ class Samples:
         return self._points(choice, place, direction)[1]
 
     def early_numbers(self) -> list[Early]:
-        """Return the numbers of the BSDFs of the first vertices if they are low-discrepancy numbers, otherwise an empty
-        list.
+        """Return the low-discrepancy numbers for the BSDFs of the first vertices. Return an empty list if there are no
+        low-discrepancy numbers.
         """
         if self.net is None:
             return []
@@ -272,7 +273,7 @@ class Samples:
 
 
 class NumberStream:
-    """The two sampler methods that emission needs, for a plain generator."""
+    """A plain generator with the two sampler methods that emission needs."""
 
     def __init__(self, generator: mi.PCG32) -> None:
         self.generator = generator
@@ -289,12 +290,13 @@ def passes(
     table: Table | None = None, light_share: float = 1, emitters: EmitterDensities | None = None,
     shares: Callable[[int], PixelShares | None] | None = None,
 ) -> list[Samples]:  # fmt: skip
-    """Return all samples of an image, in passes of at most `spp_per_pass` samples per pixel, which must divide `spp`.
+    """Return all samples of an image in passes of at most `spp_per_pass` samples per pixel. `spp_per_pass` must divide
+    `spp`.
 
-    The first pass has the seed itself, so that it traces the same paths as `ptracer`. With a `table` for the plan's
+    The first pass uses `seed` itself, so that it traces the same paths as `ptracer`. With a `table` for the plan's
     grid, emission is sampled from the table. If the plan has both kinds of paths, `light_share` is the share of light
-    paths in each pass, and `emitters` contains their densities. Raises ValueError for too many passes, or too many
-    paths in one pass.
+    paths in each pass. `emitters` then contains the emitters' densities. Raises ValueError for too many passes, or too
+    many paths in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:

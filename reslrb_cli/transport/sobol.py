@@ -1,21 +1,21 @@
 """Low-discrepancy numbers: scrambled Sobol points.
 
-The Sobol points distribute the starts of light paths, and the first scattering events of light paths, evenly over all
-paths. The first number is stratified over n lanes. [0, 1) is divided into n equal intervals, and the number of lane i
-lies in interval i. n does not need to be a power of two. Similar paths are traced side by side.
+Over all light paths, the Sobol points distribute starts and first scattering events evenly. The first number is
+stratified over n lanes. [0, 1) is divided into n equal intervals, and the number of lane i lies in interval i. n does
+not need to be a power of two. Similar paths are traced side by side.
 
 The other numbers are Sobol points with the lane number as index. Take 2^k consecutive lanes that start at a multiple of
-2^k. Take boxes of area 2^-k along the first two Sobol numbers. The sides of the boxes are [a, a + 1) times powers of
-two. Every such box contains exactly one point. Boxes along more than two numbers contain few points each.
+2^k. Take boxes of area 2^-k along the first two Sobol numbers. Each side of a box is [a, a + 1) times a power of two.
+Every such box contains exactly one point. Boxes along more than two numbers contain few points each.
 
-Points are scrambled for every pass (Owen 1995). Each binary digit is permuted by a permutation that depends on the
+Points are scrambled for every pass (Owen 1995). Scrambling permutes each binary digit. The permutation depends on the
 digits before it, which preserves the boxes. The permutations are hashes, as in Laine and Karras (2011), Burley (2020)
 and Vegdahl (2022). A random number is added to each coordinate, so each point is uniformly distributed for any hash. A
 sum over the lanes is therefore unbiased, and sums of different seeds are independent. Direction numbers are those of
 Joe and Kuo (2008).
 
-Digits are stored in reverse order, with the first one lowest. Carries in sums and products then affect only later
-digits.
+Digits are stored in reverse order, with the first digit in the lowest bit. Carries in sums and products then affect
+only later digits.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _reversed(digits: int) -> int:
 
 
 def point(index: mi.UInt32, coordinate: int, digits: int = DIGITS) -> mi.UInt32:
-    """Return the digits of a coordinate of the Sobol points with these indices. Indices have at most `digits` binary
+    """Return one coordinate's digits for the Sobol points with these indices. Indices have at most `digits` binary
     digits.
     """
     if coordinate == 0:
@@ -91,7 +91,7 @@ def scrambled(point: mi.UInt32, shift: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Random numbers of a path that are coordinates of its Sobol point.
+    """Random numbers that a path takes from the coordinates of its Sobol point.
 
     The coordinates are the numbers that emitters use (choice, place and direction), and numbers for scattering. Each of
     the first `bounces` scattering events has three numbers.
@@ -113,7 +113,7 @@ def make_coordinates(used: Sequence[bool], emitters: int, max_depth: int) -> Coo
 
 @dataclass
 class Net:
-    """Distance of lanes in the first coordinate, in units of 2^-64 (opaque, width 1)."""
+    """Distance between neighbouring lanes in the first coordinate, in units of 2^-64 (opaque, width 1)."""
 
     step: mi.UInt64
 

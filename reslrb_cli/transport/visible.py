@@ -1,5 +1,5 @@
-"""Light C_0 of directly visible emitters. C_0 is sampled by points on lamps that move or are small, and by primary
-rays.
+"""Light C_0 of directly visible emitters. Two kinds of samples give C_0: points on lamps that move or are small, and
+primary rays.
 
 A point x on a lamp has the following contribution at its film position u(x).
 
@@ -7,14 +7,13 @@ A point x on a lamp has the following contribution at its film position u(x).
 
 For a moving lamp, the formula for C_0 has the derivative with respect to the lamp's position. Film position, normal and
 density move with the lamp. The outline of the lamp is included, because points at its rim move, too. Occlusion of and
-by the lamp is missing. Primary rays give the light itself, and its derivative with respect to radiance.
+by the lamp is missing. Primary rays give C_0 itself, and the derivative of C_0 with respect to radiance.
 
-Primary rays rarely hit lamps smaller than a pixel. For lamps smaller than a pixel, points on the lamps give the light
-itself.
+Primary rays rarely hit lamps smaller than a pixel. For lamps smaller than a pixel, points on the lamps give C_0 itself.
 
-There is one primary ray per light path, with its own samples. The rays are distributed evenly over the pixels, so a
-constant background has no noise. `ptracer` connects random points of the emitters to the sensor, which has more noise
-for larger emitters.
+Each light path has one primary ray, with separate random numbers. The rays are distributed evenly over the pixels, so a
+constant background has no noise. `ptracer` connects random points of the emitters to the sensor. These connections have
+more noise for larger emitters.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
 
 
 def small_points(samples: Samples) -> LampPoints:
-    """Return detached points on the lamps smaller than a pixel. The lanes go through these lamps in turn."""
+    """Return detached points on the lamps smaller than a pixel. Successive lanes use the lamps in turn."""
     lamps, numbers = samples.plan.small_lamps, samples.numbers(SMALL_LAMP_STREAM)
     count, lane = dr.opaque(mi.UInt32, samples.width), dr.arange(mi.UInt32, samples.width)
     turn, index = lane % len(lamps), mi.UInt32(lamps[0].index)
@@ -86,7 +85,7 @@ class LampPoints:
 def _points(
     samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: NumberStream, attached: bool
 ) -> LampPoints:
-    """Return a point on each lane's lamp, given by its index in `scene.emitters()`."""
+    """Return a point on each lane's lamp. `index` is the lamp's index in `scene.emitters()`."""
     plan, sensor = samples.plan, samples.sensor
     time = sample_time(plan, sensor, numbers)
     position, aperture = numbers.next_2d(), numbers.next_2d()
@@ -170,13 +169,14 @@ def visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, loop_mode
 
 
 def visible_tangent(plan: Plan, scene: mi.Scene, primary: PrimaryRay) -> mi.Spectrum:
-    """Return the derivative (C,) of this radiance along the parameters' tangents (forward mode)."""
+    """Return the derivative (C,) of `visible_radiance` along the parameters' tangents (forward mode)."""
     with dr.suspend_grad():  # the loop itself tracks nothing
         return _look(plan, scene, primary, None, "symbolic", tangents=True).tangents[1]
 
 
 def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, adjoint: mi.Spectrum) -> None:
-    """Add the derivatives of the radiance along the primary rays, times `adjoint` (C,), to the parameters.
+    """Differentiate the radiance along the primary rays, times `adjoint` (C,). Add the derivatives to the parameters'
+    gradients.
 
     The derivative with respect to a transmission needs the radiance behind the surface. A first pass measures the
     radiance at the sensor, which is then divided by the transmission.

@@ -3,9 +3,9 @@
 The hooks process the connections. `Hooks` is the interface between a walk and an estimator. No estimator or integrator
 repeats the loop.
 
-One segment of a light path starts with the ray that reaches a vertex. It consists of the vertex's connection, the
-scattering event, and the next ray. It depends only on the ray, the intersection, the random numbers of the segment, and
-the scene. A segment can therefore be evaluated again from its ray, its intersection, its random numbers and the scene.
+One segment of a light path starts with the ray that reaches a vertex. A segment consists of the vertex's connection,
+the scattering event, and the next ray. A segment depends only on its ray, its intersection, its random numbers, and the
+scene. A segment can therefore be evaluated again from its ray, its intersection, its random numbers and the scene.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`. This walk and `ptracer` therefore trace the same paths
 from the same seed. Numbers for selections by hooks come from a separate stream. A replay that selects nothing therefore
@@ -62,7 +62,7 @@ class Hooks:
     max_iterations: int | None = None
 
     def start(self, product: Product) -> Any:
-        """Return the state before the first vertex, any PyTree. `product` is E."""
+        """Return the state before the first vertex. The state can be any PyTree. `product` is E."""
         return []
 
     def seen(self, vertex: Vertex) -> Seen | None:
@@ -78,7 +78,7 @@ class Hooks:
         return mi.Bool(True)
 
     def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Return, in a replay, the lanes that need their next vertex, among the lanes that scatter because of
+        """Return the lanes that need their next vertex in a replay. Candidates are the lanes that scatter because of
         `goes_on`.
         """
         return mi.Bool(True)
@@ -168,7 +168,7 @@ def segment(
     samples: Samples, hit: Hit, numbers: Numbers, connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True,
     tracked: bool = False, attached: bool = False, aimed: Aimed | None = None,
 ) -> Segment:  # fmt: skip
-    """Return the segment from a vertex, with `connected` and `scattered` lanes.
+    """Return the segment from a vertex. `connected` lanes connect to the sensor, and `scattered` lanes scatter.
 
     Without `evaluates`, the BSDF is not evaluated towards the sensor. With `tracked`, the scattering weight has
     derivatives of the scene's parameters if gradients are enabled. With `tracked`, the connection is evaluated later,

@@ -5,8 +5,8 @@ emitter (H), or its last vertex z_{K-1} samples the emitter by next event estima
 vertex z_1 to the sensor (L). The weight of each way is its density divided by the sum of the densities of all three
 ways. Therefore, w_H + w_N + w_L = 1. The weights depend only on the path, and have no derivative.
 
-Each walk carries two numbers. M is the density of the way in which the other walk joins at the newest vertex. M is
-relative to this walk's own density. V is the density of the ways in which the other walk joins at earlier vertices.
+Each walk carries two numbers. M is the density of finding the path if the other walk joins at the newest vertex. M is
+relative to this walk's own density. V is the density of finding the path if the other walk joins at an earlier vertex.
 These symbols are used below.
 
 - p and p~ are the BSDF's densities of the direction taken, and of the reverse direction in the other walk.
@@ -50,10 +50,11 @@ FROM_INFINITY = -1e30  # the length so far of a path that comes from infinity
 
 @dataclass
 class Rivals:
-    """Loop state: M and V of a walk before the arrival at its current vertex, and d since the last vertex.
+    """Loop state: a walk's M and V before the arrival at its current vertex, and the length d since the last vertex.
 
     Null events are not vertices. The density p_D of a spherical lamp depends on the vertex. If any lamp is a sphere,
-    `sphere` is therefore the number of the shape that the path comes from, or 0 for other shapes.
+    `sphere` is therefore the shape number of the spherical lamp that the path comes from. For other shapes, `sphere` is
+    0.
     """
 
     M: mi.Float
@@ -87,7 +88,7 @@ class Rivals:
 
 
 def cosine(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
-    """Return |cos| of a direction at a surface."""
+    """Return the |cosine| of direction `d` to the normal at `si`."""
     return dr.abs(dr.dot(si.n, d))
 
 
@@ -105,7 +106,7 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
         self: mi.Emitter, time: mi.Float, position: mi.Point2f, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float, mi.Point2f, mi.Float, mi.Float]:  # fmt: skip
         """Return five values for each emitted ray. The values are the density of places or directions, the cosine, the
-        texture coordinates, 1 if there is a V, and d.
+        texture coordinates, 1 if V is not 0, and d.
         """
         one, zero = mi.Float(1), mi.Float(0)
         lamp = lamps.get(self)

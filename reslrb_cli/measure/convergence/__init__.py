@@ -1,1 +1,1 @@
-"""Error against run time: the cost of each method, and how fast the error of the average of its steps falls."""
+"""Error against run time: the cost of each method, and how fast the error falls when steps are averaged."""

@@ -62,14 +62,14 @@ class Judgement:
                 self._whole = {key: ReferenceMean(self._rows(found, place)) for key, place in self._places().items()}
 
     def _places(self) -> dict[str, slice]:
-        """Return the slice of each parameter, and of all parameters together. Images have only the latter."""
+        """Return each parameter's slice, and the slice of all parameters together. Images have only the latter."""
         if "image" in self._slices:
             return self._slices
         return self._slices | {ALL: slice(None)}
 
     def _rows(self, member: Member, place: slice) -> np.ndarray:
-        """Return independent estimates by a reference. If there are several dL/dI, steps with the same dL/dI are
-        combined.
+        """Return the independent estimates that a reference member has made. If there are several dL/dI, steps with the
+        same dL/dI are combined.
         """
         several = self._session.plan.objective == "loss" and len(set(member.turns)) > IMAGES
         return member.means(place, IMAGES if several else None)

@@ -1,7 +1,7 @@
 """Processes of a `convergence`: the compared methods, the reference, and the tests for bias.
 
-All members take turns (`Arena`), with their own seeds, so no two share noise. A session may continue from the steps of
-an earlier one, with the same dL/dI.
+All members take turns (`Arena`). Each member has separate seeds, so no two members share noise. A session may continue
+from the steps of an earlier one, with the same dL/dI.
 """
 
 from __future__ import annotations
@@ -242,6 +242,6 @@ class Session(Arena[Plan, Member]):
         self._say(f"no slope for {names}: it needs {FEWEST_FOR_SLOPE} steps of each; {advice}")
 
     def _budget_of(self, rounds: int, share: float = 1.0) -> float:
-        """Return the seconds for `rounds` rounds of this session, with `share` times the measured work."""
+        """Return the budget in seconds for `rounds` rounds of this session. `share` scales the measured work."""
         before = self._now() - self._began - (self.rounds - self._before) * self._round_s
         return self._budget_for(share * (before + rounds * self._round_s))

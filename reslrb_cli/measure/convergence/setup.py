@@ -135,7 +135,7 @@ class Member(Stepping):
             self.close()
 
     def means(self, key: slice, groups: int | None = None) -> np.ndarray:
-        """Return means over turns, or over groups of turns, of some entries: (K, P)."""
+        """Return the means of the entries `key` for each turn, or for each group of turns: (K, P)."""
         turns, rows = np.array(self.turns), np.stack(self.rows)[:, key].astype(np.float64)
         if groups is not None:
             turns = turns % groups
@@ -199,7 +199,7 @@ def begin_survey(first: dict[str, Any]) -> Begun:
 def survey(
     problem: Problem, objective: str, camera: bool, named: bool, budget_s: float | None, light: bool = True
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the facts of a problem without targets, and the arrays for its samples.
+    """Return the facts of a problem that has no targets, and the arrays that the problem's samples need.
 
     The facts have these keys.
 
@@ -242,7 +242,7 @@ def survey(
 
 
 def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return dL/dI (H, W, C) at an image of this shape. Pixels whose `mask` (H, W, 1) is 0 are left out."""
+    """Return dL/dI (H, W, C) at the given image (H, W, C). Pixels whose `mask` (H, W, 1) is 0 are left out."""
     leaf = mi.TensorXf(image)
     dr.enable_grad(leaf)
     dr.backward(masked_loss(problem.views[0], leaf, None if mask.all() else mi.TensorXf(mask)))
@@ -250,7 +250,9 @@ def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray
 
 
 def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
-    """Return the view's loss of an attached image (H, W, C). Pixels whose `mask` (H, W, 1) is 0 equal the target."""
+    """Return the view's loss of an attached image (H, W, C). Pixels whose `mask` (H, W, 1) is 0 are replaced by the
+    target's pixels.
+    """
     if mask is None:
         return view.compare(image)
     target = view.target
@@ -280,7 +282,9 @@ def find_references(problem: Problem, objective: str) -> dict[str, Any]:
 
 
 def _unlike(config: Config) -> str | None:
-    """Return why naive AD computes other derivatives of moving parameters than the experiment requests, or None."""
+    """Return why naive AD's derivatives of moving parameters differ from the derivatives that the experiment requests,
+    or None.
+    """
     options, alike = config.integrator.options(), ALIKE[Reference.PTRACER]
     if all(options.get(name, value) == value for name, value in alike.items()):
         return None
@@ -301,7 +305,7 @@ def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
 
 
 def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
-    """Return the problem with a limit for the samples per pixel of a rendered target, and a message about it."""
+    """Return the problem with limited samples per pixel for a rendered target, and a message about the limit."""
     render = problem.config.target.render
     if render is None:
         return problem, ""
@@ -351,8 +355,8 @@ def begin_sampling(first: dict[str, Any]) -> Begun:
     """Start the process. A request asks for `count` steps from number `start` on, with `spp` samples per pixel.
 
     The answer has `step_ms` of each step and the number of `new_kernels`. The samples (count, P) go to the file `out`.
-    If `cold` is set, the answer also has the peak of Dr.Jit's arrays. `purpose` selects the seeds, and `image` selects
-    dL/dI.
+    If `cold` is set, the answer also has the peak memory of Dr.Jit's arrays. `purpose` selects the seeds, and `image`
+    selects dL/dI.
     """
     config = told(first)
     with np.load(first["arrays"]) as arrays:

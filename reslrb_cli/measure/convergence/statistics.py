@@ -90,7 +90,7 @@ class ReferenceMean:
 
     @cached_property
     def without(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Leave-one-out results: the change of the mean (K, P), the noise (K,) and the signal (K,) without each row."""
+        """Leave-one-out results for each row: the change of the mean (K, P), the noise (K,) and the signal (K,)."""
         count, deviations = len(self.rows), self.rows - self.mean
         moved = -deviations / (count - 1)
         squares = np.square(deviations).sum(1)
@@ -140,8 +140,8 @@ class MethodSamples:
         return found
 
     def slope(self) -> JackknifeEstimate | None:
-        """Return d log RMSE / d log time, or None if there are too few steps. It is -1/2 for independent, unbiased
-        steps.
+        """Return d log RMSE / d log time, or None if there are too few steps. The slope is -1/2 for independent,
+        unbiased steps.
 
         Averages are over steps of one group. The fit weights the error for each average length by the number of
         averages of that length.
@@ -204,8 +204,8 @@ class MethodSamples:
         return _joined(float(value), left, right)
 
     def seconds_to(self, error: float, biased: bool) -> tuple[float | None, bool]:
-        """Return the seconds until the relative error is `error`. Also return true if more steps are needed than were
-        measured.
+        """Return the seconds until the relative error is `error`. Also return a boolean that is true if more steps are
+        needed than were measured.
 
         The seconds are None if a bias keeps the error above `error`. At least one step is needed.
         """
@@ -218,7 +218,7 @@ class MethodSamples:
 
 
 def _halved(averages: np.ndarray) -> np.ndarray:
-    """Return the averages of pairs of neighbours in (N, ...). An odd last one is left out."""
+    """Return the average of each pair of neighbours along the first axis of (N, ...). An odd last one is left out."""
     pairs = len(averages) // 2
     return 0.5 * (averages[0 : 2 * pairs : 2] + averages[1 : 2 * pairs : 2])
 
@@ -246,7 +246,7 @@ def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, nois
 
 def _joined(value: float, left: np.ndarray, right: np.ndarray) -> JackknifeEstimate:
     """Return an estimate with the jackknife variances of the samples and of the reference. Welch and Satterthwaite's
-    rule combines the two.
+    rule combines the two variances.
     """
     sides = [side for side in (left, right) if len(side) > 1]
     variances = [float(jackknife_variance(side)) for side in sides]

@@ -65,7 +65,7 @@ def nested() -> dict:
 
 
 def critical() -> dict:
-    """A beam in a medium of index 1.5 that meets the medium's flat surface, y = 0, at the critical angle.
+    """A beam in a medium of index 1.5. The beam meets the medium's flat surface, y = 0, at the critical angle.
 
     The camera sees the bottom, which receives the totally reflected light.
     """
@@ -242,7 +242,9 @@ def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
 
 
 def turned_panes() -> dict:
-    """Two sheets that scatter on one side only: one shows its back to the camera, the other to the lamp."""
+    """Two sheets that scatter on one side only. One sheet shows its back to the camera, the second sheet to the
+    lamp.
+    """
 
     def pane(tilt: float, **place: Any) -> dict:
         return rectangle(diffuse(0.8, 0.6, 0.7), **place, rotate=([1, 0, 0], tilt), scale=0.35)
@@ -378,7 +380,8 @@ def _followed(kind: str, roughness: str) -> ExtremeCase:
     """Return the case of the derivative with respect to a roughness that moves light.
 
     The derivative has little noise, and finite differences give the reference. Nearly smooth glass blurs by less than a
-    pixel of the usual camera, which leaves almost no derivative. This camera is closer and sees a narrow beam.
+    pixel of the usual camera, which leaves almost no derivative. The case's camera is therefore closer, and sees a
+    narrow beam.
     """
 
     def scene() -> dict:

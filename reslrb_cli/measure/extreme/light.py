@@ -98,7 +98,7 @@ COLOURS_CASES = [
 
 
 def seen(camera: dict, **change: Any) -> dict:
-    """The room with a texture of 2 x 2 texels on its floor, the minimum in Mitsuba."""
+    """The room with a floor texture of 2 x 2 texels, the minimum size in Mitsuba."""
     return room(camera=camera, floor=matte(texture(2, 2) | change))
 
 

@@ -1,6 +1,6 @@
 """The extreme suite: `ExtremeCase` describes a case, and `run_case` compares its estimators with references.
 
-Each case is run with light paths and with camera paths (`WAYS`). Camera paths have the references of light paths,
+Each case is run with light paths and with camera paths (`WAYS`). Camera paths use the same references as light paths,
 except at the film's border (`_seen_by`). Camera paths are also compared with naive AD of the same paths.
 """
 
@@ -68,7 +68,7 @@ class Stock:
 class Twin:
     """`ptracer` in another scene. The case's gradients are known multiples of the other scene's gradients.
 
-    `factors` are the multiples by parameter; the default is 1.
+    `factors` holds the multiple for each parameter. The default multiple is 1.
     """
 
     scene: Scene
@@ -88,8 +88,8 @@ class Differences:
     """Finite differences of the image by `reslrb`, without Russian roulette. The differences are along random
     directions into the domain.
 
-    The finite differences use the gradient's random numbers. The differences are exact up to rounding in one case.
-    Paths do not depend on the parameters, and the image is a polynomial of degree 2.
+    The finite differences use the same random numbers as the gradient. The differences are exact up to rounding in one
+    case. The differences are exact if paths do not depend on the parameters and the image is a polynomial of degree 2.
     """
 
     step: float
@@ -108,8 +108,8 @@ class Differences:
 
 @dataclass(frozen=True)
 class Extrapolated:
-    """Finite differences of the image for each amplitude of a motion. The differences use the gradient's random
-    numbers.
+    """Finite differences of the image for each amplitude of a motion. The differences use the same random numbers as
+    the gradient.
 
     Differences with a step are corrected by differences with twice the step (`extrapolated`). The assumed error has two
     parts: a tenth of the correction, and the fraction `left` of the root mean square of the differences. The `left`
@@ -155,7 +155,7 @@ Source = Stock | Twin | Differences | Extrapolated | Exact | Zero
 
 
 def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
-    """Return the root mean square of the residual as `relative_l2`, relative to the root mean square of S_0."""
+    """Return the residual's root mean square, divided by S_0's root mean square, as `relative_l2`."""
     import drjit as dr
     import mitsuba as mi
 
@@ -177,7 +177,8 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
 
 @dataclass(frozen=True)
 class ExtremeCase:
-    """One case. `scene` is a function because it needs Mitsuba. The case uses the scene's first sensor.
+    """One case. `scene` is a function, because building the scene needs Mitsuba. The case uses the scene's first
+    sensor.
 
     - `source` is the reference of gradients besides naive AD at equal seeds. `naive` tells whether naive AD fits into
         memory.
@@ -326,7 +327,7 @@ def split(label: str) -> tuple[str, dict[str, Any]]:
 
 
 def _loses_border(case: ExtremeCase, setup: Case) -> bool:
-    """True if light paths lose light along the film's border that camera paths keep."""
+    """True if light paths lose light along the film's border and camera paths do not."""
     return bool(setup.scene.sensors()[0].film().rfilter().radius() > BOX)
 
 
@@ -449,7 +450,7 @@ def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
 
 
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:
-    """Return the comparison `found`, changed where the case has other conditions. A comparison of the suite stays
+    """Return the comparison `found`, adjusted to the case's special conditions. A comparison of the suite stays
     undecided only if the case gives a reason.
     """
     if found.verdict is Verdict.UNREACHED and (isinstance(case.source, Zero) or parameter in case.open_ended):
@@ -464,7 +465,7 @@ def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: 
 
 
 def _not_negative(found: Comparison, ours: np.ndarray, share: float) -> Comparison:
-    """Return the comparison. It fails if an entry is negative by more than this `share` of the largest entry."""
+    """Return the comparison. The comparison fails if an entry is negative by more than `share` of the largest entry."""
     if found.verdict is Verdict.HOLDS and ours.min() < -share * np.abs(ours).max():
         return replace(found, verdict=Verdict.FAILS, message=f"negative: {ours.min():.3g}")
     return found

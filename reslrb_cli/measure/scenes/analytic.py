@@ -93,7 +93,7 @@ def refraction_scene(ior: float = 1.5) -> KnownScene:
 
 
 def slab_scene(ior: float = 1.5, degrees: float = 40, max_depth: int = 6) -> KnownScene:
-    """A parallel beam through a slab to a plane far below, seen from the side."""
+    """A parallel beam that passes a slab and lights a plane far below. The camera looks from the side."""
     radiance, tau, reflectance = (2, 3, 4), (0.9, 0.8, 0.7), (0.9, 0.6, 0.8)
     distance, angle = 40.0, np.deg2rad(degrees)
     direction = np.array([np.sin(angle), -np.cos(angle), 0])
@@ -125,7 +125,8 @@ MIDDLE, HALF = (1.0, 0.8, -0.2), 0.3
 
 
 def covered(center: tuple[float, float], side: float, distance: float, size: int) -> Array:
-    """Return the share of each pixel, (H, W, 1), covered by a square parallel to the film at this distance.
+    """Return the share of each pixel (H, W, 1) that a square covers. The square is parallel to the film, at this
+    distance.
 
     `center` is in world units, x to the right and y upwards. Uses similar triangles.
     """
@@ -140,7 +141,7 @@ def covered(center: tuple[float, float], side: float, distance: float, size: int
 
 
 def speck_in_view(side: float, radiance: tuple = (3, 2, 4)) -> KnownScene:
-    """A square lamp on the border of two pixels, before a wall that it does not light."""
+    """A square lamp on the border of two pixels. The lamp does not light the wall behind it."""
     distance = 2.0
     pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / SIZE
     center = (pixel + 0.2 * side, 0.6 * pixel)  # 0.7 of it to the right of a border
@@ -160,7 +161,7 @@ def speck_in_view(side: float, radiance: tuple = (3, 2, 4)) -> KnownScene:
 
 
 def texels_over_plane(texels: ArrayLike) -> KnownScene:
-    """A square lamp with texels (N, N, 3) over a diffuse plane, seen by a camera that does not see the lamp.
+    """A square lamp with texels (N, N, 3) over a diffuse plane. The camera sees the plane, but not the lamp.
 
         L(x) = rho / pi * sum_t Le_t int_t h^2 / d^4 dA
 
@@ -227,10 +228,10 @@ def point_through_surface(
 ) -> Known:  # fmt: skip
     """A point light at `light` (3,) over a medium of index `ior` with a flat surface at y = `depth`.
 
-    A camera in the medium, straight above the origin, sees the light on the diffuse bottom, y = 0, after one
-    refraction. Light that leaves at an angle theta_1 from the vertical meets the bottom at a distance x from the point
-    below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior sin(theta_2). Light emitted
-    into a ring of directions lands in a ring on the bottom.
+    The light refracts once and reaches the diffuse bottom at y = 0. A camera in the medium, straight above the origin,
+    sees the bottom. Light that leaves at an angle theta_1 from the vertical meets the bottom at a distance x from the
+    point below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior sin(theta_2). Light
+    emitted into a ring of directions lands in a ring on the bottom.
 
         E = I (1 - R(theta_1)) tau sin(theta_1) / (x dx/dtheta_1),   L = rho / pi * E
 
@@ -262,16 +263,16 @@ def beam_through_slab(
 ) -> Known:  # fmt: skip
     """Parallel light through a parallel slab of index `ior`, on a diffuse plane that is parallel to the slab.
 
-    `angle` is the angle of incidence in radians, and `radiance` the irradiance on a plane perpendicular to the beam. R
-    is the reflectance of one surface. tau and r are the factors of each refraction and reflection, and K is the number
-    of pairs of inner reflections.
+    `angle` is the angle of incidence in radians. `radiance` is the irradiance on a plane perpendicular to the beam. R
+    is the reflectance of one surface. tau is the factor of each refraction, and r the factor of each reflection. K is
+    the number of pairs of inner reflections.
 
         T = tau^2 (1 - R)^2 (1 + q + ... + q^K),   q = (r R)^2;   the limit is tau^2 (1 - R)^2 / (1 - q)
         L = rho / pi * E cos(theta) T
 
-    This is the incoherent sum of intensities (Born and Wolf, Principles of Optics, Section 7.6). Like renderers, it
-    uses the mean of both polarisations at each surface. A path of K pairs has 4 + 2 K edges. The plane is so far away
-    that it reflects no light back to the slab, and the edges of the slab do not matter.
+    The formula is the incoherent sum of intensities (Born and Wolf, Principles of Optics, Section 7.6). Like renderers,
+    the formula uses the mean of both polarisations at each surface. A path of K pairs has 4 + 2 K edges. The plane is
+    so far away that it reflects no light back to the slab, and the edges of the slab do not matter.
     """
     rho, E, tau, r = (np.broadcast_to(np.asarray(v, float), 3) for v in (albedo, radiance, transmittance, reflectance))
     R = float(fresnel(np.array(angle), ior))
@@ -294,8 +295,8 @@ def fresnel(theta: Array, ior: float) -> Array:
 
 
 def plane_points(height: float, fov: float, size: int, order: int = 8) -> tuple[Array, Array]:
-    """Return points (H, W, order^2, 3) of the plane y = 0 seen by a camera above it, and their quadrature weights
-    (order^2,).
+    """Return points (H, W, order^2, 3) on the plane y = 0, and their quadrature weights (order^2,). A camera above the
+    plane sees the points.
 
     The camera is at (0, `height`, 0), looks down, and has -z at its upper edge. `fov` is in degrees. The film position
     of a point is linear in x and z. The points are Gauss-Legendre nodes of the pixels, and the weights sum to 1.

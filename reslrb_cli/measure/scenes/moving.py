@@ -47,8 +47,8 @@ def grid(cells: int, height: Callable[[Array, Array], Array], half: float = 1.0,
          ) -> tuple[Array, Array, Array]:  # fmt: skip
     """A sheet over [-half, half]^2 in x and z that faces up. Returns vertices, triangles and texture coordinates.
 
-    With `wide`, cells grow from the middle to the rim. The coordinates of the cells are proportional to hyperbolic
-    sines of values between -`wide` and `wide`.
+    With `wide`, cells grow from the middle to the rim. Cell coordinates are proportional to sinh(t), with t between
+    -`wide` and `wide`.
     """
     at = np.linspace(-1, 1, cells + 1)
     axis = half * (np.sinh(wide * at) / np.sinh(wide) if wide else at)
@@ -94,7 +94,7 @@ DEGREES = 57.29577951308232
 
 @dataclass(frozen=True)
 class Displacement:
-    """Moves the vertices of a mesh by the sum of amplitude k times `fields[k]`, of shape (K, V, 3)."""
+    """Moves the vertices of a mesh by the sum of amplitude k times `fields[k]`. `fields` has the shape (K, V, 3)."""
 
     key: str
     fields: np.ndarray
@@ -112,7 +112,7 @@ class Displacement:
 
 @dataclass(frozen=True)
 class Pose:
-    """Moves a `to_world`, or a position, by these degrees of freedom, in their order.
+    """Moves a `to_world` or a position by the degrees of freedom in `freedom`, in their order.
 
     `tx`, `ty` and `tz` are translations in scene units. `rx`, `ry`, `rz` (radians) and `s` (scale, 1 + amplitude) act
     about `pivot`.
@@ -162,7 +162,7 @@ Move = Displacement | Pose | Number
 
 @dataclass
 class Displaced:
-    """The values of a scene that `moves` change, with the interface `measure.gradients.Values`. AMPLITUDES has the
+    """The scene values that `moves` change. Implements the interface `measure.gradients.Values`. AMPLITUDES has the
     amplitudes of all moves.
     """
 

@@ -35,7 +35,7 @@ run: {{spp: 16}}
 
 
 def build(options: dict[str, Any]) -> Any:
-    """Return the scene with the options of CONFIG. Its texels are random, from 0.2 to 0.9, and its filter is a box.
+    """Return the scene with the options of CONFIG. The scene has random texels from 0.2 to 0.9, and a box filter.
 
     Raises ConfigError if an option is unknown or is not a positive integer.
     """
@@ -107,7 +107,7 @@ def rectangle(bsdf: dict, to_world: Any = None, **place: Any) -> dict:
 
 
 def lit_square(radiance: dict, to_world: Any = None, kind: str = "area", **place: Any) -> dict:
-    """A black `rectangle` that is an emitter, `area` or `directionalarea`."""
+    """A black `rectangle` with an emitter of the type `area` or `directionalarea`."""
     return rectangle(diffuse(0, 0, 0), to_world, **place) | {"emitter": {"type": kind, "radiance": radiance}}
 
 
@@ -132,7 +132,7 @@ def _camera(sensor: str, fov: float, to_world: Any, size: int, film: dict) -> di
 def room(**changes: Any) -> dict:
     """A corner of a room: floor and two walls, under an area light that the camera does not see.
 
-    `changes` replace or add objects; None removes one.
+    `changes` replace or add objects. The value None removes an object.
     """
     scene = {
         "type": "scene",
@@ -150,7 +150,7 @@ def room(**changes: Any) -> dict:
 
 
 def lamp(**emitter: Any) -> dict:
-    """A square area light above the room that shines down; `emitter` are options of its `area` emitter."""
+    """A square area light above the room that shines down. `emitter` has options of the `area` emitter."""
     place = transform(translate=[0.2, 1.6, 0.2], rotate=([1, 0, 0], 90), scale=0.6)
     return rectangle(diffuse(0.0, 0.0, 0.0), place) | {"emitter": {"type": "area", **emitter}}
 

@@ -9,14 +9,15 @@ The gain compares variance times time.
     gain = (variance * time of the one) / (variance * time of the other)
 
 The variance is a sum over the parameters. Each parameter's variance is divided by the mean square of its gradient. The
-jackknife over the steps gives the interval for the logarithm of the ratio of variances. The error of single times is
-added. Times include kernels and the run's other work. The other work counts equally for both options, and matters if
-iterations take milliseconds. A table that steps sample from learns first, from other paths. The table then stays fixed.
+jackknife over the steps gives the interval for the logarithm of the variance ratio. The error of single times is added.
+Times include kernels and the run's other work. The other work counts equally for both options, and matters if
+iterations take milliseconds. If steps sample from a table, the table first learns from other paths. The table then
+stays fixed.
 
 A new option with two alternatives needs a record in `records/decisions.py` (a `PaidRecord`) and a row in `LATER`. The
-option also needs a `Turns` in `sampling.py` that makes the record (like `SequencePilot`). The fourth part is a function
-like `_sequence` that calls `Tuner.decide`. `settle_sampling` calls this function. If an option has more than two
-values, each value competes with the best value so far.
+option also needs a `Turns` in `sampling.py` that makes the record (like `SequencePilot`). The option also needs a
+function like `_sequence` that calls `Tuner.decide`. `settle_sampling` calls this function. If an option has more than
+two values, each value competes with the best value so far.
 """
 
 from __future__ import annotations
@@ -212,8 +213,8 @@ def situation(problem: Problem) -> dict[str, Any]:
 class Step:
     """A gradient step or a learning walk, with its gradients, its image for each view, and times in milliseconds.
 
-    `kernel_ms` is the time of the kernels, and `image_ms` that of an image with its own samples. `compile_ms` is the
-    time to generate and compile kernels. `wall_ms` is everything else.
+    `kernel_ms` is the time of the kernels. `image_ms` is the kernel time of an image with its own samples. `compile_ms`
+    is the time to generate and compile kernels. `wall_ms` is everything else.
     """
 
     gradients: Gradients = field(default_factory=dict)
@@ -239,7 +240,7 @@ def timed(times: StepTimes, wall_ms: float | None = None) -> Step:
 
 
 def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Step:
-    """Take one step of all views with its own seeds. Leaves neither a gradient nor a change."""
+    """Take one step of all views, with separate seeds. Leaves neither a gradient nor a change."""
     start = time.perf_counter()
     problem.apply()
     with clock.step() as times:
@@ -326,8 +327,8 @@ def lessons(problem: Problem) -> float:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Samples per pixel. `step` is for a step of the run, `call` for each set with one dL/dI, and `part` for one pass
-    of a set.
+    """Samples per pixel. `step` is the sample count per step of the run, `call` per set with one dL/dI, and `part` per
+    pass of a set.
 
     `alone` tells whether images have their own samples. `rounds` is the planned number of rounds. `lessons` is how
     often tables of guided emission learn for each set, averaged over the run. A step with the option may take `longer`
@@ -364,7 +365,7 @@ Learn = Callable[[int, int], Step]
 class Turns(Generic[Record]):
     """A decision based on steps that `take` returns. If a table must learn, `learn` provides the learning walks.
 
-    `views` is the number of views in an iteration, divided by the number of views in a step here. The decision may cost
+    `views` is the view count of an iteration divided by the view count of a measured step. The decision may cost
     `share` times the time of ITERATIONS iterations. If `most` exceeds `share`, the minimum number of rounds may cost
     `most` times the time of ITERATIONS iterations.
     """
@@ -467,8 +468,8 @@ class Turns(Generic[Record]):
         return compare(own, self._times(False, images), other, self._times(True, images), confidence)
 
     def _image_gain(self) -> Gain:
-        """Return the gain in efficiency for the image. Images with their own samples use these samples. Otherwise, the
-        gradient's samples also give the image.
+        """Return the gain in efficiency for the image. If images have their own samples, these samples give the gain.
+        Without separate image samples, the gradient's samples also give the image.
         """
         own, other = ([step.images for step in steps] for steps in self._steps)
         times = [self._times(each, False) for each in (False, True)]
@@ -477,7 +478,7 @@ class Turns(Generic[Record]):
         return compare(own, times[0], other, times[1])
 
     def _is_clear(self) -> bool:
-        """Whether no more steps are needed, because the alternative is clearly better or clearly not."""
+        """True if no more steps are needed. The alternative is then clearly better, or clearly not better."""
         _, low, high = self._gain(not self._apart or self._images(self._image_gain()), CLEAR)
         return low is None or high is None or low > 1 or high < 1
 
@@ -512,7 +513,7 @@ class Turns(Generic[Record]):
         return self._decide(other, images, found | {"share": self._spent_ms / (ITERATIONS * self._iteration_ms)})
 
     def _found(self, note: str) -> dict[str, Any]:
-        """Return the fields that the records of all decisions by `Turns` have."""
+        """Return the fields that are common to all records of `Turns` decisions."""
         cost = {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
         return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **cost}
 

@@ -211,7 +211,7 @@ def suits_even_numbers(problem: Problem) -> str | None:
 
 
 def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> race.Sizes:
-    """Return the samples of the run's steps and of the planned measured steps."""
+    """Return the sample counts of the run's steps and of the planned measured steps."""
     run, adjoint = problem.config.run, problem.config.adjoint
     call = run.spp // race.sets_of(problem.config)
     part = min(problem.samples_per_pass or call, call)
@@ -222,15 +222,17 @@ def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> rac
 
 
 def planned(share: float) -> float:
-    """Return the time, in steps, for the sequence's planned rounds. Longer steps show more of the gain."""
+    """Return the planned time for rounds of the sequence decision, in units of steps. Longer steps show more of the
+    gain.
+    """
     return min(ROUNDS_SHARE * share * race.ITERATIONS, race.PLANNED)
 
 
 def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
     """Return the remaining time for measurements, as a share of the time of 200 iterations.
 
-    `reserved` is kept for other measurements. A short run may have less time left. `kernels` is the number of kernels
-    to compile.
+    `reserved` is the share that is kept for other measurements. A short run may have less time left. `kernels` is the
+    number of kernels to compile.
     """
     spent = sum(each.share for each in (problem.sides, problem.guided) if each is not None)
     return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)
@@ -255,7 +257,7 @@ class GuidingPilot(race.Turns[GuidedRecord]):
 
 
 class SequencePilot(race.Turns[SequenceRecord]):
-    """Decision: low-discrepancy numbers, or independent ones."""
+    """Decision between low-discrepancy numbers and independent numbers."""
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
         return SequenceRecord(low_discrepancy=other, **found)
@@ -381,7 +383,7 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord | None:
 
 
 def _sides(problem: Problem) -> dict[str, Any]:
-    """Return the settings of the traced paths that a decision depends on."""
+    """Return the path settings that a decision depends on."""
     sides = problem.sides
     return {} if sides is None else {"sides": [sides.paths, sides.light_share]}
 
@@ -427,9 +429,10 @@ class StepTrial:
     """Steps of a problem, taken by the integrator `plain` or by the integrator `other`. The steps leave no gradients,
     and do not change the problem.
 
-    `views` are the used views. If either integrator is guided, both sample from one table. The shared table is the
-    table of `earlier` if that trial has a table, otherwise a new table. `what` is the name of the current decision.
-    `earlier` is the trial of the previous decision with the same estimator. Both trials have the same fixed dL/dI.
+    `views` are the used views. If either integrator is guided, the guided integrators sample from one table. The shared
+    table comes from `earlier` if `earlier` has a table. Otherwise, the table is new. `what` is the name of the current
+    decision. `earlier` is the trial of the previous decision with the same estimator. Both trials have the same fixed
+    dL/dI.
     """
 
     def __init__(
@@ -470,7 +473,7 @@ class StepTrial:
         return self.table is not None and not self.table.learned
 
     def _slope(self, view: View) -> mi.TensorXf:
-        """Return the fixed dL/dI, with 0 for values that are not finite."""
+        """Return the fixed dL/dI. Non-finite values become 0."""
         spp = max(int(IMAGE_SHARE * self._problem.config.run.spp), 1)
         image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
         return to_tensor(finite(slope(view.objective, np.array(image))))
@@ -478,8 +481,8 @@ class StepTrial:
     def learn(self, round: int, spp: int) -> race.Step:
         """Let the table learn, and prepare it for sampling. It stays unchanged from then on.
 
-        In the first call, everything is done twice, and the first result is dropped. The learning time then excludes
-        compilation and recording.
+        The first call does all work twice, and drops the first result. The learning time then excludes compilation and
+        recording.
         """
         jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
         compile_ms = 0.0
@@ -548,6 +551,6 @@ class StepTrial:
 
 
 def _few(image: mi.TensorXf) -> Array:
-    """Return some values of an image, distributed over it, with 0 for values that are not finite."""
+    """Return some values, distributed over an image. Non-finite values become 0."""
     values = np.array(image, dtype=np.float32).ravel()
     return finite(values[:: -(-values.size // MOST_VALUES)])

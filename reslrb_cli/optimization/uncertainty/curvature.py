@@ -2,24 +2,25 @@
 
 Images are differentiated along the entries of small parameters, and along the brightness of whole textures
 (`plan_changes`). The curvature (`Curvature`) is H = J^T W J at the parameters' values. J is the derivative of the
-image, and W = d2L/dI2, by pixel.
+image, and W = d2L/dI2 has a second derivative for each pixel.
 
     along directions    J by differences of images at common random numbers, from two independent sets of samples a, b:
                         H = (J_a^T W J_b + J_b^T W J_a) / 2, whose noise has no bias
     by entry            random signs v over the pixels: with p_s = J_s^T (sqrt(W) v), the mean of p_a p_b is the
                         diagonal of H (Hutchinson 1989; Bekas et al. 2007), again from two sets of samples
 
-Along directions, a standard error is subtracted from the sum over the pixels. Overestimated curvature would make
-results look too certain. In the estimate by entry, single values are mostly noise. Entries whose gradients have similar
-noise have similar curvature, so they are averaged (`smooth`).
+For the curvature along directions, a standard error is subtracted from the sum over the pixels. Overestimated curvature
+would make results look too certain. In the estimate by entry, single values are mostly noise. Entries whose gradients
+have similar noise have similar curvature, so `smooth` averages the curvatures.
 
 Regularizers have their own curvature, without noise. Differences of the regularizers' gradient are added to both kinds
 of curvature.
 
-Noise of a rendered target is the same in all gradients: b = J^T d, where d is its effect on dL/dI. Images of the
-target's own integrator sample the effect d of the target's noise (`_noises`). `d_even` is the mean of d. A relative
-loss gives darkened pixels more weight, so `d_even` pulls all pixels in the same direction. `d_odd` is the remainder of
-d. `d_odd` is split into blocks of pixels that the film's filter may have mixed. B is the second moment of b.
+Noise of a rendered target adds the same b = J^T d to all gradients. Here d is the noise's effect on dL/dI. Images of
+the target's own integrator are samples of the effect d of the target's noise (`_noises`). `d_even` is the mean of d. A
+relative loss gives darkened pixels more weight, so `d_even` pulls all pixels in the same direction. `d_odd` is the
+remainder of d. `d_odd` is split into blocks of pixels that the film's filter may have mixed. B is the second moment of
+b.
 
     B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
 
@@ -73,7 +74,7 @@ class Direction:
     """One coordinate. `vector` is the change of the parameter `key` per unit, in the layout of a flat gradient.
 
     `channel` is the only image channel that the direction changes, or None. `entry` is the entry of a small parameter.
-    It is None if all entries of a texture's channel change together, in proportion to their values.
+    `entry` is None if all entries of a texture's channel change together, in proportion to their values.
     """
 
     key: str
@@ -101,7 +102,7 @@ def row_of(problem: Problem, key: str) -> Array:
 
 
 def separates(problem: Problem, key: str) -> bool:
-    """Whether each channel of a parameter changes only that channel of images, as three-channel colours do."""
+    """True if each parameter channel changes only the same channel of images, as three-channel colours do."""
     if not mi.is_rgb or any(view.target.shape[2] != 3 for view in problem.trained):
         return False
     if any(part in MIXING for part in key.replace("_", ".").split(".")):
@@ -115,7 +116,7 @@ def separates(problem: Problem, key: str) -> bool:
 def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, most: int) -> list[Change]:
     """Return the renderings for the directions of all parameters. Small parameters come first.
 
-    Steps are `share` of the scale. There are at most `most` renderings. All parameters without a rendering have no
+    Steps are `share` of the scale. There are at most `most` renderings. Parameters without a rendering have no
     directions.
     """
     small = [key for key in problem.selection.keys if problem.selection.array(key).size <= MOST_ENTRIES]
@@ -157,8 +158,8 @@ def _wholes(problem: Problem, key: str, share: float) -> list[Change]:
 class TargetNoise:
     """Effect of the noise of one view's target on dL/dI, (H, W, C).
 
-    `even` is the mean effect, and `odd` the remaining effect of one sample. Pixels have common noise in blocks with
-    side `side`.
+    `even` is the mean effect, and `odd` the remaining effect of one sample. Pixels within a block of side length `side`
+    have common noise.
     """
 
     odd: Array
@@ -166,9 +167,7 @@ class TargetNoise:
     side: int
 
     def in_blocks(self, slope: Array) -> Array:
-        """Return the product of an image's derivative (H, W, C) and the odd part, summed over each block, as a flat
-        array.
-        """
+        """Multiply an image's derivative (H, W, C) by the odd part. Return the sum over each block, as a flat array."""
         product = np.sum(slope * self.odd, axis=2)
         rows, columns = (np.arange(0, size, self.side) for size in product.shape)
         return np.asarray(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1).ravel())
@@ -182,7 +181,7 @@ class TargetNoise:
 
 
 class Curvature:
-    """Measurement of the curvature at the current values of `problem`, which needs its targets.
+    """Measurement of the curvature at the current values of `problem`. The problem needs its targets.
 
     There are two sets of samples, each with `spp` samples per pixel.
     """
@@ -285,7 +284,7 @@ class Curvature:
         return {key: value / len(views) + even[key] for key, value in odd.items()}
 
     def _add_probe(self, total: dict[str, Array], gradients: Sequence[Array], number: int) -> None:
-        """Add the product of the gradients of two sets of samples, with dL/dI by view."""
+        """Add the product of two gradients from separate sample sets. `gradients` has dL/dI for each view."""
         a, b = (self._probe(gradients, number + half) for half in (0, 1))
         for key in a:
             total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
@@ -306,10 +305,10 @@ class Curvature:
     def _noises(self, view: View, integrator: Any, spp: int, multiple: int | None) -> list[TargetNoise]:
         """Return samples of the effect that the noise of a view's target has on dL/dI. The list is empty for a file.
 
-        The target has `spp` samples. Several images have as many samples as the target. Each image takes the role of
-        the target in turn. The mean of the other images serves as the target's expected value. If this would cost too
-        much, and noise is small, differences of images with few samples are added to the target. All sample counts are
-        multiples of `multiple`.
+        The target has `spp` samples. The function renders several images with the target's sample count. Each image
+        takes the role of the target in turn. The mean of the other images serves as the target's expected value. If
+        this would cost too much, and noise is small, differences of images with few samples are added to the target.
+        All sample counts are multiples of `multiple`.
         """
         true = np.array(view.target, dtype=np.float64)
         if view.wanted.file is not None:
@@ -341,7 +340,7 @@ class Curvature:
         return [TargetNoise(each, even, side) for each in odd]
 
     def _slope(self, view: View, target: Array, image: Array) -> Array:
-        """Return dL/dI of an exposed image that is compared with another target, both (H, W, C)."""
+        """Return dL/dI of an exposed `image` for another `target`, both (H, W, C)."""
         return np.nan_to_num(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
 
     def _in_a_row(self, images: Sequence[Array]) -> Array:
@@ -370,7 +369,7 @@ class Curvature:
         differences of dL/dI.
 
         The differences of dL/dI use steps as large as the residual between image and target. If L has a kink (`l1`),
-        the result is its curvature at the scale of the noise.
+        the result is L's curvature at the scale of the noise.
         """
         image = 0.5 * (self._base[0][place] + self._base[1][place])
         true = view.kept(np.array(view.target, dtype=np.float64))
@@ -383,7 +382,8 @@ class Curvature:
 
 
 def smooth(diagonal: Array, noise: Array, sure: float = 0.0) -> Array:
-    """Return `diagonal` (N,) averaged over groups of at least GROUP entries whose gradients have similar `noise`.
+    """Return averages of `diagonal` (N,) over groups of at least GROUP entries. The gradients of a group's entries have
+    similar `noise`.
 
     The function adds `sure` standard errors to each group's average.
     """
@@ -406,7 +406,7 @@ def _of_channel(image: Array, channel: int | None) -> Array:
 
 
 def _sure_share(terms: Array) -> Array:
-    """Return the part (M,) of sums of (M, N) terms that remains after subtracting MARGIN standard errors.
+    """Return the fraction (M,) of each row sum of `terms` (M, N) that remains after subtracting MARGIN standard errors.
 
     By chance, a few bright pixels may contribute all of a curvature.
     """

@@ -47,9 +47,9 @@ SHARE, MOST_STEPS = 0.25, 50
 class Noted:
     """Iterations at which data were recorded.
 
-    `seen` is the iteration at which squared gradients were recorded (0: not yet). `keys` are the parameters with
-    recorded squares. `steps` is the number of later steps recorded for each small parameter. `paces` is the movement of
-    each parameter per unit of gradient after some iterations.
+    `seen` is the iteration at which squared gradients were recorded, or 0 before the recording. `keys` are the
+    parameters with recorded squares. `steps` is the number of later steps recorded for each small parameter. `paces`
+    has each parameter's movement per unit of gradient, recorded after some iterations.
     """
 
     seen: int
@@ -101,7 +101,7 @@ class Certainty:
         return {each.name: shapes for each in fields(LastSteps)}
 
     def see(self, before: State, state: State) -> None:
-        """Record data of an iteration from `before` to `state`. This costs almost nothing."""
+        """Record data of the iteration that leads from `before` to `state`. This costs almost nothing."""
         planned, iterations = self.problem.config.run.iterations, state.iteration
         is_last = state.stage == before.stage == len(self.problem.config.run.stages)
         if is_last and 0 < self._seen < iterations:
@@ -129,7 +129,7 @@ class Certainty:
         )
 
     def _pace(self, key: str) -> float:
-        """Return the current movement of a parameter by a step, per unit of gradient. The parameter's steepest entries
+        """Return how far a step currently moves a parameter, per unit of gradient. The parameter's steepest entries
         dominate the value.
         """
         with np.errstate(divide="ignore"):  # of parameters that have not moved yet
@@ -137,8 +137,8 @@ class Certainty:
         return 1 / max(steepness, 1e-300)
 
     def _recent(self, key: str, iterations: int) -> Array | None:
-        """Return the mean square (N,) of the gradients since the recorded squares, or None if the optimiser stores
-        none.
+        """Return the mean square (N,) of the gradients after the recording of squares, or None if the optimiser stores
+        no squares.
         """
         before, now = self.squares.get(key), self.problem.optimizer.squares(key)
         if before is None or now is None or iterations <= self._seen:
@@ -217,7 +217,7 @@ class Certainty:
             problem.apply()
 
     def _target_noise(self) -> str:
-        """Return whether the spreads include the noise of the targets, in the words of `CertaintyRecord`."""
+        """Return `target_noise` of `CertaintyRecord`, which states whether the spreads include the targets' noise."""
         read = [view.wanted.file is not None for view in self.problem.trained]
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
@@ -234,7 +234,7 @@ class Certainty:
         return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key), seen=seen)
 
     def scale(self, key: str) -> float:
-        """Return the scale of a parameter, in its unit.
+        """Return a parameter's scale, in the parameter's unit.
 
         The scale is the largest root mean square among three arrays. The arrays are the initial values, the final
         values, and the difference of both. For parameters without a unit of light, the scale is at least half of the
@@ -288,8 +288,8 @@ class Certainty:
         return found
 
     def _paces_of(self, key: str, iterations: int) -> Array | None:
-        """Return the step length of a parameter in each iteration, divided by the current one, or None if it was not
-        recorded.
+        """Return a parameter's step length in each iteration, relative to the current step length. Return None if step
+        lengths were not recorded.
         """
         if not (looks := self._paces[key]):
             return None
@@ -298,9 +298,7 @@ class Certainty:
 
 
 def hides(directions: Sequence[Direction], curvature: Array, gradients: Gradients) -> bool:
-    """True if, for some entry with gradients, noise hides all curvature along the entry's direction. The curvature is
-    (M, M).
-    """
+    """True if noise hides all curvature along the direction of some entry with gradients. The curvature is (M, M)."""
     flat = [d for d, h in zip(directions, np.diag(curvature), strict=True) if d.entry is not None and h <= 0]
     return any(np.any(gradients[d.key][:, d.entry]) for d in flat)
 

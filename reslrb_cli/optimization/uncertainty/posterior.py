@@ -1,8 +1,8 @@
-"""Distance of the final values from the optimum. The estimate is the remainder after the run's steps, corrected by
-gradients at the end.
+"""Distance of the final values from the optimum. The estimate is the offset that remains after the run's steps,
+corrected by gradients at the end.
 
-A `Measured` has the measurements of one parameter at the end of a run. A `Posterior` is the result: for entries
-together (`joint`), or for each entry as if all others were known (`alone`).
+A `Measured` has the measurements of one parameter at the end of a run. A `Posterior` is the result. `joint` treats
+entries together. `alone` treats each entry as if all other entries were known.
 
 Near the optimum, the loss is quadratic with curvature H. The offset of the values from the optimum is d = x - x*. P is
 an entry's movement by one step per unit of gradient (`Optimizer.response`).
@@ -14,10 +14,9 @@ optimum. Each step changes C.
 
     C <- (1 - eta_t P H) C (1 - eta_t P H)^T + eta_t^2 P Sigma P
 
-C contains three parts: the remainder of the start after too few iterations, the directions that the view does not
-determine, and the noise of the steps. In undetermined directions, H has no curvature, so C keeps its initial value.
-After the steps, K gradients at the final values, with mean g, measure H d. The measurement updates C as in a Kalman
-filter.
+C has three parts: the initial offset that remains after too few iterations, directions that the view does not
+determine, and the steps' noise. In undetermined directions, H has no curvature, so C keeps its initial value. After the
+steps, the mean g of K gradients at the final values measures H d. The measurement updates C as in a Kalman filter.
 
     gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
 
@@ -37,7 +36,7 @@ noise. If the observed u (g - H m) exceeds `SURPRISE` standard deviations, c is 
     c <- ((u (g - H m))^2 - s) / h^2      at most that of the start
 
 Noise of the target adds the same b to every gradient. A gradient is then H d + b + noise. Here d is the offset from the
-optimum for a target without noise. B is the second moment of b. D is the total movement of the steps by a constant
+optimum for a target without noise. B is the second moment of b. D is the steps' total movement per unit of a constant
 gradient. E, cov(d, g) and cov(g) replace C, C H and H C H + Sigma / K.
 
     D <- (1 - eta_t P H) D + eta_t P
@@ -124,8 +123,8 @@ class Measured:
 
     @property
     def prior(self) -> float:
-        """Standard deviation of the offset of an entry at the start. For a parameter with bounds, the standard
-        deviation is at most that of a uniform distribution between the bounds.
+        """Standard deviation of an entry's offset at the start. For a parameter with bounds, the standard deviation is
+        at most that of a uniform distribution between the bounds.
         """
         low, high = self.bounds
         return min(self.scale, (high - low) / np.sqrt(12))
@@ -146,7 +145,7 @@ class Measured:
         """Entries (N,) at a bound. Entries at a bound are within a step of the bound, and the gradient does not pull
         the entries back.
 
-        The gradient of the loss points upwards: at the lower bound, a positive gradient holds the value there.
+        The gradient points to larger losses. A positive gradient therefore holds the value at the lower bound.
         """
         low, high = (np.float32(bound) for bound in self.bounds)
         step = self.response * self.rates[-1] * np.sqrt(self.noise)  # the noise of the last step
@@ -164,7 +163,7 @@ class Measured:
         return np.asarray(self.at_bound & (False if self.start is None else self.value != self.start))
 
     def within(self, to_go: Array) -> Array:
-        """Return movements to the optimum, clipped at the bounds, because the curvature is not valid far away."""
+        """Return movements to the optimum, clipped at the bounds. Far away, the curvature is not valid."""
         low, high = self.bounds
         return np.clip(to_go, np.minimum(self.value - high, 0), np.maximum(self.value - low, 0)).astype(np.float64)
 
@@ -202,10 +201,10 @@ def joint(
     `curvature` is H (M, M), and `noise` the covariance of one gradient (M, M). `gradient` is the mean of `samples`
     gradients. `samples` is one count for all entries, or one count for each of the M entries. If the counts differ, the
     smaller sample set is part of the larger sample set. Three arguments are (M,). `response` is the diagonal of P.
-    `scale` is the standard deviation of the offset at the start. `came` is the known movement after the iterations of
-    `rates`. `rates` are the eta of all iterations. `fixed` is the matrix B (M, M) of the noise that all gradients have
-    in common, or None. The computation expresses each entry in units of the entry's scale. Matrices of entries with
-    different units are therefore well-conditioned.
+    `scale` is the standard deviation of the offset at the start. `came` is the known movement in the last iterations,
+    which `rates` does not contain. `rates` are the eta of all iterations. `fixed` is the matrix B (M, M) of the noise
+    that all gradients have in common, or None. The computation expresses each entry in units of the entry's scale.
+    Matrices of entries with different units are therefore well-conditioned.
     """
     units = np.outer(scale, scale)
     H, Sigma = _positive(curvature * units), _positive(noise * units)
@@ -227,11 +226,11 @@ def joint(
 
 
 def _unforeseen(H: Array, E: Array, beside: Array, surprise: Array) -> Array:
-    """Return an addition to the covariance E of the offsets, for gradients that contradict E. Both are in units of the
-    standard deviations at the start.
+    """Return the amount to add to the offsets' covariance E if the gradients contradict E. The addition and E are in
+    units of the standard deviations at the start.
 
-    `surprise` is the difference from the expected gradients. `beside` is the part of the covariance of `surprise` that
-    does not come from E.
+    `surprise` is the difference between measured and expected gradients. `beside` is the part of `surprise`'s
+    covariance that does not come from E.
     """
     values, vectors = np.linalg.eigh(H)
     c, s = (np.einsum("me,mn,ne->e", vectors, each, vectors) for each in (E, beside))
@@ -245,8 +244,8 @@ def alone(
     curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
     rates: Sequence[float] | Array, fixed: Array | float = 0.0, came: Array | float = 0.0,
 ) -> Posterior:  # fmt: skip
-    """Return the offset of each entry, as if all other entries were known. All arrays are (M,), with the meanings in
-    `joint`. C is the model's covariance, even if gradients contradict the model.
+    """Return the offset of each entry, as if all other entries were known. All arrays are (M,). `joint` explains the
+    arguments. The function does not correct the model's covariance C, even if gradients contradict the model.
     """
     h = np.maximum(curvature, 0.0)
     C, D = scale**2, np.zeros_like(h)
@@ -262,14 +261,14 @@ def alone(
 
 
 def _driven(step: Array, curvature: Array) -> Array:
-    """Return the movement by one step per unit of a constant gradient. Curvature limits the movement at the point where
-    the curvature compensates for the gradient.
+    """Return one step's movement per unit of a constant gradient. The movement ends where the curvature compensates for
+    the gradient.
     """
     return np.asarray(np.minimum(step, 1 / np.maximum(curvature, 1e-300)))
 
 
 def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Array) -> tuple[Array, Array]:
-    """Return the covariance after all steps, for a start with unit variances. Also return the total movement by a
+    """Return the covariance after all steps if all variances are 1 at the start. Also return the total movement by a
     constant gradient.
 
     An entry that no step moves stays unchanged.
@@ -293,6 +292,6 @@ def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Arr
 
 
 def _positive(matrix: Array) -> Array:
-    """Return the nearest symmetric matrix without negative eigenvalues, which are caused by noise."""
+    """Return the nearest symmetric matrix without negative eigenvalues. Noise causes negative eigenvalues."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

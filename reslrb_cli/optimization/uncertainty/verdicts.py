@@ -1,13 +1,14 @@
-"""Verdicts on final values, by rules on measurements, and their record. Nothing here depends on scenes.
+"""Rules that turn measurements into verdicts on final values, and the record of the verdicts. Nothing here depends on
+scenes.
 
 - `weigh` turns gradients and curvature into spreads and verdicts, in a `CertaintyRecord`.
 - `judge_together` judges all directions together, and finds out which of them compensate for each other.
 - `Verdict`, `judge` and `summarise` apply the rules below.
 
-The first rule that applies to an entry decides. `spread` is the standard deviation of its final value around the
-optimum. `alone` is the spread that remains if all other parameters are known. `to_go` is the estimated distance to the
-optimum. tau is `TOLERANCE` of the entry's scale. `to_go` refers to the optimum of the loss with the noisy target, but
-`spread` does not.
+The first rule that applies to an entry decides. `spread` is the standard deviation of the entry's final value around
+the optimum. `alone` is the spread that remains if all other parameters are known. `to_go` is the estimated distance to
+the optimum. tau is `TOLERANCE` times the entry's scale. `to_go` refers to the optimum for the noisy target. `spread`
+refers to the optimum for a target without noise.
 
 | verdict          | condition |
 |---|---|
@@ -19,15 +20,13 @@ optimum. tau is `TOLERANCE` of the entry's scale. `to_go` refers to the optimum 
 | `not determined` | `alone` <= `OTHERS` of `spread`: others compensate for it; the most correlated one is named |
 | `below the noise`| otherwise: the gradients do not determine the value to tau |
 
-If the most correlated partner of a parameter is `still moving`, the parameter is not `settled`, because it will move
-with its partner.
+A parameter is not `settled` if its most correlated partner is `still moving`, because both move together.
 
-If the derivative of a parameter lacks a significant share, its verdict is `derivative incomplete`. A run measures this
-before its first iteration (`measure/missing.py`).
+If the derivative of a parameter lacks a significant share, its verdict is `derivative incomplete`. A run measures the
+missing share before its first iteration (`measure/missing.py`).
 
-A parameter of several entries is `settled` if the share `SETTLED_SHARE` of its visible entries with an effect is
-settled. Otherwise the parameter's verdict is the most frequent verdict among the remaining visible entries with an
-effect.
+A parameter of several entries is `settled` if at least `SETTLED_SHARE` of its visible entries with an effect are
+settled. Otherwise, the parameter gets the most frequent verdict of the unsettled visible entries with an effect.
 """
 
 from __future__ import annotations
@@ -116,11 +115,11 @@ class ParameterCertainty:
     comes from the noise of rendered targets. `to_go` is the estimated distance. All are in the parameter's unit. A
     small parameter has one number for each entry. A large parameter has the root mean square over the entries with an
     effect. The numbers are None if nothing was measured, and for entries at their bounds. `partner` is the parameter
-    that compensates for this one, if any.
+    that compensates for this parameter, if there is one.
 
-    `moved` is the root mean square movement of the entries since the start. `reach` is the distance of all steps in one
-    direction, or None if the step length depends on the gradient (`sgd`). `rate` is the learning rate. `seen` is the
-    share of a texture's texels that some view shows, or None for other parameters.
+    `moved` is the root mean square movement of the entries since the start. `reach` is the distance that all steps
+    cover in one direction. `reach` is None if the step length depends on the gradient (`sgd`). `rate` is the learning
+    rate. `seen` is the share of a texture's texels that some view shows, or None for other parameters.
     """
 
     verdict: str
@@ -142,8 +141,8 @@ class CertaintyRecord(Jsonable):
     The costs are the numbers of gradients, renderings along directions and random probes. `measure_s` is the measuring
     time in seconds without compilation. `compile_s` is the compilation time. `share` is `measure_s` divided by the time
     of the run's iterations. `iterations`, `scale`, `learning_rate` and `target_spp` repeat the run's settings.
-    `learning_rate` is that of `optimizer`. `target_noise` tells whether the spreads include the noise of the targets:
-    `measured` if all targets were rendered, `in part` if some were, otherwise `left out`.
+    `learning_rate` is that of `optimizer`. `target_noise` is `measured` if all targets were rendered, `in part` if some
+    were, otherwise `left out`. The spreads include only the noise of rendered targets.
     """
 
     parameters: dict[str, ParameterCertainty]
@@ -160,7 +159,7 @@ class CertaintyRecord(Jsonable):
     target_spp: int | None = None
 
     def without_derivatives(self, keys: Collection[str]) -> CertaintyRecord:
-        """Return the record with `derivative incomplete` for these parameters, if there are any."""
+        """Return the record with the verdict `derivative incomplete` for the parameters `keys`."""
         verdict = Verdict.INCOMPLETE.value
         judged = {key: replace(about, verdict=verdict, shares={verdict: 1.0}, partner=None) if key in keys else about
                   for key, about in self.parameters.items()}  # fmt: skip
@@ -169,11 +168,11 @@ class CertaintyRecord(Jsonable):
 
 @dataclass
 class Coordinates:
-    """Joint posterior of all free directions, by position.
+    """Joint posterior of all free directions, in the order of the directions.
 
     `spread` is the standard deviation, and `of_target` is the part of `spread` that the target's noise causes. `to_go`
     is the distance to the optimum, and `error` is its standard error. `to_go` and `error` exclude the target's noise.
-    `partners` are the parameters that compensate.
+    For each direction, `partners` names the parameter that compensates.
     """
 
     spread: Array
@@ -233,8 +232,8 @@ def judge_together(
 
 
 def _eta(measured: Mapping[str, Measured], keys: Collection[str]) -> Array:
-    """Return the common eta of the parameters `keys` for all iterations. The common eta is the geometric mean of the
-    parameters' own eta.
+    """Return one eta per iteration for all parameters in `keys`. Each eta is the geometric mean over all parameters in
+    `keys`.
     """
     first, paces = next(iter(measured.values())), [measured[key].pace for key in keys]
     found = [np.log(np.maximum(pace, 1e-300)) for pace in paces if pace is not None]
@@ -242,7 +241,7 @@ def _eta(measured: Mapping[str, Measured], keys: Collection[str]) -> Array:
 
 
 def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array:
-    """Return the covariance (M, M) of the noise of one gradient. `samples` (M, K) are gradients, `variance` (M,) their
+    """Return the noise covariance (M, M) of one gradient. `samples` (M, K) are gradients, `variance` (M,) their
     variances, and `curvature` is H (M, M).
 
     With far fewer samples than entries, the samples do not determine a covariance. However, noise of dL/dI reaches the
@@ -280,11 +279,12 @@ def weigh(
     fixed: Array,
     fixed_diagonal: Gradients,
 ) -> dict[str, ParameterCertainty]:
-    """Return the certainty of each parameter, from the curvature along directions and, for large parameters, by entry.
+    """Return the certainty of each parameter, from the curvature along directions. For large parameters, also use the
+    curvature of each entry.
 
     `pixels` is the number of image values that show a texture, if known. They determine at most as many entries.
-    `fixed` is the counterpart of `curvature` for the noise of the targets. `fixed_diagonal` is the counterpart of
-    `diagonal`.
+    `fixed` is the target noise B (M, M), in the same directions as `curvature`. `fixed_diagonal` is the target noise of
+    each entry, as in `diagonal`.
     """
     found, result = judge_together(measured, directions, curvature, fixed), {}
     for key, own in measured.items():
@@ -322,7 +322,7 @@ def _large(
     pixels: int | None,
 ) -> ParameterCertainty:  # fmt: skip
     """Judge each entry of a large parameter as if all other entries and parameters were known. Another parameter may
-    still compensate for the whole offset.
+    still compensate for the offset of the whole parameter.
     """
     touched, shape = own.touched, own.value.shape
     prior = np.full(shape, own.prior)

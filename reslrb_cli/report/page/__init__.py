@@ -25,10 +25,10 @@ REFRESH_SECONDS = 5
 def write_report(
     folder: Path, manifest: Mapping[str, Any] | None = None, current: Mapping[str, Array] | None = None
 ) -> Path:
-    """Write `report.html` into a run folder from the content of the folder; return its path.
+    """Write `report.html` into a run folder from the content of the folder. Return the path of the report.
 
     Images are embedded, so the page can be moved. Files that the folder lacks, such as those of a failed run, are left
-    out. For a run in progress, pass its current manifest and parameter values; the page then reloads itself until its
+    out. For a run in progress, pass its current manifest and parameter values. The page then reloads itself until its
     last version.
     """
     run = read_run(folder)
@@ -40,7 +40,7 @@ def write_report(
 
 
 def write_page(sources: Sequence[Source], path: Path, live: bool = False) -> None:
-    """Write one page about all `sources` to `path`, atomically; with `live`, the page reloads itself."""
+    """Write one page about all `sources` to `path`, atomically. With `live`, the page reloads itself."""
     page = render(sources, live)
     write_atomically(path, lambda file: file.write(page.encode("utf-8", "replace")))
 

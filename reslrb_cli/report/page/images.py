@@ -61,7 +61,7 @@ class Picture:
 
 
 def show(values: Array, alt: str, *caption: str) -> Picture:
-    """Return linear values (H, W, C) as an sRGB picture; fewer than three channels are shown as grey."""
+    """Return linear values (H, W, C) as an sRGB picture. Fewer than three channels are shown as grey."""
     values = fit(np.nan_to_num(values[:, :, :3] if values.shape[2] >= 3 else values[:, :, :1], posinf=1e30))
     encoded = np.round(255 * encode(np.clip(values, 0.0, 1.0))).astype(np.uint8)
     return _embed(as_png(np.broadcast_to(encoded, (*encoded.shape[:2], 3))), encoded.shape, alt, caption)
@@ -85,7 +85,7 @@ def _embed(png: bytes, shape: tuple[int, ...], *about: Any) -> Picture:
 
 
 def fit(values: Array) -> Array:
-    """Return `values` (H, W, C), shrunk to `MOST_PIXELS` if they are larger."""
+    """Return `values` (H, W, C), shrunk to a longer side of at most `MOST_PIXELS`."""
     longest = max(values.shape[:2])
     if longest <= MOST_PIXELS:
         return values
@@ -103,7 +103,7 @@ MOST_MAPS = 40
 
 
 def gradient_maps(paths: Sequence[Path]) -> Markup:
-    """Return a row for each file of layers; both gradients are summed over channels and share one scale."""
+    """Return a row for each file of layers. Both gradients in a row are summed over channels and share one scale."""
     rows = Markup()
     for path in paths[:MOST_MAPS]:
         try:
@@ -122,7 +122,7 @@ def gradient_maps(paths: Sequence[Path]) -> Markup:
 
 
 def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, Any]) -> Markup:
-    """Return a table of the views, and the loss of those that are held out.
+    """Return a table of the views, and the loss of the held-out views.
 
     The result is empty for a single view with default settings. All pixels of such a view have equal weights.
     """
@@ -146,7 +146,7 @@ def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
 
 
 def seen_tables(runs: Sequence[Run]) -> Markup:
-    """Return tables of the perceptual errors of the runs' images and colours, at the start and at the end."""
+    """Return tables of perceptual errors at start and end, for the images and colours of all runs."""
     images: list[dict[str, Any]] = []
     colors: list[dict[str, Any]] = []
     for run in runs:
@@ -170,8 +170,8 @@ _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 def image_rows(run: Run) -> Markup:
     """Return a row per sensor: the initial image, the final image, the target, and maps of the error and dL/dI.
 
-    All images of a sensor share one exposure, from the manifest or else chosen for the target. Missing images are left
-    out.
+    All images of a sensor share one exposure. The exposure comes from the manifest, or else is chosen for the target.
+    Missing images are left out.
     """
     folder, exposures = run.path / "images", shown_exposures(run.manifest.get("views"))
     suffixes = {match[1] or "" for path in folder.glob("*.exr") if (match := _OF_A_SENSOR.fullmatch(path.name))}
@@ -201,7 +201,7 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float 
 
 
 def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[Picture]:
-    """Return the maps of |I - T| and dL/dI with their scales; a missing map, or one without a scale, is left out."""
+    """Return the maps of |I - T| and dL/dI with their scales. Missing maps, and maps without a scale, are left out."""
     about = (results.get("error_maps") or {}).get(f"error{suffix}")
     layers = read_comparison(folder, suffix)
     shown = []
@@ -217,7 +217,7 @@ def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[P
 
 
 def _between(folder: Path, suffix: str, exposure: float) -> list[Picture]:
-    """Return the images saved between iterations, an even selection if there are many."""
+    """Return the images saved between iterations. If there are many, return an even selection."""
     pattern = re.compile(rf"iteration-(\d+){suffix}\.exr")
     found = sorted((int(match[1]), path) for path in folder.iterdir() if (match := pattern.fullmatch(path.name)))
     if len(found) > MOST_BETWEEN:

@@ -106,8 +106,8 @@ def diagram(
     has a point.
 
     The y axis is logarithmic if positive values span a large factor. The x axis is logarithmic with base `log_x` if
-    that is given and all values are positive. `floors` are drawn as dotted horizontal lines. Labels must not contain $,
-    which Matplotlib takes for a formula.
+    `log_x` is given and all values are positive. `floors` are drawn as dotted horizontal lines. Labels must not contain
+    $, which Matplotlib takes for a formula.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG

@@ -52,7 +52,9 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
 
 
 def label(entry: Entry) -> str:
-    """Return the name of an integrator with its options that are not default, `reslrb:reservoir, capacity 4`."""
+    """Return an integrator's name with all options that differ from the defaults, for example `reslrb:reservoir,
+    capacity 4`.
+    """
     parts = ":".join(str(entry[name]) for name in ("integrator", "estimator") if entry.get(name))
     return parts + (f", capacity {entry['capacity']}" if entry.get("capacity") not in (None, 1) else "")
 
@@ -64,7 +66,7 @@ def _with_sizes(entry: Entry) -> dict[str, Any]:
 
 
 def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
-    """Return a curve of `y` over `x` for each label; spreads become medians with a band."""
+    """Return a curve of `y` over `x` for each label. For spreads, the curve shows medians with a band."""
     curves = []
     for place, name in enumerate(labels):
         rows = sorted((row for row in entries if naming(row) == name and row.get(x)), key=lambda row: float(row[x]))
@@ -83,7 +85,7 @@ MOST_DRAWN = 8
 
 
 def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
-    """Return the summary, diagrams and a table of a convergence, and the number of other lines."""
+    """Return the summary, diagrams and a table of a convergence. Also return the number of other lines."""
     kinds = {
         kind: [entry for entry in objects if entry.get("kind") == kind] for kind in ("point", "method", "reference")
     }
@@ -142,7 +144,7 @@ Parts = list[tuple[str, Markup]]
 
 
 def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
-    """Return the title of a page about `sources`, its header, and its parts as titles and markup."""
+    """Return three results for a page about `sources`: title, header, and parts as titles and markup."""
     names = [source.name for source in sources]
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     title = ", ".join(names[:MOST_NAMED]) + more
@@ -187,13 +189,13 @@ def overview(runs: Sequence[Run]) -> Markup:
 
 
 def _estimator(run: Run) -> str:
-    """Return the estimator or the integrator of the gradients, if the manifest has it."""
+    """Return the estimator or the integrator of the gradients, if the manifest names one."""
     plan = run.manifest.get("plan")
     return str(plan.get("estimator") or plan.get("integrator") or "") if isinstance(plan, dict) else ""
 
 
 def _final_error(run: Run) -> str:
-    """Return the final error of all parameters; if their units differ, the largest relative error."""
+    """Return the final error of all parameters, or the largest relative error if the units differ."""
     total = run.results.get("rmse") or {}
     if total.get("final") is not None:
         return f"RMSE {number(total['final'], 3)}"

@@ -38,7 +38,9 @@ WARM_UP = 5
 
 
 def step_ms(records: Sequence[Mapping[str, Any]], name: str = "step_ms") -> float | None:
-    """Return the median milliseconds of a step, or of the part `name`, without the first steps, or None if unknown."""
+    """Return the median milliseconds of a step, or of the part `name`. The first steps do not count. Return None if
+    unknown.
+    """
     known = [record[name] for record in records[WARM_UP:] or records if record.get(name) is not None]
     return statistics.median(known) if known else None
 
@@ -121,7 +123,7 @@ def problems(run: Run) -> Markup:
 
 
 def run_parts(run: Run) -> dict[str, Markup]:
-    """Return the parts of a run below its header, by title and in order; parts that do not apply are empty."""
+    """Return the parts of a run below its header, by title and in order. Parts that do not apply are empty."""
     results = run.results
     parts: dict[str, Callable[[], Markup]] = {
         "Images": lambda: image_rows(run),

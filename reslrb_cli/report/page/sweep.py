@@ -42,7 +42,7 @@ CAPTION_WIDTH, VALUE_WIDTH = 80, 60
 
 
 def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
-    """Return the parts of a sweep, by title and in order; parts that do not apply are empty."""
+    """Return the parts of a sweep, by title and in order. Parts that do not apply are empty."""
     sweep, runs = source.sweep, run_records(source)
     figures, short = figures_of(runs), short_keys(sweep.keys)
     drawn = sweep.combinations[:MOST_CURVES]
@@ -77,7 +77,9 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
 
 
 def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
-    """Return diagrams of the loss and, if known, the parameter error over iteration and time: medians with bands."""
+    """Return diagrams of the loss and, if known, the parameter error. Medians with bands are drawn over iteration and
+    time.
+    """
     own = [_runs(source, combination) for combination in drawn]
     if not any(run.records for runs in own for run in runs):
         return Markup()
@@ -112,7 +114,7 @@ def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
 
 
 def _by_time(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
-    """Return times in seconds (N,), and the values of each run (runs, N) after its last iteration before each time.
+    """Return times in seconds (N,), and for each run its latest value at each time (runs, N).
 
     The first time is the earliest one at which all runs have completed an iteration. A run that has ended keeps its
     last value.
@@ -132,7 +134,7 @@ def _column(run: Run, name: str) -> list[float | None]:
 
 
 def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
-    """Return the curve of medians where all runs have a value, with minimum and maximum as a band."""
+    """Return the curve of medians at the places where all runs have a value. The band shows minimum and maximum."""
     known = np.isfinite(values).all(axis=0)
     xs, values = xs[known], values[:, known]
     if not len(xs):
@@ -145,7 +147,7 @@ def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
 
 
 def _shown(source: SweepRuns) -> tuple[list[tuple[Combination, Run]], Markup]:
-    """Return the first finished run of each combination, and a line that says so."""
+    """Return the first finished run of each combination, and a line of text that explains this selection."""
     found = []
     for combination in source.sweep.combinations:
         done = [run for run in _runs(source, combination) if run.manifest.get("status") == Status.FINISHED]
@@ -197,8 +199,8 @@ def _textures(source: SweepRuns) -> Markup:
 
 
 def _moment(place: int) -> str:
-    """Return the key of a combination's texture for `visible`. The first key is `final`, so this texture sets the
-    exposure.
+    """Return the key that `visible` uses for a combination's texture. The first combination's key is `final`, so its
+    texture sets the exposure.
     """
     return f"final {place}" if place else "final"
 

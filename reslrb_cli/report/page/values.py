@@ -27,7 +27,7 @@ _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 
 
 def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = False) -> Markup:
-    """Return a table of the value and error of each parameter at start and end, and the true value if known.
+    """Return a table with each parameter's value and error at start and end, and its true value if known.
 
     `notes` adds a remark on how errors are computed.
     """
@@ -78,10 +78,10 @@ def texture_pictures(run: Run) -> Markup:
 
 
 def visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Array], str]:
-    """Return the arrays scaled for viewing, all in the same way, and a remark on the scaling.
+    """Return the arrays, all scaled in the same way for viewing, and a remark on the scaling.
 
-    Heights, which may be negative, are mapped to black and white. Other textures, which may be far above 1, get the
-    exposure that suits the true texture, or the final one.
+    Heights, which may be negative, are mapped to the range from black to white. Other textures may be far above 1. The
+    exposure suits the true texture or, if it is unknown, the final texture.
     """
     if heights:
         low, high = finite_range(arrays.values())

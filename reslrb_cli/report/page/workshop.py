@@ -36,21 +36,21 @@ VIEWS = {
 
 
 def sheet(numbers: Mapping[str, Any], pictures: Mapping[str, Array], name: str) -> str:
-    """Return the sheet as a page of its own, titled `name`; see `workshop`."""
+    """Return the sheet (see `workshop`) as a page of its own with the title `name`."""
     return document(name, lay_out("header", name), [(title, body) for title, body in parts(numbers, pictures).items()])
 
 
 def workshop(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> Markup:
     """Return the workshop sheet as a part of the run's page.
 
-    `numbers` is the content of fabrication.json. `pictures` are linear images (H, W, C) by name: `CAPTIONS`, `VIEWS`,
-    and the names of deviations. Pictures and numbers that are missing are left out.
+    `numbers` is the content of fabrication.json. `pictures` are linear images (H, W, C). Their names are in `CAPTIONS`
+    and `VIEWS`, or are names of deviations. Pictures and numbers that are missing are left out.
     """
     return Markup().join(lay_out("heading", title) + body for title, body in parts(numbers, pictures).items() if body)
 
 
 def parts(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> dict[str, Markup]:
-    """Return the parts of the sheet by title; parts that do not apply are empty."""
+    """Return the parts of the sheet by title. Parts that do not apply are empty."""
     kind, found = numbers["kind"], numbers.get("tolerances") or {}
     setup = numbers.get("setup")
     light = next((name for name in found if name.startswith("light of ")), "")
@@ -121,7 +121,7 @@ def _angle(cosine: float) -> float:
 
 
 def material(kind: str, ior: float | None) -> dict[str, str]:
-    """Return material and finish of a `kind`, by name."""
+    """Return material and finish for the `kind` of solid, by name."""
     if kind == "mirror":
         return {
             "material": "any that can be polished",

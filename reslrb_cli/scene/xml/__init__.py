@@ -1,1 +1,1 @@
-"""Scene files before Mitsuba makes objects of them: reading, mending, checks, and building."""
+"""Processing of scene files before Mitsuba makes objects: reading, mending, checks, and building."""

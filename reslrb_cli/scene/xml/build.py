@@ -19,13 +19,13 @@ _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Te
 
 
 class Owners:
-    """The elements of a description by the ids of their objects, to find the element of a parameter."""
+    """Elements of a description by the ids of their objects. `place` finds the element of a parameter."""
 
     def __init__(self, root: Element) -> None:
         self._elements = root.by_id()
 
     def place(self, params: mi.SceneParameters, key: str) -> tuple[Element, list[str]] | None:
-        """Return the element of the nearest object above the parameter `key`, and the remaining names of the key.
+        """Return the nearest element above the parameter `key`, and the key's names below this element.
 
         Returns None if no object above the parameter has an element. `params` are the parameters of a scene that was
         built from the description.
@@ -46,7 +46,7 @@ class Owners:
         return owner, names
 
     def _nested(self, owner: Element, name: str, node: mi.Object) -> Element | None:
-        """Return the child element of `owner` for the object `node`, which Mitsuba calls `name` there.
+        """Return the child element of `owner` for the object `node`. Mitsuba calls this object `name` within `owner`.
 
         The search does not use ids. Some objects, for example bitmaps, lose their ids, and objects in a group have no
         ids.
@@ -80,7 +80,7 @@ def _place_textures(root: Element) -> None:
     """Move each texture directly below `root` to the place of the first reference to it. Other references stay.
 
     Without this move, Mitsuba would list a texture's parameters as the scene's own, under the texture's id. Some
-    textures lose their id. Nothing would show that the texture's parameters belong to a material or a light.
+    textures lose their id. The listing would not show that the texture's parameters belong to a material or a light.
     """
     textures = {child.id: child for child in root.children if child.tag == "texture" and child.id}
     for alias in root.walk("alias"):
@@ -99,9 +99,10 @@ def _place_textures(root: Element) -> None:
 
 
 def build(description: Description) -> tuple[Any, list[Note]]:
-    """Build the Mitsuba object of a description. Return the object, with notes on parameters that no plugin uses.
+    """Build the Mitsuba object of a description. Return the object, and notes on parameters that no plugin uses.
 
-    Nothing is merged, so all parameters keep their names. Raises ConfigError, located, if Mitsuba refuses the scene.
+    Nothing is merged, so all parameters keep their names. Raises ConfigError with a location if Mitsuba refuses the
+    scene.
     """
     _place_textures(description.root)
     text = _Text(description.root)
@@ -136,7 +137,9 @@ class _Text:
         return self._elements[bisect.bisect_right(self._starts, offset) - 1]
 
     def located(self, message: str) -> ConfigError:
-        """Convert Mitsuba's message to one line located in the scene's files instead of Mitsuba's sources and `xml`."""
+        """Convert Mitsuba's message to one line that names places in the scene's files. The line names no places in
+        Mitsuba's sources or in `xml`.
+        """
         place = _PLACE.search(message)
         element = self._elements[int(place[1]) - 1] if place else None
         text = _ORIGIN.sub("", message).strip()

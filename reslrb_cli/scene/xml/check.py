@@ -56,7 +56,7 @@ _SHOWN = 5
 
 
 def check(description: Description) -> None:
-    """Raise ConfigError, located by file and line, if the description is not safe for Mitsuba's parser."""
+    """Raise ConfigError with file and line if the description is not safe for Mitsuba's parser."""
     for element in description.root.walk():
         if element.is_object:
             _check_plugin(description.root, element)
@@ -87,7 +87,8 @@ def _check_plugin(root: Element, element: Element) -> None:
 
 
 def _check_numbers(element: Element) -> None:
-    """Refuse NaN, infinite colours and positions, and vectors with a wrong number of components or two definitions.
+    """Refuse NaN, and infinite colours and positions. Also refuse vectors with a wrong number of components or with two
+    definitions.
 
     Mitsuba would not report their location.
     """
@@ -140,7 +141,7 @@ def film_sizes(description: Description) -> list[FilmSize]:
 
 
 def _size_of(film: Element) -> FilmSize:
-    """Return the size of a film. Ignores values that are not numbers: Mitsuba refuses them."""
+    """Return the size of a film. Ignores values that are not numbers, because Mitsuba refuses such values."""
     values = {child.name: child.value.strip() for child in film.children}
     numbers = {name: int(value[:20]) for name, value in values.items() if value.isdecimal()}
     width, height = numbers.get("width", 0), numbers.get("height", 0)
@@ -150,7 +151,7 @@ def _size_of(film: Element) -> FilmSize:
 
 
 def check_files(description: Description) -> None:
-    """Raise ConfigError, located by file and line, if a file is missing, damaged or too large."""
+    """Raise ConfigError with file and line if a file is missing, damaged or too large."""
     for _, element, name in description.named_files():
         if (wrong := _wrong_file(name, description)) is not None:
             raise element.fail("material" if element.name == "material" else "filename", wrong)
@@ -183,7 +184,7 @@ _SIZES = ("width", "height", "crop_offset_x", "crop_offset_y", "crop_width", "cr
 
 
 def resize_films(root: Element, size: tuple[int, int]) -> None:
-    """Set the films of all sensors below `root` to this (width, height) in pixels, and remove crop windows."""
+    """Set the films of all sensors below `root` to `size` (width, height) in pixels, and remove crop windows."""
     for sensor in root.walk("sensor"):
         films = [child for child in sensor.children if child.tag == "film"]
         if not films:

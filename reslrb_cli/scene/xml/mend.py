@@ -1,8 +1,8 @@
-"""Conversion of scene files of other Mitsuba versions and exporters to Mitsuba 3, and stable ids.
+"""Conversion of scene files from other Mitsuba versions and exporters to Mitsuba 3. Assignment of stable ids.
 
 Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives an object
-without an id a new id. The new id consists of the object's kind and its number among all objects of this kind. The
-notes that it returns say what was mended or left out.
+without an id a new id. The new id consists of the object's kind and its number among all objects of this kind. `mend`
+returns notes on the parts that were mended or left out.
 
 The plugins `regular`, `irregular` and `blackbody` need wavelengths, which RGB variants lack. `mend` replaces `regular`,
 `irregular` and `blackbody` plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba converts a
@@ -54,7 +54,7 @@ def _in_order(notes: Iterable[Note], root: Element) -> list[Note]:
 
 
 def warnings(notes: Sequence[Note], root: Element) -> list[str]:
-    """Return one line per kind of note, located at its first occurrence."""
+    """Return one line per kind of note. Each line names the first occurrence of its kind."""
     kinds: dict[tuple[str, str, object], list[Element]] = {}
     for note in _in_order(notes, root):
         kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
@@ -165,8 +165,8 @@ def linear(element: Element) -> str:
 
 
 def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
-    """Return the attributes of the <spectrum> element that is equivalent to a plugin of `SPECTRA`, as a parameter of
-    `owner`.
+    """Return the attributes of a <spectrum> element, a parameter of `owner`. The element is equivalent to `spectrum`, a
+    plugin of `SPECTRA`.
 
     Raises ConfigError if the plugin is not a valid spectrum, or is a black body outside of an emitter.
     """
@@ -229,7 +229,9 @@ def _numbers(spectrum: Element, name: str) -> np.ndarray:
 
 
 def transform_coordinates(texture: Element) -> Element | None:
-    """Replace `uscale`, `voffset` and so on of a texture by a `to_uv` transform. Return the first of them, or None."""
+    """Replace a texture's `uoffset`, `voffset`, `uscale` and `vscale` by a `to_uv` transform. Return the first of them,
+    or None.
+    """
     names = ("uoffset", "voffset", "uscale", "vscale")
     given = {child.name: child for child in texture.children if child.tag == "float" and child.name in names}
     if not given:
@@ -257,8 +259,8 @@ def _name_objects(root: Element) -> list[Note]:
 
     The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Some ids cannot be used
     in a key and are replaced. Ids to be replaced are empty, very long or unprintable, start with `_unnamed_`, or belong
-    to an earlier object. References are updated. Raises ConfigError if a reference names the id of two objects that
-    differ.
+    to an earlier object. References are updated. Raises ConfigError if a reference names an id that two different
+    objects share.
     """
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
@@ -351,7 +353,7 @@ class _Mender:
         self.notes.append(Note(element, wrong, done))
 
     def mend_below(self, element: Element) -> None:
-        """Mend all elements below `element`, which must be mended already."""
+        """Mend all elements below `element`. `element` itself must be mended already."""
         kept = []
         names = {child.name for child in element.children}
         for child in element.children:
@@ -413,7 +415,7 @@ class _Mender:
     # --- parameters ---------------------------------------------------------------------------------------------------
 
     def _parameter(self, element: Element, owner: Element, names: set[str]) -> bool:
-        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`.
+        """Mend the name and the value of a parameter of `owner`. `names` are the names of all parameters of `owner`.
 
         Returns False if the parameter must be left out.
         """
@@ -473,7 +475,7 @@ class _Mender:
         owner.children[:] = [child for child in owner.children if child not in dropped]
 
     def mend_spectra(self, root: Element) -> None:
-        """Replace plugins of spectra by <spectrum> parameters, since RGB variants cannot evaluate the plugins."""
+        """Replace spectrum plugins by <spectrum> parameters, since RGB variants cannot evaluate these plugins."""
         named = {id: item for id, item in root.by_id().items() if item.type in SPECTRA}
         for owner in [element for element in root.objects() if element.type != "specfilm"]:
             kept = []

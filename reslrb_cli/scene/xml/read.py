@@ -1,4 +1,4 @@
-"""Scene files as elements: reading, with includes and variables resolved, and XML for Mitsuba's parser.
+"""Reading of scene files as elements, with includes and variables resolved. Writing of XML for Mitsuba's parser.
 
 Each element knows its file and line.
 """
@@ -32,14 +32,14 @@ _QUOTED = 60
 
 
 def quoted(text: str, mark: str = "`") -> str:
-    """Quote text from a file for a message: shortened, and with terminal control characters escaped."""
+    """Quote text from a file for a message. Shorten the text, and escape terminal control characters."""
     text = text if len(text) <= _QUOTED else text[: _QUOTED - 3] + "..."
     return f"{mark}{text if text.isprintable() else repr(text)[1:-1]}{mark}"
 
 
 @dataclass(frozen=True)
 class Source:
-    """One file of a scene, and the Mitsuba `version` that it declares, or None."""
+    """One file of a scene. `version` is the Mitsuba version that the file declares, or None."""
 
     file: Path
     version: tuple[int, ...] | None
@@ -54,7 +54,7 @@ class Source:
 class Element:
     """An XML element with its attributes and children in their order.
 
-    `written` is the element's name in the file if mending has changed the name.
+    `written` is the original name in the file if mending has changed the element's name.
     """
 
     tag: str
@@ -111,7 +111,9 @@ class Element:
         return ConfigError(self.place, key, message)
 
     def walk(self, *tags: str) -> Iterator[Element]:
-        """Yield this element and all below it, in the order of the file, optionally only those with one of `tags`."""
+        """Yield this element and all elements below it in the order of the file. With `tags`, yield only elements with
+        one of these tags.
+        """
         waiting = [self]
         while waiting:
             element = waiting.pop()
@@ -120,11 +122,13 @@ class Element:
             waiting += reversed(element.children)
 
     def objects(self) -> list[Element]:
-        """Return all objects of `walk`: the nodes of Mitsuba's parser, in its order."""
+        """Return all objects that `walk` yields. These objects are the nodes of Mitsuba's parser, in the parser's
+        order.
+        """
         return [element for element in self.walk() if element.is_object]
 
     def by_id(self) -> dict[str, Element]:
-        """Return all objects of `walk` by their ids and aliases."""
+        """Return all objects that `walk` yields, by their ids and aliases."""
         found = {element.id: element for element in self.objects() if element.id}
         for alias in self.walk("alias"):
             if alias.id in found:
@@ -151,7 +155,9 @@ _DECLARED_ENCODING = re.compile(rb"""^\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]
 
 
 def read_document(file: Path) -> Element:
-    """Return the root element of an XML file. Raises ConfigError, located in the file, if it is not XML."""
+    """Return the root element of an XML file. Raises ConfigError with the line in the file if the file is not valid
+    XML.
+    """
     text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), _decode(read_file(file)))
     return _parse(file, _BARE_AMPERSAND.sub("&amp;", text))
 
@@ -187,7 +193,7 @@ def _parse(file: Path, text: str) -> Element:
 
 
 def _version(text: str) -> tuple[int, ...] | None:
-    """Parse a version, or None unless it is three numbers, as Mitsuba requires."""
+    """Parse a version. Return None unless the text consists of three numbers, as Mitsuba requires."""
     return tuple(map(int, text.split("."))) if re.fullmatch(r"\d+\.\d+\.\d+", text) else None
 
 
@@ -233,10 +239,10 @@ class Description:
 
 
 def read_description(file: Path, options: Mapping[str, str]) -> Description:
-    """Read the scene in `file` and all files that it includes. `options` are the values of its `$name` variables.
+    """Read the scene in `file` and all files that it includes. `options` are the values of the scene's `$name`
+    variables.
 
-    Raises ConfigError, located by file and line, if a file cannot be read, a variable has no value, or an option has no
-    variable.
+    Raises ConfigError if a file cannot be read, a variable has no value, or an option has no variable.
     """
     reader = _Reader(dict(options), set(options))
     folders = [file.absolute().parent]
@@ -257,8 +263,8 @@ def read_description(file: Path, options: Mapping[str, str]) -> Description:
 class _Reader:
     """State shared by the files of one scene.
 
-    `values` holds variables by name: those that the user gives, and defaults in the order of the files. `unused` are
-    the user's variables that no file has used so far.
+    `values` holds all variables by name. The user's variables come first, then defaults in the order of the files.
+    `unused` are the user's variables that no file has used so far.
     """
 
     values: dict[str, str]
@@ -330,7 +336,9 @@ class _Reader:
         return element.fail(f"${name}", message)
 
     def _include(self, include: Element, folders: list[Path]) -> list[Element]:
-        """Return the elements that replace `include`: the objects of a scene, or the single object of a file."""
+        """Return the elements that replace `include`. A scene file gives its objects, and any other file gives its
+        single object.
+        """
         here = [include.source.file.absolute().parent, *folders]
         if (file := _find(_required(include, "filename"), here)) is None:
             raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
