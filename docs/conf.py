@@ -26,6 +26,8 @@ nb_execution_mode = "auto"
 nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
+# Progress bars and log lines of the notebooks
+nb_output_stderr = "remove"
 
 html_theme = "furo"
 html_title = f"reslrb {version}"

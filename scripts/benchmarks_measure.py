@@ -280,7 +280,7 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
         "The columns of the estimators contain two figures. The first is the largest deviation in standard errors\n"
         f"over many seeds (limit {z:.1f}). The second is the largest relative L2 distance at equal seeds\n"
         f"(limit {distance:.0e}). Comparisons that fail or stay open are in bold.\n"
-        "[gradcheck.md](gradcheck.md) explains references and verdicts.\n\n"
+        "[Check gradients](gradcheck.md) explains references and verdicts.\n\n"
         f"{table(('case', 'subject', 'references', 'seeds', *estimators), rows)}\n"
     )
 

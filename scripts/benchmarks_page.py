@@ -260,7 +260,8 @@ class Blocks:
             found = f"{counts['hold']} of {counts['comparisons']} comparisons hold, {counts['fail']} fail"
         return _filled(
             "`reslrb gradcheck --suite extreme` compares the gradients of every estimator with references in "
-            f"{scenes} difficult scenes: {found} ([docs/extreme.md](docs/extreme.md)). Measured at {commit_of(origin)}."
+            f"{scenes} difficult scenes: {found} ([The extreme suite](docs/extreme.md)). "
+            f"Measured at {commit_of(origin)}."
         )
 
     def experiments(self) -> str:
@@ -307,7 +308,7 @@ def gallery(blocks: Blocks) -> str:
     """Return docs/gallery.md: the picture, errors, costs and command of each experiment that has a picture."""
     parts = [
         "# Gallery\n\n"
-        "Every experiment of `configs/`, as it is shipped. Each picture shows the target image, the image at the start "
+        "This page shows every shipped experiment in `configs/`. Each picture shows the target image, the image at the start "
         "of\nthe run, and the image at its end. Copy an experiment with `reslrb example NAME`.\n"
     ]
     found = blocks.recorded({experiment_record(name): name for name in EXPERIMENTS if gallery_picture(name).exists()})

@@ -211,7 +211,7 @@ _MARK = "## Reference\n"
 _FIRST = ("load", "optimize", "Run", "Record", "render", "gradient", "gradcheck", "convergence", "export")
 
 #: Of these, what is below them stands elsewhere.
-_ELSEWHERE = {"Config": "Its sections are its attributes: `config.run.iterations` ([config.md](config.md))."}
+_ELSEWHERE = {"Config": "Its sections are its attributes: `config.run.iterations` ([Configuration](config.md))."}
 
 _PYTHON = f"""\
 {_MARK}

@@ -120,7 +120,10 @@ def _have_two_threads(dr: ModuleType) -> None:
 
 
 def _check_loaded_llvm(dr: ModuleType) -> None:
-    """Refuse a libLLVM that a previously imported Dr.Jit chose itself."""
+    """Raise BackendError if Dr.Jit has no usable libLLVM, or a libLLVM older than `MIN_VERSION`.
+
+    Both can happen only if Dr.Jit was imported before reslrb_cli, and chose its libLLVM itself.
+    """
     fault = ""
     if not dr.has_backend(dr.JitBackend.LLVM):
         fault = "found no usable libLLVM"

@@ -115,7 +115,7 @@ def command(
 
 
 def _check_shards(config: Config, workers: Place | None) -> None:
-    """Raise ConfigError if a step has no shards to distribute."""
+    """Raise ConfigError if `--cluster` is used with only one shard, or with `run.stages`."""
     if workers is not None and config.shards == 1:
         reason = "--cluster needs more than one shard; set run.shards to auto, or to a number above 1"
         raise ConfigError(config.source, "run.shards", reason)

@@ -152,7 +152,11 @@ def look_at(path: Path) -> None:
 
 
 def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCode:
-    """Return the exit code of a comparison: `done` if anything was measured, otherwise a code for the reason."""
+    """Return the exit code of a comparison. The code is INTERRUPTED if `interrupted`, whatever was measured.
+
+    Otherwise, the code is DONE if `done`. `done` is true if anything was measured. If nothing was measured, the code is
+    OUT_OF_MEMORY if all `states` are, and CHECK_FAILED if not.
+    """
     if interrupted:
         return ExitCode.INTERRUPTED
     memory = states == {BenchStatus.OUT_OF_MEMORY}

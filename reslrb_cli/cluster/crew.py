@@ -144,7 +144,8 @@ class Crew:
     def start(self) -> None:
         """Wait until the first worker is ready. Then wait a limited time for all other workers.
 
-        Raises MachineError if no worker is ready. The message lists failures and errors of the experiment.
+        Raises MachineError if no worker can be used, or if the scheduler has ended. If workers were left out, the
+        message names the first of these workers, the worker's reason, and the number of these workers.
         """
         begin = time.monotonic()
         first_s: float | None = None

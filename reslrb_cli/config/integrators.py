@@ -273,7 +273,7 @@ class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
 
 class Own(Integrator, json_schema_extra=NEEDS_TYPE):
     """Your own Mitsuba integrator, a class in a Python file. Needs `--allow-code` on the command line
-    ([your_integrator.md](your_integrator.md))."""
+    ([Your own integrator](your_integrator.md))."""
 
     type: Literal["custom"] = Field(default="custom", description="Your own Mitsuba integrator.")
     file: CodePlace

@@ -89,7 +89,7 @@ class SSIM(Loss, json_schema_extra=NEEDS_TYPE):
 
 class Custom(Loss, json_schema_extra=NEEDS_TYPE):
     """Your own loss, a Python function. Needs `--allow-code` on the command line
-    ([losses.md](losses.md#a-loss-of-ones-own))."""
+    ([A loss of one's own](losses.md#a-loss-of-ones-own))."""
 
     type: Literal["custom"] = Field(default="custom", description="Your own loss, a Python function.")
     file: CodePlace | None = None

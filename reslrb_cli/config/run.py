@@ -213,8 +213,8 @@ class RunConfig(Section):
     held-out views if there are any, otherwise the loss of the iterations. With `schedule: plateau` the run ends only at
     the smallest learning rate. At most 5 % of the runs end while the loss still falls by more than `relative` per
     window. With the defaults, a run continues for about 300 iterations after its loss has stopped falling if losses
-    have 10 % noise, and for about 500 at 30 % ([steps.md](steps.md#when-a-loss-is-flat)). `{}`: the defaults. null:
-    never."""
+    have 10 % noise, and for about 500 at 30 % ([When a loss is flat](steps.md#when-a-loss-is-flat)). `{}`: the
+    defaults. null: never."""
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -131,9 +131,11 @@ class Config(Section):
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
-        """Value of `run.adjoint` for a single step or shard, after `auto` is resolved. `auto` becomes `batched` if
-        `run.batches` divides the sample count and the passes divide each batch. For a shard of a view's samples,
-        `others` becomes `independent`.
+        """Value of `run.adjoint` for a single step or shard, after `auto` and `others` are resolved.
+
+        If shards split the samples of a view (`in_rounds`), `auto` and `others` become `independent`. Otherwise, `auto`
+        and `others` become `batched` if `run.spp` can be split into `run.batches` batches, their halves and the passes.
+        If not, `auto` and `others` become `independent`.
         """
         if self.in_rounds:
             return "independent"

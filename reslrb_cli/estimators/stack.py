@@ -127,7 +127,9 @@ class StackState:
         return dr.select(self.needed == self.count, self.since, 0)
 
     def plus(self, value: mi.Spectrum, active: mi.Bool) -> StackState:
-        """Return the state after a contribution in active lanes: delta times `value`, per unit of throughput."""
+        """Return the state after a contribution in active lanes. `value` is delta times the contribution, per unit of
+        throughput.
+        """
         since = dr.select(active, self.gap() + self.throughput * value, self.since)
         return replace(self, needed=dr.select(active, self.count, self.needed), since=since)
 

@@ -298,8 +298,8 @@ class Heard:
 
 
 class Hearing(Hooks):
-    """Hooks that sum the contributions of each path. dL/dI and contributions are divided by `loudness` and the number
-    of paths.
+    """Hooks that sum the contributions of each path. dL/dI is multiplied by `loudness`, which is the reciprocal of the
+    largest |dL/dI|. Contributions are not divided by the number of paths.
     """
 
     def __init__(self, samples: Samples, adjoint: AdjointImage, loudness: mi.Float) -> None:

@@ -54,7 +54,7 @@ def most_cells(paths: int) -> float:
 class Learned:
     """Contributions of the paths of one sensor.
 
-    `squares` (2, cells) are the sums for gradient and image, and `draws` the number of paths that started in each cell.
+    `sums` (2, cells) are the sums for gradient and image, and `draws` the number of paths that started in each cell.
     Arrays are float32, and never modified.
 
     - `calls` is the number of gradients so far. It restarts when a table is found to be wrong.

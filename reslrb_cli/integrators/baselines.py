@@ -105,7 +105,11 @@ class Projective(Replayed):
                 setattr(self.plugin, name, spp)
 
     def obstacle(self, scene: mi.Scene, sensors: Iterable[mi.Sensor], moved: Iterable[mi.Object]) -> str | None:
-        """Return why Mitsuba 3.9 computes silhouettes or shadow edges of the `moved` shapes wrongly, or None."""
+        """Return why Mitsuba 3.9 computes outlines that the sensor sees wrongly, or None.
+
+        If `sppp` is 0, such outlines are left out, and nothing is checked. A sensor that is not perspective is refused
+        for any `moved` shapes. Shadow edges are not checked.
+        """
         advice = "or set integrator.sppp to 0, which leaves out outlines seen by the sensor"
         for sensor in sensors if self.plugin.sppp != 0 else ():
             if sensor.class_name() != "PerspectiveCamera":

@@ -1,9 +1,11 @@
 """The files that `reslrb lens` writes for a face: the scene, its mesh, and the configuration that refines the face.
 
 The module contains only text and arrays, in millimetres, with the axes of `surface.py`. The lamp for parallel light has
-the size of the face as seen along the light. The beam therefore exactly covers the face. A light with the sun's angular
-diameter consists of `SUNS` such lamps. A point light is a spot whose cone ends at the face's corners. The mount around
-the face is black. The camera is a point on the receiver's normal, and throws no shadow.
+the size of the face as seen along the light. For a rectangular mirror in oblique light, the lamp is wider, because
+parts of the relief stand out of the plane. A light with the sun's angular diameter consists of `SUNS` distant lamps,
+which are slightly larger. A point light is a spot. The spot's cone ends at the corners of a rectangular face. For a
+round face, the cone has the mean angle to the edge. The mount around the face is black. The camera is a point on the
+receiver's normal, and throws no shadow.
 """
 
 from __future__ import annotations
@@ -37,9 +39,9 @@ _LEAST = 0.02
 
 
 def leaving(surface: Surface) -> float:
-    """Return the light that leaves the face, in mm^2.
+    """Return the light that leaves the face.
 
-    The value is for parallel light of irradiance 1, or for a point light of intensity 1.
+    The value is in mm^2 for parallel light of irradiance 1, and in steradians for a point light of intensity 1.
     """
     setting = surface.setting
     h, (ny, nx) = surface.heights, surface.heights.shape
@@ -170,8 +172,8 @@ def lamps(surface: Surface, power: float, sun: float) -> str:
 
 
 def _half_cone(surface: Surface) -> float:
-    """Return the angle (radians) between a point light's axis and its rays to a face's corners. For a round face,
-    returns the mean angle to the edge.
+    """Return the largest angle (radians) between a point light's axis and its rays to a face's corners. For a round
+    face, returns the mean angle to the edge.
     """
     setting, rays = surface.setting, Rays(surface.setting)
     is_round = setting.outline == "round"

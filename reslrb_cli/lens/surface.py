@@ -1,5 +1,5 @@
-"""Face of a lens or mirror whose caustic shows a picture. Rays follow Snell's law, and `transport.py` computes the
-heights.
+"""Face of a lens or mirror whose caustic shows a picture. A lens refracts rays by Snell's law, and a mirror reflects
+rays. `transport.py` computes the heights.
 
 Lengths are in millimetres. The face is z = h(x, y) near the plane z = 0, with its normal towards the receiver. Light
 reaches a lens from z < 0 through a plane face at z = -thickness, and a mirror from z > 0. The central ray meets the
@@ -330,11 +330,11 @@ def _check(picture: Array, setting: Setting) -> None:
 
 
 def _reaches(setting: Setting) -> bool:
-    """True if the face can send light from its corners and centre to the picture's corners and centre. The light must
-    reach the receiver's front.
+    """True if the face can send light from 3 x 3 points to the corresponding points of the picture. The points are the
+    corners, the midpoints of the edges, and the centre. The light must reach the receiver's front.
 
-    The face normal N is proportional to n_i d_i - n_t d_t. N has a positive component along the refracted direction d_t
-    only if n_i d_i . d_t > n_t. Refraction therefore turns light by less than arccos(1 / n).
+    For a lens, the face normal N is proportional to n_i d_i - n_t d_t. N has a positive component along the refracted
+    direction d_t only if n_i d_i . d_t > n_t. Refraction therefore turns light by less than arccos(1 / n).
     """
     rays = Rays(setting)
     x, y = (a.ravel() for a in transport.grid((3, 3), (1.5 * setting.size[0], 1.5 * setting.size[1])))

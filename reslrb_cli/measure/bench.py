@@ -251,8 +251,8 @@ class Bench(Arena[Sweep, BenchRun]):
         return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
 
     def _needed(self, left: int) -> str:
-        """Describe the time that the remaining values would have taken. The time includes the value that has just
-        ended.
+        """Describe the estimated total time of the measurement with all remaining values. The total includes the time
+        already spent.
         """
         late, warm = sum(run.late for run in self.members), len(self._alive())
         if warm == 0:

@@ -48,8 +48,8 @@ def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray
     """Return a standard normal score of mean(a) - mean(b) for each entry. Means are taken along axis 0, and the other
     axes hold the entries.
 
-    `rounding` is the relative error of floating point. The rounding error is added to the standard error. Entries
-    without noise, such as a directly visible lamp, can then be compared.
+    `rounding` is the relative error of floating point. The rounding error is added to the standard error in quadrature.
+    Entries without noise, such as a directly visible lamp, can then be compared.
     """
     mean_a, mean_b = a.mean(0), b.mean(0)
     var_a, var_b = a.var(0, ddof=1) / len(a), b.var(0, ddof=1) / len(b)
@@ -66,9 +66,9 @@ def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray
 def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -> np.ndarray:
     """Return a standard normal score of mean(difference) against zero for each entry. The mean is taken along axis 0.
 
-    The estimates have equal seeds and share some noise. `difference` is (N, ...). `floor` is the rounding error, and is
-    added to the standard error. `bias` is a known error such as truncation. The function subtracts `bias` from the size
-    of the mean difference.
+    The estimates have equal seeds and share some noise. `difference` is (N, ...). `floor` is the absolute rounding
+    error, and is added to the standard error in quadrature. `bias` bounds a known error such as truncation. The
+    function subtracts `bias` from the absolute value of the mean difference, and clips the result at 0.
     """
     mean, var, floor = difference.mean(0), difference.var(0, ddof=1) / len(difference), np.square(floor)
     mean = np.sign(mean) * np.maximum(np.abs(mean) - bias, 0.0)
@@ -231,7 +231,7 @@ def compare_expectations(
     exact values. If the parameter's `shape` is given, z scores belong to parts of the parameter (`entries`) instead of
     single values. `bias` is the possible error of the reference, in the reference's units. `bias` is one number, or a
     number for each entry. Only larger differences count. `bias` cannot be used with other seeds. `rounding` is relative
-    to the entries, and added to the standard error.
+    to the entries. The rounding error is added to the standard error in quadrature.
     """
     problem = _problem(ours, reference)
     if problem is not None:
@@ -303,9 +303,10 @@ def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, f
 
 
 def tail_weight(samples: np.ndarray) -> float:
-    """Return the share of the variance of (N, E) samples that comes from single samples.
+    """Return the normalised mean kurtosis of the entries of (N, E) samples.
 
-    The share is 0 for normal deviates, and 1 if one sample has all of the variance.
+    The value is 0 for normal deviates, and 1 if each entry has one outlier and all other samples are equal. The value
+    is negative for lighter tails. With fewer than `TAIL_SEEDS` samples or without variance, the value is 0.
     """
     count = len(samples)
     squares = np.square(samples - samples.mean(0))

@@ -252,8 +252,8 @@ class Gradcheck:
 
 
 def _draws_plainly(config: Config) -> bool:
-    """True if an integrator's paths equal the paths of naive AD at equal seeds. Guiding and a quasi-random sequence
-    make the paths differ.
+    """True if an integrator's paths equal the paths of naive AD at equal seeds. Guiding, a quasi-random sequence and
+    `pixels: measured` make the paths differ.
     """
     options = config.integrator.options()
     usual = {"guiding": "off", "sequence": "independent", "pixels": "even"}

@@ -155,8 +155,9 @@ class Direction:
 def directions(case: Case, key: str, bounds: tuple[float, float], count: int, seed: int = 3) -> list[Direction]:
     """Return up to `count` directions that change only the parameter `key` and stay within its `bounds`.
 
-    In the first direction all entries grow, so nothing cancels. In the others, signs are random. If the largest step
-    would take an entry beyond a bound, differences are one-sided. Every entry then moves away from its nearer bound.
+    If the largest step would take an entry beyond a bound, differences are one-sided, and in all directions every entry
+    moves away from its nearer bound. Otherwise, all entries grow in the first direction, so nothing cancels. The other
+    directions have random signs.
     Entries are 0.5 to 1 times the width of the bounds. With infinite bounds, entries are 0.5 to 1 times the parameter's
     size.
     """

@@ -274,8 +274,8 @@ MOST_SEEDS, MOST_VIEWS = 64, 4
 def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[MissingRecord]:
     """Measure the missing share of the loss's derivative before a run, for each parameter that moves light.
 
-    Calls `warn` with one line if something is missing. Raises ConfigError if more than half is missing, unless the run
-    accepts incomplete derivatives.
+    Calls `warn` with one line if a derivative is incomplete, or if its missing share is unknown. Raises ConfigError if
+    a missing share exceeds one half by more than two standard errors, unless the run accepts incomplete derivatives.
     """
     config, found = problem.config, measure_missing(problem)
     told = [record for record in found if record.is_incomplete]
@@ -292,8 +292,8 @@ def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[Missing
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:
-    """Measure the missing share of each parameter that moves light. The measurement takes at most the fraction
-    `run.measuring` of the run's samples.
+    """Measure the missing share of each parameter that moves light. The sample limit is the fraction `run.measuring` of
+    the run's samples. Only the longer step and the last seed may exceed the limit.
 
     The parameters keep their values. If the sample limit is too low for a measurement, the parameter's record has no
     share. Heightmaps with an unknown share are left out, because their rims hardly move. The function restores the
@@ -347,8 +347,10 @@ class _Short:
         return [embed(case, key, row) for row in rows]
 
     def measure(self) -> list[MissingRecord]:
-        """Measure all parameters with the shorter step. Parameters with an unknown share are measured again with the
-        longer step.
+        """Measure all parameters with the shorter step. If a parameter's share is too uncertain, use more seeds and try
+        the longer step.
+
+        If the remaining samples are too few, or if dL/dI is zero, all records have no share.
         """
         image_spp, fewest = 2 * self.problem.config.run.spp, seeds(FEWEST)
         along = sum(map(len, self._rows.values()))

@@ -64,9 +64,10 @@ class PathVertex:
 class Offender:
     """The first non-finite value of a view. Values are ordered by path, then by vertex.
 
-    `quantity` names the value. `value` has one number per channel. For a derivative of the loss, `value` is empty.
-    `pixel` (x, y) is its place on the film. `where` is None if the non-finite value is a derivative of the loss.
-    `image` and `target` are the two values that the loss compares at `pixel`. They are None for a path.
+    `quantity` names the value. `value` has one number per channel. For dL/dI and for a parameter's gradient, `value` is
+    empty. `pixel` (x, y) is its place on the film, or None for a parameter's gradient. `where` is None for dL/dI, and
+    for integrators whose paths are not checked. `image` and `target` are the two values that the loss compares at
+    `pixel`. They are None for a path and for a parameter's gradient.
     """
 
     sensor: int

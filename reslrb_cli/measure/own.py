@@ -7,9 +7,9 @@ For images, r is the ratio of the image sums.
     r = E<g, u> / E<G, u>,      u from other seeds of G than the denominator
 
 Ratios are measured for paths of 1, 2, 3, ... segments without Russian roulette, and for each parameter. Images are
-linear in emission. If both passes trace the same paths and add the same terms, sum(dL/dE E) equals the image weighted
-by dL/dI at each seed. Each measurement rules out possible faults, and the message names the remaining ones. The message
-reports measurements, and is no proof.
+linear in emission. If both passes trace the same paths and add the same terms, sum(dL/dE E) equals sum(dL/dI I) at each
+seed, where I is the image. Each measurement rules out possible faults, and the message names the remaining ones. The
+message reports measurements, and is no proof.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ CONSTANTS = {"2": 2.0, "1/2": 0.5, "pi": np.pi, "1/pi": 1 / np.pi, "2 pi": 2 * n
 
 @dataclass(frozen=True)
 class Ratio:
-    """An estimate divided by its correct value, or None if the reference is too noisy."""
+    """An estimate divided by its correct value, and the standard error of this ratio."""
 
     value: float
     error: float
@@ -166,7 +166,7 @@ class Looking:
         return mine, ours
 
     def gradients(self, **other: int) -> dict[str, Ratio]:
-        """Return the ratio for each parameter whose reference gradient is nonzero."""
+        """Return the ratio for each parameter whose reference gradient differs significantly from zero."""
         self._measure("gradients", other)
         own, ours = self._pair(**other)
         reference = np.stack([self.parts.gradient(ours, seed) for seed in self._each(2 * self._seeds, 6)])
@@ -185,7 +185,8 @@ class Looking:
     def emission(
         self, depth: int | None = None, seen: int | None = None, even: bool = False
     ) -> tuple[Ratio, float] | None:
-        """Return the ratio of sum(dL/dE E) to the image. The ratio must be 1, because images are linear in emission.
+        """Return the ratio of sum(dL/dE E) to sum(dL/dI I), where I is the image. The ratio must be 1, because images
+        are linear in emission.
 
         Also returns how much the ratio varies between seeds. At each seed, the image and the derivative sum use the
         same paths. Returns None if the emission of some emitter is not given by a number (`.value`, `scale`). `depth`
@@ -203,7 +204,7 @@ class Looking:
     def _by_emission(
         self, keys: list[str], max_depth: int, seen: int | None = None, even: bool = False, **other: int
     ) -> tuple[Array, Array]:
-        """Return sum(dL/dE E) and the weighted image for each seed. Both values must be equal."""
+        """Return sum(dL/dE E) and sum(dL/dI I) for each seed, where I is the image. Both sums must be equal."""
         depths = max_depth, max_depth if seen is None else seen
         own, image = (self.parts.own_with(self.label, max_depth=n, **other) for n in depths)
         case = Case(self.parts.case.scene, keys, self.parts.case.sensor)

@@ -86,7 +86,7 @@ def _serve(first: dict[str, Any], load: Callable[[], Begin], questions: IO[str],
 
 
 def _limit(memory_limit: int | None) -> None:
-    """Limit the address space to `memory_limit` plus the memory in use."""
+    """Limit the address space of the whole process to `memory_limit` bytes. A lower hard limit takes precedence."""
     if memory_limit is not None:
         import resource
 

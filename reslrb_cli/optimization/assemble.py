@@ -90,7 +90,8 @@ def assemble(
 def load_for_rendering(
     config: Config, initial: bool, values: Mapping[str, Any] | None = None
 ) -> tuple[Any, list[int], Any, int | None]:
-    """Load the scene and make the integrator. The parameters get `values`, or with `initial` their initial values.
+    """Load the scene and make the integrator. With `initial`, the parameters get their initial values, and then the
+    given `values`. Without `initial`, the scene is as in its file, and `values` is ignored.
 
     Returns the scene, the indices of the used sensors, the integrator, and its `samples_per_pass`.
     """
@@ -330,7 +331,8 @@ def resized(problem: Problem, key: str, value: Array) -> Array:
     change of the parameter's value.
 
     Heights are resampled by cubic splines at their positions in space. On a flat grid with a vertex for each height,
-    the heights cover the grid from edge to edge. Textures are resampled bilinearly, and smoothed first if they shrink.
+    the heights cover the grid from edge to edge. On other meshes, heights are at the centres of texels. Along an axis
+    that shrinks, texels of a texture are averaged. Along an axis that grows, texels are interpolated linearly.
     """
     shape, selection = problem.selection.array(key).shape, problem.selection
     if value.shape == shape:

@@ -170,7 +170,9 @@ def allocated(size: int) -> int:
 
 
 def _replicas(entries: int) -> int:
-    """Return the number of copies for scattering into an array: on a CPU, each thread has a copy of a small array."""
+    """Return the bytes of the copies for scattering into an array. On a CPU, each thread has a copy of a small array.
+    Large arrays, and arrays on a GPU, have no copies.
+    """
     threads = dr.thread_count() + 1
     if dr.backend_v(mi.Float) != dr.JitBackend.LLVM or entries * threads > dr.expand_threshold():
         return 0

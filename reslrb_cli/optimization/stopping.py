@@ -86,7 +86,10 @@ class Watch:
 
     @property
     def _first(self) -> int:
-        """First iteration of the run as configured."""
+        """Index of the first iteration whose loss is tested. Without stages, the index is 0.
+
+        With stages, the first iteration of the run as configured is skipped.
+        """
         stages, iterations = self.config.run.stages, self.config.run.iterations
         return math.ceil(stages[-1].until * iterations) + 1 if stages else 0
 

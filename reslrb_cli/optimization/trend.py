@@ -10,7 +10,7 @@ correlated over less than a window.
 
 The test is repeated after every window, for several k, and a run stops at the first success. The j-th test therefore
 uses the share 2 / (j (j - 1)) of `CHANCE`. The tested values of k divide the share equally. The shares sum to 1 from j
-= 3 on. At most 5 % of runs stop although their loss falls by `relative` per window, for runs of any length.
+= 3 on. At most about `CHANCE` of runs stop although their loss falls by `relative` per window, for runs of any length.
 
 `find_trend` tests the ranks of all losses (Conover and Iman 1981). The test fits a line to ten parts of the series, as
 in `stands`.

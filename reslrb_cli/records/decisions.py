@@ -85,9 +85,10 @@ class PaidRecord(Finding):
 
     The gradient's efficiency is 1 / (variance * time). `gain` is the efficiency with the method divided by the
     efficiency without the method. `low` and `high` are the ends of the 95 % interval of `gain`. `image_gain`,
-    `image_low` and `image_high` are the corresponding values for the image, if the image uses the gradient's samples.
-    Values that were not measured are None. If the method is off despite its gain, `note` gives the reason. `rounds` is
-    the number of measured steps of each kind. `share` is the cost of measuring, relative to the time of 200 iterations.
+    `image_low` and `image_high` are the corresponding values for the image. If images have their own samples, these
+    samples give the values. Values that were not measured are None. If the method is off despite its gain, `note` gives
+    the reason. `rounds` is the number of measured steps of each kind. `share` is the cost of measuring, relative to the
+    time of 200 iterations.
     """
 
     gain: float | None = None
@@ -112,8 +113,8 @@ class PaidRecord(Finding):
 class PathsRecord(PaidRecord):
     """Choice of `paths` (light, camera, both). If `paths` is `both`, `light_share` is the share of light paths.
 
-    `gain` compares the chosen share of light paths with the best other share. `note` tells whether the other share was
-    tried before or after the chosen share.
+    If a tried share was better, `gain` compares the chosen share with the best share before it. Otherwise, `gain`
+    compares the share that was tried last with the chosen share. `note` names the other share, or gives a reason.
     """
 
     paths: str

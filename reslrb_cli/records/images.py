@@ -164,7 +164,9 @@ def read_layers(path: Path) -> dict[str, Array]:
 
 
 def _place(letter: str) -> tuple[int, int, str]:
-    """Return a sort key for channels: R, G, B, A in this order, numbers by value, and other channels by name."""
+    """Return a sort key for channels. R, G, B, A come first, in this order. Numbers follow by value. Other names count
+    as 0, and are sorted by name.
+    """
     if letter in "RGBA":
         return 0, "RGBA".index(letter), ""
     return 1, int(letter) if letter.isdecimal() else 0, letter

@@ -350,8 +350,7 @@ INCOMPLETE = "derivative incomplete"
 class MissingRecord(Line):
     """Share of a parameter's derivative that the attached gradient lacks, relative to finite differences.
 
-    `share` and `standard_error` are None if noise hides the derivative, or if there was no time to measure them
-    (`seeds` is 0).
+    `share` and `standard_error` are None if noise hides the derivative, or if nothing was measured (`seeds` is 0).
     """
 
     case: str
@@ -364,7 +363,7 @@ class MissingRecord(Line):
 
     @property
     def is_unknown(self) -> bool:
-        """True if the interval of the missing share includes both 0 and a value above one half."""
+        """True if there is no share, or if the share's interval includes both 0 and a value above one half."""
         if self.share is None or self.standard_error is None:
             return True
         margin = NOTHING * self.standard_error
@@ -372,7 +371,7 @@ class MissingRecord(Line):
 
     @property
     def is_incomplete(self) -> bool:
-        """True if so much of the derivative is missing that the recovered values are unreliable."""
+        """True if the missing share is unknown, or so large that the recovered values are unreliable."""
         return self.is_unknown or (self.share or 0) > max(NOTHING * (self.standard_error or 0), NOTICED)
 
     @property

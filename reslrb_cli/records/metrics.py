@@ -187,7 +187,7 @@ def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Re
     the returned records.
 
     `last` is the last record as stored in the checkpoint. It replaces a line lost to a full disk. Raises a ConfigError
-    that names file and line if a record other than the last is missing or damaged.
+    that names the file if other records are missing, or file and line if a complete line is damaged.
     """
     path = folder / METRICS_FILE
     content = read_file(path) if count and os.path.lexists(path) else b""

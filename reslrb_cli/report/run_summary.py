@@ -185,7 +185,7 @@ def measured_line(kind: type[Finding], measured: Mapping[str, Any] | None) -> st
 
 
 def _is_of_target(about: Mapping[str, Any]) -> bool:
-    """True if most of a spread comes from the target's noise."""
+    """True if the target's noise makes up more than `OF_TARGET` of any entry's spread."""
     pairs = zip(about.get("of_target") or (), about.get("spread") or (), strict=False)
     return any(part is not None and whole and part > OF_TARGET * whole for part, whole in pairs)
 

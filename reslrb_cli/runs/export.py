@@ -273,7 +273,8 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
 
 
 def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None:
-    """Return the target image (H, W, C) of a sensor, or None if `target.file` does not have the size of the film.
+    """Return the target image (H, W, C) of a sensor. Return None if `target.file` is not set, or does not have the size
+    of the film.
 
     Raises ConfigError instead of returning None if the target is `needed` for tolerances.
     """

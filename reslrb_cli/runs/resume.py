@@ -168,7 +168,9 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
 
     `wanted` is a configuration that must agree with the run. The default for `wanted` is `config.yaml` in the run's
     folder. Raises ConfigError if the folder holds no run, the run is in use, or the last two states are both damaged.
-    Raises ConfigError also if a setting that must not change differs.
+    Raises ConfigError also if a setting that must not change differs, or if `run.iterations` is below the number of
+    finished iterations. Raises ConfigError also if an input file has changed, if records are missing or damaged, or if
+    the output folder cannot be used.
     """
     with opened(run) as (folder, manifest):
         said: list[str] = []

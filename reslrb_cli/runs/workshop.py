@@ -85,7 +85,9 @@ def add_tolerances(
 
 
 def original_of(plan: Fabrication, wanted: Array) -> Array | None:
-    """Return the luminance (H, W) of the picture before its dark parts were raised, or None for an unknown picture."""
+    """Return the luminance (H, W) of the picture before its dark parts were raised. Return None if the picture is
+    unknown, or does not have the size of `wanted`.
+    """
     if plan.picture is None:
         return None
     picture = luminance(read_image(plan.picture))

@@ -190,9 +190,10 @@ class Surroundings:
         self._horizon: Horizon | None = None
 
     def follow(self, scene: mi.Scene) -> Horizon:
-        """Return a sphere around all current shapes of the scene, and set it in the scene's emitters.
+        """Return a sphere around all current shapes of the scene, and set it in the scene's infinite emitters.
 
-        The sphere does not change while it contains all shapes.
+        The sphere does not change while it contains all shapes, and its radius is less than `TOO_LARGE` times the
+        needed radius.
         """
         sphere, before = scene.bbox().bounding_sphere(), self._horizon
         if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * sphere.radius:

@@ -110,9 +110,10 @@ def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, 
 def _coincident(scene: Any) -> str | None:
     """Return the problem of a scene in which rays of a sensor or a light meet two coincident faces, or None.
 
-    Rounding decides which face a ray meets. For two faces with one BSDF, the choice of the face does not matter in two
-    cases. Either the faces face the same way, or both are `twosided`. Otherwise, light paths and camera paths show
-    different scenes. The test detects triangles with three common corners, and equal disks and spheres.
+    Rounding decides which face a ray meets. For two faces with one BSDF and no emission, the choice of the face does
+    not matter in two cases. Either the faces face the same way, or the BSDF is `twosided` and the shading normals are
+    the faces' normals. Otherwise, light paths and camera paths show different scenes. The test detects triangles with
+    three common corners, and equal disks and spheres.
     """
     shapes = scene.shapes()
     twins = _twin_faces(shapes) | _twin_shapes(shapes)
@@ -197,8 +198,8 @@ def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
 def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
     """True if it matters which of two coincident faces a ray meets.
 
-    `turned` tells whether the faces' normals are opposite. `bent` tells whether their shading normals differ from their
-    normals.
+    It matters if a face emits, if the BSDFs differ, or if the normals are opposite (`turned`). Opposite normals do not
+    matter for a `twosided` BSDF, unless a face's shading normals differ from its normal (`bent`).
     """
     if one.is_emitter() or other.is_emitter() or one.bsdf() != other.bsdf():
         return True

@@ -85,10 +85,10 @@ def _corners_of(element: Element, description: Description) -> Corners | None:
 
 
 def _corners_of_grid(mesh: mi.Mesh) -> Corners | None:
-    """Return the parallelogram of a mesh with more than four vertices. The mesh's texture coordinates are proportional
-    to its positions.
+    """Return the parallelogram of a mesh with at least four vertices and with texture coordinates.
 
-    Returns None if the mesh does not cover the whole parallelogram.
+    Returns None unless the positions are an affine function of the texture coordinates, and the mesh covers the whole
+    parallelogram.
     """
     if mesh.vertex_count() < 4 or not mesh.has_vertex_texcoords():
         return None

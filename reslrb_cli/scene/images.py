@@ -65,9 +65,9 @@ class _Header:
 def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> mi.Bitmap:
     """Decode the image file `path`. `size` is the required (width, height), or None for any.
 
-    Pixels are as stored. If `upright`, pixels and size are rotated by EXIF (`TURNS`). Raises a ConfigError that names
-    the file if the file is unreadable, no image, too large, of another size, damaged or truncated. The header is
-    checked first.
+    Pixels are as stored. If `upright`, pixels and size are rotated or mirrored by EXIF (`TURNS`). Raises a ConfigError
+    that names the file if the file is unreadable, no image, too large, of another size, damaged or truncated. The
+    header is checked first.
     """
     header = _examine(path)
     orientation = header.orientation if upright else 1
@@ -106,7 +106,7 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Return a view of an image (H, W, ...), rotated upright according to its EXIF `orientation`."""
+    """Return a view of an image (H, W, ...), rotated or mirrored upright according to its EXIF `orientation`."""
     if orientation >= 5:  # rows of the file are columns of the view
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):

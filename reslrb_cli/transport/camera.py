@@ -1,8 +1,8 @@
 """The only camera-path loop: film ray, hit emitters, next event estimation, scattering, roulette.
 
-The hooks process the light that is found, as in the light-path loop (`walk.py`). Both loops share the scattering, the
-factors and the random numbers of a segment. The two ways to find light are weighted against each other, and against
-light paths if there are any (`weights.py`).
+The hooks process the light that is found, as in the light-path loop (`walk.py`). Both loops share the scattering and
+the factors. The camera-path loop draws its own random numbers. The two ways to find light are weighted against each
+other, and against light paths if there are any (`weights.py`).
 """
 
 from __future__ import annotations

@@ -31,8 +31,8 @@ class EmitterDensities:
     """Densities of a scene's emitters, as opaque arrays (R,). The index is the emitter's number in Dr.Jit's registry,
     which emitter pointers also contain.
 
-    `choice` is the probability of selecting an emitter. `emitted` is e, without a factor that depends on a texture.
-    `kind` tells which factor this is.
+    `choice` is the probability of selecting an emitter. `emitted` is e without the factor that varies between rays, for
+    example a texture's density. `kind` tells which factor this is.
     """
 
     choice: mi.Float
@@ -58,7 +58,9 @@ class EmitterDensities:
 
 
 def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: bool) -> tuple[float, int]:
-    """Return the part of e that is equal for all rays of an emitter, and the kind of the remaining factor."""
+    """Return the part of e that is equal for all rays of an emitter, and the kind of the remaining factor. The part
+    does not include the probability of selecting the emitter.
+    """
     name = emitter.class_name()
     disk = 0.0 if plan.horizon is None else 1 / (np.pi * plan.horizon.radius**2)
     if lamp is not None:

@@ -185,7 +185,7 @@ class Plan:
 
     @property
     def has_light_at_points(self) -> bool:
-        """Whether any emitter has no extent: a point, or a direction."""
+        """True if any emitter is not a shape. Lights at points and in one direction count, and so do environments."""
         return any(name not in ("AreaLight", "DirectionalArea") for name in self.needs.emitters)
 
     @property

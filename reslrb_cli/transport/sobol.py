@@ -50,7 +50,7 @@ BOUNCES = 2
 def directions(coordinate: int) -> tuple[int, ...]:
     """Return a direction number for each binary digit of an index, from the lowest digit on.
 
-    Each direction number is added (modulo 2) to the 32 digits of the point.
+    If a digit of the index is 1, its direction number is added (modulo 2) to the 32 digits of the point.
     """
     if coordinate == 0:
         return tuple(1 << k for k in range(DIGITS))

@@ -178,8 +178,8 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: Primary
     """Differentiate the radiance along the primary rays, times `adjoint` (C,). Add the derivatives to the parameters'
     gradients.
 
-    The derivative with respect to a transmission needs the radiance behind the surface. A first pass measures the
-    radiance at the sensor, which is then divided by the transmission.
+    The derivative with respect to a transmission needs the radiance behind the surface. A first pass measures the total
+    radiance at the sensor. The total minus the radiance up to the surface is then divided by the transmission.
     """
     masks = plan.differentiate_null
     total = visible_radiance(plan, scene, primary) if masks else mi.Spectrum(0)

@@ -52,9 +52,9 @@ FROM_INFINITY = -1e30  # the length so far of a path that comes from infinity
 class Rivals:
     """Loop state: a walk's M and V before the arrival at its current vertex, and the length d since the last vertex.
 
-    Null events are not vertices. The density p_D of a spherical lamp depends on the vertex. If any lamp is a sphere,
-    `sphere` is therefore the shape number of the spherical lamp that the path comes from. For other shapes, `sphere` is
-    0.
+    Null events are not vertices. The density p_D of an outward spherical lamp without a texture depends on the vertex.
+    If there are spherical lamps of this kind, `sphere` is therefore the shape number of the lamp that a light path
+    comes from. For other emitters, and after the first event, `sphere` is 0.
     """
 
     M: mi.Float

@@ -207,13 +207,14 @@ def survey(
     - `independent`: the valid stock integrator for each key, or None. `why`: the reason against others for each key.
     - `without`: stock integrators that are valid for no key, with the reason.
     - `paths`: the paths of the reference, which determine the reference's light.
-    - `masked`: whether pixels along the border are left out. `pixels`: the number of pixels.
+    - `masked`: true if pixels along the film's border are left out, because some of the compared images are dark there
+        and others are not. `pixels`: the number of pixels.
     - `pictures`: a description of the rendered images.
 
     The arrays are `mask` (H, W, 1), the first view's `target_arrays`, and `adjoints` (B, H, W, C). If the image is the
-    objective, `mask` is the only array. `camera` is true if camera paths take part. Camera paths take part if they are
-    valid or `named`. Camera paths have no dark film border. `light` is true if methods with a dark film border take
-    part. `budget_s` is the time of the whole measurement, if it is limited.
+    objective, `mask` is the only array. `camera` is true if some method may have camera paths. These methods take part
+    if `named`, or if `prb` is valid for some key. Images with camera paths have no dark film border. `light` is true if
+    methods with a dark film border take part. `budget_s` is the time of the whole measurement, if it is limited.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())

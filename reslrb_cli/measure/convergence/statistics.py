@@ -204,10 +204,12 @@ class MethodSamples:
         return _joined(float(value), left, right)
 
     def seconds_to(self, error: float, biased: bool) -> tuple[float | None, bool]:
-        """Return the seconds until the relative error is `error`. Also return a boolean that is true if more steps are
-        needed than were measured.
+        """Return the seconds until the relative error is `error`. Also return a boolean that is true if the seconds are
+        extrapolated.
 
-        The seconds are None if a bias keeps the error above `error`. At least one step is needed.
+        The seconds are None if a bias keeps the error above `error`. At least one step is needed. The boolean is true
+        if more steps are needed than were measured. The boolean is also true if the reference's own error (`floor`) is
+        unknown or larger than `error`. If the seconds are None, the boolean is false.
         """
         room = error**2 - (self.squared_bias if biased else 0.0)
         if room <= 0:

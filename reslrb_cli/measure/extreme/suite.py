@@ -86,10 +86,11 @@ class Twin:
 @dataclass(frozen=True)
 class Differences:
     """Finite differences of the image by `reslrb`, without Russian roulette. The differences are along random
-    directions into the domain.
+    directions. For one-sided differences, the directions point into the domain.
 
-    The finite differences use the same random numbers as the gradient. The differences are exact up to rounding in one
-    case. The differences are exact if paths do not depend on the parameters and the image is a polynomial of degree 2.
+    The finite differences use the same random numbers as the gradient, unless the case's options set `rr_depth`. The
+    differences are exact up to rounding if paths do not depend on the parameters and the image is a polynomial of
+    degree 2.
     """
 
     step: float

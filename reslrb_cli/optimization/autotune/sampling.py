@@ -81,8 +81,10 @@ def settle(problem: Problem, say: race.Say, cache: PilotCache | None = None) -> 
 
 
 def settle_paths(tuner: race.Tuner) -> None:
-    """Decide the integrator's kinds of paths, if the configuration leaves the kinds open and both kinds can render the
-    scene.
+    """Decide the integrator's share of light paths, if both kinds of paths can render the scene.
+
+    The configuration must leave the decision open. Either `paths` is `auto`, or `paths` is `both` and `light_share` is
+    `auto`.
     """
     problem = tuner.problem
     if not race.is_auto(problem.config, "paths") or problem.paths != "both":
@@ -231,8 +233,8 @@ def planned(share: float) -> float:
 def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
     """Return the remaining time for measurements, as a share of the time of 200 iterations.
 
-    `reserved` is the share that is kept for other measurements. A short run may have less time left. `kernels` is the
-    number of kernels to compile.
+    `reserved` is the share that is kept for other measurements. A short run may have less time left. `kernels` is a
+    number of steps. Time to compile the kernels of these steps is subtracted.
     """
     spent = sum(each.share for each in (problem.sides, problem.guided) if each is not None)
     return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)

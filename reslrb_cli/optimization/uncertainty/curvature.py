@@ -303,12 +303,13 @@ class Curvature:
         return [list(sample) for sample in zip(*by_view, strict=True)]
 
     def _noises(self, view: View, integrator: Any, spp: int, multiple: int | None) -> list[TargetNoise]:
-        """Return samples of the effect that the noise of a view's target has on dL/dI. The list is empty for a file.
+        """Return samples of the effect that the noise of a view's target has on dL/dI. For a file, the samples are
+        zero.
 
         The target has `spp` samples. The function renders several images with the target's sample count. Each image
         takes the role of the target in turn. The mean of the other images serves as the target's expected value. If
-        this would cost too much, and noise is small, differences of images with few samples are added to the target.
-        All sample counts are multiples of `multiple`.
+        `spp` exceeds `AGAIN` times the samples of a step, the images have few samples instead. Their differences,
+        scaled to the target's noise, are then added to the target. All sample counts are multiples of `multiple`.
         """
         true = np.array(view.target, dtype=np.float64)
         if view.wanted.file is not None:

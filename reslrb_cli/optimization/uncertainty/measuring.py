@@ -304,7 +304,10 @@ def hides(directions: Sequence[Direction], curvature: Array, gradients: Gradient
 
 
 class _Budget:
-    """Time for more measurements. The first call always returns true, because it compiles kernels."""
+    """Time for more measurements. A call returns true if time is left and `stop()` is false.
+
+    The longest time between two calls does not count, because it is assumed to include a compilation.
+    """
 
     def __init__(self, seconds: float, stop: Callable[[], bool]) -> None:
         self._seconds, self._stop = seconds, stop

@@ -20,7 +20,8 @@ refers to the optimum for a target without noise.
 | `not determined` | `alone` <= `OTHERS` of `spread`: others compensate for it; the most correlated one is named |
 | `below the noise`| otherwise: the gradients do not determine the value to tau |
 
-A parameter is not `settled` if its most correlated partner is `still moving`, because both move together.
+A `settled` parameter becomes `still moving` if the parameter that compensates for it is `still moving`, because both
+move together.
 
 If the derivative of a parameter lacks a significant share, its verdict is `derivative incomplete`. A run measures the
 missing share before its first iteration (`measure/missing.py`).
@@ -113,13 +114,14 @@ class ParameterCertainty:
 
     `spread` is one standard deviation of the final value around the optimum. `of_target` is the part of `spread` that
     comes from the noise of rendered targets. `to_go` is the estimated distance. All are in the parameter's unit. A
-    small parameter has one number for each entry. A large parameter has the root mean square over the entries with an
-    effect. The numbers are None if nothing was measured, and for entries at their bounds. `partner` is the parameter
-    that compensates for this parameter, if there is one.
+    small parameter has one number for each entry. A large parameter has the root mean square over its visible entries
+    with an effect that are not at a bound. The numbers are None if nothing was measured, and for entries at their
+    bounds or without effect. `partner` is the parameter that compensates for this parameter, if there is one.
 
-    `moved` is the root mean square movement of the entries since the start. `reach` is the distance that all steps
-    cover in one direction. `reach` is None if the step length depends on the gradient (`sgd`). `rate` is the learning
-    rate. `seen` is the share of a texture's texels that some view shows, or None for other parameters.
+    `moved` is the root mean square movement since the start, over the visible entries with a gradient. `reach` is the
+    distance that all steps cover in one direction. `reach` is None if the step length depends on the gradient (`sgd`).
+    `rate` is the learning rate. `seen` is the share of a texture's texels that some view shows, or None for other
+    parameters.
     """
 
     verdict: str

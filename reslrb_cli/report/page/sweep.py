@@ -199,8 +199,8 @@ def _textures(source: SweepRuns) -> Markup:
 
 
 def _moment(place: int) -> str:
-    """Return the key that `visible` uses for a combination's texture. The first combination's key is `final`, so its
-    texture sets the exposure.
+    """Return the key that `visible` uses for a combination's texture. The first combination's key is `final`. Its
+    texture sets the exposure if the true texture is unknown.
     """
     return f"final {place}" if place else "final"
 
