@@ -166,8 +166,9 @@ def _type(value: dict[str, Any]) -> str:
             names = list(dict.fromkeys(_type(option) for option in value[union]))
             if "number" in names and "integer" in names:
                 names.remove("integer")
-            listed = " or list of sections" * ("list of sections" in names)
-            return " or ".join(names) if "section" not in names else f"section{listed}" + " or null" * ("null" in names)
+            if "section" in names:  # a section's own table describes its other types
+                names = [name for name in ("section", "list of sections", "text", "null") if name in names]
+            return " or ".join(names)
     if "$ref" in value:
         return _IN_A_LINE.get(value["$ref"].rsplit("/", 1)[1], "section")
     if "enum" in value:
