@@ -135,7 +135,7 @@ class RunConfig(Section):
     without its suffix."""
     output: WorkPath = Field(default=Path("runs"), validate_default=True)
     """Folder for run folders, relative to the working directory."""
-    iterations: Count = Field(default=200, description="Total number of optimisation steps. A resumed run includes the steps before.")
+    iterations: Count = Field(default=200, description="Total number of optimisation steps, also for a resumed run.")
     max_seconds: Positive | None = None
     """Time limit in seconds. The run ends, as finished, before the iteration that would exceed the limit if it took the
     mean time of an iteration. The first iteration is always completed. The limit includes the measurement of automatic

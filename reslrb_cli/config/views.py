@@ -37,7 +37,8 @@ class Mask(Section):
 
     file: ConfigPath | None = None
     """Image of weights, with the size of the target, relative to the config file. 0 leaves a pixel out. Values are used
-    as stored; those of 8 and 16 bits are divided by the largest possible value. Several channels are averaged, and alpha is ignored."""
+    as stored; those of 8 and 16 bits are divided by the largest possible value. Several channels are averaged, and
+    alpha is ignored."""
     specular: bool = True
     """Leave out pixels that see smooth glass or mirrors directly. Light tracing cannot render them. If shapes move,
     each iteration finds these pixels anew."""
