@@ -308,8 +308,8 @@ def gallery(blocks: Blocks) -> str:
     """Return docs/gallery.md: the picture, errors, costs and command of each experiment that has a picture."""
     parts = [
         "# Gallery\n\n"
-        "This page shows every shipped experiment in `configs/`. Each picture has three images: the target, the image at\n"
-        "the start of the run, and the image at its end. Copy an experiment with `reslrb example NAME`.\n"
+        "This page shows every shipped experiment in `configs/`. Each picture has three images: the target,\n"
+        "the image at the start of the run, and the image at its end. Copy an experiment with `reslrb example NAME`.\n"
     ]
     found = blocks.recorded({experiment_record(name): name for name in EXPERIMENTS if gallery_picture(name).exists()})
     for name, record in found.values():
