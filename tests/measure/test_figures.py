@@ -197,7 +197,7 @@ def test_agreement_holds(tmp_path: Path) -> None:
     assert (tmp_path / "figure5.png").read_bytes().startswith(b"\x89PNG")
     plan = {"origin": ORIGIN, "plan": {"spp": 32}, "film": [16, 9], "max_depth": 32, "left_out": 0.25}
     said = FIGURES["figure5"](json.loads(json.dumps(plan | record, allow_nan=False)))
-    assert "Film 16x9, paths of length 32; dL/dI is 0 in 25.0% of the pixels:" in said
+    assert "The film has 16x9 pixels, and the paths have length 32. dL/dI is 0 in 25.0% of the pixels." in said
     assert "| reslrb:reservoir, 32 spp - prb, 32 spp |" in said
 
 
