@@ -21,7 +21,7 @@ from scipy import stats
 
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config.integrators import Prb, Ptracer, WalkAd
+from reslrb_cli.config.integrators import Prb, Ptracer, WalkAdConfig
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
@@ -115,7 +115,7 @@ def comparable(config: Config, by: str) -> Config:
         return config.model_copy(update={"integrator": Prb(type="prb", **shared)})
     if by == "walk_ad":
         options: Any = shared | {"filter_normalization": "detached", "attached": own.attached}
-        return config.model_copy(update={"integrator": WalkAd(type="walk_ad", **options)})
+        return config.model_copy(update={"integrator": WalkAdConfig(type="walk_ad", **options)})
     other = {} if by == OWN else {"estimator": by}
     return config.model_copy(update={"integrator": own.model_copy(update=alike | other)})
 

@@ -32,7 +32,7 @@ FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
 FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 
-class Exposure(click.ParamType):
+class ExposureType(click.ParamType):
     """A factor above 0, or None for `auto`."""
 
     name = "FACTOR|auto"
@@ -74,7 +74,7 @@ class Exposure(click.ParamType):
 )
 @click.option(
     "--exposure",
-    type=Exposure(),
+    type=ExposureType(),
     default="1",
     show_default=True,
     help="Factor of the image in a PNG or JPG: a number, or auto, which suits everything in view except lamps. "

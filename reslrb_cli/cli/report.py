@@ -35,7 +35,7 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     from reslrb_cli.records.sweeps import PAGE_FILE
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.perceptual import with_seen_errors
-    from reslrb_cli.report.sources import Run, SweepRuns, read_sources
+    from reslrb_cli.report.sources import ShownRun, SweepRuns, read_sources
 
     if len(paths) > MOST_SOURCES:
         raise ConfigError("RUN", "", f"{len(paths)} are given; a page shows at most {MOST_SOURCES}")
@@ -44,9 +44,9 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
         sources = read_sources(paths, tell)
     gc.freeze()  # otherwise Python searches millions of numbers for cycles during drawing
     if output is None:
-        if len(sources) != 1 or not isinstance(sources[0], Run | SweepRuns):
+        if len(sources) != 1 or not isinstance(sources[0], ShownRun | SweepRuns):
             raise ConfigError("--output", "", "is missing; give a file to write, e.g. -o page.html")
-        output = sources[0].path / ("report.html" if isinstance(sources[0], Run) else PAGE_FILE)
+        output = sources[0].path / ("report.html" if isinstance(sources[0], ShownRun) else PAGE_FILE)
     check_writable("--output", output)
     write_page([with_seen_errors(source) for source in sources], output)
     echo(f"look at {os.path.relpath(output)}")

@@ -44,7 +44,7 @@ from reslrb_cli.report.format import shorten
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
     from reslrb_cli.records.metrics import Line
-    from reslrb_cli.records.sweeps import Sweep
+    from reslrb_cli.records.sweeps import SweepPlan
     from reslrb_cli.report.sources import SweepRuns
     from reslrb_cli.runs.sweep import Plan
 
@@ -158,7 +158,7 @@ def command(
         return _run(folder, sweep, json_file, quiet, verbose)
 
 
-def _run(folder: Path, sweep: Sweep, json_file: Path | None, quiet: bool, verbose: bool) -> int:
+def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, verbose: bool) -> int:
     """Run the remaining runs of the sweep, update its page, and print the results."""
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.config.loader import load

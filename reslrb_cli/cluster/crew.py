@@ -228,7 +228,8 @@ class Crew:
         if not self._left_out:
             return f"--cluster: no worker within {NOBODY_S:.0f} s"
         worker, reason = next(iter(self._left_out.items()))
-        more = f" (the same for {len(self._left_out)} workers)" if len(self._left_out) > 1 else ""
+        others = len(self._left_out) - 1
+        more = f" (left out as well: {others} more)" if others else ""
         return f"--cluster: no worker can be used: {self._name(worker)} {reason}{more}"
 
     def _name(self, worker: str) -> str:

@@ -68,7 +68,7 @@ class Opening:
 
 
 @dataclass
-class _State:
+class _WorkerState:
     """The state of a worker, and the digest of its context."""
 
     opening: str
@@ -76,7 +76,7 @@ class _State:
     stands: str = ""
 
 
-_state: _State | None = None
+_state: _WorkerState | None = None
 
 #: Environment variable of a worker: 1 allows users' own code there, if the experiment's user allows it, too.
 ALLOW_CODE = "RESLRB_ALLOW_CODE"
@@ -138,7 +138,7 @@ def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int
         value, seconds = opening.function(folder, threads, *opening.arguments)
     except Exception as error:  # the run could load it, so the fault is on this machine
         return Fault(me, f"cannot: {describe(error)}", is_out_of_memory(error))
-    _state = _State(opening.digest, value)
+    _state = _WorkerState(opening.digest, value)
     return Answer(me, seconds, time.perf_counter() - begin)
 
 

@@ -70,7 +70,7 @@ def _removed(location: Location, value: Any = None) -> str | None:
 
 
 @dataclass(frozen=True)
-class Problem:
+class SettingError:
     """One error: its location in the notation of `--set`, and its description. `explain` says what would be right.
 
     `unknown` is pydantic's location of an unknown key. Only `explain` searches for the nearest known key, because the
@@ -86,7 +86,7 @@ class Problem:
         return self.message if self.unknown is None else _unknown_key(self.unknown)
 
 
-def problems(error: ValidationError, data: Any) -> list[Problem]:
+def problems(error: ValidationError, data: Any) -> list[SettingError]:
     """Return the errors that `error` reports for `data`, each once. Unknown keys come first, because unknown keys
     explain missing keys.
     """
@@ -94,37 +94,39 @@ def problems(error: ValidationError, data: Any) -> list[Problem]:
     return sorted(found, key=lambda problem: problem.unknown is None)
 
 
-def _problem(detail: ErrorDetails, data: Any) -> Problem:
+def _problem(detail: ErrorDetails, data: Any) -> SettingError:
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     location = _location(detail["loc"], data)
     key = format_location(location)
     if kind == "extra_forbidden":
-        return Problem(key, "unknown key", unknown=detail["loc"])
+        return SettingError(key, "unknown key", unknown=detail["loc"])
     if kind == "located":
-        return Problem(_join(key, context["key"]), context["message"])
+        return SettingError(_join(key, context["key"]), context["message"])
     if kind.startswith("union_tag"):
         if not isinstance(value, dict):
-            return Problem(key, _but_is("must be a mapping such as {type: NAME}", value))
+            return SettingError(key, _but_is("must be a mapping such as {type: NAME}", value))
         if advice := _removed((*location, "type"), value.get("type")):
-            return Problem(_join(key, "type"), f"{value['type']} {advice}")
+            return SettingError(_join(key, "type"), f"{value['type']} {advice}")
         given, known = value.get("type"), [str(_type_name(section)) for section in _candidates(detail["loc"])[0]]
-        return Problem(_join(key, "type"), _but_is("must be " + _one_of(known, given), given))
+        return SettingError(_join(key, "type"), _but_is("must be " + _one_of(known, given), given))
     if kind == "missing" and isinstance(location[-1], str):
-        return Problem(key, "missing; it has no default")
+        return SettingError(key, "missing; it has no default")
     if kind == "missing":  # an entry of a pair
-        return Problem(format_location(location[:-1]), "must be a list of two: it has too few entries")
+        return SettingError(format_location(location[:-1]), "must be a list of two: it has too few entries")
     if kind == "too_long":
         most = {1: "one", 2: "two"}.get(context["max_length"], str(context["max_length"]))
-        return Problem(key, f"must be a list of {most}: it has too many entries")
+        return SettingError(key, f"must be a list of {most}: it has too many entries")
     if kind == "too_short":
-        return Problem(key, "must have at least one entry")
+        return SettingError(key, "must have at least one entry")
     if kind == "wrong":
-        return Problem(key, _but_is(context.get("message") or detail["msg"], value))
+        return SettingError(key, _but_is(context.get("message") or detail["msg"], value))
     if kind == "literal_error":
-        return Problem(key, _but_is("must be " + _one_of(re.findall(r"'([^']*)'", context["expected"]), value), value))
+        return SettingError(
+            key, _but_is("must be " + _one_of(re.findall(r"'([^']*)'", context["expected"]), value), value)
+        )
     if kind in _EXPECTED:
-        return Problem(key, _but_is("must be " + _EXPECTED[kind].format(**context), value))
-    return Problem(key, detail["msg"])
+        return SettingError(key, _but_is("must be " + _EXPECTED[kind].format(**context), value))
+    return SettingError(key, detail["msg"])
 
 
 # --- where ------------------------------------------------------------------------------------------------------------

@@ -247,7 +247,7 @@ class PrbProjective(Integrator, json_schema_extra=NEEDS_TYPE):
     as many as the step has."""
 
 
-class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
+class WalkAdConfig(AttachingTracer, json_schema_extra=NEEDS_TYPE):
     """The paths of `reslrb` with naive reverse-mode differentiation, for comparisons at equal seeds."""
 
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
@@ -262,7 +262,7 @@ class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
         return self
 
 
-class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
+class TrajectoryConfig(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
     """The light paths of `reslrb`, reversed by Dr.Jit. Dr.Jit records each path's loop state in thread-local memory."""
 
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
@@ -292,7 +292,9 @@ class Own(Integrator, json_schema_extra=NEEDS_TYPE):
         return code_file(self.file)
 
 
-AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | PrbProjective | WalkAd | Trajectory | Own, ByType("reslrb")]
+AnyIntegrator = Annotated[
+    Reslrb | Ptracer | Prb | PrbProjective | WalkAdConfig | TrajectoryConfig | Own, ByType("reslrb")
+]
 
 
 def _check_share(paths: str, light_share: float | str) -> None:

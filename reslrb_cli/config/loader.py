@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from reslrb_cli.config.errors import Problem, problems
+from reslrb_cli.config.errors import SettingError, problems
 from reslrb_cli.config.files import read_file
 from reslrb_cli.config.integrators import Own
 from reslrb_cli.config.optimizers import Custom
@@ -221,7 +221,7 @@ def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) 
             raise ConfigError(config.source, key, reason)
 
 
-def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem: Problem, path: Path) -> str:
+def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem: SettingError, path: Path) -> str:
     """Return the origin of `problem`: the override that causes it, or the file.
 
     `stages` holds several versions of the settings: first the settings of the file, then the settings after each
@@ -268,7 +268,7 @@ def read_text(path: Path, source: str) -> str:
         raise ConfigError(source, "", "is not UTF-8 text; a configuration is a YAML file") from None
 
 
-def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[Problem]]:
+def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[SettingError]]:
     """Return the configuration, or the errors in `raw`."""
     # a section whose lines are all commented out reads as null
     data = {key: value for key, value in raw.items() if value is not None or key not in Config.model_fields}

@@ -169,7 +169,7 @@ class StopRule(Section):
     shows that it falls by less. Smaller values and noisier losses need more windows."""
 
 
-class Optimizer(Choice):
+class OptimizerSettings(Choice):
     """Options of all optimisers: the learning rate and its schedule."""
 
     type: str
@@ -222,10 +222,10 @@ class Optimizer(Choice):
 
     def own_options(self) -> dict[str, Any]:
         """Return the options of the update rule itself (beta_1, ...), without those that all optimisers share."""
-        return {name: value for name, value in self.options().items() if name not in Optimizer.model_fields}
+        return {name: value for name, value in self.options().items() if name not in OptimizerSettings.model_fields}
 
 
-class Adam(Optimizer):
+class Adam(OptimizerSettings):
     """Adam (Kingma and Ba 2015)."""
 
     type: Literal["adam"] = Field(default="adam", description="Adam (Kingma and Ba 2015).")
@@ -239,7 +239,7 @@ class Adam(Optimizer):
     epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
 
 
-class SGD(Optimizer, json_schema_extra=NEEDS_TYPE):
+class SGD(OptimizerSettings, json_schema_extra=NEEDS_TYPE):
     """Gradient descent with momentum."""
 
     type: Literal["sgd"] = Field(default="sgd", description="Gradient descent, with momentum if it is above 0.")

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.integrators import Integrator, Own, WalkAd
+from reslrb_cli.config.integrators import Integrator, Own, WalkAdConfig
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.parameters import size_of
 from reslrb_cli.config.schema import Config
@@ -153,7 +153,7 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
     """
     if isinstance(integrator, Own):
         return integrator.paths
-    if not isinstance(integrator, ReslrbConfig | WalkAd):
+    if not isinstance(integrator, ReslrbConfig | WalkAdConfig):
         return "light" if integrator.type in LIGHT_TRACERS else "camera"
     if moves:
         return "light"
@@ -200,7 +200,7 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
     """
     if isinstance(integrator, ReslrbConfig):
         integrator = integrator.undecided_off().model_copy(update={"paths": paths})
-    elif isinstance(integrator, WalkAd):
+    elif isinstance(integrator, WalkAdConfig):
         integrator = integrator.model_copy(update={"paths": paths})
     options: dict[str, Any] = integrator.options()
     if isinstance(integrator, ReslrbConfig):

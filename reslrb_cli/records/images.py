@@ -167,7 +167,7 @@ def _place(letter: str) -> tuple[int, int, str]:
     """Return a sort key for channels. R, G, B, A come first, in this order. Numbers follow by value. Other names count
     as 0, and are sorted by name.
     """
-    if letter in "RGBA":
+    if letter in tuple("RGBA"):
         return 0, "RGBA".index(letter), ""
     return 1, int(letter) if letter.isdecimal() else 0, letter
 

@@ -394,22 +394,22 @@ class MissingRecord(Line):
         """Return the record as one line of text."""
         if not self.seeds:
             return (
-                f"{self.parameter}: silhouettes and edges of shadows are not in the derivative; there was no time to "
-                "measure what they make up"
+                f"{self.parameter}: the derivative lacks silhouettes and shadow edges; their share was not measured "
+                "(too few samples, or a derivative of the loss that is 0)"
             )
         if self.share is None or self.standard_error is None:
-            return f"{self.parameter}: the derivative itself is less than what {self.seeds} seeds could see"
+            return f"{self.parameter}: {self.seeds} seeds cannot distinguish the derivative from 0"
         figures = self.percent()
         if self.is_unknown:
             return (
-                f"{self.parameter}: {self.seeds} seeds could not tell what share of the derivative is missing "
-                f"({figures}; silhouettes, edges of shadows, light that leaves the film)"
+                f"{self.parameter}: {self.seeds} seeds cannot determine the missing share of the derivative "
+                f"({figures}; silhouettes, shadow edges, light that leaves the film)"
             )
         if self.share <= max(NOTHING * self.standard_error, LEAST):
-            return f"{self.parameter}: nothing is missing that {self.seeds} seeds could see ({figures})"
+            return f"{self.parameter}: {self.seeds} seeds detect no missing part of the derivative ({figures})"
         return (
-            f"{self.parameter}: {figures} of the derivative is missing (silhouettes, edges of shadows, light that "
-            "leaves the film)"
+            f"{self.parameter}: {figures} of the derivative is missing (silhouettes, shadow edges, light that leaves "
+            "the film)"
         )
 
 

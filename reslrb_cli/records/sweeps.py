@@ -52,7 +52,7 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class SweepPlan:
     """Plan of a sweep: every combination with every seed, and the failed runs by name.
 
     `config` is the configuration file and `overrides` the values of `--set`, both as the user wrote them. `codes` holds
@@ -79,7 +79,7 @@ class Sweep:
         """Combination and seed of each run, in order: all combinations with the first seed, then with the next."""
         return ((combination, seed) for seed in self.seeds for combination in self.combinations)
 
-    def with_failure(self, name: str, failure: Failure | None) -> Sweep:
+    def with_failure(self, name: str, failure: Failure | None) -> SweepPlan:
         """Return the sweep with `failure` for the run `name`. If `failure` is None, remove the run's failure."""
         others = {other: each for other, each in self.failures.items() if other != name}
         return replace(self, failures=others if failure is None else {**others, name: failure})
@@ -90,7 +90,7 @@ class Sweep:
         write_atomically(folder / SWEEP_FILE, lambda file: file.write(text), durable=True)
 
 
-_READER = TypeAdapter(Sweep)
+_READER = TypeAdapter(SweepPlan)
 
 
 def in_words(value: Any) -> str:
@@ -139,7 +139,7 @@ def is_sweep(folder: Path) -> bool:
     return (folder / SWEEP_FILE).is_file()
 
 
-def read_sweep(folder: Path) -> Sweep:
+def read_sweep(folder: Path) -> SweepPlan:
     """Read the sweep in `folder`. Raises a ConfigError that names the sweep's file if the file is missing or
     damaged.
     """

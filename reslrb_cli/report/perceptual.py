@@ -16,7 +16,7 @@ import numpy as np
 
 from reslrb_cli.optimization.errors import comparison_grid, nearest, on_grid
 from reslrb_cli.records.images import load_image, read_mask, read_parameters
-from reslrb_cli.report.sources import Run, Source
+from reslrb_cli.report.sources import ShownRun, Source
 from reslrb_cli.report.tonemap import encode, exposure_for, shown_exposures
 
 Array = np.ndarray[Any, Any]
@@ -191,7 +191,7 @@ def _colors(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
 
 def with_seen_errors(source: Source) -> Source:
     """Return `source`, with perceptual errors added to the results of a run that lacks them."""
-    if not isinstance(source, Run) or "seen" in source.results:
+    if not isinstance(source, ShownRun) or "seen" in source.results:
         return source
     try:
         found = seen_errors(source.path, source.results, source.manifest.get("views"))

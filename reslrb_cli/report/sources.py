@@ -13,7 +13,7 @@ from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.measurement_files import Origin, Tell, read_lines, read_origin
-from reslrb_cli.records.sweeps import Sweep, is_sweep, read_sweep, run_name
+from reslrb_cli.records.sweeps import SweepPlan, is_sweep, read_sweep, run_name
 
 Array = np.ndarray[Any, Any]
 
@@ -28,7 +28,7 @@ MAP_LAYERS = ("gradient", "reference", "z")
 
 
 @dataclass(frozen=True)
-class Run:
+class ShownRun:
     """Run: its folder, its name on the page, its manifest, and one record per iteration.
 
     `current` holds the parameter values by key while the run is in progress, otherwise None. `damaged` holds the
@@ -107,12 +107,12 @@ class SweepRuns:
 
     path: Path
     name: str
-    sweep: Sweep
-    runs: Mapping[str, Run]
+    sweep: SweepPlan
+    runs: Mapping[str, ShownRun]
     kind = "sweep"
 
 
-Source = Run | Measurements | Maps | SweepRuns
+Source = ShownRun | Measurements | Maps | SweepRuns
 
 
 def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source]:
@@ -130,7 +130,7 @@ def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source
     return found
 
 
-def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) -> Run:
+def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) -> ShownRun:
     """Read the run in `folder` as far as possible. For any other folder, return an empty run."""
     try:
         lines = read_lines(folder / metrics.METRICS_FILE, tell)
@@ -138,7 +138,7 @@ def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) ->
         records = [record for entry in lines.objects if (record := _record(entry)) is not None]
     except ConfigError:  # there are none yet
         records, damaged = [], []
-    return Run(folder, name or folder.absolute().name, read_manifest(folder) or {}, records, damaged=damaged)
+    return ShownRun(folder, name or folder.absolute().name, read_manifest(folder) or {}, records, damaged=damaged)
 
 
 def read_sweep_runs(folder: Path, name: str | None = None, tell: Tell | None = None) -> SweepRuns:

@@ -17,8 +17,8 @@ from reslrb_cli.config.files import duration
 from reslrb_cli.records.measurements import Band, Range
 from reslrb_cli.records.sweeps import (
     Combination,
-    Sweep,
     SweepBestRecord,
+    SweepPlan,
     SweepRowRecord,
     SweepRunRecord,
     in_words,
@@ -28,7 +28,7 @@ from reslrb_cli.records.sweeps import (
 )
 from reslrb_cli.report.format import count, interval, number, shorten, table
 from reslrb_cli.report.run_summary import units_differ
-from reslrb_cli.report.sources import Run, SweepRuns, is_number
+from reslrb_cli.report.sources import ShownRun, SweepRuns, is_number
 
 #: Settings that make losses, or errors, incomparable if they vary.
 OTHER_LOSS = ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out")
@@ -73,7 +73,7 @@ def _number(value: Any) -> float | None:
     return float(value) if is_number(value) else None
 
 
-def _error(run: Run, relative: bool) -> float | None:
+def _error(run: ShownRun, relative: bool) -> float | None:
     """Return the final error of all parameters. If `relative`, return the root mean square of their relative errors."""
     if not relative:
         return _number((run.results.get("rmse") or {}).get("final"))
@@ -82,7 +82,7 @@ def _error(run: Run, relative: bool) -> float | None:
     return math.sqrt(sum(error**2 for error in known) / len(known)) if known else None
 
 
-def row_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepRowRecord]:
+def row_records(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[SweepRowRecord]:
     """Return the results of the finished runs of each combination."""
     ratios = {of: _ratios(sweep, runs, of) for of in OTHERS}
     return [
@@ -110,7 +110,7 @@ def _row(
 # --- the best combination ---------------------------------------------------------------------------------------------
 
 
-def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBestRecord]:
+def best_records(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[SweepBestRecord]:
     """Return the best combination by loss and the best by error, if the combinations can be compared. The result is
     empty for a single combination.
 
@@ -125,7 +125,7 @@ def best_records(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[SweepBest
     return found
 
 
-def incomparable(sweep: Sweep, others: Sequence[str]) -> str:
+def incomparable(sweep: SweepPlan, others: Sequence[str]) -> str:
     """Return the first varied setting that is in `others`, or below a setting in `others`. Learning rates do not count.
     Return "" if there is none.
     """
@@ -133,7 +133,7 @@ def incomparable(sweep: Sweep, others: Sequence[str]) -> str:
     return next((key for key in keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in others)), "")
 
 
-def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
+def _paired(sweep: SweepPlan, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
     """Return each combination's values by the combination's name. Each value belongs to one seed. The values use only
     seeds that all combinations have.
 
@@ -152,7 +152,7 @@ def _paired(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, 
     return {name: [values[seed] for seed in seeds] for name, values in found.items()} if seeds else {}
 
 
-def _groups(sweep: Sweep, values: Mapping[str, list[float]]) -> dict[str, list[list[float]]]:
+def _groups(sweep: SweepPlan, values: Mapping[str, list[float]]) -> dict[str, list[list[float]]]:
     """Group combinations that differ only in learning rates. Return the values of each group by the name of the group's
     best combination.
 
@@ -172,7 +172,7 @@ def is_rate(key: str) -> bool:
     return key.endswith("learning_rate")
 
 
-def _ratios(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, Range]:
+def _ratios(sweep: SweepPlan, runs: Sequence[SweepRunRecord], of: str) -> dict[str, Range]:
     """Return each other group's ratio to the first group, by the name of the group's best combination."""
     groups = _groups(sweep, _paired(sweep, runs, of))
     first = next(iter(groups.values()), [])
@@ -181,7 +181,7 @@ def _ratios(sweep: Sweep, runs: Sequence[SweepRunRecord], of: str) -> dict[str, 
 
 
 def _best(
-    of: str, verdict: Verdict, groups: Mapping[str, list[list[float]]], labels: dict[str, str]
+    of: str, verdict: Ranking, groups: Mapping[str, list[list[float]]], labels: dict[str, str]
 ) -> SweepBestRecord:
     values = {name: rows[0] for name, rows in groups.items()}
     second = min((name for name in values if name != verdict.best), key=lambda name: float(np.median(values[name])))
@@ -246,7 +246,7 @@ ALPHA = 0.05
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Ranking:
     """Best combination (lowest median), the combinations `tied` with the best, and the combinations that the best
     `beats`. `tied` and `beats` are in order of medians.
 
@@ -261,7 +261,7 @@ class Verdict:
     enough: int
 
 
-def find_best(values: Mapping[str, Sequence[float]]) -> Verdict | None:
+def find_best(values: Mapping[str, Sequence[float]]) -> Ranking | None:
     """Find the combination with the lowest median, and the combinations tied with the best. Return None if there are no
     values.
 
@@ -278,7 +278,7 @@ def find_best(values: Mapping[str, Sequence[float]]) -> Verdict | None:
     enough = next(count for count in range(2, 1000) if _least_p(count) < level)
     can_tell = _least_p(len(values[best])) < level
     tied = [name for name in others if name not in apart]
-    return Verdict(best, tied, apart, bool(others) and not can_tell, enough)
+    return Ranking(best, tied, apart, bool(others) and not can_tell, enough)
 
 
 def _signed_ranks(one: Sequence[float], other: Sequence[float]) -> float:
@@ -294,7 +294,7 @@ def _least_p(pairs: int) -> float:
     return 2.0 ** (1 - pairs)
 
 
-def notes(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
+def notes(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
     """Return remarks on the table: what is not compared, and what failed."""
     lines = []
     if key := incomparable(sweep, OTHER_LOSS):
@@ -311,7 +311,7 @@ def notes(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
     return lines
 
 
-def _outermost(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
+def _outermost(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
     """Return one line for each best learning rate that lies at an end of the tried range. A better rate may lie
     beyond.
     """
@@ -358,7 +358,7 @@ def row_figures(records: Sequence[SweepRowRecord], runs: Sequence[SweepRunRecord
     return found | figures_of(runs) | ratios
 
 
-def lines(sweep: Sweep, runs: Sequence[SweepRunRecord]) -> list[str]:
+def lines(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
     """Return the table with one line per combination, the best combinations, and remarks."""
     records = row_records(sweep, runs)
     keys, figures, short = sweep.keys, row_figures(records, runs), short_keys(sweep.keys)

@@ -259,20 +259,25 @@ class RunProgress:
 
     def add(self, state: State, record: Record) -> None:
         """Add one iteration, with the `state` after it."""
-        if self._counts(record.iteration):  # losses on films of another size cannot be compared
+        if self._is_whole(self.state) and self._is_whole(state):  # the iteration starts with the values of `self.state`
             self.best.see(record, self.state.values)
         self._take(record)
-        if self.stages.is_whole(state.stage):
+        if self._is_whole(state):
             self.certainty.see(self.state, state)
         self.state = state
 
-    def _counts(self, iteration: int) -> bool:
-        """True if the current iteration and the previous iteration both used the run's own problem. The values of the
-        current iteration come from the previous iteration.
-        """
+    def _is_whole(self, state: State) -> bool:
+        """True if the state belongs to the run's own problem. Losses on films of another size cannot be compared."""
+        return self.stages.is_whole(state.stage)
+
+    def _recent_losses(self, records: Sequence[Record]) -> list[float]:
+        """Return the last losses of the run's own problem, as far as the current number of iterations tells."""
+        if not self._is_whole(self.state):
+            return []
         config = self.problem.config
-        begun = (max(iteration - 1, 0), iteration)
-        return all(self.stages.is_whole(config.stage_number(each / config.run.iterations)) for each in begun)
+        starts = [max(each.iteration - 1, 0) / config.run.iterations for each in records[-WINDOW:]]
+        whole = [self.stages.is_whole(config.stage_number(start)) for start in starts]
+        return [each.loss for each, counts in zip(records[-WINDOW:], whole, strict=True) if counts]
 
     def values(self) -> dict[str, Array]:
         """Return the newest values, in the form of `Problem.values`."""
@@ -358,7 +363,7 @@ class RunProgress:
         for record in records:
             self._take(record)
             self.watch.add(record)
-        self.best.recent.extend(record.loss for record in records[-WINDOW:] if self._counts(record.iteration))
+        self.best.recent.extend(self._recent_losses(records))
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.restore(met.certainty, met.squares, met.last_steps)

@@ -31,7 +31,7 @@ from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.records.sweeps import (
     SWEEP_FILE,
     Combination,
-    Sweep,
+    SweepPlan,
     config_file,
     in_words,
     is_sweep,
@@ -72,7 +72,7 @@ class Varied:
 class Plan:
     """Checked sweep. `configs` maps each combination's name to its configuration with the first seed."""
 
-    sweep: Sweep
+    sweep: SweepPlan
     configs: dict[str, Config]
 
 
@@ -133,7 +133,7 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     digests = file_digests({str(file): file for file in sorted(files)})
     codes = {str(file): digests.pop(str(file)) for file in sorted(own)}
     run_seeds = list(range(first, first + seeds))
-    return Plan(Sweep(str(path), list(overrides), combinations, run_seeds, codes=codes, files=digests), configs)
+    return Plan(SweepPlan(str(path), list(overrides), combinations, run_seeds, codes=codes, files=digests), configs)
 
 
 def _with_chosen(
@@ -196,7 +196,7 @@ def _bounded(name: str) -> str:
 @contextlib.contextmanager
 def opened(
     folder: Path, plan: Plan | None, seeds: int | None = None, retry: bool = False, allow_code: bool = False
-) -> Iterator[Sweep]:
+) -> Iterator[SweepPlan]:
     """Open the sweep in `folder`, and lock it while the block runs.
 
     With a `plan`, the function opens the plan's sweep. If the folder holds no sweep yet, the function starts the sweep.
@@ -270,7 +270,7 @@ def _put(text: bytes, file: IO[bytes]) -> None:
     file.write(text)
 
 
-def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
+def _check_same(folder: Path, kept: SweepPlan, plan: Plan) -> None:
     """Raise ConfigError if the sweep in `folder` differs from the plan. The error names the first difference."""
     advice = "give another folder with -o, or continue that sweep with --resume"
     there = [(each.name, each.settings) for each in kept.combinations]
@@ -296,7 +296,7 @@ def _check_same(folder: Path, kept: Sweep, plan: Plan) -> None:
             raise ConfigError(plan.sweep.config, key, reason)
 
 
-def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
+def _check_files(folder: Path, kept: SweepPlan, allowed: bool) -> None:
     """Raise ConfigError if a file of the sweep has changed, or if the sweep would run code that is not allowed."""
     for file, digest in (kept.codes | kept.files).items():
         if file in kept.codes and not allowed:
@@ -307,7 +307,7 @@ def _check_files(folder: Path, kept: Sweep, allowed: bool) -> None:
             raise ConfigError(file, "", reason)
 
 
-def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Sweep:
+def _grown(kept: SweepPlan, planned: Sequence[int] | None, seeds: int | None) -> SweepPlan:
     """Return the sweep extended to more seeds if requested. Raises ConfigError if fewer seeds are requested than the
     sweep has.
     """
@@ -325,12 +325,12 @@ def _grown(kept: Sweep, planned: Sequence[int] | None, seeds: int | None) -> Swe
 # --- runs still to be done --------------------------------------------------------------------------------------------
 
 
-def is_left(folder: Path, sweep: Sweep, name: str) -> bool:
+def is_left(folder: Path, sweep: SweepPlan, name: str) -> bool:
     """True if a run of the sweep must still be started or resumed."""
     return name not in sweep.failures and (read_manifest(folder / name) or {}).get("status") != Status.FINISHED
 
 
-def command(folder: Path, sweep: Sweep, combination: Combination, seed: int) -> list[str]:
+def command(folder: Path, sweep: SweepPlan, combination: Combination, seed: int) -> list[str]:
     """Return the arguments for `reslrb` that start one run, or that resume an interrupted run.
 
     User code is allowed, because `opened` has checked the permission. Waits for a killed process that still holds the

@@ -65,7 +65,7 @@ def test_a_derivative_that_lacks_more_than_half_is_refused(experiment: Path):
     assert result.exit_code == 2
     *_, line = result.output.splitlines()
     assert line.startswith(f"{experiment}: integrator.type: box.x: ")
-    assert "of the derivative is missing (silhouettes, edges of shadows" in line
+    assert "of the derivative is missing (silhouettes, shadow edges" in line
     assert "--set integrator.type=prb_projective includes all of it" in line
     assert f"--set {ACCEPT} runs it anyway" in line
 
@@ -98,7 +98,7 @@ def test_a_continued_run_remembers_the_missing_share(run: tuple[str, Path]):
 def test_an_unmeasured_share_is_reported(experiment: Path):
     """Also by a dry run."""
     result = done("optimize", experiment, "--dry-run", *settings("run.measuring=0"))
-    assert "box.x: silhouettes and edges of shadows are not in the derivative; there was no time" in result.output
+    assert "box.x: the derivative lacks silhouettes and shadow edges; their share was not measured" in result.output
     assert "--set integrator.type=prb_projective includes all of it" in result.output
 
 
@@ -162,5 +162,7 @@ def test_a_rising_loss_is_explained_by_the_missing_part():
     results["incomplete"] = [vars(record(0.47, 0.02))]
     assert find_remedy(results, "box.color") is None
     told = warnings(results)
-    assert "silhouettes and edges of shadows (47% +- 2.0% of that of box.x is missing), and a lower rate" in told[1]
+    assert (
+        "silhouettes and shadow edges (47% +- 2.0% of the derivative of box.x is missing), and a lower rate" in told[1]
+    )
     assert "derivative incomplete: box.x (47% +- 2.0% of it is missing)" in told

@@ -24,10 +24,10 @@ from reslrb_cli.cli import main, progress, sweep
 from reslrb_cli.cli.terminal import Interrupts
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.lock import FolderLock
-from reslrb_cli.records.sweeps import Combination, Sweep, SweepRunRecord, in_words, read_sweep, run_name, short_keys
+from reslrb_cli.records.sweeps import Combination, SweepPlan, SweepRunRecord, in_words, read_sweep, run_name, short_keys
 from reslrb_cli.report import sweep as judged
 from reslrb_cli.report.page import sweep as curves
-from reslrb_cli.report.sources import Run, read_sweep_runs
+from reslrb_cli.report.sources import ShownRun, read_sweep_runs
 from reslrb_cli.report.sweep import best_records, find_best, lines, notes, ratio, row_records, run_records
 from reslrb_cli.runs import recorder as recording
 from reslrb_cli.runs import sweep as plans
@@ -529,7 +529,7 @@ def test_pairs_reveal_differences_that_the_spread_over_seeds_hides():
 def pretended(losses, key="run.spp", **about):
     """A sweep of so many settings and seeds (settings, seeds), and its finished runs of these losses."""
     combinations = [Combination(f"spp={k}", {key: k}) for k in range(len(losses))]
-    sweep = Sweep("a.yaml", [], combinations, list(range(len(losses[0]))))
+    sweep = SweepPlan("a.yaml", [], combinations, list(range(len(losses[0]))))
     done = {"status": "finished", "error": 0.5, "elapsed_s": 2.0, "peak_mib": 3.0}
     runs = [SweepRunRecord(run_name(each, seed), each.settings, seed, **done | {"loss": float(losses[k][seed])} | about)
             for seed in sweep.seeds for k, each in enumerate(combinations)]  # fmt: skip
@@ -579,7 +579,7 @@ def pretended_rates(errors, rates, seeds=8):
         for seed in range(seeds)
         for each, error in zip(combinations, true, strict=True)
     ]
-    return Sweep("a.yaml", [], combinations, list(range(seeds))), runs
+    return SweepPlan("a.yaml", [], combinations, list(range(seeds))), runs
 
 
 def test_settings_are_compared_at_their_best_learning_rates():
@@ -662,7 +662,7 @@ def test_curves_are_medians_with_minimum_and_maximum():
         [([1.0], [9.0]), ([2.0, 3.0], [7.0, 5.0]), ([0.5, 1.5, 4.0, 5.0], range(4))]
     ):
         records = [{"elapsed_s": at, "loss": float(loss)} for at, loss in zip(times, losses, strict=True)]
-        runs.append(Run(Path(), str(number), {}, records))
+        runs.append(ShownRun(Path(), str(number), {}, records))
     curve = curves._median("", 0, *curves._by_iteration(runs, "loss"))
     assert (curve.xs, curve.ys, [end.tolist() for end in curve.band]) == ([0], [7.0], [[0.0], [9.0]])
     curve = curves._median("", 0, *curves._by_time(runs, "loss"))

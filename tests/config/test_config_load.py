@@ -13,7 +13,7 @@ import pytest
 from config.test_config_bad_input import PARAMETER, changed, line_of
 from make_reference import DOCS, EXAMPLE, json_schema, markdown, write
 
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb, WalkAd
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb, WalkAdConfig
 from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
 from reslrb_cli.config.optimizers import SGD, Adam
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
@@ -424,9 +424,9 @@ def test_impossible_paths(options: dict[str, Any], words: str) -> None:
 
 
 def test_naive_differentiation_uses_the_given_paths() -> None:
-    assert WalkAd().options()["paths"] == "light"
+    assert WalkAdConfig().options()["paths"] == "light"
     with pytest.raises(ValueError, match="has no effect with paths: camera, only with both"):
-        WalkAd(paths="camera", light_share=0.3)
+        WalkAdConfig(paths="camera", light_share=0.3)
 
 
 def test_auto_is_stack() -> None:

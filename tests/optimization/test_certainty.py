@@ -173,14 +173,14 @@ def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
 
 def test_noisy_curvature_is_measured_again_with_all_samples(folder, monkeypatch):
     """Where a first look finds no curvature of a colour, a second one does."""
-    asked, along = [], measuring.Curvature.along
+    asked, along = [], measuring.LossCurvature.along
 
     def hidden(self, changes, go_on):
         asked.append(self.spp)
         directions, H, B = along(self, changes, go_on)
         return directions, H * (self.spp > blind), B
 
-    monkeypatch.setattr(measuring.Curvature, "along", hidden)
+    monkeypatch.setattr(measuring.LossCurvature, "along", hidden)
     toy = replace(WORK[2], settings=("run.spp=64", "run.iterations=60"))
     found = {}
     for blind in (0, 16, 64):

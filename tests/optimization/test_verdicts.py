@@ -11,14 +11,21 @@ import pytest
 from reslrb_cli.optimization.results import got_worse
 from reslrb_cli.optimization.trend import Change, find_trend, window
 from reslrb_cli.optimization.uncertainty import posterior
-from reslrb_cli.optimization.uncertainty.curvature import Direction, smooth
+from reslrb_cli.optimization.uncertainty.curvature import ParameterDirection, smooth
 from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured, alone, joint
-from reslrb_cli.optimization.uncertainty.verdicts import Verdict, judge, noise_covariance, shares, summarise, weigh
+from reslrb_cli.optimization.uncertainty.verdicts import (
+    ParameterVerdict,
+    judge,
+    noise_covariance,
+    shares,
+    summarise,
+    weigh,
+)
 
 # The rules of verdicts, one by one, and the posterior that they rest on, against runs of the model itself.
 
 
-def judged(*entries: dict[str, float | bool]) -> list[Verdict]:
+def judged(*entries: dict[str, float | bool]) -> list[ParameterVerdict]:
     """The verdicts of entries that are settled, but for these changes, of two gradients whose noise has either sign."""
     usual = {"value": 0.5, "low": 0.0, "high": 1.0, "touched": True, "gradient": 0.0, "error": 1.0, "step": 0.01}
     usual |= {"start": 0.5, "spread": 0.01, "alone": 0.01, "to_go": 0.0, "to_go_error": 0.01}
@@ -35,59 +42,65 @@ def judged(*entries: dict[str, float | bool]) -> list[Verdict]:
 
 
 @pytest.mark.parametrize(("changes", "verdict"), [
-    ({}, Verdict.SETTLED),
-    ({"spread": 0.049}, Verdict.SETTLED),
-    ({"spread": 0.051, "alone": 0.05}, Verdict.BELOW_NOISE),
-    ({"spread": 0.2, "alone": 0.2, "to_go": 0.19, "to_go_error": 0.05}, Verdict.STILL_MOVING),
-    ({"spread": 0.2, "alone": 0.2, "to_go": -0.19, "to_go_error": 0.05}, Verdict.STILL_MOVING),
+    ({}, ParameterVerdict.SETTLED),
+    ({"spread": 0.049}, ParameterVerdict.SETTLED),
+    ({"spread": 0.051, "alone": 0.05}, ParameterVerdict.BELOW_NOISE),
+    ({"spread": 0.2, "alone": 0.2, "to_go": 0.19, "to_go_error": 0.05}, ParameterVerdict.STILL_MOVING),
+    ({"spread": 0.2, "alone": 0.2, "to_go": -0.19, "to_go_error": 0.05}, ParameterVerdict.STILL_MOVING),
     # As near to where its target has it as noise lets it be; that is somewhere else.
-    ({"spread": 0.2, "alone": 0.2, "of_run": 0.049, "to_go": 0.045}, Verdict.BELOW_NOISE),
-    ({"spread": 0.2, "alone": 0.2, "of_run": 0.051, "to_go": 0.045}, Verdict.STILL_MOVING),
-    ({"spread": 0.2, "alone": 0.2, "to_go": 0.09, "to_go_error": 0.05}, Verdict.BELOW_NOISE),
-    ({"spread": 0.2, "alone": 0.02, "to_go": 0.01, "to_go_error": 0.2}, Verdict.NOT_DETERMINED),
-    ({"touched": False, "spread": 0.2}, Verdict.NO_EFFECT),
+    ({"spread": 0.2, "alone": 0.2, "of_run": 0.049, "to_go": 0.045}, ParameterVerdict.BELOW_NOISE),
+    ({"spread": 0.2, "alone": 0.2, "of_run": 0.051, "to_go": 0.045}, ParameterVerdict.STILL_MOVING),
+    ({"spread": 0.2, "alone": 0.2, "to_go": 0.09, "to_go_error": 0.05}, ParameterVerdict.BELOW_NOISE),
+    ({"spread": 0.2, "alone": 0.02, "to_go": 0.01, "to_go_error": 0.2}, ParameterVerdict.NOT_DETERMINED),
+    ({"touched": False, "spread": 0.2}, ParameterVerdict.NO_EFFECT),
     # It ran to its bound, where no gradient is left; and it began there, and never had one.
-    ({"touched": False, "value": 0.0}, Verdict.AT_BOUND),
-    ({"touched": False, "value": 1.0}, Verdict.AT_BOUND),
-    ({"touched": False, "value": 0.0, "start": 0.0}, Verdict.NO_EFFECT),
+    ({"touched": False, "value": 0.0}, ParameterVerdict.AT_BOUND),
+    ({"touched": False, "value": 1.0}, ParameterVerdict.AT_BOUND),
+    ({"touched": False, "value": 0.0, "start": 0.0}, ParameterVerdict.NO_EFFECT),
     # At a bound, where the gradient holds it there: L falls downwards where dL/dx > 0.
-    ({"value": 0.0, "gradient": 5.0, "spread": 0.2}, Verdict.AT_BOUND),
-    ({"value": 0.0, "gradient": 0.5, "spread": 0.2}, Verdict.AT_BOUND),
-    ({"value": 0.0, "gradient": -5.0}, Verdict.SETTLED),
-    ({"value": 1.0, "gradient": -5.0, "spread": 0.2}, Verdict.AT_BOUND),
-    ({"value": 1.0, "gradient": 5.0}, Verdict.SETTLED),
+    ({"value": 0.0, "gradient": 5.0, "spread": 0.2}, ParameterVerdict.AT_BOUND),
+    ({"value": 0.0, "gradient": 0.5, "spread": 0.2}, ParameterVerdict.AT_BOUND),
+    ({"value": 0.0, "gradient": -5.0}, ParameterVerdict.SETTLED),
+    ({"value": 1.0, "gradient": -5.0, "spread": 0.2}, ParameterVerdict.AT_BOUND),
+    ({"value": 1.0, "gradient": 5.0}, ParameterVerdict.SETTLED),
     # Shaken off it by noise, by less than a few steps.
-    ({"value": 0.02, "gradient": 5.0, "spread": 0.2}, Verdict.AT_BOUND),
-    ({"value": 0.02, "gradient": 0.5}, Verdict.SETTLED),
-    ({"value": 0.2, "gradient": 5.0}, Verdict.SETTLED),
-    ({"value": 3.0, "low": -np.inf, "high": np.inf}, Verdict.SETTLED),
+    ({"value": 0.02, "gradient": 5.0, "spread": 0.2}, ParameterVerdict.AT_BOUND),
+    ({"value": 0.02, "gradient": 0.5}, ParameterVerdict.SETTLED),
+    ({"value": 0.2, "gradient": 5.0}, ParameterVerdict.SETTLED),
+    ({"value": 3.0, "low": -np.inf, "high": np.inf}, ParameterVerdict.SETTLED),
 ])  # fmt: skip
 def test_the_rules(changes, verdict):
     assert judged(changes) == [verdict]
 
 
 def test_entries_are_judged_one_by_one():
-    assert judged({}, {"touched": False}) == [Verdict.SETTLED, Verdict.NO_EFFECT]
+    assert judged({}, {"touched": False}) == [ParameterVerdict.SETTLED, ParameterVerdict.NO_EFFECT]
 
 
 @pytest.mark.parametrize(("entries", "verdict"), [
-    ("sssss", Verdict.SETTLED),
-    ("ssssm", Verdict.SETTLED),
-    ("sss", Verdict.SETTLED),
-    ("ssb", Verdict.AT_BOUND),
-    ("ssssssmmb", Verdict.STILL_MOVING),
-    ("ssbbm", Verdict.AT_BOUND),
-    ("nnn", Verdict.NO_EFFECT),
-    ("nnnnnnnns", Verdict.SETTLED),
-    ("nnnnnnnnm", Verdict.STILL_MOVING),
-    ("uuu", Verdict.NOT_SEEN),
-    ("uun", Verdict.NOT_SEEN),
-    ("uuuuuuuus", Verdict.SETTLED),
-    ("uuuunnssm", Verdict.STILL_MOVING),
+    ("sssss", ParameterVerdict.SETTLED),
+    ("ssssm", ParameterVerdict.SETTLED),
+    ("sss", ParameterVerdict.SETTLED),
+    ("ssb", ParameterVerdict.AT_BOUND),
+    ("ssssssmmb", ParameterVerdict.STILL_MOVING),
+    ("ssbbm", ParameterVerdict.AT_BOUND),
+    ("nnn", ParameterVerdict.NO_EFFECT),
+    ("nnnnnnnns", ParameterVerdict.SETTLED),
+    ("nnnnnnnnm", ParameterVerdict.STILL_MOVING),
+    ("uuu", ParameterVerdict.NOT_SEEN),
+    ("uun", ParameterVerdict.NOT_SEEN),
+    ("uuuuuuuus", ParameterVerdict.SETTLED),
+    ("uuuunnssm", ParameterVerdict.STILL_MOVING),
 ])  # fmt: skip
 def test_a_parameter_combines_its_entries(entries, verdict):
-    kinds = {"s": Verdict.SETTLED, "m": Verdict.STILL_MOVING, "b": Verdict.AT_BOUND, "n": Verdict.NO_EFFECT,
-             "u": Verdict.NOT_SEEN}  # fmt: skip
+    named = ParameterVerdict
+    kinds = {
+        "s": named.SETTLED,
+        "m": named.STILL_MOVING,
+        "b": named.AT_BOUND,
+        "n": named.NO_EFFECT,
+        "u": named.NOT_SEEN,
+    }
     found = shares([kinds[entry] for entry in entries])
     assert sum(found.values()) == pytest.approx(1)
     assert summarise(found) is verdict
@@ -254,7 +267,7 @@ def recover(random, iterations, start=START, tails=3.0):
 
 def told_of(measured):
     """The verdicts on wall and ceiling, whose curvature is known."""
-    directions = [Direction(name, np.ones(1), None, 0) for name in measured]
+    directions = [ParameterDirection(name, np.ones(1), None, 0) for name in measured]
     return {name: each.verdict for name, each in
             weigh(measured, directions, ROOM, {}, {}, np.zeros((2, 2)), {}).items()}  # fmt: skip
 
@@ -271,7 +284,7 @@ def test_a_value_that_depends_on_a_moving_one_is_not_settled():
             )
             for key, size, mean in (("exposure", scale, 0.06), ("colour", 0.5, 0.02))
         }  # fmt: skip
-        directions = [Direction(key, np.ones(1), None, 0) for key in measured]
+        directions = [ParameterDirection(key, np.ones(1), None, 0) for key in measured]
         found = weigh(measured, directions, H * (np.eye(2) + shared * (1 - np.eye(2))), {}, {}, np.zeros((2, 2)), {})
         return {key: each.verdict for key, each in found.items()}
 

@@ -32,7 +32,7 @@ from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
 from reslrb_cli.report.perceptual import with_seen_errors
-from reslrb_cli.report.sources import Run, read_sources
+from reslrb_cli.report.sources import ShownRun, read_sources
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
 # What stands on a run's page.
@@ -140,7 +140,7 @@ def test_heights_are_shown_from_lowest_to_highest(tmp_path):
     np.savez(tmp_path / "parameters" / "true" / "parameters.npz", **{"slab.heightmap": heights})
     about = {"quantity": "length", "shape": [1, 3, 1]}
     manifest = {"results": {"parameters": {"slab.heightmap": about}}}
-    page = Page(texture_pictures(Run(tmp_path, "slab", manifest, [])))
+    page = Page(texture_pictures(ShownRun(tmp_path, "slab", manifest, [])))
     shown = {alt: pixels(uri) for alt, uri in page.pictures}
     assert shown["true: slab.heightmap"][0, 0, 0] == 0
     assert shown["true: slab.heightmap"][0, 2, 0] == 1

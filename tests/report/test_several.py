@@ -29,7 +29,7 @@ from reslrb_cli.records.manifest import Status
 from reslrb_cli.report.page import render
 from reslrb_cli.report.page.run import DAMAGED
 from reslrb_cli.report.plots import COLORS
-from reslrb_cli.report.sources import Maps, Measurements, Run, read_sources
+from reslrb_cli.report.sources import Maps, Measurements, ShownRun, read_sources
 
 # One page about several runs and measurements: what stands on it, and what is damaged or hostile in it.
 
@@ -121,7 +121,7 @@ def test_measurements_are_recognised_by_their_contents(tmp_path):
     write_maps(tmp_path / "maps")
     make_run(tmp_path / "run")
     found = read_sources([tmp_path / name for name in ("x.jsonl", "y.txt", "z", "maps", "run")])
-    assert [type(source) for source in found] == [Measurements, Measurements, Measurements, Maps, Run]
+    assert [type(source) for source in found] == [Measurements, Measurements, Measurements, Maps, ShownRun]
     assert [source.kind for source in found[:4]] == ["bench", "gradcheck", "convergence", "maps"]
     markup = render(found)
     page = Page(markup)

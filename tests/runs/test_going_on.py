@@ -171,6 +171,17 @@ def test_a_run_killed_in_five_stages_resumes_to_the_same_end(experiment: Path, m
     assert differences(whole, left) == []
 
 
+def test_fewer_iterations_end_a_coarse_stage_at_once(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run was killed in its coarse stage, after the end of this stage in the shorter run. Losses and values of the
+    coarse stage are not among the best."""
+    sets = ["--set", "run.stages=[{until: 0.4, resolution: 0.5}]", "--set", "run.checkpoint_every={iterations: 1}"]
+    _, left = run_and_kill(monkeypatch, 20, "--set", "run.iterations=60", *sets, *ITERATIONS[4:])
+    assert optimize("--resume", str(left), "--quiet", "--set", "run.iterations=22") == 0
+    assert json.loads((left / "manifest.json").read_text())["results"]["best"] is None
+    assert optimize("--resume", str(left), "--quiet", "--set", "run.iterations=40") == 0
+    assert json.loads((left / "manifest.json").read_text())["results"]["best"]["iteration"] > 20
+
+
 def test_a_run_with_wrong_tables_resumes(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its newest state is that of a moment at which gradients are counted anew."""
     right = Learned.with_more

@@ -1,7 +1,7 @@
 """Gauss-Newton curvature of the loss, and the directions in which it is measured.
 
 Images are differentiated along the entries of small parameters, and along the brightness of whole textures
-(`plan_changes`). The curvature (`Curvature`) is H = J^T W J at the parameters' values. J is the derivative of the
+(`plan_changes`). The curvature (`LossCurvature`) is H = J^T W J at the parameters' values. J is the derivative of the
 image, and W = d2L/dI2 has a second derivative for each pixel.
 
     along directions    J by differences of images at common random numbers, from two independent sets of samples a, b:
@@ -70,7 +70,7 @@ PROBED = 2
 
 
 @dataclass(frozen=True)
-class Direction:
+class ParameterDirection:
     """One coordinate. `vector` is the change of the parameter `key` per unit, in the layout of a flat gradient.
 
     `channel` is the only image channel that the direction changes, or None. `entry` is the entry of a small parameter.
@@ -84,14 +84,14 @@ class Direction:
 
 
 @dataclass(frozen=True)
-class Change:
+class ParameterChange:
     """Rendering with changed parameter values. `values` has the changed values for each key, in the form of
     `Selection.array`. The change is `amount` along each of the directions.
     """
 
     values: dict[str, Array]
     amount: float
-    directions: list[Direction]
+    directions: list[ParameterDirection]
 
 
 def row_of(problem: Problem, key: str) -> Array:
@@ -113,7 +113,7 @@ def separates(problem: Problem, key: str) -> bool:
     return isinstance(problem.optimizer[key], mi.Color3f)
 
 
-def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, most: int) -> list[Change]:
+def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, most: int) -> list[ParameterChange]:
     """Return the renderings for the directions of all parameters. Small parameters come first.
 
     Steps are `share` of the scale. There are at most `most` renderings. Parameters without a rendering have no
@@ -121,7 +121,7 @@ def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, mo
     """
     small = [key for key in problem.selection.keys if problem.selection.array(key).size <= MOST_ENTRIES]
     textures = [key for key in problem.selection.keys if problem.selection.array(key).ndim == 3]
-    changes: list[Change] = []
+    changes: list[ParameterChange] = []
     for key in (*small, *(key for key in textures if key not in small)):
         made = _entries(problem, key, scales[key], share) if key in small else _wholes(problem, key, share)
         if len(changes) + len(made) <= most:
@@ -129,9 +129,9 @@ def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, mo
     return changes
 
 
-def _entries(problem: Problem, key: str, scale: float, share: float) -> list[Change]:
+def _entries(problem: Problem, key: str, scale: float, share: float) -> list[ParameterChange]:
     row, together = row_of(problem, key), separates(problem, key)
-    directions = [Direction(key, unit, k if together else None, k) for k, unit in enumerate(np.eye(row.size))]
+    directions = [ParameterDirection(key, unit, k if together else None, k) for k, unit in enumerate(np.eye(row.size))]
     low, high = problem.selection.spec(key).bounds or (-np.inf, np.inf)
     changes = []
     for group in [directions] if together else [[direction] for direction in directions]:
@@ -139,19 +139,19 @@ def _entries(problem: Problem, key: str, scale: float, share: float) -> list[Cha
         inside = [np.sum((moved >= low) & (moved <= high)) for moved in (row + step, row - step)]
         side = 1.0 if inside[0] >= inside[1] else -1.0
         moved = (row + side * step).reshape(problem.selection.array(key).shape)
-        changes.append(Change({key: moved}, side * scale * share, group))
+        changes.append(ParameterChange({key: moved}, side * scale * share, group))
     return changes
 
 
-def _wholes(problem: Problem, key: str, share: float) -> list[Change]:
+def _wholes(problem: Problem, key: str, share: float) -> list[ParameterChange]:
     array, row = problem.selection.array(key), row_of(problem, key)
     channels = array.shape[2]
     if not np.any(row) or (channels > 1 and not separates(problem, key)):
         return []
     of = [np.where(np.arange(row.size) % channels == channel, row, 0.0) for channel in range(channels)]
-    directions = [Direction(key, v, None if channels == 1 else c) for c, v in enumerate(of) if v.any()]
+    directions = [ParameterDirection(key, v, None if channels == 1 else c) for c, v in enumerate(of) if v.any()]
     # Darker, so that values exceed no bound except 0.
-    return [Change({key: array * (1 - share)}, -share, directions)]
+    return [ParameterChange({key: array * (1 - share)}, -share, directions)]
 
 
 @dataclass
@@ -180,7 +180,7 @@ class TargetNoise:
         return self.odd * spread
 
 
-class Curvature:
+class LossCurvature:
     """Measurement of the curvature at the current values of `problem`. The problem needs its targets.
 
     There are two sets of samples, each with `spp` samples per pixel.
@@ -202,11 +202,13 @@ class Curvature:
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises()
 
-    def along(self, changes: Sequence[Change], go_on: Callable[[], bool]) -> tuple[list[Direction], Array, Array]:
+    def along(
+        self, changes: Sequence[ParameterChange], go_on: Callable[[], bool]
+    ) -> tuple[list[ParameterDirection], Array, Array]:
         """Return the directions of the rendered changes, and the matrices H and B (M, M) along the directions.
         Rendering ends when `go_on` returns false.
         """
-        directions: list[Direction] = []
+        directions: list[ParameterDirection] = []
         columns: list[list[Array]] = [[], []]
         odd: list[list[Array]] = [[], []]
         even: list[float] = []
@@ -242,7 +244,7 @@ class Curvature:
         a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
         return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
 
-    def _of_regularizers(self, directions: Sequence[Direction]) -> Array:
+    def _of_regularizers(self, directions: Sequence[ParameterDirection]) -> Array:
         """Return the curvature of regularizers along directions (M, M). It is zero between different parameters."""
         bent = [self.problem.stiffness(direction.key, direction.vector) for direction in directions]
         return _symmetric(np.array([

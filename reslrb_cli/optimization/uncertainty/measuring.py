@@ -15,7 +15,13 @@ from reslrb_cli.optimization.loop import learning_rate_factor
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
-from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, Direction, plan_changes, row_of
+from reslrb_cli.optimization.uncertainty.curvature import (
+    MOST_ENTRIES,
+    LossCurvature,
+    ParameterDirection,
+    plan_changes,
+    row_of,
+)
 from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
 from reslrb_cli.records.clock import StepClock
@@ -175,13 +181,13 @@ class Certainty:
             with clock.step() as times:
                 unit = problem.samples_per_pass or 1
                 spp = max(max(config.run.spp // PART, min(config.run.spp, FEW)) // unit, 1) * unit
-                curvature = Curvature(problem, spp)
+                curvature = LossCurvature(problem, spp)
                 scales = {key: self.scale(key) for key in gradients}
                 most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
                 plan = plan_changes(problem, scales, STEP, most)
                 directions, H, B = curvature.along(plan, go_on)
                 if spp < config.run.spp and hides(directions, H, gradients) and go_on():
-                    again = Curvature(problem, config.run.spp)
+                    again = LossCurvature(problem, config.run.spp)
                     found = again.along(plan, go_on)
                     curvature.changes += again.changes
                     if len(found[0]) == len(directions):
@@ -297,7 +303,7 @@ class Certainty:
         return np.asarray(np.interp(np.arange(1, iterations + 1), at, found) / found[-1])
 
 
-def hides(directions: Sequence[Direction], curvature: Array, gradients: Gradients) -> bool:
+def hides(directions: Sequence[ParameterDirection], curvature: Array, gradients: Gradients) -> bool:
     """True if noise hides all curvature along the direction of some entry with gradients. The curvature is (M, M)."""
     flat = [d for d, h in zip(directions, np.diag(curvature), strict=True) if d.entry is not None and h <= 0]
     return any(np.any(gradients[d.key][:, d.entry]) for d in flat)

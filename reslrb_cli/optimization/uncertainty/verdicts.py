@@ -3,7 +3,7 @@ scenes.
 
 - `weigh` turns gradients and curvature into spreads and verdicts, in a `CertaintyRecord`.
 - `judge_together` judges all directions together, and finds out which of them compensate for each other.
-- `Verdict`, `judge` and `summarise` apply the rules below.
+- `ParameterVerdict`, `judge` and `summarise` apply the rules below.
 
 The first rule that applies to an entry decides. `spread` is the standard deviation of the entry's final value around
 the optimum. `alone` is the spread that remains if all other parameters are known. `to_go` is the estimated distance to
@@ -38,7 +38,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reslrb_cli.optimization.uncertainty.curvature import MARGIN, Direction, smooth
+from reslrb_cli.optimization.uncertainty.curvature import MARGIN, ParameterDirection, smooth
 from reslrb_cli.optimization.uncertainty.posterior import SURE, Measured, alone, joint
 from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.records.measurements import INCOMPLETE
@@ -58,7 +58,7 @@ Gradients = dict[str, Array]
 Values = list[float | None] | None
 
 
-class Verdict(str, enum.Enum):
+class ParameterVerdict(str, enum.Enum):
     """Verdict on a final value. If several verdicts are equally frequent among the entries, the first verdict in the
     order of this enum counts.
     """
@@ -73,38 +73,40 @@ class Verdict(str, enum.Enum):
     SETTLED = "settled"
 
 
-def judge(own: Measured, spread: Array, of_run: Array, alone: Array, to_go: Array, error: Array) -> list[Verdict]:
+def judge(
+    own: Measured, spread: Array, of_run: Array, alone: Array, to_go: Array, error: Array
+) -> list[ParameterVerdict]:
     """Return the verdict on each entry of a parameter. All arrays are (N,), in the parameter's unit.
 
     `of_run` is the spread without the target's noise, and `error` the standard error of `to_go`.
     """
     tolerance = TOLERANCE * own.scale
     rules = [
-        (~own.touched & ~own.driven, Verdict.NO_EFFECT),
-        (own.at_bound, Verdict.AT_BOUND),
-        (spread <= tolerance, Verdict.SETTLED),
-        ((np.abs(to_go) > SURE * error) & (of_run > tolerance), Verdict.STILL_MOVING),
-        (alone <= OTHERS * spread, Verdict.NOT_DETERMINED),
-        (np.ones(own.value.shape, dtype=bool), Verdict.BELOW_NOISE),
+        (~own.touched & ~own.driven, ParameterVerdict.NO_EFFECT),
+        (own.at_bound, ParameterVerdict.AT_BOUND),
+        (spread <= tolerance, ParameterVerdict.SETTLED),
+        ((np.abs(to_go) > SURE * error) & (of_run > tolerance), ParameterVerdict.STILL_MOVING),
+        (alone <= OTHERS * spread, ParameterVerdict.NOT_DETERMINED),
+        (np.ones(own.value.shape, dtype=bool), ParameterVerdict.BELOW_NOISE),
     ]
     first = np.argmax([holds for holds, _ in rules], axis=0)
     return [rules[place][1] for place in first]
 
 
-def shares(verdicts: Sequence[Verdict]) -> dict[Verdict, float]:
+def shares(verdicts: Sequence[ParameterVerdict]) -> dict[ParameterVerdict, float]:
     """Return the share of the entries with each verdict."""
-    return {verdict: verdicts.count(verdict) / len(verdicts) for verdict in Verdict if verdict in verdicts}
+    return {verdict: verdicts.count(verdict) / len(verdicts) for verdict in ParameterVerdict if verdict in verdicts}
 
 
-def summarise(found: Mapping[Verdict, float]) -> Verdict:
+def summarise(found: Mapping[ParameterVerdict, float]) -> ParameterVerdict:
     """Return the verdict of a parameter from the shares of its entries."""
-    without = (Verdict.NO_EFFECT, Verdict.NOT_SEEN)
+    without = (ParameterVerdict.NO_EFFECT, ParameterVerdict.NOT_SEEN)
     effective = {verdict: share for verdict, share in found.items() if verdict not in without}
     if not effective:
         return max(without, key=lambda verdict: found.get(verdict, 0.0))
-    if effective.get(Verdict.SETTLED, 0.0) >= SETTLED_SHARE * sum(effective.values()):
-        return Verdict.SETTLED
-    others = [verdict for verdict in Verdict if verdict not in (Verdict.SETTLED, *without)]
+    if effective.get(ParameterVerdict.SETTLED, 0.0) >= SETTLED_SHARE * sum(effective.values()):
+        return ParameterVerdict.SETTLED
+    others = [verdict for verdict in ParameterVerdict if verdict not in (ParameterVerdict.SETTLED, *without)]
     return max(others, key=lambda verdict: found.get(verdict, 0.0))
 
 
@@ -162,14 +164,14 @@ class CertaintyRecord(Jsonable):
 
     def without_derivatives(self, keys: Collection[str]) -> CertaintyRecord:
         """Return the record with the verdict `derivative incomplete` for the parameters `keys`."""
-        verdict = Verdict.INCOMPLETE.value
+        verdict = ParameterVerdict.INCOMPLETE.value
         judged = {key: replace(about, verdict=verdict, shares={verdict: 1.0}, partner=None) if key in keys else about
                   for key, about in self.parameters.items()}  # fmt: skip
         return replace(self, parameters=judged)
 
 
 @dataclass
-class Coordinates:
+class JointPosterior:
     """Joint posterior of all free directions, in the order of the directions.
 
     `spread` is the standard deviation, and `of_target` is the part of `spread` that the target's noise causes. `to_go`
@@ -186,8 +188,8 @@ class Coordinates:
 
 
 def judge_together(
-    measured: Mapping[str, Measured], directions: Sequence[Direction], curvature: Array, fixed: Array
-) -> Coordinates:
+    measured: Mapping[str, Measured], directions: Sequence[ParameterDirection], curvature: Array, fixed: Array
+) -> JointPosterior:
     """Judge all directions in one joint posterior. `curvature` is H (M, M), and `fixed` is the target noise B (M, M).
 
     Entries at their bounds, or without effect, count as known.
@@ -211,7 +213,7 @@ def judge_together(
                 steps[place], pull[place] = len(own.last), gradients.mean()
                 mean[place], came[place] = own.value[direction.entry] - (values.mean(), values[0])
         free[place] = free[place] and np.any(along)
-    result = Coordinates(scale.copy(), of_target, to_go, error, [None] * count, scale.copy())
+    result = JointPosterior(scale.copy(), of_target, to_go, error, [None] * count, scale.copy())
     at = np.flatnonzero(free)
     if not at.size:
         return result
@@ -261,7 +263,7 @@ def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array
     return np.asarray(np.where(beside, factor * alike, 1.0) * np.outer(sd, sd))
 
 
-def _partner(row: Array, place: int, chosen: Array, directions: Sequence[Direction]) -> str | None:
+def _partner(row: Array, place: int, chosen: Array, directions: Sequence[ParameterDirection]) -> str | None:
     """Return the parameter whose offset has the highest correlation with the offset at `place`. Return None if no other
     offset has a sufficient correlation.
     """
@@ -274,7 +276,7 @@ def _partner(row: Array, place: int, chosen: Array, directions: Sequence[Directi
 
 def weigh(
     measured: Mapping[str, Measured],
-    directions: Sequence[Direction],
+    directions: Sequence[ParameterDirection],
     curvature: Array,
     diagonal: Gradients,
     pixels: Mapping[str, int],
@@ -295,15 +297,15 @@ def weigh(
             result[key] = _small(own, at, found)
         else:
             result[key] = _large(own, diagonal.get(key), fixed_diagonal.get(key), at, found, pixels.get(key))
-    moving = {key for key, about in result.items() if about.verdict == Verdict.STILL_MOVING.value}
+    moving = {key for key, about in result.items() if about.verdict == ParameterVerdict.STILL_MOVING.value}
     for place, direction in enumerate(directions):
         about = result[direction.key]
-        if about.verdict == Verdict.SETTLED.value and found.partners[place] in moving - {direction.key}:
-            result[direction.key] = replace(about, verdict=Verdict.STILL_MOVING.value)
+        if about.verdict == ParameterVerdict.SETTLED.value and found.partners[place] in moving - {direction.key}:
+            result[direction.key] = replace(about, verdict=ParameterVerdict.STILL_MOVING.value)
     return result
 
 
-def _small(own: Measured, at: Sequence[int], found: Coordinates) -> ParameterCertainty:
+def _small(own: Measured, at: Sequence[int], found: JointPosterior) -> ParameterCertainty:
     to_go, error = own.within(found.to_go[at]), found.error[at]
     of_run = np.hypot(to_go, error)
     spread = np.maximum(found.spread[at], of_run)  # bounds may have shortened the distance
@@ -312,15 +314,15 @@ def _small(own: Measured, at: Sequence[int], found: Coordinates) -> ParameterCer
     verdicts = judge(own, spread, of_run, alone_, to_go, error)
     verdict = summarise(shares(verdicts))
     named = [name for name, each in zip(partners, verdicts, strict=True) if name and each is verdict]
-    partner = named[0] if named and verdict is Verdict.NOT_DETERMINED else None
+    partner = named[0] if named and verdict is ParameterVerdict.NOT_DETERMINED else None
     # A value at a bound may be as far from the optimum as the optimum is beyond the bound.
-    known = [each not in (Verdict.AT_BOUND, Verdict.NO_EFFECT) for each in verdicts]
+    known = [each not in (ParameterVerdict.AT_BOUND, ParameterVerdict.NO_EFFECT) for each in verdicts]
     parts = (np.where(known, part, np.nan) for part in (spread, to_go, found.of_target[at]))
     return _certainty(verdict, verdicts, partner, *parts)
 
 
 def _large(
-    own: Measured, diagonal: Array | None, fixed: Array | None, at: Sequence[int], found: Coordinates,
+    own: Measured, diagonal: Array | None, fixed: Array | None, at: Sequence[int], found: JointPosterior,
     pixels: int | None,
 ) -> ParameterCertainty:  # fmt: skip
     """Judge each entry of a large parameter as if all other entries and parameters were known. Another parameter may
@@ -341,23 +343,31 @@ def _large(
         spread = np.where(touched, np.hypot(own.within(whole.to_go), whole.error), prior)
     verdicts = judge(own, spread, of_run, np.full(shape, np.inf), to_go, error)
     if own.seen is not None:
-        verdicts = [v if seen else Verdict.NOT_SEEN for v, seen in zip(verdicts, own.seen, strict=True)]
+        verdicts = [v if seen else ParameterVerdict.NOT_SEEN for v, seen in zip(verdicts, own.seen, strict=True)]
     verdict, partner = summarise(shares(verdicts)), None
-    for place in at if verdict in (Verdict.SETTLED, Verdict.BELOW_NOISE) else ():
+    for place in at if verdict in (ParameterVerdict.SETTLED, ParameterVerdict.BELOW_NOISE) else ():
         name = found.partners[place]
         if name is not None and found.alone[place] <= OTHERS * found.spread[place] and found.spread[place] > TOLERANCE:
-            verdict, partner = Verdict.NOT_DETERMINED, name
+            verdict, partner = ParameterVerdict.NOT_DETERMINED, name
     shown = touched if own.seen is None else touched & own.seen
-    if verdict is Verdict.SETTLED and pixels is not None and int(shown.sum()) > pixels:
-        verdict, partner = Verdict.NOT_DETERMINED, None
-    kept = [each not in (Verdict.AT_BOUND, Verdict.NO_EFFECT, Verdict.NOT_SEEN) for each in verdicts]
+    if verdict is ParameterVerdict.SETTLED and pixels is not None and int(shown.sum()) > pixels:
+        verdict, partner = ParameterVerdict.NOT_DETERMINED, None
+    kept = [
+        each not in (ParameterVerdict.AT_BOUND, ParameterVerdict.NO_EFFECT, ParameterVerdict.NOT_SEEN)
+        for each in verdicts
+    ]
     is_known = diagonal is not None and any(kept)
     sizes = (np.array([rms(part[kept]) if is_known else np.nan]) for part in (spread, to_go, of_target))
     return _certainty(verdict, verdicts, partner, *sizes)
 
 
 def _certainty(
-    verdict: Verdict, verdicts: Sequence[Verdict], partner: str | None, spread: Array, to_go: Array, of_target: Array
+    verdict: ParameterVerdict,
+    verdicts: Sequence[ParameterVerdict],
+    partner: str | None,
+    spread: Array,
+    to_go: Array,
+    of_target: Array,
 ) -> ParameterCertainty:
     named = {each.value: share for each, share in shares(verdicts).items()}
     return ParameterCertainty(verdict.value, named, _numbers(spread), _numbers(to_go), partner, _numbers(of_target))

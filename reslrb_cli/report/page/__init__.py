@@ -14,7 +14,7 @@ from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.report.page.layout import document
 from reslrb_cli.report.page.measured import several_parts
 from reslrb_cli.report.page.run import guarded, header, run_parts
-from reslrb_cli.report.sources import Run, Source, read_run
+from reslrb_cli.report.sources import ShownRun, Source, read_run
 
 Array = np.ndarray[Any, Any]
 
@@ -47,7 +47,7 @@ def write_page(sources: Sequence[Source], path: Path, live: bool = False) -> Non
 
 def render(sources: Sequence[Source], live: bool = False) -> str:
     """Return the page about one run, or about several sources side by side, as HTML."""
-    if len(sources) == 1 and isinstance(sources[0], Run):
+    if len(sources) == 1 and isinstance(sources[0], ShownRun):
         run = sources[0]
         title, head, parts = run.name, guarded(partial(header, run)), list(run_parts(run).items())
     else:

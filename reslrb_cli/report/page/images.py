@@ -16,7 +16,7 @@ from reslrb_cli.optimization.targets import WORDS
 from reslrb_cli.records.images import load_image, read_layers
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.layout import key, lay_out, soft
-from reslrb_cli.report.sources import Run
+from reslrb_cli.report.sources import ShownRun
 from reslrb_cli.report.tonemap import (
     as_png,
     color_stops,
@@ -145,7 +145,7 @@ def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def seen_tables(runs: Sequence[Run]) -> Markup:
+def seen_tables(runs: Sequence[ShownRun]) -> Markup:
     """Return tables of perceptual errors at start and end, for the images and colours of all runs."""
     images: list[dict[str, Any]] = []
     colors: list[dict[str, Any]] = []
@@ -167,7 +167,7 @@ MOST_BETWEEN = 12
 _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 
-def image_rows(run: Run) -> Markup:
+def image_rows(run: ShownRun) -> Markup:
     """Return a row per sensor: the initial image, the final image, the target, and maps of the error and dL/dI.
 
     All images of a sensor share one exposure. The exposure comes from the manifest, or else is chosen for the target.

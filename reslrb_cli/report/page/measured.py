@@ -17,7 +17,7 @@ from reslrb_cli.report.page.sweep import sweep_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.plots import Curve
 from reslrb_cli.report.run_summary import worst
-from reslrb_cli.report.sources import Maps, Measurements, Run, Source, SweepRuns, is_number
+from reslrb_cli.report.sources import Maps, Measurements, ShownRun, Source, SweepRuns, is_number
 from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 
 Entry = Mapping[str, Any]
@@ -148,13 +148,13 @@ def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
     names = [source.name for source in sources]
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     title = ", ".join(names[:MOST_NAMED]) + more
-    runs = [source for source in sources if isinstance(source, Run)]
+    runs = [source for source in sources if isinstance(source, ShownRun)]
     parts = run_comparison(runs) if runs else []
     for source in sources:
         if isinstance(source, SweepRuns):
             title_of = (lambda part, name=source.name: f"{part}: {name}") if len(sources) > 1 else str
             parts += [(title_of(part), markup) for part, markup in sweep_parts(source).items()]
-        elif not isinstance(source, Run):
+        elif not isinstance(source, ShownRun):
             parts.append((f"{HEADINGS[source.kind]}: {source.name}", guarded(partial(measured, source))))
     for run in runs:
         own = record_parts(run)
@@ -164,7 +164,7 @@ def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
     return title, lay_out("header", title), parts
 
 
-def run_comparison(runs: Sequence[Run]) -> Parts:
+def run_comparison(runs: Sequence[ShownRun]) -> Parts:
     """Return the parts of the page that show several runs side by side."""
     made: dict[str, Callable[[], Markup]] = {
         "Runs": lambda: overview(runs),
@@ -177,7 +177,7 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
     return [(title, guarded(make)) for title, make in made.items()]
 
 
-def overview(runs: Sequence[Run]) -> Markup:
+def overview(runs: Sequence[ShownRun]) -> Markup:
     """Return a table of the runs: how each ended, its results, and the time of an iteration."""
     rows = [
         {"run": run, "place": place, "estimator": _estimator(run), "error": _final_error(run),
@@ -188,13 +188,13 @@ def overview(runs: Sequence[Run]) -> Markup:
     return lay_out("run.overview", rows)
 
 
-def _estimator(run: Run) -> str:
+def _estimator(run: ShownRun) -> str:
     """Return the estimator or the integrator of the gradients, if the manifest names one."""
     plan = run.manifest.get("plan")
     return str(plan.get("estimator") or plan.get("integrator") or "") if isinstance(plan, dict) else ""
 
 
-def _final_error(run: Run) -> str:
+def _final_error(run: ShownRun) -> str:
     """Return the final error of all parameters, or the largest relative error if the units differ."""
     total = run.results.get("rmse") or {}
     if total.get("final") is not None:
@@ -206,7 +206,7 @@ def _final_error(run: Run) -> str:
     return "" if known is None else f"RMSE {number(known, 3)}"
 
 
-def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
+def _each(runs: Sequence[ShownRun], make: Callable[[ShownRun], Markup]) -> Markup:
     """Return the results of `make` for all runs, each below the run's name. If its data are damaged, a line says so."""
     made = [(run, guarded(partial(make, run))) for run in runs]
     return Markup().join(lay_out("heading", key(run.name)) + markup for run, markup in made if markup)

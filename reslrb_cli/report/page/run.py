@@ -31,7 +31,7 @@ from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
 from reslrb_cli.report.page.workshop import CAPTIONS, VIEWS, workshop
 from reslrb_cli.report.run_summary import error_line, measured_line, warnings
-from reslrb_cli.report.sources import Run
+from reslrb_cli.report.sources import ShownRun
 
 #: Number of first steps left out of medians, because they compile kernels.
 WARM_UP = 5
@@ -82,7 +82,7 @@ def workers(shared: Mapping[str, Any] | None, elapsed_s: float | None) -> Markup
 DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
-def fabrication(run: Run) -> Markup:
+def fabrication(run: ShownRun) -> Markup:
     """Return the workshop sheet for the run's solid. The result is empty without one."""
     text = _read(run.path / FABRICATION_FILE)
     if not text:
@@ -94,7 +94,7 @@ def fabrication(run: Run) -> Markup:
     return workshop(numbers, pictures)
 
 
-def header(run: Run) -> Markup:
+def header(run: ShownRun) -> Markup:
     """Return the run's name, its outcome in a sentence, what to do next, its results and its warnings."""
     seconds, loss = run.last("elapsed_s"), run.results.get("loss")
     parts = (
@@ -113,7 +113,7 @@ def header(run: Run) -> Markup:
     )
 
 
-def problems(run: Run) -> Markup:
+def problems(run: ShownRun) -> Markup:
     """Return the error and the warnings of a run, and a line about unreadable records."""
     lines, error = warnings(run.results, "±"), run.manifest.get("error")
     if run.damaged:
@@ -122,7 +122,7 @@ def problems(run: Run) -> Markup:
     return lay_out("note", [error] if error else [], "failed") + lay_out("note", lines)
 
 
-def run_parts(run: Run) -> dict[str, Markup]:
+def run_parts(run: ShownRun) -> dict[str, Markup]:
     """Return the parts of a run below its header, by title and in order. Parts that do not apply are empty."""
     results = run.results
     parts: dict[str, Callable[[], Markup]] = {
@@ -141,7 +141,7 @@ def run_parts(run: Run) -> dict[str, Markup]:
     return {title: guarded(make) for title, make in parts.items()} | record_parts(run)
 
 
-def record_parts(run: Run) -> dict[str, Markup]:
+def record_parts(run: ShownRun) -> dict[str, Markup]:
     """Return the parts about the execution of one run, by title. A comparison with other runs leaves these parts
     out.
     """

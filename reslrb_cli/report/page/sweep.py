@@ -19,7 +19,7 @@ from reslrb_cli.report.page.values import visible
 from reslrb_cli.report.perceptual import PLACES
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve
 from reslrb_cli.report.run_summary import units_differ
-from reslrb_cli.report.sources import Run, SweepRuns
+from reslrb_cli.report.sources import ShownRun, SweepRuns
 from reslrb_cli.report.sweep import (
     RATIOS,
     RATIOS_LINE,
@@ -98,13 +98,13 @@ def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
     return parts + soft(f"{more} more combinations are not drawn." if more else "")
 
 
-def _runs(source: SweepRuns, combination: Combination) -> list[Run]:
+def _runs(source: SweepRuns, combination: Combination) -> list[ShownRun]:
     """Return the runs of a combination that have at least one iteration."""
     names = [run_name(combination, seed) for seed in source.sweep.seeds]
     return [run for name in names if (run := source.runs.get(name)) is not None and run.records]
 
 
-def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
+def _by_iteration(runs: Sequence[ShownRun], name: str) -> tuple[Array, Array]:
     """Return the iterations (N,) and the values of each run (runs, N), NaN where unknown."""
     most = max(len(run.records) for run in runs)
     values = np.full((len(runs), most), np.nan)
@@ -113,7 +113,7 @@ def _by_iteration(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
     return np.arange(most), values
 
 
-def _by_time(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
+def _by_time(runs: Sequence[ShownRun], name: str) -> tuple[Array, Array]:
     """Return times in seconds (N,), and for each run its latest value at each time (runs, N).
 
     The first time is the earliest one at which all runs have completed an iteration. A run that has ended keeps its
@@ -129,7 +129,7 @@ def _by_time(runs: Sequence[Run], name: str) -> tuple[Array, Array]:
     return times, values
 
 
-def _column(run: Run, name: str) -> list[float | None]:
+def _column(run: ShownRun, name: str) -> list[float | None]:
     return [record[name] for record in run.records]
 
 
@@ -146,7 +146,7 @@ def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def _shown(source: SweepRuns) -> tuple[list[tuple[Combination, Run]], Markup]:
+def _shown(source: SweepRuns) -> tuple[list[tuple[Combination, ShownRun]], Markup]:
     """Return the first finished run of each combination, and a line of text that explains this selection."""
     found = []
     for combination in source.sweep.combinations:
@@ -210,6 +210,6 @@ def _picture(values: Array, combination: Combination, said: str) -> Picture:
     return show(values, title, lay_out("titled", title, ""), said)
 
 
-def _error(run: Run, name: str) -> str:
+def _error(run: ShownRun, name: str) -> str:
     pair: Mapping[str, Any] = (run.results.get("parameter_rmse") or {}).get(name) or {}
     return "" if pair.get("final") is None else f"RMSE {number(pair['final'], 3)}"

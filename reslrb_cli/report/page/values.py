@@ -17,7 +17,7 @@ from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.perceptual import PLACES, is_color
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve, points_together
 from reslrb_cli.report.run_summary import MOMENTS, is_settled, spread_words, units_differ, verdict_words
-from reslrb_cli.report.sources import Run
+from reslrb_cli.report.sources import ShownRun
 from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
 
 Array = np.ndarray[Any, Any]
@@ -50,7 +50,7 @@ def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = 
     return lay_out("run.parameters", rows, moments, list(errors), noted, relative)
 
 
-def texture_pictures(run: Run) -> Markup:
+def texture_pictures(run: ShownRun) -> Markup:
     """Return each texture at start and end (or now), the true texture if known, and the mask of reached texels."""
     folder = run.path / "parameters"
     archives = {moment: read_parameters(folder / sub) for moment, sub in _FOLDERS.items()}
@@ -120,7 +120,7 @@ ABSCISSAE = (("iteration", "iteration"), ("elapsed_s", "time in steps and update
 Figures = list[float | None]
 
 
-def convergence(run: Run) -> Markup:
+def convergence(run: ShownRun) -> Markup:
     """Return diagrams of the loss and the known parameter errors over iterations and over time."""
     if not run.records:
         yet = "has been completed yet; the first one also compiles what the others use"
@@ -140,7 +140,7 @@ def convergence(run: Run) -> Markup:
     return curves + soft(f"{words}{more} more are not drawn." if more else "") + _thinning([run])
 
 
-def convergence_of_all(runs: Sequence[Run]) -> Markup:
+def convergence_of_all(runs: Sequence[ShownRun]) -> Markup:
     """Return diagrams of the loss and the error of several runs. Add one diagram for each parameter that several runs
     share.
     """
@@ -167,7 +167,7 @@ def convergence_of_all(runs: Sequence[Run]) -> Markup:
     return parts + _thinning(runs)
 
 
-def _both(label: str, curves: Sequence[tuple[Run, str, int, Figures]]) -> Markup:
+def _both(label: str, curves: Sequence[tuple[ShownRun, str, int, Figures]]) -> Markup:
     """Return the same curves in two diagrams side by side, over iterations and over time."""
     drawn = [
         ("", diagram([Curve(title, _column(run, name), ys, k) for run, title, k, ys in curves], caption, label))
@@ -176,7 +176,7 @@ def _both(label: str, curves: Sequence[tuple[Run, str, int, Figures]]) -> Markup
     return lay_out("diagrams", drawn)
 
 
-def _thinning(runs: Sequence[Run]) -> Markup:
+def _thinning(runs: Sequence[ShownRun]) -> Markup:
     most = max((points_together(len(run.records)) for run in runs), default=1)
     if most <= 1:
         return Markup()
@@ -185,17 +185,17 @@ def _thinning(runs: Sequence[Run]) -> Markup:
     return soft(f"Of runs with more than {MOST_POINTS} iterations each point is the mean of some, at most {most}.")
 
 
-def _column(run: Run, name: str) -> Figures:
+def _column(run: ShownRun, name: str) -> Figures:
     return [record[name] for record in run.records]
 
 
-def _errors(run: Run, name: str, scale: float | None) -> Figures:
+def _errors(run: ShownRun, name: str, scale: float | None) -> Figures:
     """Return the errors of one parameter, divided by `scale` if given."""
     errors = [record["parameter_errors"].get(name) for record in run.records]
     return [None if error is None else error / (scale or 1.0) for error in errors]
 
 
-def _total_relative(run: Run) -> Figures:
+def _total_relative(run: ShownRun) -> Figures:
     """Return the root mean square of the relative errors of all parameters."""
     curves = [_errors(run, name, scale) for name, scale in run.scales.items() if scale]
     known = [[error for error in errors if error is not None] for errors in zip(*curves, strict=True)]
