@@ -146,7 +146,7 @@ def record(share: float | None, error: float | None, seeds: int = 8) -> MissingR
 )
 def test_consequences_of_a_share(found: MissingRecord, incomplete: bool, refused: bool):
     assert (found.is_incomplete, found.is_for_the_most_part) == (incomplete, refused)
-    assert ("nothing is missing" in found.line()) is (found.share == 0.1)
+    assert ("detect no missing part" in found.line()) is (found.share == 0.1)
 
 
 def test_a_rising_loss_is_explained_by_the_missing_part():
