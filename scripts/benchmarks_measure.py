@@ -147,9 +147,17 @@ def stale() -> list[str]:
 
 
 def _changed(commit: str, place: str) -> int:
-    """Return how many files of a folder have changed since a commit, not counting comments and docstrings."""
+    """Return how many files of a folder have changed since a commit. Comments and docstrings do not count."""
     files = (_git("diff", "--name-only", "--no-renames", commit, "HEAD", "--", place, *UNMEASURED) or "").splitlines()
-    return sum(not file.endswith(".py") or _syntax(commit, file) != _syntax("HEAD", file) for file in files)
+    read = {".py": _syntax, ".yaml": _settings}
+    made = {file: read.get(Path(file).suffix) for file in files}
+    return sum(make is None or make(commit, file) != make("HEAD", file) for file, make in made.items())
+
+
+def _settings(commit: str, file: str) -> Any:
+    """Return the content of a YAML file at a commit, or None without the file."""
+    text = _git("show", f"{commit}:{file}")
+    return None if text is None else yaml.safe_load(text)
 
 
 def _syntax(commit: str, file: str) -> str | None:
