@@ -90,18 +90,17 @@ def _parallel(start: list[float], end: list[float], half: float, radiance: dict)
 TRACED: dict[str, Any] = {"image": "ptracer", "spp": 512}
 
 GLASS_CASES = [
-    ExtremeCase("opacity_0", "a mask that is not there", lambda: veiled(0.0), (FLOOR, LAMP), Stock("prb"), spp=128),
-    ExtremeCase("opacity_1", "a mask that hides all", lambda: veiled(1.0), (FLOOR, LAMP, VEIL), Stock("prb"), spp=128),
-    ExtremeCase("opacity_texture_0_and_1", "a mask of opaque and of clear texels",
+    ExtremeCase("opacity_0", "a transparent mask", lambda: veiled(0.0), (FLOOR, LAMP), Stock("prb"), spp=128),
+    ExtremeCase("opacity_1", "an opaque mask", lambda: veiled(1.0), (FLOOR, LAMP, VEIL), Stock("prb"), spp=128),
+    ExtremeCase("opacity_texture_0_and_1", "a mask with opaque and with transparent texels",
                 lambda: veiled(bitmap(np.array([[[0.0], [1.0]], [[1.0], [0.0]]]))), (FLOOR, LAMP, VEIL), Stock("prb"),
                 spp=128),
-    ExtremeCase("opacity_0.4", "the opacity of a mask, at a depth at which the image is quadratic in it",
+    ExtremeCase("opacity_0.4", "the opacity of a mask, at a depth where the image is quadratic in the opacity",
                 lambda: veiled(0.4), (OPACITY,), Differences(0.3), spp=1024, options={"max_depth": 3}, signed=True),
-    ExtremeCase("albedo_0_behind_mask", "a wall that is 0 in one channel behind a mask: what the mask lets pass is "
-                "a factor of a derivative that no contribution shows",
+    ExtremeCase("albedo_0_behind_mask", "a wall that is 0 in one channel, behind a mask",
                 lambda: veiled(0.4, wall={"type": "twosided", "bsdf": diffuse(0, 0.7, 0.4)}), (WALL, VEIL),
                 Differences(0.05, "up"), spp=128),
-    ExtremeCase("nested_dielectrics", "a ball of glass in a ball of water", nested,
+    ExtremeCase("nested_dielectrics", "a glass ball inside a water ball", nested,
                 ("water.bsdf.specular_transmittance.value", "glass.bsdf.specular_transmittance.value",
                  "floor.bsdf.reflectance.value"), Stock("ptracer"), image="ptracer", spp=512,
                 options={"max_depth": 8}),
@@ -109,11 +108,11 @@ GLASS_CASES = [
                 ("surface.bsdf.specular_reflectance.value", "floor.bsdf.reflectance.value"), Stock("ptracer"),
                 image="ptracer", spp=512),
     exact("refraction", "a point light over a pool", refraction_scene, POOL, 3, **TRACED),
-    exact("index_1", "the same without a change of index", lambda: refraction_scene(1.0), POOL, 3, **TRACED),
-    exact("index_3", "the same with index 3", lambda: refraction_scene(3.0), POOL, 3, **TRACED),
-    exact("slab", "a beam through a glass slab, reflected inside it up to six times",
+    exact("index_1", "a point light over a pool of index 1", lambda: refraction_scene(1.0), POOL, 3, **TRACED),
+    exact("index_3", "a point light over a pool of index 3", lambda: refraction_scene(3.0), POOL, 3, **TRACED),
+    exact("slab", "a beam through a glass slab, with up to six reflections inside the slab",
           lambda: slab_scene(1.5, 40, 10), SLAB, 10, seeds=24, **TRACED),
-    exact("slab_index_3_grazing", "index 3 at 85 degrees: most of the light is reflected",
+    exact("slab_index_3_grazing", "a beam at 85 degrees on a slab of index 3: most of the light is reflected",
           lambda: slab_scene(3.0, 85, 10), SLAB, 10, **TRACED),
 ]  # fmt: skip
 
@@ -206,22 +205,24 @@ def moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, 
 ROUGH: dict[str, Any] = {"type": "roughdielectric", "alpha": 0.1}
 
 MOTION_CASES = [
-    moved("slope_0", "a flat surface of glass that begins to bend", surface(slope=0)),
-    moved("slope_1e-6", "slopes of a millionth", surface(slope=1e-5)),
-    moved("slope_0.3", "slopes of a third", surface(slope=3), 0.005),
+    moved("slope_0", "a flat glass surface that begins to bend", surface(slope=0)),
+    moved("slope_1e-6", "a glass surface with slopes of one millionth", surface(slope=1e-5)),
+    moved("slope_0.3", "a glass surface with slopes of a third", surface(slope=3), 0.005),
     moved("sliding_faces", "a surface whose faces slide through the light", surface(), moves=sliding),
     moved("total_reflection", "a surface with waves, beyond the critical angle",  # light from inside
           lambda: pool(glass(), beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2, cells=256), 0.0015),
     moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, moves=bending(0.1)),
     moved("parallel_faces", "a slab with flat faces that begins to bend", moving_slab(0), depth=4),
-    moved("thin_slab", "a slab of ten ray offsets", moving_slab(0, THIN), 0.1, depth=4, moves=bending(THIN), spp=256),
-    moved("moved_index_1", "glass of index 1, and the lamp over it", surface(1.0), moves=with_lamp),
-    moved("moved_index_3", "glass of index 3", surface(3.0)),
-    moved("moved_rough_1.001", "rough glass of index 1.001, and the lamp over it", surface(1.001, **ROUGH),
+    moved("thin_slab", "a slab whose thickness is ten ray offsets",
+          moving_slab(0, THIN), 0.1, depth=4, moves=bending(THIN), spp=256),
+    moved("moved_index_1", "moving glass of index 1, and the lamp above the glass", surface(1.0), moves=with_lamp),
+    moved("moved_index_3", "moving glass of index 3", surface(3.0)),
+    moved("moved_rough_1.001", "moving rough glass of index 1.001, and the lamp above the glass",
+          surface(1.001, **ROUGH),
           moves=with_lamp, equal=1e-3),
-    moved("moved_rough_3", "rough glass of index 3", surface(3.0, **ROUGH), equal=1e-3),
-    moved("millimetres", "a slab a thousand times its size", moving_slab(scale=1e3), depth=4, moves=bending(1, 1e3)),
-    moved("shrunk_to_0.03", "a slab three hundredths of its size", moving_slab(scale=0.03), depth=4,
+    moved("moved_rough_3", "moving rough glass of index 3", surface(3.0, **ROUGH), equal=1e-3),
+    moved("millimetres", "a slab at a thousand times its size", moving_slab(scale=1e3), depth=4, moves=bending(1, 1e3)),
+    moved("shrunk_to_0.03", "a slab at three hundredths of its size", moving_slab(scale=0.03), depth=4,
           moves=bending(1, 0.03), left=5e-3),
 ]  # fmt: skip
 
@@ -283,25 +284,27 @@ def vertical_light() -> dict:
 
 
 PLACES_CASES = [
-    ExtremeCase("scaled_1e-2", "the room a hundredth of its size", lambda: placed(1e-2), (FLOOR, WALL, LAMP),
+    ExtremeCase("scaled_1e-2", "the room at a hundredth of its size", lambda: placed(1e-2), (FLOOR, WALL, LAMP),
                 Twin(room)),
-    ExtremeCase("scaled_1e+4", "the room ten thousand times its size", lambda: placed(1e4), (FLOOR, WALL, LAMP),
+    ExtremeCase("scaled_1e+4", "the room at ten thousand times its size", lambda: placed(1e4), (FLOOR, WALL, LAMP),
                 Twin(room)),
-    ExtremeCase("moved_100", "the room 100 from the origin, fifty times its own size", lambda: placed(1, AWAY),
+    ExtremeCase("moved_100", "the room 100 units from the origin, which is fifty times its own size",
+                lambda: placed(1, AWAY),
                 (FLOOR, WALL, LAMP), Twin(room)),
     ExtremeCase("grazing_sensor", "a camera that looks along the floor",
                 lambda: room(camera=pinhole([0.9, -0.95, 0.9], [-0.9, -0.96, -0.2], [0, 1, 0], 25)),
                 (FLOOR, WALL, LAMP), Stock("ptracer"), spp=512),
-    ExtremeCase("grazing_lamp", "a lamp on the floor's edge, at right angles to it", vertical_light,
+    ExtremeCase("grazing_lamp", "a lamp at the edge of the floor, at a right angle to the floor", vertical_light,
                 (FLOOR, WALL, LAMP), Stock("ptracer"), spp=128),
-    ExtremeCase("back_facing", "sheets that turn their backs on camera and lamp", turned_panes,
+    ExtremeCase("back_facing", "one-sided sheets that face away from the camera and the lamp", turned_panes,
                 ("first.bsdf.reflectance.value", "second.bsdf.reflectance.value", FLOOR), Stock("ptracer"), spp=256),
-    ExtremeCase("shading_normals", "eight flat faces shaded as a sphere", lambda: octahedron(0.7, 0.5, 0.8),
+    ExtremeCase("shading_normals", "eight flat faces with the shading normals of a sphere",
+                lambda: octahedron(0.7, 0.5, 0.8),
                 ("solid.bsdf.reflectance.value", FLOOR), Stock("prb"), spp=256),
-    ExtremeCase("shading_normals_albedo_0", "the same in black: the derivative alone shows how its normals are treated",
+    ExtremeCase("shading_normals_albedo_0", "eight black faces with the shading normals of a sphere",
                 lambda: octahedron(0, 0, 0), ("solid.bsdf.reflectance.value", FLOOR), Differences(0.05, "up"),
                 spp=256),
-    ExtremeCase("normal_map", "normals that lean by up to 60 degrees", normal_map,
+    ExtremeCase("normal_map", "shading normals that are tilted by up to 60 degrees", normal_map,
                 ("floor.nested_bsdf.reflectance.value", WALL), Stock("prb"), spp=512),
 ]  # fmt: skip
 
@@ -369,7 +372,8 @@ def _case(kind: str, roughness: str) -> ExtremeCase:
     is_followed = is_parameter and (kind, roughness) in FOLLOWED
     is_noisy = is_parameter and not is_followed and float(roughness) <= 0.1
     return ExtremeCase(
-        f"{kind}_{roughness}", f"light by way of a {kind} of roughness {roughness}", lambda: plate(kind, roughness),
+        f"{kind}_{roughness}", f"light that a {kind} of roughness {roughness} reflects or transmits",
+        lambda: plate(kind, roughness),
         (f"plate.bsdf.{colour}.value", RECEIVER, *([key] if is_parameter else [])), Stock("prb"), spp=256,
         signed=is_parameter, open_ended={key: NOISE} if is_noisy else {},
         elsewhere={key: followed(kind, roughness)} if is_followed else {},
@@ -392,7 +396,7 @@ def _followed(kind: str, roughness: str) -> ExtremeCase:
         return made
 
     return ExtremeCase(
-        followed(kind, roughness), f"how light follows the roughness {roughness} of a {kind}", scene, (),
+        followed(kind, roughness), f"light whose direction follows the roughness {roughness} of a {kind}", scene, (),
         Extrapolated(0.05 * float(roughness), 2e-3), image="", spp=256, signed=True,
         options={"max_depth": 3},  # from the plate to the floor: the edges beyond do not move
         ours={"attached": True}, equal=5e-4, moves=lambda scene: [Number("plate.bsdf.alpha.value")],

@@ -63,36 +63,38 @@ ROULETTE = {"max_depth": 5, "rr_depth": 2}
 
 COLOURS_CASES = [
     ExtremeCase(
-        "albedo_0_in_one_channel", "texels that are exactly 0 in one channel: ds/s is 0/0 there",
+        "albedo_0_in_one_channel", "texels that are exactly 0 in one channel, so ds/s is 0/0",
         lambda: room(floor=matte(columns((0.5, 0.0, 0.4), (0.6, 0.3, 0.0)))), (FLOOR, WALL), Differences(0.05, "up")),
     ExtremeCase(
-        "albedo_0", "texels that are exactly 0 in all channels: throughput ends there, its derivative does not",
+        "albedo_0", "texels that are exactly 0 in all channels: the throughput is 0, but its derivative is not",
         lambda: dark(0), (FLOOR, WALL), Differences(0.05, "up")),
     ExtremeCase(
-        "albedo_0_roulette", "the same with Russian roulette, which knows throughput alone",
+        "albedo_0_roulette", "texels that are exactly 0, with Russian roulette on throughput alone",
         lambda: dark(0), (FLOOR, WALL), Differences(0.05, "up"), spp=256, options=ROULETTE),
     ExtremeCase(
-        "albedo_1e-6", "texels a millionth above 0: what lies behind weighs a millionth, its derivative does not",
+        "albedo_1e-6", "texels of one millionth: the contribution behind them is tiny, but its derivative is not",
         lambda: dark(1e-6), (FLOOR, WALL), Stock("ptracer")),
     ExtremeCase(
-        "albedo_1e-6_roulette", "the same with Russian roulette", lambda: dark(1e-6), (FLOOR, WALL), Stock("ptracer"),
+        "albedo_1e-6_roulette", "texels of one millionth, with Russian roulette",
+        lambda: dark(1e-6), (FLOOR, WALL), Stock("ptracer"),
         spp=256, options=ROULETTE),
     ExtremeCase(
         "albedo_1", "a floor and a wall that are exactly white", lambda: bright(1), (FLOOR, WALL), Stock("ptracer")),
     ExtremeCase(
-        "albedo_1-1e-6", "the same a millionth below 1", lambda: bright(1 - 1e-6), (FLOOR, WALL), Stock("ptracer")),
+        "albedo_1-1e-6", "a floor and a wall that are one millionth below white",
+        lambda: bright(1 - 1e-6), (FLOOR, WALL), Stock("ptracer")),
     ExtremeCase(
-        "pure_colours", "red light on a green floor and a blue wall: the image is black, the derivative is not",
+        "pure_colours", "red light on a green floor and a blue wall: the image is black, but its derivative is not",
         lambda: room(floor=matte(columns((0, 0.8, 0), (0, 0.5, 0))), wall=matte(rgb(0, 0, 0.7)),
                      side=matte(rgb(0, 0.7, 0)), lamp=lamp(radiance=rgb(5, 0, 0))), (FLOOR, WALL, LAMP),
         Differences(0.05, "up")),
     ExtremeCase(
-        "pure_colours_roulette", "each product is zero in a channel of its own, and roulette goes by the others",
+        "pure_colours_roulette", "products that are zero in different channels, with Russian roulette",
         lambda: room(floor=matte(columns((0.9, 0, 0), (0, 0.9, 0))), wall=matte(rgb(0, 0.8, 0.8)),
                      side=matte(rgb(0.8, 0, 0.8)), lamp=lamp(radiance=rgb(5, 5, 0))), (FLOOR, WALL, LAMP),
         Differences(0.05, "up"), spp=256, options=ROULETTE),
     ExtremeCase(
-        "lamp_0", "a lamp of radiance 0: a black image, whose derivative is that of a white lamp",
+        "lamp_0", "a lamp of radiance 0: the image is black, but its derivative equals that of a white lamp",
         lambda: room(lamp=lamp(radiance=rgb(0, 0, 0))), (LAMP,), Differences(0.5, "up")),
 ]  # fmt: skip
 
@@ -117,9 +119,9 @@ FILMS_CASES = [
                 lambda: seen(camera(), to_uv=transform(scale=0.4)), (FLOOR, LAMP), Stock("ptracer")),
     ExtremeCase("film_1x4096", "a film of one column of 4096 pixels", strip, (FLOOR, LAMP), Stock("ptracer"),
                 spp=64),
-    ExtremeCase("film_border", "a filter that reaches over the film's border, where samples are lost",
+    ExtremeCase("film_border", "a filter that reaches beyond the film's border, where samples are lost",
                 lambda: seen(camera("gaussian", size=4)), (FLOOR, LAMP), Stock("ptracer"), image="ptracer", spp=1024),
-    ExtremeCase("film_crop", "a crop window of 3 x 2 pixels, and a filter that reaches over its border",
+    ExtremeCase("film_crop", "a crop window of 3 x 2 pixels, and a filter that reaches beyond its border",
                 lambda: seen(camera("tent", crop_offset_x=6, crop_offset_y=12, crop_width=3, crop_height=2)),
                 (FLOOR, LAMP), Stock("ptracer"), image="ptracer", spp=512),
 ]  # fmt: skip
@@ -200,34 +202,34 @@ def white_box() -> dict:
 LIGHTS_CASES = [
     ExtremeCase("emission_1e-25", "a lamp of radiance 1e-25 under a fixed adjoint image", lambda: lit(1e-25),
                 (WALL, LAMP), Twin(lambda: lit(1), {WALL: 1e-25})),
-    ExtremeCase("emission_1e-25_roulette", "the same with Russian roulette, which goes by throughput",
+    ExtremeCase("emission_1e-25_roulette", "a lamp of radiance 1e-25, with Russian roulette on throughput",
                 lambda: lit(1e-25), (WALL, LAMP), Twin(lambda: lit(1), {WALL: 1e-25}), spp=256, options=ROULETTE),
     ExtremeCase("emission_1e+25", "a lamp of radiance 1e+25 under a fixed adjoint image", lambda: lit(1e25),
                 (WALL, LAMP), Twin(lambda: lit(1), {WALL: 1e25})),
-    ExtremeCase("emission_1e-25_and_1e+25", "both in one scene", two_lamps,
+    ExtremeCase("emission_1e-25_and_1e+25", "lamps of radiance 1e-25 and 1e+25 in one scene", two_lamps,
                 (WALL, LAMP, "dim.emitter.radiance.value"), Stock("ptracer"), spp=128),
     ExtremeCase("lamp_of_area_1e-8", "a lamp of side 1e-4 and radiance 4e8", lambda: small_lamp(4e8), (WALL, LAMP),
                 Stock("ptracer")),
-    ExtremeCase("lamp_of_area_1e-8_roulette", "the same of radiance 1: what a path carries is 1e-8 from the start",
+    ExtremeCase("lamp_of_area_1e-8_roulette", "a lamp of side 1e-4 and radiance 1, with Russian roulette",
                 lambda: small_lamp(1), (WALL, LAMP), Stock("ptracer"), spp=256, options=ROULETTE),
     ExtremeCase("sun_1e6", "a sun of contrast 1e6 in an environment map", sun, ("sky.data", WALL), Stock("prb"),
                 spp=256),
     ExtremeCase("grazing_light", "parallel light at half a degree over a floor", skimming,
                 ("floor.brdf_0.reflectance.value", "light.irradiance.value"), Stock("ptracer"), spp=256),
-    ExtremeCase("connection_1e8", "the first connection of each path weighs 1e8 times more than all others", speck,
+    ExtremeCase("connection_1e8", "the first connection has 1e8 times the weight of all other connections", speck,
                 ("speck.bsdf.reflectance.value", "box.bsdf.reflectance.value", LAMP), Stock("ptracer"),
                 image="ptracer", spp=256, options={"max_depth": 5}, residual=True),
-    ExtremeCase("no_connection", "no light path connects to a sensor that looks away", away, (WALL, LAMP), Zero()),
+    ExtremeCase("no_connection", "no light path connects, because the sensor looks away", away, (WALL, LAMP), Zero()),
     exact("furnace", "a closed furnace, 16 bounces", lambda: grey(16), FURNACE, 16, residual=True),
-    exact("furnace_roulette", "a closed furnace without a depth limit: roulette alone ends its paths",
+    exact("furnace_roulette", "a closed furnace without a depth limit: only Russian roulette ends the paths",
           lambda: grey(-1), FURNACE, -1, rr_depth=5, seeds=12, residual=True),
     exact("furnace_1024", "a furnace of albedo 1, 1024 bounces",
           lambda: furnace_scene((1, 1, 1), (0.5, 1, 2), 1024, 4), FURNACE, 1024, spp=256, image="", naive=False,
           residual=True),
-    ExtremeCase("white_box_100", "a white box with an obstacle, 100 bounces: more than have a bit for visibility",
+    ExtremeCase("white_box_100", "a white box with an obstacle, and more bounces than bits for visibility",
                 white_box, ("box.bsdf.reflectance.value", "cube.bsdf.reflectance.value"), Stock("ptracer"),
                 image="path", options={"max_depth": 100, "hide_emitters": True}, residual=True),
-    exact("furnace_black", "a furnace of albedo 0, whose derivative is its first bounce",
+    exact("furnace_black", "a furnace of albedo 0: only the first bounce has a derivative",
           lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8), FURNACE, 8),
 ]  # fmt: skip
 
@@ -260,11 +262,11 @@ def _sums(name: str, spp: int) -> ExtremeCase:
 LOSSES_CASES = [
     ExtremeCase("negative_loss", "a loss with negative derivatives", room, (LIT_FLOOR, LAMP), Stock("ptracer"),
                 weights=np.negative, signed=True),
-    ExtremeCase("mixed_loss", "a loss with derivatives of either sign, by channel and pixel", room, (LIT_FLOOR, LAMP),
+    ExtremeCase("mixed_loss", "a loss whose derivatives have both signs, by channel and pixel", room, (LIT_FLOOR, LAMP),
                 Stock("ptracer"), weights=mixed, signed=True, spp=256),
-    ExtremeCase("nan_loss", "NaN in the loss's derivative: refused and counted", room, (LIT_FLOOR, LAMP),
+    ExtremeCase("nan_loss", "NaN in the loss's derivative is refused and counted", room, (LIT_FLOOR, LAMP),
                 Stock("ptracer"), weights=spoilt(np.nan)),
-    ExtremeCase("infinite_loss", "infinity in the loss's derivative: refused and counted", room, (LIT_FLOOR, LAMP),
+    ExtremeCase("infinite_loss", "infinity in the loss's derivative is refused and counted", room, (LIT_FLOOR, LAMP),
                 Stock("ptracer"), weights=spoilt(-np.inf)),
     _sums("sums_1e7", 10**7),
     _sums("sums_1e8", 10**8),
@@ -284,11 +286,11 @@ def spots() -> KnownScene:
 
 #: Lamps that no sample finds, or one sample in a thousand.
 UNFOUND_CASES = [
-    exact("lamp_of_a_thousandth_of_a_pixel", "a lamp in view that one primary ray in a thousand hits",
+    exact("lamp_of_a_thousandth_of_a_pixel", "a visible lamp that one in a thousand primary rays hits",
           lambda: speck_in_view(side=0.0037, radiance=(300, 200, 400)), {"radiance": LAMP}, 1, image="ptracer"),
-    exact("black_texels", "a lamp with texels that are black, and drawn in proportion to their radiance: never", spots,
+    exact("black_texels", "a lamp with black texels, which are never sampled in proportion to radiance", spots,
           TEXELS, 2, spp=256),
-    exact("black_lamp", "a lamp with nothing but black texels: there is no density in proportion to them",
+    exact("black_lamp", "a lamp with only black texels, so no density is proportional to radiance",
           lambda: texels_over_plane(np.zeros((2, 2, 3))), TEXELS, 2, spp=256,
           open_ended={PLANE: "there is no light that it could reflect"}),
 ]  # fmt: skip
