@@ -1,9 +1,12 @@
-"""Whether two sets of renders agree: Welch's test for each block of pixels, corrected for how many there are.
+"""Comparison of two sets of renders by Welch's test for each block of pixels, corrected for the number of blocks.
 
-Beside the blocks, the mean of the whole image is tested: a bias that is everywhere small shows there. Two sides must
-hold: max |z| under Sidak's threshold for all blocks and channels, and the root mean square of z under that of as many
-normal deviates as there are blocks (channels may be fully correlated), or, entry by entry, as the correlated entries
-are worth.
+The mean of the whole image is tested as well, because it shows a small bias in all blocks. Two criteria must hold:
+
+- max |z| is below Sidak's threshold for all blocks and channels.
+- The root mean square of z is below the limit for as many independent normal deviates as there are blocks. Channels may
+    be fully correlated.
+
+Entry by entry, this limit uses the effective number of independent entries.
 """
 
 from __future__ import annotations
@@ -20,7 +23,9 @@ from reslrb_cli.measure.comparison import ALPHA, combined_z_rms, effective_entri
 
 @dataclass(frozen=True)
 class Agreement:
-    """Result of a comparison; `z` is (blocks, C), the whole image's last; `difference` is mean_a / mean_b - 1."""
+    """Result of a comparison. `z` has the shape (blocks, C), and the last row belongs to the whole image. `difference`
+    is mean_a / mean_b - 1.
+    """
 
     z: np.ndarray
     threshold: float
@@ -32,7 +37,7 @@ class Agreement:
 
     @property
     def holds(self) -> bool:
-        """Whether both criteria hold; NaN does not."""
+        """True if both criteria hold. NaN fails them."""
         return bool(np.abs(self.z).max() < self.threshold and self.z_rms < self.z_rms_threshold)
 
     def __bool__(self) -> bool:
@@ -51,21 +56,25 @@ class Agreement:
 
 
 def renders(render: Callable[[int], Any], seeds: Iterable[int]) -> np.ndarray:
-    """Stack `render(seed)` of all seeds, as float64: (N, ...)."""
+    """Return `render(seed)` for all seeds, stacked as float64: (N, ...)."""
     return np.stack([np.array(render(seed), dtype=np.float64) for seed in seeds])
 
 
 def blocks(samples: np.ndarray, size: int) -> np.ndarray:
-    """Means over blocks of `size` x `size` pixels of (N, H, W, C) samples: (N, blocks, C). Remainders count too."""
+    """Return the means over blocks of `size` x `size` pixels of (N, H, W, C) samples, as (N, blocks, C). Incomplete
+    blocks at the edges count too.
+    """
     _, height, width, _ = samples.shape
     rows, columns = range(0, height, size), range(0, width, size)
     return np.stack([samples[:, y : y + size, x : x + size].mean((1, 2)) for y in rows for x in columns], axis=1)
 
 
 def compare(a: np.ndarray, b: np.ndarray, block: int | None = 8, alpha: float = ALPHA) -> Agreement:
-    """Compare (N, H, W, C) with (M, H, W, C) renders block by block; `block=None`: (N, ...) entry by entry.
+    """Compare (N, H, W, C) renders with (M, H, W, C) renders block by block. With `block=None`, compare (N, ...)
+    renders entry by entry.
 
-    Assert on the result: `assert agreement, agreement` (or `assert compare(...)`, whose failure prints it).
+    Assert on the result with `assert agreement, agreement`. A failure of `assert compare(...)` prints the result as
+    well.
     """
     if a.shape[1:] != b.shape[1:]:
         raise ValueError(f"renders of different shapes: {a.shape[1:]} and {b.shape[1:]}")

@@ -1,4 +1,4 @@
-"""How tests compute: kernels without LLVM's optimisations, by one thread."""
+"""In tests, kernels are compiled without LLVM's optimisations and run on one thread."""
 
 from __future__ import annotations
 
@@ -24,19 +24,22 @@ SILENT_SINCE = (20, 0, 0)
 
 
 def search_path(*first: Path) -> str:
-    """PYTHONPATH of a process that looks in these folders first, and then where this one would."""
+    """Return the PYTHONPATH of a process that searches the given folders before the folders of this process's
+    PYTHONPATH.
+    """
     return os.pathsep.join([*map(str, first), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
 def is_silent(library: ctypes.CDLL) -> bool:
-    """Whether this libLLVM leaves passes out without a word."""
+    """Return whether this libLLVM leaves out passes without printing a message for each pass."""
     version = shared_library.llvm_version(library)
     return version is not None and version >= SILENT_SINCE
 
 
 def leave_out_optimisations() -> bool:
-    """Tells libLLVM, before Dr.Jit uses it, to leave optimisations out, here and in processes that inherit the
-    environment; False where there is no libLLVM that could."""
+    """Make libLLVM leave out optimisations, before Dr.Jit uses libLLVM. The setting also applies to processes that
+    inherit the environment. Return False if no libLLVM can leave them out silently.
+    """
     path = Path(os.environ.get(llvm.VARIABLE, ""))
     if not path.is_file() or not is_silent(library := shared_library.load(path)):
         return False
@@ -67,10 +70,11 @@ MAKE, COMMON, PROVIDE = (
 
 
 def compute_alone() -> bool:
-    """One thread from now on, once a variant is set; False where this Mitsuba's OpenEXR cannot do with it.
+    """Use one thread from now on, once a variant is set. Return False if this Mitsuba's OpenEXR does not work with one
+    thread.
 
-    With Mitsuba's provider of threads nothing of an EXR file would ever be read or written (CONTRIBUTING.md). A pool
-    of no threads has one that does at once what it is given; it is put in the place of Mitsuba's.
+    With one thread, Mitsuba's provider of threads would never read or write anything of an EXR file (CONTRIBUTING.md).
+    A pool without threads has a provider that runs each task at once. That provider replaces Mitsuba's provider.
     """
     import drjit as dr
     import mitsuba as mi

@@ -1,4 +1,6 @@
-"""What all tests share: libLLVM chosen before Mitsuba is imported, the variant, a clean allocator between modules."""
+"""Shared setup of all tests: the choice of libLLVM before Mitsuba is imported, the variant, and a clean allocator
+between modules.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ HEAVY = ("colour", "matplotlib.pyplot", "reslrb_cli.cli.optimize", "reslrb_cli.r
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests that need a browser, if there is none."""
+    """Leave out tests that need a browser if there is no browser."""
     if find_chromium() is None:
         left_out = [item for item in items if "chromium" in getattr(item, "fixturenames", ())]
         config.hook.pytest_deselected(items=left_out)
@@ -42,7 +44,7 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
 
 @pytest.hookimpl(trylast=True)
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say in one line that they were left out."""
+    """Print one line if tests that need a browser are left out."""
     if find_chromium() is None:
         terminalreporter.write_line(
             "no Chromium: tests that look at pages in a browser are left out (scripts/setup --test brings one)"
@@ -50,8 +52,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What is there until the last test is not looked through again and again for what has become free: each recording
-    of a step has Python do that."""
+    """Exclude all existing objects from later garbage collections. Python collects garbage for each recording of a
+    step, and the objects exist until the last test anyway.
+    """
     if "PYTEST_XDIST_WORKER" in os.environ:  # which has many tests before it
         for name in HEAVY:
             importlib.import_module(name)
@@ -60,13 +63,15 @@ def pytest_collection_finish() -> None:
 
 
 def is_quick(config: pytest.Config) -> bool:
-    """Whether it is not the long runs that are asked for; RESLRB_TEST_OPTIMISED=1 has all tests run as users do."""
+    """Return True unless the long tests are requested. With RESLRB_TEST_OPTIMISED=1, return False, so that all tests
+    run as for users.
+    """
     is_long = "long" in config.option.markexpr and "not long" not in config.option.markexpr
     return not is_long and not os.environ.get("RESLRB_TEST_OPTIMISED")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compiles quickly, where that is worth it, and heeds signals."""
+    """Leave out compiler optimisations in quick runs, and handle ignored signals by default."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         # Shells start what is in the background with SIGINT ignored, and nohup without SIGHUP: so would be all runs
         # that tests start, some of which are to be interrupted.
@@ -78,10 +83,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def llvm(pytestconfig: pytest.Config) -> str:
-    """Sets the variant, once, and returns its name.
+    """Set the variant once, and return its name.
 
-    It is `llvm_ad_rgb`, and tests are skipped if the machine has no backend for it. If RESLRB_TEST_VARIANT names a
-    variant, a missing backend fails the tests: whoever names one wants it tested.
+    The variant is `llvm_ad_rgb`. Tests are skipped if the machine has no backend for it. If RESLRB_TEST_VARIANT names a
+    variant, a missing backend fails the tests, because the user wants to test this variant.
     """
     named = os.environ.get("RESLRB_TEST_VARIANT")
     try:
@@ -95,7 +100,9 @@ def llvm(pytestconfig: pytest.Config) -> str:
 
 @pytest.fixture(autouse=True, scope="module")
 def _release_jit_memory() -> Iterator[None]:
-    """Gives the JIT's cached memory back after each module, so that peaks measured in one do not show in the next."""
+    """Free the JIT's cached memory after each module, so that the memory peaks of one module do not affect the next
+    module.
+    """
     yield
     if "drjit" in sys.modules:
         gc.collect()
@@ -104,7 +111,7 @@ def _release_jit_memory() -> Iterator[None]:
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A place for a disk, which is taken away at the end."""
+    """Folder where a test may mount a disk. The disk is unmounted at the end."""
     place = tmp_path / "disk"
     place.mkdir()
     yield place

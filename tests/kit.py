@@ -1,4 +1,4 @@
-"""Parts of scene files, which the small scenes of many tests are put together from."""
+"""Parts of scene files, from which many tests build their small scenes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ POSTER_BSDF = f'<bsdf type="diffuse" id="poster">\n        {TEXTURE.format("post
 
 
 def named(id: str) -> str:
-    """Return the attribute that names an object; "" names none."""
+    """Return the attribute with an object's name. An empty `id` gives an empty text."""
     return f' id="{id}"' if id else ""
 
 
 def scene(*parts: str) -> str:
-    """Return the text of a scene file."""
+    """Return the text of a scene file with these parts."""
     return "\n".join(['<scene version="3.0.0">', *(f"    {part}" for part in parts), "</scene>", ""])
 
 
@@ -24,7 +24,7 @@ def sensor(
     origin: str = "0, 0, 4", target: str = "0, 0, 0", up: str = "0, 1, 0", size: object = 8, fov: float = 50,
     id: str = "", rfilter: str = "box", pixels: str = "rgb",
 ) -> str:  # fmt: skip
-    """Return a perspective sensor; its film has `size` pixels, a number (or a variable) or (width, height)."""
+    """Return a perspective sensor. `size` is the film's size in pixels: a number, a variable, or (width, height)."""
     width, height = size if isinstance(size, tuple) else (size, size)
     return f"""<sensor type="perspective"{named(id)}>
         <float name="fov" value="{fov:g}"/>
@@ -37,21 +37,21 @@ def sensor(
 
 
 def diffuse(color: str, id: str = "") -> str:
-    """Return a diffuse surface of one colour."""
+    """Return a diffuse BSDF of one colour."""
     return f'<bsdf type="diffuse"{named(id)}><rgb name="reflectance" value="{color}"/></bsdf>'
 
 
 def ref(id: str) -> str:
-    """Return a reference to an object that stands elsewhere in the file."""
+    """Return a reference to an object that is defined elsewhere in the file."""
     return f'<ref id="{id}"/>'
 
 
 def area(radiance: str, id: str = "") -> str:
-    """Return what makes a shape a lamp."""
+    """Return an area emitter, which makes a shape a lamp."""
     return f'<emitter type="area"{named(id)}><rgb name="radiance" value="{radiance}"/></emitter>'
 
 
 def shape(kind: str, id: str, *parts: str, place: str = "") -> str:
-    """Return a shape; `place` are the steps of its `to_world`, the first that is done first."""
+    """Return a shape. `place` contains the steps of its `to_world`, in the order of execution."""
     moved = f'<transform name="to_world">{place}</transform>' if place else ""
     return f'<shape type="{kind}"{named(id)}>{moved}{"".join(parts)}</shape>'

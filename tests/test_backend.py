@@ -1,4 +1,4 @@
-"""The choice of libLLVM and of the variant, and memory that is Dr.Jit's own."""
+"""The choice of libLLVM and of the variant, and memory that belongs to Dr.Jit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Machine = Callable[..., list[Path]]
 
 @pytest.fixture
 def _forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Each test searches anew, without the choice that the tests themselves run under."""
+    """Make each test search again, without the choice under which the tests themselves run."""
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     for cached in (llvm.choose, llvm._examine):
         cached.cache_clear()
@@ -45,9 +45,10 @@ def _forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
-    """`machine({"libLLVM-15.so.1": "loads"})` lays out a machine with these libraries alone.
+    """`machine({"libLLVM-15.so.1": "loads"})` makes a machine that has only these libraries.
 
-    Each says what its trial does: prints a version, or exits with a message of the dynamic loader.
+    The text of each library gives the result of its trial. The trial prints this text as a version, or exits with this
+    text as a message of the dynamic loader.
     """
     trial = tmp_path / "forecast.py"
     trial.write_text(
@@ -322,12 +323,12 @@ ALIGNMENT = 64  # bytes; what Dr.Jit's own memory has
 
 
 def address(array):
-    """Where the memory of a Dr.Jit array lies."""
+    """Return the memory address of a Dr.Jit array."""
     return np.array(array, copy=False).ctypes.data
 
 
 def lying_at(offset, values):
-    """A NumPy array that begins so many bytes after a multiple of ALIGNMENT."""
+    """Return a NumPy array that begins `offset` bytes after a multiple of ALIGNMENT."""
     values = np.asarray(values)
     room = np.empty(values.nbytes + 2 * ALIGNMENT, np.uint8)
     begin = -room.ctypes.data % ALIGNMENT + offset

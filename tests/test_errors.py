@@ -1,4 +1,4 @@
-"""Messages and seeds."""
+"""Error messages and seeds."""
 
 from __future__ import annotations
 

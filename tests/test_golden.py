@@ -1,4 +1,6 @@
-"""Golden values (tests/golden/golden.py): a change that is to change nothing changes no bit, no text and no format."""
+"""Golden values (tests/golden/golden.py). A change without intended effects must change no bit, no text and no
+format.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ pytestmark = pytest.mark.long
 
 @pytest.fixture(scope="module")
 def values() -> dict[str, object]:
-    """Those of this machine."""
+    """Golden values of this machine."""
     known = CONTENT["machines"].get(golden.machine())
     if known is None:
         pytest.skip("no values of this processor and libLLVM: tests/golden/golden.py makes them, on the commit before")

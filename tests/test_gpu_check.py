@@ -1,4 +1,6 @@
-"""`scripts/gpu_check`: its commands run on a CPU at the smallest sizes, and all that it names is there."""
+"""The commands of `scripts/gpu_check` run on a CPU at the smallest sizes. All files and tests that the script names
+exist.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,9 @@ def test_a_failing_command_is_named_and_the_others_run(tmp_path: Path) -> None:
 
 
 def test_a_named_variant_is_tested_or_fails() -> None:
-    """Tests that are skipped for want of a GPU would look like tests that pass on it."""
+    """A requested variant that is not available fails the test run. Skipped tests would look like tests that pass on a
+    GPU.
+    """
     test = "tests/conformance/test_replay.py::test_without_light_there_is_no_replay"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", test]
     environment = os.environ | {"RESLRB_TEST_VARIANT": "cuda_ad_rgb", "DRJIT_LIBCUDA_PATH": "/nonexistent.so"}

@@ -1,4 +1,4 @@
-"""Imports run one way, and the package can be imported without Mitsuba."""
+"""Imports go in one direction, and the package can be imported without Mitsuba."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ FOREIGN = {
 
 
 def violations(root: Path) -> list[str]:
-    """Every import under `root` (a folder laid out as the package) that goes the wrong way, one line each."""
+    """Return one line for each import under `root` that goes in the wrong direction. The folder `root` is laid out as
+    the package.
+    """
     found = []
     for path in sorted(root.rglob("*.py")):
         parts = path.relative_to(root).with_suffix("").parts
@@ -73,12 +75,12 @@ def violations(root: Path) -> list[str]:
 
 @functools.cache
 def _tree(path: Path) -> ast.Module:
-    """The syntax tree of a module, which takes most of the time."""
+    """Return the syntax tree of a module, which is cached because parsing takes most of the time."""
     return ast.parse(path.read_text())
 
 
 def _imports(path: Path, parts: tuple[str, ...]) -> list[tuple[int, str]]:
-    """(line, absolute dotted name) of each import of a module, those inside functions too."""
+    """Return (line, absolute dotted name) for each import of a module, including imports inside functions."""
     names = []
     for node in ast.walk(_tree(path)):
         if isinstance(node, ast.Import):
@@ -90,10 +92,11 @@ def _imports(path: Path, parts: tuple[str, ...]) -> list[tuple[int, str]]:
 
 
 def circles(root: Path, package: str = "reslrb_cli") -> list[list[str]]:
-    """Files under `root` (a folder laid out as the package) that need one another, at most one circle.
+    """Return the files under `root` that form an import circle, at most one circle. The folder `root` is laid out as
+    the package.
 
-    All imports count, under TYPE_CHECKING and inside functions as well, and so do dotted names in text: a module that
-    is imported by its name is needed as much.
+    All imports count, including those under TYPE_CHECKING and inside functions. Dotted names in text also count,
+    because a module that is imported by its name is also needed.
     """
     paths = {_module(package, path.relative_to(root)): path for path in root.rglob("*.py")}
     needs: dict[str, set[str]] = {}
@@ -114,7 +117,7 @@ def _module(package: str, path: Path) -> str:
 
 
 def _names_in_text(path: Path, package: str) -> list[str]:
-    """Dotted names of the package that stand in the text of a module, but for docstrings."""
+    """Return the dotted names of the package in the text of a module, except in docstrings."""
     tree = _tree(path)
     has_docstring = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     docstrings = {id(node.body[0].value) for node in ast.walk(tree)

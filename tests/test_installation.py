@@ -1,4 +1,6 @@
-"""Packages on the path that are not Mitsuba and Dr.Jit, or not those that are wanted: one line, exit code 3."""
+"""Packages on the path that are not Mitsuba and Dr.Jit, or have the wrong version. Each gives one line and exit
+code 3.
+"""
 
 from __future__ import annotations
 

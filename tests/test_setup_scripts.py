@@ -1,4 +1,6 @@
-"""The scripts' cheap properties; that they set up a bare machine is tried by running them on one."""
+"""Properties of the scripts that are cheap to test. Whether the scripts set up a bare machine is tested by running them
+there.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,7 @@ esac
 
 
 def set_up(folder: Path, python: Path, *options: str, **environment: str) -> str:
-    """Run a checkout's `scripts/setup` with a pretended Python; what it said."""
+    """Run a checkout's `scripts/setup` with a fake Python, and return the output."""
     command = [folder / "scripts/setup", *options]
     environment = os.environ | {"RESLRB_PYTHON": str(python)} | environment
     done = subprocess.run(
@@ -54,7 +56,7 @@ def set_up(folder: Path, python: Path, *options: str, **environment: str) -> str
 
 
 def make_checkout(folder: Path) -> None:
-    """Make a folder with what `scripts/setup` reads."""
+    """Make a folder with the files that `scripts/setup` reads."""
     (folder / "scripts").mkdir(parents=True)
     shutil.copy(ROOT / "scripts/setup", folder / "scripts/setup")
     shutil.copy(ROOT / "pyproject.toml", folder / "pyproject.toml")
@@ -62,12 +64,12 @@ def make_checkout(folder: Path) -> None:
 
 @pytest.fixture
 def python(tmp_path: Path) -> Path:
-    """The pretended Python."""
+    """The fake Python."""
     return make_program(tmp_path / "python", PYTHON)
 
 
 def make_program(path: Path, text: str) -> Path:
-    """Write a script that can be run."""
+    """Write an executable script."""
     path.unlink(missing_ok=True)
     path.write_text(text)
     path.chmod(0o755)
@@ -75,7 +77,7 @@ def make_program(path: Path, text: str) -> Path:
 
 
 def test_a_copied_folder_gets_its_own_environment(tmp_path: Path, python: Path) -> None:
-    """Its scripts would otherwise run the folder that was copied."""
+    """With the copied environment, the scripts in the copy would run the original folder."""
     first, second = tmp_path / "a checkout", tmp_path / "a checkout 2"
     make_checkout(first)
     assert set_up(first, python).endswith("setup: done\n")

@@ -1,4 +1,4 @@
-"""The documentation site builds without warnings, and its pages fit phones and desktops without the network."""
+"""The documentation site builds without warnings. Its pages fit phones and desktops and need no network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the default suite leaves out changes no value: optimisations of kernels, threads."""
+"""The default suite leaves out optimisations of kernels and uses one thread. Neither changes any value."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ print(dr.reinterpret_array(UInt32, y * v.z + v.x * v.y).numpy().tobytes().hex())
 
 
 def compiled(way: str, home: Path) -> tuple[str, dict[str, bytes]]:
-    """What the script prints, and the kernels that it left on the disk, by name."""
+    """Return the output of the script, and the kernels that the script left on the disk, by name."""
     home.mkdir()
     folder = home / (".drjit" if way == "optimised" else compilation.CACHE.name)
     environment = {key: value for key, value in os.environ.items() if key != "DRJIT_CACHE_DIR"}
@@ -104,7 +104,7 @@ assert (np.array(mi.Bitmap(file)) == image[:20]).all()
 
 @pytest.mark.usefixtures("llvm")
 def test_one_thread_reads_and_writes_images(tmp_path: Path) -> None:
-    """And several, if a test has them."""
+    """A test with several threads also reads and writes images."""
     scene = ROOT / "scenes" / "grey_room" / "scene.xml"
     done = subprocess.run(
         [sys.executable, "-c", READS_AND_WRITES, str(tmp_path), str(scene)], capture_output=True, text=True,

@@ -1,5 +1,4 @@
-"""What a wheel has in it, and that it works where nothing of this repository is: an example is copied, and run, and so
-are the notebooks."""
+"""The content of a wheel, and its use without this repository. An example is copied and run, and the notebooks run."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ SOURCES = ("pyproject.toml", "README.md", "LICENSE", "reslrb_cli", "configs", "s
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A wheel of this repository, made of a copy without the network."""
+    """A wheel of this repository, built from a copy without the network."""
     if int(setuptools.__version__.partition(".")[0]) < LEAST_SETUPTOOLS:
         pytest.skip(
             f"setuptools {setuptools.__version__} makes none of this project; scripts/setup --test has a newer one"
@@ -52,7 +51,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def installed(wheel: Path, folder: Path) -> Path:
-    """A Python that has the wheel, and what that needs from this environment, but not this repository."""
+    """Return a Python that has the wheel and its requirements from this environment, but not this repository."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
     (site,) = folder.glob("lib/python*/site-packages")
     install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--target", site, wheel]
@@ -65,7 +64,7 @@ def installed(wheel: Path, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """That Python."""
+    """The Python with the wheel."""
     return installed(wheel, tmp_path_factory.mktemp("installed") / "environment")
 
 
@@ -84,7 +83,7 @@ def test_the_wheel_contains_all_data_files(wheel: Path) -> None:
 
 
 def test_examples_are_unchanged_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each can be copied, and loads as the same experiment, all of its files its own."""
+    """Each example can be copied. The copy loads as the same experiment, with its own copies of all files."""
     monkeypatch.chdir(tmp_path)
     assert {ROOT / "configs" / f"{name}.yaml" for name in examples()} == set((ROOT / "configs").rglob("*.yaml"))
     listed = reslrb("example").stdout.splitlines()
@@ -102,7 +101,7 @@ def test_examples_are_unchanged_copies(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def paths(value: str | list[str]) -> list[Path]:
-    """Those of a setting that names a file, or several."""
+    """Return the paths in a setting that names one file or several files."""
     return [Path(each) for each in (value if isinstance(value, list) else [value])]
 
 
@@ -130,7 +129,7 @@ def test_existing_files_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wo
 
 
 def test_an_example_runs_from_another_folder(python: Path, tmp_path: Path, llvm: str) -> None:
-    """Also its page, whose templates lie in the package, and a second command by `reslrb` itself."""
+    """The run also writes its page, whose templates are in the package. A second command runs by `reslrb` itself."""
     program, elsewhere = python.with_name("reslrb"), tmp_path / "elsewhere"
     elsewhere.mkdir()
     # the script that pip puts beside the packages, where `--target` has it
@@ -180,7 +179,9 @@ STOPPED = [
 
 
 def execute(notebook: Any, python: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Execute a notebook in a kernel of `python`, in `folder`, with an example where the repository has it."""
+    """Execute a notebook in a kernel of `python`, in `folder`. An example is copied to the place that it has in the
+    repository.
+    """
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     kernel = folder / "jupyter/kernels/wheel/kernel.json"
     kernel.parent.mkdir(parents=True)
@@ -230,5 +231,5 @@ def test_the_stop_button_of_a_notebook_and_a_nan_loss_keep_the_result(
 
 
 def said(cell: Any) -> str:
-    """What a cell printed."""
+    """Return the text that a cell printed."""
     return "".join(output.text for output in cell.outputs if output.get("name") == "stdout")

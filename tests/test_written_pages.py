@@ -1,4 +1,4 @@
-"""docs/benchmarks.md, docs/paper.md and the README's tables are what `scripts/` make of the records."""
+"""docs/benchmarks.md, docs/paper.md and the README's tables match the output of `scripts/` for the records."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
 
 
 def test_no_figure_is_typed_by_hand() -> None:
-    """Units with a figure before them stand in records alone; memory and time of the paper's machine are published."""
+    """Numbers with a unit come only from records. The published memory of the paper's machine is the only exception."""
     published = ("142 MB",)
     for template in (RECORDS / pages.TEMPLATE, PAPER / "page.md"):
         text = template.read_text(encoding="utf-8")
@@ -152,7 +152,7 @@ NOT_HERE = {"docs/benchmarks/gpu.md"}
 
 
 def test_files_named_in_text_exist() -> None:
-    """The documentation may name any file; of other files' text the names of tests are looked at."""
+    """In the documentation, every named file must exist. In other files, only the names of tests are checked."""
     listed = subprocess.check_output(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, text=True)
     files = [name for name in listed.split() if (ROOT / name).is_file()]
     ends = {name[at:] for name in (f"/{file}" for file in files) for at in range(len(name)) if name[at] == "/"}
@@ -170,12 +170,12 @@ def test_files_named_in_text_exist() -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A copy of the records."""
+    """Folder with a copy of the records."""
     return Path(shutil.copytree(RECORDS, tmp_path / "records"))
 
 
 def change(file: Path, key: str, value: object) -> None:
-    """Change a member of the last line."""
+    """Change a member of the record in the file's last line."""
     *others, last = file.read_text(encoding="utf-8").splitlines()
     file.write_text("\n".join([*others, json.dumps(json.loads(last) | {key: value})]) + "\n", encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""Parameters of which the default suite runs a part, and a scene of somebody else, if it is there."""
+"""Parameters of which the default suite runs only a part, and a scene of another author, if available."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ import pytest
 
 
 def name_of(one: Any) -> str:
-    """What a parameter of a test is called."""
+    """Return the name of a test's parameter."""
     return str(getattr(one, "name", one))
 
 
 def a_few(names: Iterable[Any], few: Collection[str]) -> list[Any]:
-    """Parameters of a test: of `names` those in `few` by default, all others for `-m long`.
+    """Return the parameters of a test. By default only the names in `few` run, and all others need `-m long`.
 
-    Where a name has an attribute `name`, that is its id. Raises ValueError where one of the few is not among the names.
+    If a name has an attribute `name`, this attribute is the id. Raises ValueError if an entry of `few` is not among the
+    names.
     """
     names = list(names)
     if unknown := set(few) - {name_of(one) for one in names}:
@@ -31,10 +32,11 @@ def a_few(names: Iterable[Any], few: Collection[str]) -> list[Any]:
 def taking_turns(
     name: str, names: Sequence[Any], way: str, ways: Sequence[Any], few: Collection[str] | None = None
 ) -> pytest.MarkDecorator:
-    """Parametrises with all pairs. By default each of `names` comes with one of `ways`, which take turns.
+    """Parametrise a test with all pairs of `names` and `ways`. By default each name comes with one way, and the ways
+    take turns.
 
-    The other pairs are for `-m long`, and so are all of names that are not in `few`, if given. Where a name has an
-    attribute `name`, that is its id. Raises ValueError where one of the ways would never have a turn.
+    The other pairs need `-m long`. If `few` is given, all pairs of names outside `few` also need `-m long`. If a name
+    has an attribute `name`, this attribute is the id. Raises ValueError if one of the ways would never have a turn.
     """
     turns = [name_of(one) for one in names if few is None or name_of(one) in few]
     if len(ways) > len(turns):
@@ -54,7 +56,9 @@ _BESIDE = Path(__file__).parents[2] / "shared" / "scenes" / "grey-white-room"
 
 
 def real_room() -> Path:
-    """The room's file: in the folder that RESLRB_GREY_WHITE_ROOM names, or beside the repository; else skips."""
+    """Return the room's file in the folder that RESLRB_GREY_WHITE_ROOM names, or beside the repository. Skip the test
+    if there is no file.
+    """
     folder = Path(os.environ.get("RESLRB_GREY_WHITE_ROOM") or _BESIDE)
     if not (folder / "scene.xml").exists():
         pytest.skip(

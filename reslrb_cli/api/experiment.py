@@ -226,7 +226,7 @@ def gradcheck(
     - `spp`: samples per pixel of one gradient.
     - `integrators`: your own Mitsuba integrators, `FILE.py:CLASS[(OPTION=VALUE,...)]`. They are checked instead of the
         estimators of `reslrb` (docs/your_integrator.md).
-    - `allow_code`: permit running the code of these files.
+    - `allow_code`: permit running the code of the integrators' files.
 
     For your own integrators, the log (`logging.INFO`) reports noise and cost. The log also gives hints if an integrator
     is wrong.

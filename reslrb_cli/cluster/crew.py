@@ -63,10 +63,11 @@ LOSSES = 100
 class Spent:
     """Time that one worker, or all rounds of calls, have spent, in seconds.
 
-    - `standing`: time to set the context of calls, as a mean over a round's workers.
-    - `computing`: time to compute, as a mean over a round's workers.
-    - `waiting`: time in which these workers waited for the slowest one.
-    - `wall`: time from the first question to the last answer. The rest of it is communication.
+    - `standing`: mean time that a round's workers need to set the context of calls.
+    - `computing`: mean time that a round's workers compute.
+    - `waiting`: mean time that a round's workers wait for the slowest worker.
+    - `wall`: time from the first question to the last answer. The part of `wall` beyond the other three times is
+        communication.
 
     `calls` is the number of answered calls. `again` is the number of repeated calls.
     """

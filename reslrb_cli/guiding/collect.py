@@ -359,11 +359,14 @@ class Hearing(Hooks):
 class Said:
     """Evaluated contributions of guided samples: sums over paths.
 
-    - `starts` (voices * cells) are squared contributions by the cell that a path starts in, with the image last.
-    - `squares` (voices * CELLS) are squared later contributions at throughput 1, by the cell of a ray that leaves a
+    - `starts` (voices * cells) has squared contributions for each quantity and each cell in which paths start. The
+        image is the last quantity.
+    - `squares` (voices * CELLS) has squared later contributions at throughput 1, for each cell of a ray that leaves a
         vertex. `followed` counts later vertices, and `left` (CELLS) counts rays.
-    - `whole` (rows * BINS) are squares by quantity, the weights of paths at the emitter, and their vertices.
-    - `places` (voices * blocks, or empty) are squared contributions by block of the film, as if no path had been aimed.
+    - `whole` (rows * BINS) has the squared contributions for each quantity, the weights of paths at the emitter, and
+        the paths' vertex counts.
+    - `places` (voices * blocks, or empty) has squared contributions for each block of the film. The values are
+        corrected to paths without aiming.
     """
 
     starts: mi.Float

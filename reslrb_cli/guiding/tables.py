@@ -57,12 +57,12 @@ class Learned:
     `sums` (2, cells) are the sums for gradient and image, and `draws` the number of paths that started in each cell.
     Arrays are float32, and never modified.
 
-    - `calls` is the number of gradients so far. It restarts when a table is found to be wrong.
-    - `onward` are the later contributions by position, or None if unknown.
-    - `worse` is the mean square contribution of the newest paths divided by that of uniform paths. Far above 1, the
-        table is harmful, for example after a change of the scene.
-    - `film` (2, blocks) are sums of squares by block of the film (`transport/aim.py`). There are no blocks if no path
-        is aimed.
+    - `calls` is the number of gradients so far. The count restarts when a table is found to be wrong.
+    - `onward` has the later contributions for each position. `onward` is None if they are unknown.
+    - `worse` is the mean square contribution of the newest paths divided by the mean square contribution of uniform
+        paths. If `worse` is far above 1, the table is harmful, for example after a change of the scene.
+    - `film` (2, blocks) has the sums of squares for each block of the film (`transport/aim.py`). There are no blocks if
+        no path is aimed.
     """
 
     sums: Array

@@ -39,12 +39,12 @@ FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
 class Differentiated:
     """Parameters that track derivatives.
 
-    - `bsdf_nodes` are the nodes of BSDFs with such parameters: textures, nested BSDFs, and meshes whose attributes are
-        textures.
+    - `bsdf_nodes` are the nodes of BSDFs that have differentiated parameters: textures, nested BSDFs, and meshes whose
+        attributes are textures.
     - `emission_nodes` are the nodes of emission: emitters and their textures.
     - `shapes` are moving shapes, and `emitters` are emitters with moving rays.
-    - `least` gives the value up to which a parameter counts as zero, for parameters that are factors of a path.
-    - `entries` are the numbers of differentiated entries by node.
+    - `least` has a value for each parameter that is a factor of a path. A parameter up to this value counts as zero.
+    - `entries` is the number of differentiated entries for each node.
     """
 
     bsdf_nodes: tuple[mi.Object, ...]

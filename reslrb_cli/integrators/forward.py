@@ -1,9 +1,9 @@
 """Forward mode and naive AD: hooks of walks that store no data of a path.
 
-- `TrackedSplat` and `RecordedObjective` compute the image, or the objective, with tracked derivatives. Naive AD and
-    Dr.Jit's reversal use them.
-- `TangentSplat` and `CameraTangents` compute the forward-mode derivative of the image, by light paths and by camera
-    paths.
+- `TrackedSplat` computes the image with tracked derivatives, and `RecordedObjective` computes the objective. Naive AD
+    and Dr.Jit's reversal use these classes.
+- `TangentSplat` computes the forward-mode derivative of the image from light paths. `CameraTangents` computes the
+    derivative from camera paths.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 `adjoint` selects the samples that dL/dI comes from.
 
-- `correlated`: one set of samples serves image and gradient, as in naive AD of one rendering.
+- `correlated`: image and gradient use one set of samples, as in naive AD of one rendering.
 - `independent`: the samples of the gradient have their own seed, as in `mi.render`.
-- `batched`: the samples are divided into batches. Each batch takes dL/dI from the image of the earlier ones
+- `batched`: the samples are divided into batches. Each batch takes dL/dI from the image of the earlier batches
     (`_batched`).
 
 With `halves`, each set of samples has two halves, and images are (2, H, W, C). A loss that multiplies an image by
@@ -233,11 +233,12 @@ def gradient_step(
     - `objective` maps the image, a tensor (H, W, C) that tracks derivatives, to a scalar.
     - `sensor` is a sensor of the scene, or its index.
     - `params` are the scene's parameters, by default `mi.traverse(scene)`.
-    - `spp` of 0 means the sensor's own number.
-    - `batches` is the number of batches for `adjoint="batched"`. The loss is then the loss of the image of all samples.
-    - `on_image` is called once the image and the loss are evaluated, if there is such a moment.
-    - `on_samples` is called with the image of each differentiated set of samples, and with its dL/dI. A factor of the
-        image can then be differentiated with the same samples.
+    - `spp` is a sample count. 0 means the sensor's sample count.
+    - `batches` is the number of batches for `adjoint="batched"`. The returned loss then belongs to the image of all
+        samples.
+    - `on_image` is called after the image and the loss are evaluated, if the step evaluates them before the gradient.
+    - `on_samples` is called for each differentiated set of samples, with the set's image and dL/dI. The callback can
+        then differentiate a factor of the image with the same samples.
     - With `halves`, `objective` and `on_samples` receive the images (2, H, W, C) of two halves of the samples.
         `protocol.whole_of` returns their mean. Every set must then have an even number of samples.
 

@@ -41,11 +41,11 @@ _SAME, _SIZE = 1e-5, 1e-3
 class Sheet:
     """A face over a grid.
 
-    - `points` (ny nx, 3) are in mm, in rows of equal y, the least y first. `x` (nx,) and `y` (ny,) are the coordinates
-        of columns and rows.
+    - `points` (ny nx, 3) are in mm. The points form rows of equal y, starting with the least y. `x` (nx,) and `y` (ny,)
+        are the coordinates of columns and rows.
     - `triangles` (n, 3) are counterclockwise as seen from +z.
-    - `name` is the id of its mesh.
-    - `smooth` tells whether the mesh has interpolated normals. Flat triangles would then send light elsewhere.
+    - `name` is the id of the face's mesh.
+    - `smooth` is true if the mesh has interpolated normals. Flat triangles would send light elsewhere than this mesh.
     """
 
     name: str

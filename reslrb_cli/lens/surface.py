@@ -33,8 +33,8 @@ class Setting:
 
     - `size` is the width and height of the face. A round `outline` is the ellipse within this size.
     - `picture_size` is the size of the picture on the receiver.
-    - `light_distance` is the distance of a point light, or of an area light's centre, from the first face that it
-        meets. It is infinite for parallel light.
+    - `light_distance` is the distance from the light to the first face that the light meets. For an area light, the
+        distance starts at the light's centre. The distance is infinite for parallel light.
     - `incidence` is the angle (degrees, about y) between the central ray and z.
     - `tilt` has the angles (degrees) of the receiver about its horizontal and its vertical axis.
     - `through` is true if the picture is seen from behind the receiver.
@@ -60,9 +60,9 @@ class Surface:
     - `heights` (ny, nx) are h at the centres of a grid's cells, with row 0 at the least y. A round face has heights
         outside of its outline, too.
     - `inside` (ny, nx) marks the cells inside the outline.
-    - `floor` is the fraction of the maximum to which darker parts of the picture were raised.
-    - `relief` is the height between the lowest and the highest point, and `relief_at_twice` the same at twice the
-        distance.
+    - `floor` is a fraction of the picture's maximum. Darker parts of the picture were raised to this fraction.
+    - `relief` is the height between the lowest and the highest point. `relief_at_twice` is this height for a face at
+        twice the distance.
     """
 
     setting: Setting

@@ -59,11 +59,12 @@ class Optics(Protocol):
 class Transport:
     """A solution of (1).
 
-    - `h` (ny, nx) is the potential. `slopes` are its derivatives along the axes at the edges (left, right, bottom,
-        top).
-    - `T` (2, ny, nx) are the images of the cells' centres. `light` (ny, nx) is mu, with mean 1.
-    - `residual` is the root mean square residual of (1)'s logarithm, weighted by the light.
-    - `converged` tells whether the residual became small, possibly for a picture blurred by a few pixels.
+    - `h` (ny, nx) is the potential. `slopes` are the derivatives of `h` along the axes at the edges (left, right,
+        bottom, top).
+    - `T` (2, ny, nx) has the points of the picture to which T maps the cells' centres. `light` (ny, nx) is mu, with
+        mean 1.
+    - `residual` is the root mean square residual of the logarithm of (1). The mean is weighted by the light.
+    - `converged` is true if the residual became small. The picture may have been blurred by a few pixels for this.
     - `pushed` is the picture that T makes, with mean 1. `error` is sum |pushed - nu| / sum nu, over the picture's
         pixels or larger cells.
     - `folded` is the share of cells that T turns over. `stretch` is the largest factor by which T lengthens a segment,
@@ -148,8 +149,8 @@ def solve(
 ) -> Transport:
     """Solve (1) from the coarsest grid up to `shape`.
 
-    - `picture` (my, mx) is nu, with positive values and row 0 at the least y. It covers a rectangle of `target` (width,
-        height) about 0.
+    - `picture` (my, mx) is nu, with positive values and row 0 at the least y. The picture covers a rectangle of size
+        `target` (width, height), centred at 0.
     - `size` is the size of the aperture.
     - `start` (6,) is the polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2. It maps the aperture approximately
         evenly to the picture.

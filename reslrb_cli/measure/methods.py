@@ -381,7 +381,7 @@ class Plan(Measurement):
         """Arguments of `survey`, which describe the kinds of paths in the measurement.
 
         - `camera`: some method may have camera paths.
-        - `named`: some method has camera paths whatever the scene supports.
+        - `named`: some method has camera paths, regardless of what the scene supports.
         - `light`: some method has only light paths.
         """
         spp = self.config.run.spp

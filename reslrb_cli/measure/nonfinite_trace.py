@@ -44,10 +44,10 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 class PathVertex:
     """A vertex of a path, with all data for tracing the path again.
 
-    - `samples` names the samples of the step that the path belongs to, `seed` is their sampler's seed, and `path` is
-        its index among `paths`.
-    - `vertex` is the number of the vertex. Vertex 0 is on the emitter or, for camera paths, on the sensor. `samples`
-        tells which of the two.
+    - `samples` names the set of samples that the path belongs to. `seed` is the seed of this set's sampler. `path` is
+        the path's index among `paths`.
+    - `vertex` is the number of the vertex. Vertex 0 is on the emitter for light paths, and on the sensor for camera
+        paths. `samples` tells which kind of path it is.
     - `position` is in world space, and `surface` is the shape's id.
     """
 

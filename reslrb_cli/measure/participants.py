@@ -77,7 +77,8 @@ class CheckSettings:
 
     - `named` tells whether the user named the integrators. Otherwise integrators that cannot take part are left out.
     - `spent_s` is the part of the budget that earlier sessions used.
-    - `initial` has values of parameters, as `Selection.array` returns them. They replace those of `config`.
+    - `initial` has values of parameters, as `Selection.array` returns them. These values replace the values in
+        `config`.
     """
 
     config: Config
@@ -150,10 +151,11 @@ class Way:
 class Participants:
     """The loaded scene with every integrator by its label. A variant must be set.
 
-    - `ways` has the paths of each estimator, by its label. Dictionaries "by way" have the names for light paths first,
-        then the names for other paths (`Way.named`).
-    - `stock` has the stock reference of each parameter's gradient, or None. `why` has the reasons against the others.
-    - `images` has references of the image, by way. `exact` has gradients in closed form.
+    - `ways` maps the label of each estimator to the estimator's paths. Dictionaries "by way" have the names for light
+        paths first, then the names for other paths (`Way.named`).
+    - `stock` has the stock reference for each parameter's gradient, or None. `why` has the reasons against the other
+        stock references.
+    - `images` has the reference of the image for each way. `exact` has gradients in closed form.
     - `listed` has the estimators that take part. If derivatives are attached, only estimators with attached derivatives
         on light paths take part.
 

@@ -2,7 +2,8 @@
 measurement.
 
 - `Process` is one worker, which exchanges lines of JSON with `workers.py`.
-- `Contestant` is one of several workers that are compared, and how it ended. `Stepping` takes steps.
+- `Contestant` is one of several compared workers, and records how the worker ended. `Stepping` is a contestant that
+    takes steps.
 - `Pace` divides the time of a sweep among depths and rounds.
 """
 

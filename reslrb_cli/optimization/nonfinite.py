@@ -1,9 +1,9 @@
 """Reaction of a run to values that are not finite (`run.on_nonfinite`). They never reach a parameter.
 
-- `stop`: the first iteration with such a value ends the run, and updates nothing.
-- `skip`: a parameter with such a value in its gradient is not updated. If the loss or its derivative has one, no
-    parameter is updated.
-- `zero`: such entries of gradients and of the loss's derivative count as 0, and the update continues. A parameter
+- `stop`: the first iteration with a non-finite value ends the run, and updates nothing.
+- `skip`: a parameter with a non-finite value in its gradient is not updated. If the loss or its derivative has a
+    non-finite value, no parameter is updated.
+- `zero`: non-finite entries of gradients and of the loss's derivative count as 0, and the update continues. A parameter
     without a finite gradient entry is not updated. If the loss is not finite, no parameter is updated.
 
 The run ends if updates are skipped in `PATIENCE` consecutive iterations.

@@ -154,17 +154,19 @@ class Results:
     def to_json(self) -> dict[str, Any]:
         """Return the content for the manifest.
 
-        - `parameter_rmse` and `relative_error` are initial and final errors by key. The latter are divided by the root
-            mean square of the true value.
+        - `parameter_rmse` and `relative_error` are the initial and final errors for each key. `relative_error` is
+            divided by the root mean square of the true value.
         - `rmse` is the error of all parameters together, or null if their units differ.
-        - `parameters` has, by key, quantity and shape, the share of entries that light and sensor reach, the root mean
-            square of the true value over these entries (`scale`), and `initial`, `final` and `true` values (`summary`).
+        - `parameters` has, for each key, the quantity, the shape, and the share of entries that light and sensor reach.
+            `scale` is the root mean square of the true value over these entries. `initial`, `final` and `true`
+            summarise the values (`summary`).
         - `loss_trend` has loss and noise at the start and the end, or null for a short run.
-        - `image_loss` is the loss of the saved images of training views, which have less noise. `fitted_scale` is the
-            factor of the final images by sensor, only with `loss.scale: fitted`.
+        - `image_loss` is the loss of the training views' saved images, which have less noise. `fitted_scale` is the
+            factor of the final image for each sensor. `fitted_scale` exists only with `loss.scale: fitted`.
         - `held_out` is the mean loss of the held-out views.
-        - `worse` has the keys whose error ended above its start.
-        - `samples` has the samples of a step and of a rendered target, or null without one.
+        - `worse` has the keys of parameters whose final error is above the initial error.
+        - `samples` has the sample counts of a step and of a rendered target. Without a rendered target, the target's
+            count is null.
         """
         trend = find_trend(self._losses)
         run, render = self.problem.config.run, self.problem.config.target.render

@@ -1,6 +1,6 @@
 """State of a run's iterations, and the decisions before the first iteration.
 
-- `State` has everything that determines the next iteration. Equal states lead to equal states.
+- `State` has everything that determines the next iteration. Equal states lead to equal next states.
 - `standing` returns the current state of a problem, and `put` sets a problem to a state.
 - `load` reads a stored state if it fits the problem.
 - `Settled` has the data common to all processes of a run: initial values, estimator, passes, masks, ways of sampling.
@@ -36,22 +36,23 @@ from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expec
 class State:
     """State at the start of an iteration. For a new run, `standing` without a state returns the initial state.
 
-    - `iteration` is the number of finished iterations. `standstill` is the number of the last consecutive iterations in
-        which something was skipped.
-    - `peak_mib` is the allocator's maximum, and `scaling` the result of `scale: auto`.
-    - `units` are length and gain of variables by parameter (`Variable`), and `moments` are the optimiser's. `clamp` has
-        the iterations of the clamp, and `clamp_sums` its sums.
-    - `guiding` are the numbers of gradients of guided emission by sensor, and `learned` its arrays by
-        `<sensor>/<what>`.
-    - `values` are the scene's, in the optimiser's form. In a file they are in their displayed form, and `halo` has the
-        rest.
-    - `stage` is the number of the state's stage. `base` has the run's values at its start, for a stage with its own
-        problem (`stages`).
-    - `drops` is the number of reductions of the rate by a plateau, and `since` the number of iterations before the last
-        of them.
-    - `stopped` tells why the run ends as finished, and `end` why it fails. Both are "" otherwise.
+    - `iteration` is the number of finished iterations. `standstill` counts the latest consecutive iterations in which
+        some update was skipped.
+    - `peak_mib` is the allocator's peak memory. `scaling` is the result of `scale: auto`.
+    - `units` has the length and the gain of each parameter's variable (`Variable`). `moments` are the optimiser's
+        moments. `clamp` has the clamp's iteration count for each parameter, and `clamp_sums` has the clamp's sums.
+    - `guiding` has the gradient count of guided emission for each sensor. `learned` has the arrays of guided emission,
+        named `<sensor>/<what>`.
+    - `values` are the scene's, in the optimiser's form. A file has their displayed form. In a file, `halo` has the
+        complete arrays of parameters whose displayed form lacks data.
+    - `stage` is the number of the state's stage. For a stage with its own problem (`stages`), `base` has the run's
+        values at the start of the stage.
+    - `drops` counts the reductions of the rate by a plateau. `since` is the number of iterations before the last
+        reduction.
+    - `stopped` is the reason why the run ends as finished. `end` is the reason why the run fails. Without a reason, the
+        field is "".
     - `first_s` is `elapsed_s` after the first iteration.
-    - `gradients` are those of the previous step, in the form of `values`.
+    - `gradients` are the gradients of the previous step, in the form of `values`.
     """
 
     iteration: int

@@ -15,13 +15,14 @@ uses the share 2 / (j (j - 1)) of `CHANCE`. The tested values of k divide the sh
 `find_trend` tests the ranks of all losses (Conover and Iman 1981). The test fits a line to ten parts of the series, as
 in `stands`.
 
-- It rose, or fell, if the line does, or if the last tenth of the iterations is significantly on that side of the first
-    tenth. Both need the levels of these tenths to agree.
-- It also fell if the first three losses are above the second half, because many falls end within a few iterations.
-- It also rose if the first loss is below all others, and significantly below the last tenth. Some runs jump at their
-    first step, and come down again to a level above their start.
-- Otherwise it was flat if it significantly fell by less than `MOST_FALL`. The test adds this fall to the series, and
-    requires the line to rise.
+- The loss rose (or fell) if the line rises (or falls). The same holds if the last tenth of the iterations is
+    significantly above (or below) the first tenth. In both cases, the levels of these tenths must agree.
+- The loss also fell if the first three losses are above the second half of the losses. Many falls end within a few
+    iterations.
+- The loss also rose if the first loss is below all others, and significantly below the last tenth. Some runs jump at
+    their first step, and then come down to a level above their start.
+- Otherwise, the loss was flat if its fall is significantly less than `MOST_FALL`. The test adds `MOST_FALL` to the
+    series as a gradual rise, and requires the line to rise.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """View: one sensor, its target image, and their comparison.
 
-- `Exposure` is the factor of a view's image before the comparison: a number, or a recovered parameter. The model is
-    target = exposure * image, with one exposure E for all channels or one for each. The derivative of a loss L(E I)
-    with respect to E is the sum over pixels of dL/dI I / E. It uses the samples of the other derivatives. If dL/dI
-    comes from other samples than I, it is as unbiased as these.
+- `Exposure` is the factor of a view's image before the comparison. The factor is a number or a recovered parameter. The
+    model is target = exposure * image, with one exposure E for all channels or one for each channel. The derivative of
+    a loss L(E I) with respect to E is the sum over pixels of dL/dI I / E. This sum uses the samples of the other
+    derivatives. If dL/dI comes from other samples than I, the sum is as unbiased as the other derivatives.
 - `Wanted` has the settings of the views, from `views` or, for a single view, from `target`.
 - `Masked` has the masked pixels of a view, and `View` is the view itself.
 """
@@ -203,14 +203,15 @@ class View:
     """View through the scene's sensor with the index `sensor`. `share` is its weight in the loss. The shares of
     training views sum to 1.
 
-    - `made` is the target (H, W, C) without alpha. Until it exists, it is None, and `target` raises LookupError.
-    - `weights` have the same shape and a mean of 1. They are 0 for entries that `masked` excludes, and None if all are
-        equal.
-    - `fits` tells whether the image is scaled to fit the target (`fitted`, with `across`).
+    - `made` is the target (H, W, C) without alpha. Before the target exists, `made` is None, and `target` raises
+        LookupError.
+    - `weights` have the target's shape and a mean of 1. Entries that `masked` excludes have the weight 0. `weights` is
+        None if all weights are equal.
+    - `fits` is true if the image is scaled to fit the target (`fitted`, with the argument `across`).
     - A `held_out` view is not trained on, and has its own loss.
     - `codes` are the user's losses.
-    - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`), or None without such a
-        mask.
+    - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`). `fixed` is None if no such
+        mask is used.
     """
 
     sensor: int

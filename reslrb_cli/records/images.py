@@ -192,8 +192,8 @@ PARAMETERS_FILE = "parameters.npz"
 def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     """Write parameter values into `folder`.
 
-    - `<key>.exr` and `<key>.png` of each texture (H, W, C). The EXR can replace the original texture in the scene file.
-        The PNG is for viewing; for a heightmap, black is the lowest point and white the highest.
+    - `<key>.exr` and `<key>.png`: each texture (H, W, C). The EXR can replace the original texture in the scene file.
+        The PNG is for viewing. In the PNG of a heightmap, black is the lowest point and white the highest.
     - `parameters.json`: the shape of every parameter, and the values of small parameters that are not textures.
     - `parameters.npz`: the values of all parameters.
     """

@@ -63,14 +63,16 @@ class Manifest:
     - `process`: the process that uses the folder.
     - `plan`: the parts of a step.
     - `paths`, `guided`, `sequence`, `pixels`: settings chosen by measurement (`records/decisions.py`).
-    - `incomplete`: the missing share of the derivative of each parameter that moves light (`MissingRecord`).
+    - `incomplete`: the missing share of the derivative, for each parameter that moves light (`MissingRecord`).
     - `memory`: how the run keeps its memory budget.
     - `scaling`: the measurements of each parameter for `scale: auto`.
     - `shared`: the time of workers (`SharedTime`).
-    - `views`: per view the share of the loss, the pixels left out by kind, and the factor for viewing (`shown`).
+    - `views`: for each view, the share of the loss, the excluded pixels of each kind, and the factor for viewing
+        (`shown`).
     - `results`: `iterations`, values and errors by key, `certainty`, `warnings`, perceptual errors (`seen`), ...
     - `error`: the line that the user saw if the run failed.
-    - `resumed`: per resumption the iteration, the time, the command, the state, and the changed settings and versions.
+    - `resumed`: for each resumption, the iteration, the time, the command, the state, and the changed settings and
+        versions.
 
     Entries that do not apply are None or empty.
     """

@@ -43,13 +43,14 @@ class Spread:
 class BenchRecord(Line):
     """Cost of a step of one integrator at one depth, sample count, film size and texture size.
 
-    - `estimator` is None if the integrator has none. Its name is followed by options other than the defaults, except
-        `capacity`: `reservoir(weight=adjoint)`.
-    - `step_ms` is the wall time of warm steps. Its parts are `kernel_ms` (execution of kernels), `codegen_ms` (their
-        generation, with the lookup in the kernel cache) and `tracing_ms` (the rest, mostly Python).
+    - `estimator` is None for an integrator without estimators. Options other than the defaults follow the name, for
+        example `reservoir(weight=adjoint)`. The option `capacity` is left out.
+    - `step_ms` is the wall time of warm steps. `kernel_ms` is the part for executing kernels. `codegen_ms` is the part
+        for generating kernels, including the lookup in the kernel cache. `tracing_ms` is the remaining part, mostly
+        Python.
     - `cold_ms` is the wall time of the first step in a new process with an empty kernel cache. `cold_codegen_ms` is the
         part for generating and compiling kernels.
-    - `peak_mib` is the peak memory of the allocator in that step, including the scene.
+    - `peak_mib` is the peak memory of the allocator in the first step, including the scene.
     - `scratch_bytes` is the thread-local memory of a path.
     - `texels` is the texel count of all textures that are parameters.
     - `paths` are the paths of the integrator (`light`, `camera`, `both`). If `paths` is `both`, `light_share` is the
@@ -139,16 +140,20 @@ class PointRecord(Line):
 class MethodRecord(Line):
     """Summary of the points of one method and parameter. `repeats` is the number of steps.
 
-    - `relative_rmse` is the error of one step, from the variance of the steps, and `step_s` the seconds per step.
+    - `relative_rmse` is the error of one step, computed from the variance of the steps. `step_s` is the number of
+        seconds per step.
     - `cold_s` are the seconds of the first step in a new process, including compilation.
     - `slope` is d log error / d log seconds.
-    - `efficiency` is 1 / (relative variance * seconds). For a `biased` method, it uses squared bias + variance.
-    - `bias_z` is the largest deviation from `bias_reference` in standard errors. `bias_z_limit` is a limit for it,
-        which chance exceeds anywhere in the table with probability 1e-4.
-    - `bias` is the relative bias, if there is one. `biased` is None if undecided, with the reason in `message`.
+    - `efficiency` is 1 / (relative variance * seconds). For a `biased` method, squared bias + variance replaces the
+        variance.
+    - `bias_z` is the largest deviation from `bias_reference` in standard errors. `bias_z_limit` is the limit for
+        `bias_z`. By chance, any value in the table exceeds its limit with probability 1e-4.
+    - `bias` is the relative bias, if there is one. `biased` is None if the bias is undecided. `message` then gives the
+        reason.
     - `independent` tells whether the reference shares no code with the method.
-    - `seconds_to` has the time until averages reach each error (`0.1`, `0.03`, `0.01`), or None if a bias prevents it.
-    - `extrapolated` has the errors whose time lies beyond the measured steps or below the reference's error.
+    - `seconds_to` has the time until averages reach each error (`0.1`, `0.03`, `0.01`). The time is None if a bias
+        keeps averages above the error.
+    - `extrapolated` lists the errors that need more steps than were measured, or that are below the reference's error.
 
     Values that were not measured are None.
     """
@@ -275,11 +280,11 @@ class Compared:
 class Comparison:
     """Outcome of a comparison of estimates with a reference.
 
-    - `relative_l2` is the distance from the reference divided by its norm. At equal seeds it compares samples,
-        otherwise means.
+    - `relative_l2` is the distance from the reference divided by the reference's norm. The distance compares samples at
+        equal seeds, and means otherwise.
     - `z_rms` and `z_max` are in standard errors. Their limits are corrected for the number of comparisons.
     - `cosine` is the cosine of the angle between the means.
-    - `variance_ratio` is the variance divided by that of the reference.
+    - `variance_ratio` is the variance divided by the reference's variance.
     - `detectable` is the smallest detectable deviation, as a fraction of the reference.
     - `message` has remarks.
 

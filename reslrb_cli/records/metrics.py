@@ -96,16 +96,18 @@ class Record(Line):
     - `elapsed_s` is the time in steps and updates since the start. Writing files and computing `parameter_errors` do
         not count.
     - `peak_mib` is the peak memory of the allocator since the start.
-    - `nonfinite` is the number of non-finite entries in the loss, its derivative by the image, and the gradients.
-    - `nonfinite_by_parameter` is the number in gradients and updates, for parameters with such entries.
+    - `nonfinite` is the number of non-finite entries in the loss, in dL/dI, and in the gradients.
+    - `nonfinite_by_parameter` is the number of non-finite entries in gradients and updates, for each parameter with
+        such entries.
     - `grad_norm` is the norm of the gradient before clamping, without non-finite entries.
     - `clamped` is None if gradients are not clamped.
-    - `held_out` is the loss of the held-out views, or None if there are none or the iteration did not compute it.
+    - `held_out` is the loss of the held-out views. `held_out` is None without held-out views, or if the iteration did
+        not compute the loss.
     - `regularized` is None without regularizers.
-    - `parameter_errors` has the root mean square error of each parameter with a known true value. It is in the unit of
-        the parameter, over the entries that light and sensor reach.
-    - `parameter_rmse` is the same over all these parameters. It is None if they have no common unit or no true value is
-        known.
+    - `parameter_errors` has the root mean square error of each parameter with a known true value. Each error has the
+        parameter's unit and covers the entries that light and sensor reach.
+    - `parameter_rmse` is the error over all parameters in `parameter_errors`. The error is None if these parameters
+        have no common unit, or if no true value is known.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)

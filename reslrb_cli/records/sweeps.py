@@ -169,8 +169,8 @@ class SweepRunRecord(Line):
 
     - `status` is as in a manifest, or `waiting`. `message` is the error if the run failed.
     - `loss` is the loss of the final image.
-    - `error` is the root mean square error over all parameters with a known true value. If they have no common unit
-        (`relative`), it is the root mean square of their relative errors.
+    - `error` is the root mean square error over all parameters with a known true value. If the parameters have no
+        common unit (`relative`), `error` is the root mean square of their relative errors.
     - `elapsed_s` are the seconds in steps and updates.
     - `peak_mib` is the peak memory of the allocator.
 

@@ -31,8 +31,8 @@ class Outcome:
 
     - `grade`: "good" if the run finished and all its values are reliable, "failed" if it failed, otherwise "open".
     - `sentence`: how the run went.
-    - `proposal`: what to do next; may be empty.
-    - `command`: command for the proposal; may be empty.
+    - `proposal`: what to do next. The text may be empty.
+    - `command`: command for the proposal. The text may be empty.
     """
 
     grade: str

@@ -1,9 +1,10 @@
 """Preparation of a run, and its progress: the state of the iterations, the results so far, and their checkpoints.
 
-- `plan_record` is the entry about the plan of a step in a run's manifest.
+- `plan_record` is the entry in a run's manifest that describes the plan of a step.
 - `changes` and `check_changes` tell which settings of an experiment may change when its run is resumed.
-- `prepare` makes a problem that is ready to run from a configuration, and `manifest_of` its manifest.
-- `PreparedRun` is a run that is ready to start or to resume. `begin` makes a new one.
+- `prepare` makes a problem from a configuration. The problem is ready to run. `manifest_of` makes the problem's
+    manifest.
+- `PreparedRun` is a run that is ready to start or to resume. `begin` makes a `PreparedRun` for a new run.
 - `RunProgress` has the state and the results of a run.
 """
 

@@ -29,10 +29,12 @@ def setup_of(
 
     - `kind` is `lens` or `mirror`. `face_size` and `picture_size` are widths and heights.
     - `receiver_distance` is the distance from the centre of the face (x = y = z = 0) to the centre of the receiver.
-    - `light_distance` is the distance from the side that faces the lamp to a point lamp, or `parallel`.
+    - `light_distance` is the distance of a point lamp from the side that faces the lamp. For parallel light, the entry
+        is `parallel`.
     - `lit_side` is `front` or `back`, the side of the solid that faces the lamp.
-    - `light_direction` is the direction in which the light travels. `receiver` is the centre of the receiver, and
-        `receiver_normal` its normal towards the solid. `picture_up` and `picture_right` are directions on the receiver.
+    - `light_direction` is the direction in which the light travels. `receiver` is the receiver's centre.
+        `receiver_normal` is the receiver's normal towards the solid. `picture_up` and `picture_right` are directions on
+        the receiver.
     - `through` tells whether the picture reads correctly for a viewer behind the receiver.
     """
     shapes = {shape.id(): shape for shape in scene.shapes()}

@@ -48,13 +48,13 @@ class Value:
 class ParameterInfo:
     """Entry of `mi.traverse`.
 
-    - `kind` is the type of its owner: `bsdf`, `emitter`, `attribute` (of a mesh, such as `vertex_color`), `shape`,
-        `sensor`, `film`, `medium`, `integrator` or `scene`.
+    - `kind` is the type of the object that has the parameter: `bsdf`, `emitter`, `attribute` (of a mesh, such as
+        `vertex_color`), `shape`, `sensor`, `film`, `medium`, `integrator` or `scene`.
     - `type` and `shape` describe the value. The shape of a texture is (height, width, channels).
-    - `obstacle` is the reason why it cannot be recovered, or None if it can be.
-    - `value` is None if it is no number.
-    - `bits` are the bits of a texel if Mitsuba's precision is too low for gradients. Such a texture must be read as
-        floating point (`load.read_as_floats`). Otherwise it is None.
+    - `obstacle` is the reason why the parameter cannot be recovered, or None if the parameter can be recovered.
+    - `value` is None if the value is not a number.
+    - `bits` is the number of bits per texel if Mitsuba's precision is too low for gradients. Otherwise, `bits` is None.
+        A texture with too low precision must be read as floating point (`load.read_as_floats`).
     """
 
     key: str

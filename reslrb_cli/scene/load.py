@@ -40,11 +40,11 @@ def load_scene(
     """Load a Mitsuba scene (XML, versions 0.4 to 3). A variant must be set.
 
     - `options` are the values of the file's `$name` variables.
-    - `size` is the (width, height) of all films in pixels, instead of those in the files.
+    - `size` is the (width, height) of all films in pixels, and replaces the sizes in the files.
     - `cameras` is a file of cameras that replace the scene's sensors.
     - `look` is called with the description before anything is built, and may raise exceptions.
-    - `keys` are keys or globs of parameters that need derivatives. Their bitmaps of 8 or 16 bits are read as floating
-        point.
+    - `keys` are keys or globs of parameters that need derivatives. If a bitmap of these parameters has 8 or 16 bits,
+        the bitmap is read as floating point.
     - Without `warn`, the scene is not checked for doubtful parts.
 
     Shapes are not merged, so all parameters keep their names. An object without an id is named by its kind and a

@@ -196,10 +196,10 @@ def select_parameters(
     A glob selects the matching parameters that can be recovered. `source` names the configuration in errors. Raises
     ConfigError for:
 
-    - a key that matches nothing, nothing that can be recovered, or a parameter of another spec;
+    - a key that matches no parameter, no recoverable parameter, or a parameter of another spec;
     - an object that cannot be moved;
     - an initial value that does not fit, is not finite, or lies outside of the bounds or the range of the transform;
-    - a resolution for another parameter than a texture.
+    - a resolution for a parameter that is not a texture.
     """
     selection, origin = _choose(mi.traverse(scene), specs, source)
     for key, settings in selection.specs.items():

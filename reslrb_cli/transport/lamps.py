@@ -2,14 +2,14 @@
 
 `lamp_ray` samples light in five cases in which Mitsuba's own samples are wrong, or lack a derivative.
 
-- Sphere: Mitsuba rotates the points of a sphere with its `to_world`, but not their normals.
+- Sphere: Mitsuba rotates a sphere's points with the sphere's `to_world`, but does not rotate the normals.
 - `directionalarea`: Mitsuba keeps the area that the shape had when it was loaded.
-- Moving mesh: Mitsuba samples a face in proportion to its area, and divides by the area of the mesh. It treats both as
-    constants. The density on face f is P_f / A_f(theta), and only P_f is constant.
-- Textured moving mesh: Mitsuba finds points by a ray in the plane of texture coordinates, and differentiates them as if
-    they moved along this ray.
-- Differentiated texture: Mitsuba samples texels in proportion to their radiance, and never black texels, whose
-    derivatives are as large as any.
+- Moving mesh: Mitsuba samples a face in proportion to its area, and divides by the area of the mesh. Mitsuba treats
+    both areas as constants. The density on face f is P_f / A_f(theta), and only P_f is constant.
+- Textured moving mesh: Mitsuba finds points by a ray in the plane of texture coordinates. Mitsuba differentiates the
+    points as if they moved along this ray.
+- Differentiated texture: Mitsuba samples texels in proportion to their radiance. Mitsuba never samples black texels,
+    although their derivatives are as large as any.
 """
 
 from __future__ import annotations

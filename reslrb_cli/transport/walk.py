@@ -46,12 +46,12 @@ class Hooks:
     number.
 
     - `numbers` is the number of random numbers that `vertex` gets at each vertex.
-    - Without `connects`, no connection is evaluated, and `vertex` gets only its geometry.
-    - With `replaying`, the path is known to continue as far as `goes_on` requests. Throughput and roulette are then not
-        computed.
-    - `tracked` hooks keep derivatives of the factors in the loop state, and the loop is evaluated vertex by vertex
-        (naive AD). With `max_iterations`, the loop stays symbolic, and Dr.Jit reverses it from a record of the loop
-        state in thread-local memory. If the hooks are also `attached`, the rays have derivatives, too.
+    - Without `connects`, no connection is evaluated, and `vertex` gets only the connection's geometry.
+    - With `replaying`, the path is known to continue as far as `goes_on` requests. The walk then does not compute
+        throughput and roulette.
+    - `tracked` hooks keep derivatives of the factors in the loop state. The loop is then evaluated vertex by vertex
+        (naive AD). With `max_iterations`, the loop stays symbolic. Dr.Jit then reverses the loop from a record of the
+        loop state in thread-local memory. If the hooks are also `attached`, the rays have derivatives, too.
     """
 
     numbers: int = 0

@@ -9,11 +9,12 @@ Each walk carries two numbers. M is the density of finding the path if the other
 relative to this walk's own density. V is the density of finding the path if the other walk joins at an earlier vertex.
 These symbols are used below.
 
-- p and p~ are the BSDF's densities of the direction taken, and of the reverse direction in the other walk.
+- p is the BSDF's density of the direction taken. p~ is the BSDF's density of the reverse direction in the other walk.
 - c is the |cosine| of the direction taken, and d the length of the segment.
-- N is the number of all light paths divided by that of the camera paths of a pixel.
+- N is the number of all light paths divided by the number of camera paths per pixel.
 - p_cam is the sensor's density of a direction for one pixel.
-- e is the density of an emitter's rays (of place and direction) divided by the cosine at its surface, if it has one.
+- e is the density of an emitter's rays over place and direction. If the emitter has a surface, this density is divided
+    by the cosine at the surface.
 - p_D is the density with which next event estimation samples an emitter's directions at a vertex.
 
 Both e and p_D include the choice of the emitter.

@@ -1,4 +1,4 @@
-"""The Python of README and docs runs as it stands, and the reference is that of the docstrings."""
+"""The Python blocks of the README and of docs run unchanged, and the reference matches the docstrings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 
 @pytest.fixture
 def checkout(llvm: str, tmp_path: Path) -> Path:
-    """A folder with the experiments and scenes of this one, into which scripts may write."""
+    """Folder with the repository's experiments and scenes, into which scripts may write."""
     for name in ("configs", "scenes"):
         (tmp_path / name).symlink_to(ROOT / name)
     return tmp_path
@@ -34,12 +34,12 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def script_of(text: str) -> str:
-    """The Python blocks, one after the other."""
+    """Return the Python blocks of `text`, joined in their order."""
     return "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL))
 
 
 def run(script: str, folder: Path) -> list[str]:
-    """The lines that a script prints."""
+    """Run a script and return the lines it prints."""
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=folder, env=environment(folder))
     assert done.returncode == 0, done.stderr
@@ -48,7 +48,9 @@ def run(script: str, folder: Path) -> list[str]:
 
 @pytest.fixture
 def quick_checkout(llvm: str, tmp_path: Path) -> Path:
-    """The same, with the one experiment of the page, small: it measures nothing, and its target has few samples."""
+    """Folder with the repository's scenes and a small version of the page's only experiment. The experiment measures
+    nothing, and its target has few samples.
+    """
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     (tmp_path / "configs").mkdir()
     text = (ROOT / "configs/cornell_floor.yaml").read_text(encoding="utf-8")
@@ -82,7 +84,7 @@ def test_scripts_of_the_readme_run(checkout: Path) -> None:
 
 
 def blocks(name: str) -> list[str]:
-    """The Python blocks of a page."""
+    """Return the Python blocks of a page."""
     return re.findall(r"^```python\n(.*?)^```", (ROOT / name).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
@@ -99,7 +101,7 @@ def test_every_python_block_of_the_docs_is_run() -> None:
 
 
 def test_statements_of_the_docs_about_a_run_hold(checkout: Path) -> None:
-    """The slope of recovered values, the median step of a run, and a loss of one's own."""
+    """The docs' scripts work on a run: the slope of recovered values, the median step, and a custom loss."""
     (slope,), (edges,) = blocks("docs/steps.md"), blocks("docs/losses.md")
     (steps,) = blocks("docs/benchmarks.md")
     (checkout / "my_loss.py").write_text(edges, encoding="utf-8")
@@ -146,7 +148,7 @@ def test_a_notebook_is_valid_and_has_no_outputs(path: Path) -> None:
 
 @pytest.mark.long
 def test_the_wrong_integrator_of_the_docs_is_found(checkout: Path) -> None:
-    """And what the program says of it is what the page says; with two lines exchanged it is right."""
+    """The program prints what the page shows. With two lines exchanged, the integrator is correct."""
     page = (DOCS / "your_integrator.md").read_text(encoding="utf-8")
     code, (said,) = script_of(page), re.findall(r"^    mine.py:Replay: (its image holds.*)$", page, re.MULTILINE)
     first, second = (line for line in code.splitlines() if "behind = " in line or "L = L + Le" in line)

@@ -1,4 +1,4 @@
-"""`rl.load`, and what looks at an experiment in a single call: as the commands have it."""
+"""`rl.load`, and the functions that examine an experiment in a single call, agree with the commands."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def experiment(**run: Any) -> dict[str, Any]:
-    """`tiny.yaml` as a script has it."""
+    """Return `tiny.yaml` as a mapping in Python."""
     return {
         "variant": "llvm_ad_rgb",
         "scene": {"file": Path("scene.xml")},
@@ -213,7 +213,9 @@ def test_the_gradient_equals_that_of_the_first_iteration(folder: Path) -> None:
 
 
 def test_the_gradient_belongs_to_the_loss(folder: Path) -> None:
-    """By differences along itself, at equal seeds and many samples: nothing here is discontinuous in the values."""
+    """Finite differences along the gradient match the gradient, at equal seeds and many samples. The loss has no
+    discontinuity in the values.
+    """
     smooth = rl.load("tiny.yaml", {"run.adjoint": "correlated", "run.spp": 256})
     at = {KEY: np.full((4, 4, 3), 0.4, np.float32), LAMP: np.float32([4, 5, 6])}
     _, gradient = rl.gradient(smooth, at)
@@ -261,7 +263,7 @@ SIMPLE = {"parameters[1]": {"key": LAMP, "initial": [3, 4, 5]}}
 
 
 def lines_of(file: str) -> list[dict[str, Any]]:
-    """The lines of a file of `--json`, without that which says what measured."""
+    """Return the lines of a `--json` file without the first line, which describes the origin of the measurement."""
     return [json.loads(line) for line in Path(file).read_text().splitlines()][1:]
 
 
@@ -279,7 +281,7 @@ def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
 
 
 class Played(Session):
-    """A session whose processes pretend, and whose clock only they move."""
+    """Session with simulated processes, and a clock that only these processes advance."""
 
     def __init__(self, plan: Plan, folder: Path, stop: Callable[[], bool], say: Callable[[str], None], **given: Any):
         stage = Stage()
@@ -307,7 +309,7 @@ def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch
 
 
 class Interrupting(logging.Handler):
-    """Has an interrupt come once something is said that has these words, and keeps what is said."""
+    """Log handler that stores all messages and sends an interrupt when a message contains `words`."""
 
     def __init__(self, words: str) -> None:
         super().__init__(logging.DEBUG)
@@ -330,7 +332,7 @@ class Interrupting(logging.Handler):
 def test_an_interrupt_ends_long_calls(
     folder: Path, caplog: pytest.LogCaptureFixture, call: Callable[[], Any], words: str, later: str
 ) -> None:
-    """It is not kept waiting until all is measured."""
+    """An interrupt ends a call before all measurements are done."""
     shutil.copy(Path(__file__).parents[1] / "measure/own_replay.py", folder)
     handler = Interrupting(words)
     with caplog.at_level(logging.DEBUG, "reslrb_cli"):

@@ -1,4 +1,4 @@
-"""`rl.optimize`: what a loop of one's own comes to, with and without a folder, however it ends."""
+"""`rl.optimize`: the results of a user's loop, with and without a folder, for every way of ending the loop."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def status_of(folder: Path) -> str:
 
 @pytest.mark.parametrize("settings", [{}, {"optimizer.scale": "auto", "optimizer.clamp_gradient": 1.5}])
 def test_a_loop_gives_the_results_of_the_command(experiment: Path, settings: dict[str, Any]) -> None:
-    """Bit by bit: parameters, state and records; without a folder too."""
+    """All results match bit by bit. The loop is tested with and without a folder."""
     sets = [word for key, value in (SET | settings).items() for word in ("--set", f"{key}={json.dumps(value)}")]
     assert optimize("tiny.yaml", "--quiet", *sets) == 0
     run = rl.optimize("tiny.yaml", folder="runs/mine", overrides=SET | settings)
@@ -76,7 +76,7 @@ def test_a_loop_gives_the_results_of_the_command(experiment: Path, settings: dic
 
 
 def test_everything_can_be_inspected_between_iterations(experiment: Path) -> None:
-    """And that changes nothing."""
+    """Inspection does not change results."""
     plain = rl.optimize("tiny.yaml", overrides=SET)
     expected = [as_json(record) for record in plain]
     run = rl.optimize("tiny.yaml", overrides=SET)
@@ -102,7 +102,7 @@ def test_everything_can_be_inspected_between_iterations(experiment: Path) -> Non
 
 
 def test_two_experiments_alternate(experiment: Path) -> None:
-    """Each is, bit by bit, what it is alone."""
+    """Each run gives the same records as alone, bit by bit."""
     other = SET | {"run.iterations": 4, "run.seed": 7, "optimizer.type": "sgd"}
     alone = [list(map(as_json, rl.optimize("tiny.yaml", overrides=each))) for each in (SET, other)]
     runs = [rl.optimize("tiny.yaml", overrides=each) for each in (SET, other)]
@@ -146,7 +146,7 @@ def leave_by_an_interrupt(run: rl.Run) -> None:
 
 
 def leave_by_an_interrupt_at_work(run: rl.Run) -> None:
-    """It comes while the second iteration is at work, which is made whole, and is not lost."""
+    """Send an interrupt while the second iteration is at work. The run completes this iteration and keeps it."""
     write, seen = recording.MetricsWriter.write, list[int]()
 
     def interrupted(self: Any, record: rl.Record) -> None:
@@ -324,7 +324,7 @@ except KeyboardInterrupt:
 
 
 def test_an_interrupt_from_outside_keeps_the_result(experiment: Path) -> None:
-    """SIGINT of a terminal or a notebook, at any moment of any iteration."""
+    """SIGINT, as from a terminal or a notebook, may arrive at any moment of an iteration."""
     environment = {**os.environ, "PYTHONPATH": search_path(), "RESLRB_CACHE": str(experiment / "cache")}
     process = subprocess.Popen(
         [sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
@@ -361,7 +361,7 @@ def test_other_threads_iterate_too(experiment: Path) -> None:
 
 
 def test_a_run_can_be_watched(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A bar, and the figure that a notebook shows."""
+    """`live` shows a progress bar and draws a notebook's figure as a PNG."""
     from reslrb_cli.api import live
 
     run = rl.optimize("tiny.yaml", overrides=SET)
@@ -372,7 +372,7 @@ def test_a_run_can_be_watched(experiment: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_the_figure_is_shown_from_time_to_time(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At once, and at the end; one that fails ends nothing."""
+    """The figure appears at once and at the end. A failing figure does not end the run."""
     from reslrb_cli.api import live
 
     shown: list[bytes] = []

@@ -1,4 +1,4 @@
-"""What tests of commands share: a log that ends with each test, and a cache of their own."""
+"""Common setup for the tests of commands: each test has its own log handlers and its own cache."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ DRAWN: dict[tuple[str, str], str] = {}
 
 
 def drawn_once(made: Sequence[Curve], caption: str, label: str) -> str:
-    """The first diagram of its kind, for all that have something to show: to draw takes longer than these runs."""
+    """Return the first diagram that was drawn with this caption and label, for all sets of curves with data. Drawing
+    takes longer than these runs.
+    """
     if not any(len(curve.known()) for curve in made):
         return diagram(made, caption, label)
     if (caption, label) not in DRAWN:
@@ -29,7 +31,9 @@ def drawn_once(made: Sequence[Curve], caption: str, label: str) -> str:
 
 @pytest.fixture(autouse=True)
 def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A command logs to the standard error that it finds first, which the next test closes."""
+    """Clear the log handlers and set a separate cache. The handler would keep the standard error that the next test
+    closes.
+    """
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path_factory.mktemp("cache")))
     # tests/report looks at diagrams.
     monkeypatch.setattr(values, "diagram", drawn_once)
@@ -41,7 +45,7 @@ def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: py
 
 @pytest.fixture
 def optimize(llvm, tmp_path, monkeypatch, capsys, request):
-    """A function that runs `reslrb optimize tiny.yaml` and returns exit code, standard output and standard error."""
+    """Function that runs `reslrb optimize tiny.yaml` and returns the exit code, standard output and standard error."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
     if getattr(request, "param", None) != "real page":  # which takes longer than the run
@@ -60,7 +64,7 @@ def optimize(llvm, tmp_path, monkeypatch, capsys, request):
 
 @pytest.fixture
 def during(monkeypatch):
-    """A function that has `act(record)` called after each iteration."""
+    """Function that installs `act`, so that the command calls `act(record)` after each iteration."""
 
     def install(act):
         show = progress.Progress.show

@@ -1,4 +1,4 @@
-"""Scenes and photographs as they are found elsewhere: without ids, spelt as years ago, clipped."""
+"""Scenes and photographs as users find them: without ids, in old spelling, and with clipped pixels."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ FACES = ((0, 4, 1), (1, 4, 2), (2, 4, 3), (3, 4, 0), (0, 1, 2), (0, 2, 3))
 
 
 def write_studio(folder: Path) -> Path:
-    """Scene and what it names, its sky too; a variant must be set."""
+    """Write the studio scene with its files and its sky. A variant must be set."""
     _write_meshes(folder)
     _write_image(folder / "bumps.png", 16, 1)
     import mitsuba as mi
@@ -199,7 +199,7 @@ def write_studio(folder: Path) -> Path:
 
 
 def write_terrace(folder: Path) -> Path:
-    """The same of the terrace."""
+    """Write the terrace scene with its files. A variant must be set."""
     _write_meshes(folder)
     _write_image(folder / "tiles.png", 32, 3)
     (folder / "scene.xml").write_text(TERRACE)
@@ -250,7 +250,9 @@ SENSOR = """<sensor type="perspective">
 
 
 def cornell_box(size: int, extra: str = "", eyes: tuple[str, ...] = ("0, 0, 3.9",)) -> str:
-    """Mitsuba's Cornell box as XML, with a film of `size` squared for each eye, and `extra` elements."""
+    """Return Mitsuba's Cornell box as XML, with the `extra` elements. Each eye has a sensor with a film of `size` x
+    `size` pixels.
+    """
     import mitsuba as mi
 
     lines = [SENSOR.format(eye, size=size) for eye in eyes]
@@ -275,7 +277,7 @@ def cornell_box(size: int, extra: str = "", eyes: tuple[str, ...] = ("0, 0, 3.9"
 
 
 def write_noise(path: Path, width: int, height: int) -> Path:
-    """8 bits of nothing in particular; a variant must be set."""
+    """Write an 8-bit image of random pixels. A variant must be set."""
     import mitsuba as mi
 
     image = np.random.default_rng(3).uniform(0, 0.9, (height, width, 3)).astype(np.float32)
@@ -284,7 +286,7 @@ def write_noise(path: Path, width: int, height: int) -> Path:
 
 
 def write_photograph(folder: Path, size: int, spp: int, exposure: float = 1.0, extra: str = "") -> None:
-    """Put scene, photograph and `photo.yaml` into `folder`; a variant must be set."""
+    """Write the scene, the photograph and `photo.yaml` into `folder`. A variant must be set."""
     import mitsuba as mi
 
     (folder / "scene.xml").write_text(cornell_box(size, extra))

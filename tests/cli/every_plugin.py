@@ -1,7 +1,8 @@
-"""Every plugin that Mitsuba 3.9.1 ships, in a scene of its own, and what becomes of that: docs/plugins.md as data.
+"""Every plugin that Mitsuba 3.9.1 ships, in a separate scene, and how the program treats this scene. This module is
+docs/plugins.md as data.
 
-`python tests/cli/every_plugin.py` writes the page anew. Of each plugin there is one row at least, and one more for each
-place or form in which it is treated otherwise.
+`python tests/cli/every_plugin.py` writes the page again. Each plugin has at least one row. Each place or form of the
+plugin that is treated differently has another row.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ WHITE = '<bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.5, 0.4"/></b
 
 
 def film(inner: str = "", type: str = "hdrfilm", size: int = 16) -> str:
-    """A film, with a box filter unless `inner` brings one."""
+    """Return a film, with a box filter unless `inner` contains a filter."""
     rfilter = "" if "<rfilter" in inner else '<rfilter type="box"/>'
     return f"""<film type="{type}"><integer name="width" value="{size}"/><integer name="height" value="{size}"/>
     {inner}{rfilter}</film>"""
@@ -37,7 +38,7 @@ def film(inner: str = "", type: str = "hdrfilm", size: int = 16) -> str:
 
 def sensor(type: str = "perspective", inner: str = '<float name="fov" value="50"/>', on: str = "",
            place: str = PLACE) -> str:  # fmt: skip
-    """A sensor that looks at the scene."""
+    """Return a sensor that looks at the scene."""
     return f'<sensor type="{type}" id="camera">{place}{inner}{on or film()}</sensor>'
 
 
@@ -46,12 +47,15 @@ CAMERA = sensor()
 
 @dataclass(frozen=True)
 class Row:
-    """What becomes of a scene with a plugin.
+    """How the program treats a scene with a plugin.
 
-    `where` says in which place or form the plugin stands, `scene` is XML that is added to floor, lamp and sensor, or,
-    where that has its own, replaces lamp or sensor. `light` is why light paths (`reslrb`, `ptracer`) refuse it,
-    `camera` the same of `prb`; both are parts of what is printed. `loading` is the error of loading it, `mended` the
-    warning; `note` is for the page alone, and so is `without`, what light paths leave out.
+    - `where` names the place or form of the plugin.
+    - `scene` is XML that is added to the floor, the lamp and the sensor. A lamp or sensor in `scene` replaces the
+        default.
+    - `light` is the reason why light paths, for example of `reslrb` and `ptracer`, refuse the scene. `camera` is the
+        reason why `prb` refuses the scene. Both are parts of the printed message.
+    - `loading` is the error of loading the scene, and `mended` is the warning.
+    - `note` and `without` are used only for the page. `without` names the part that light paths leave out.
     """
 
     kind: str
@@ -67,54 +71,54 @@ class Row:
 
     @property
     def name(self) -> str:
-        """What a test of it is called."""
+        """Name of the row's test."""
         return f"{self.plugin} {self.where}".strip()
 
     @property
     def refused(self) -> bool:
-        """Whether no integrator takes it."""
+        """True if no integrator accepts the scene."""
         return bool(self.loading or (self.light and self.camera))
 
     def xml(self) -> str:
-        """The scene."""
+        """Return the scene's XML."""
         lamp = "" if 'id="lamp"' in self.scene else LIGHT.format(RADIANCE)
         camera = "" if "<sensor" in self.scene else CAMERA
         return f'<scene version="3.0.0">\n{camera}\n{FLOOR}\n{lamp}\n{self.scene}\n</scene>\n'
 
 
 def thing(bsdf: str, shape: str = "rectangle", more: str = "", place: str = '<rotate x="1" angle="-30"/>') -> str:
-    """Something to look at."""
+    """Return a shape with a BSDF."""
     return f'<shape type="{shape}" id="thing"><transform name="to_world">{place}</transform>{more}{bsdf}</shape>'
 
 
 def filed(shape: str, file: str, bsdf: str = WHITE) -> str:
-    """A shape from a file."""
+    """Return a shape read from a file."""
     return thing(bsdf, shape, f'<string name="filename" value="{file}"/>', '<scale value="0.6"/>')
 
 
 def bitmap(name: str, file: str = "texture.exr") -> str:
-    """A texture from a file."""
+    """Return a texture read from a file."""
     raw = '<boolean name="raw" value="true"/><string name="format" value="variant"/>'
     return f'<texture type="bitmap" name="{name}"><string name="filename" value="{file}"/>{raw}</texture>'
 
 
 def painted(texture: str) -> str:
-    """A thing whose reflectance is this."""
+    """Return a shape whose reflectance is `texture`."""
     return thing(f'<bsdf type="diffuse">{texture.format("reflectance")}</bsdf>')
 
 
 def lit(texture: str) -> str:
-    """A lamp whose radiance is this."""
+    """Return a lamp whose radiance is `texture`."""
     return LIGHT.format(texture.format("radiance"))
 
 
 def fog(inner: str = "", type: str = "homogeneous", name: str = "interior", bsdf: str = '<bsdf type="null"/>') -> str:
-    """A ball of a medium."""
+    """Return a sphere with a medium."""
     return f'<shape type="sphere" id="fog">{bsdf}<medium name="{name}" type="{type}">{inner}</medium></shape>'
 
 
 def phase(inner: str) -> str:
-    """A ball of a medium with this phase function."""
+    """Return a sphere filled with a medium that has this phase function."""
     return fog(inner)
 
 
@@ -328,7 +332,7 @@ FEW = (
 
 
 def write_files(folder: Path) -> None:
-    """Put what the scenes name into `folder`; a variant must be set."""
+    """Write the files that the scenes name into `folder`. A variant must be set."""
     import mitsuba as mi
     from mitsuba.python.tensor_io import write
 
@@ -431,7 +435,7 @@ without `-m long` it runs the refused plugins and a few others.
 
 
 def page() -> str:
-    """docs/plugins.md."""
+    """Return docs/plugins.md."""
     parts = [HEAD]
     for kind, heading in KINDS.items():
         parts.append(f"\n## {heading}\n\n| plugin | light paths | `prb` |\n|---|---|---|\n")

@@ -1,4 +1,6 @@
-"""Options that are `auto`, and `memory_budget`, in whole runs of a small scene: command line and manifest."""
+"""Options set to `auto`, and `memory_budget`, in whole runs of a small scene. The tests examine the command line and
+the manifest.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations:
 
 @pytest.fixture
 def experiment(llvm, tmp_path, monkeypatch):
-    """A folder with a scene and a configuration, the working directory in it, and a cache of its own."""
+    """Folder with a scene and a configuration. The folder is the working directory."""
     import mitsuba as mi
 
     mi.Bitmap(np.full((4, 4, 3), 0.6, dtype=np.float32)).write(str(tmp_path / "poster.exr"))
@@ -40,7 +42,7 @@ def optimize(capsys, *settings: str, verbose: bool = False) -> tuple[int, str]:
 
 
 def wide(*settings: str) -> list[str]:
-    """At 32x32: memory is that of paths."""
+    """Enlarge the film to 32x32, so that paths dominate the memory."""
     text = Path("scene.xml").read_text()
     Path("scene.xml").write_text(text.replace('name="width" value="16"', 'name="width" value="32"').replace(
         'name="height" value="16"', 'name="height" value="32"'))  # fmt: skip
@@ -48,7 +50,9 @@ def wide(*settings: str) -> list[str]:
 
 
 def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatch):
-    """Where a tenth of the run has no room for it, what is `auto` is decided by the scene; with more room it is not."""
+    """Without enough time for measuring in a tenth of the run, the scene decides the `auto` options. With more time,
+    measurements decide them.
+    """
     from reslrb_cli.optimization.autotune.race import Turns
 
     options = ["integrator={max_depth: 4}", "run.measuring=0.1", "run.iterations=3"]
@@ -91,7 +95,9 @@ def test_the_scene_decides_if_nothing_is_measured(experiment, light, parallel):
 
 
 def test_other_settings_are_another_situation(experiment):
-    """And what changes neither a step's samples nor what it differentiates is none."""
+    """A setting that changes neither a step's samples nor its derivatives, for example the run's name, keeps the
+    situation.
+    """
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization.assemble import assemble_scene
     from reslrb_cli.optimization.autotune.race import situation
@@ -177,7 +183,9 @@ def test_auto_is_not_an_option_of_the_plugin(llvm):
 
 
 def peaks_without_and_with(budget, capsys, *settings):
-    """Peaks in MiB of runs without a budget and with one, and the latter's plan; the losses agree."""
+    """Return the peaks in MiB of runs without and with a budget, and the memory plan of the second run. Both runs must
+    have about the same loss.
+    """
     peaks, losses = [], []
     for setting in ("null", budget):
         code, err = optimize(capsys, *settings, f"run.memory_budget={setting}")
@@ -216,7 +224,9 @@ def test_paths_use_no_memory_if_the_adjoint_is_known(experiment, capsys, estimat
 
 @pytest.mark.parametrize("estimator", a_few(["reservoir", "event"], ["reservoir"]))
 def test_a_weight_with_the_adjoint_works_in_a_whole_run(experiment, capsys, estimator):
-    """What is rendered or differentiated besides the steps (what light reaches, saved images) has to know it too."""
+    """Renderings and derivatives outside the steps, for example for the mask or saved images, must also support
+    `weight: adjoint`.
+    """
     code, err = optimize(capsys, f"integrator={{max_depth: 4, estimator: {estimator}, weight: adjoint}}")
     assert code == 0, err
     assert np.load(f"runs/box/parameters/{KEY}.mask.npy").all()
@@ -305,7 +315,7 @@ def test_counted_memory_of_a_path_matches_its_stored_state(experiment, monkeypat
 
 @taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "adjoint", ["batched", "correlated"])
 def test_all_sample_counts_share_kernels(experiment, estimator, adjoint):
-    """Kernels of a measurement would otherwise be compiled for nothing."""
+    """Otherwise, a measurement would compile kernels that the run does not use."""
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization.assemble import assemble
     from reslrb_cli.optimization.autotune import race

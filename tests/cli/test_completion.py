@@ -18,7 +18,7 @@ from reslrb_cli.config.yaml_text import format_location
 
 
 def offered(kind: type[ShellComplete], *words: str) -> list[tuple[str, str]]:
-    """Type and text of what a shell is offered for the last of the words, which is begun."""
+    """Return the types and texts of the candidates that a shell offers for the last, incomplete word."""
     shell = kind(main, {}, "reslrb", "_RESLRB_COMPLETE")
     return [(item.type, item.value) for item in shell.get_completions(list(words[:-1]), words[-1])]
 
@@ -58,7 +58,9 @@ def test_completed_keys_are_valid_overrides():
 
 
 def test_bash_completes():
-    """Evaluate the line of docs/commands.md in a bash, and call the function that it defines as Tab does."""
+    """A bash evaluates the line of docs/commands.md, and then calls the function that this line defines, as the Tab key
+    does.
+    """
     program = (
         'eval "$(_RESLRB_COMPLETE=bash_source reslrb)"\n'
         "COMP_WORDS=(reslrb optimize a.yaml --set run.sp) COMP_CWORD=4\n"

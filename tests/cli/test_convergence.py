@@ -45,7 +45,7 @@ def read(path: Path) -> list[dict]:
 
 
 def test_a_scene_end_to_end(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each exact method agrees with ptracer, and the error of averages falls as it should."""
+    """The bias of each method stays below its limit, and the error of averages falls at the expected rate."""
     names = ["ptracer", "reslrb:reservoir(capacity=2)"]
     args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16"]
     (folder / "out").mkdir()

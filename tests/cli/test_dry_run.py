@@ -1,4 +1,4 @@
-"""`optimize --dry-run`: what it prints agrees with the run that follows, and it writes no folder."""
+"""`optimize --dry-run` agrees with the run that follows, and writes no run folder."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_memory_matches_the_run(experiment: Path, capsys: pytest.CaptureFixture[
 
 
 def test_long_steps_are_extrapolated_from_shorter_ones(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By steps whose cost is known: as much as a constant and so much a sample."""
+    """The measured steps have a known cost: a constant, plus a fixed amount for each sample."""
     taken = []
 
     def measure(problem: object, spp: int) -> trial.Steps:
@@ -88,7 +88,9 @@ def test_long_steps_are_extrapolated_from_shorter_ones(experiment: Path, monkeyp
 
 
 def test_each_trial_starts_at_the_initial_values(experiment: Path) -> None:
-    """Else texels that a trial has moved to 0 would have the next one trace, and keep, what the run does not need."""
+    """A trial may move texels to 0. If the next trial started there, it would trace and store more than the run
+    needs.
+    """
     problem = assemble(load(experiment / "tiny.yaml", [*SETS, "optimizer.learning_rate=0.4"]))
     problem = replace(problem, truth={})
     begin = {key: value.copy() for key, value in problem.values().items()}
@@ -114,7 +116,9 @@ def test_steps_are_timed_without_compilation(experiment: Path) -> None:
 def test_work_before_the_iterations_is_measured_once(
     experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keeps: bool
 ) -> None:
-    """Decisions are measured now, for the run that follows; without a cache the run measures them again."""
+    """A dry run measures the decisions and stores them for the run that follows. Without a cache, the run measures them
+    again.
+    """
     cache = experiment / "cache"
     monkeypatch.setenv("RESLRB_CACHE", str(cache))
     if not keeps:

@@ -1,4 +1,4 @@
-"""Scenes and photographs from elsewhere, through the commands that somebody would try on them."""
+"""Scenes and photographs from other sources, through the commands that a user would try on them."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ COMMANDS = {
 
 @pytest.fixture(params=SCENES)
 def name_scenes_from_elsewhere(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A scene in `scene.xml` of the working directory, and 8 bits of its image, brighter by a half, in `photo.png`."""
+    """Name of a scene from another source. The working directory holds its `scene.xml` and `photo.png`, an 8-bit image
+    that is 1.5 times as bright as the scene.
+    """
     write, size = SCENES[request.param]
     scene = load_scene(write(tmp_path), size=size)
     image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": -1}), spp=64))
@@ -156,7 +158,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def keys_of_run(folder: Path) -> dict[str, list[str]]:
-    """The keys in each of a run's records, in their order."""
+    """Return the keys in each of a run's records, in their order."""
     with (
         np.load(folder / "checkpoint" / "state.npz") as state,
         np.load(folder / "parameters" / "parameters.npz") as found,
@@ -232,7 +234,7 @@ def test_the_other_commands_accept_the_names(folder):
 
 
 def optimize(*given: str) -> tuple[dict[str, np.ndarray], dict]:
-    """Recovered values, and the manifest."""
+    """Return recovered values and the manifest."""
     sets = settings(*given)
     with pytest.raises(SystemExit) as end:
         main(["optimize", "photo.yaml", "--force", *sets])
@@ -244,13 +246,15 @@ def optimize(*given: str) -> tuple[dict[str, np.ndarray], dict]:
 
 
 def errors(values: dict[str, np.ndarray]) -> dict[str, float]:
-    """The greatest error of any channel, by wall."""
+    """Return the largest error of any channel for each wall."""
     return {key: float(np.abs(values[key] - true).max()) for key, true in WALLS.items()}
 
 
 @pytest.mark.long
 def test_walls_beside_a_clipped_lamp(llvm, tmp_path, monkeypatch):
-    """At exposure 1, by `l2`, with the lamp in view: the mask makes the difference between right and black walls."""
+    """The photograph has exposure 1, the loss is `l2`, and the lamp is in view. With the mask, the walls are correct.
+    Without the mask, the walls are wrong.
+    """
     write_photograph(tmp_path, 64, 1024)
     monkeypatch.chdir(tmp_path)
     values, manifest = optimize()
@@ -264,7 +268,9 @@ def test_walls_beside_a_clipped_lamp(llvm, tmp_path, monkeypatch):
 
 @pytest.mark.long
 def test_walls_of_a_photograph_with_unknown_exposure(llvm, tmp_path, monkeypatch):
-    """At an exposure of 0.8 that is recovered with the walls; taken for 1, the same photograph makes them darker."""
+    """The run recovers the exposure of 0.8 together with the walls. If the run assumes an exposure of 1, the same
+    photograph gives walls that are too dark.
+    """
     write_photograph(tmp_path, 32, 1024, exposure=0.8)
     monkeypatch.chdir(tmp_path)
     values, manifest = optimize("target.exposure=auto", "integrator.estimator=stack")
@@ -279,7 +285,9 @@ def test_walls_of_a_photograph_with_unknown_exposure(llvm, tmp_path, monkeypatch
 
 @pytest.mark.usefixtures("llvm")
 def test_invisible_texels_are_told_from_settled_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a truth, too. They light the lamp's face, and by it what is seen: a gradient, and no colour of theirs."""
+    """No true value is known. Invisible texels light the lamp's face, and so the visible texels. They have a gradient,
+    but their colours remain unknown.
+    """
     monkeypatch.chdir(tmp_path)
     tiny.write_experiment(tmp_path)
     scene = tiny.SCENE.replace('name="fov" value="50"', 'name="fov" value="14.25"')  # the middle 2 x 2 of 4 x 4 texels
@@ -335,7 +343,7 @@ def wall(place: str, bsdf: str) -> str:
 
 
 def room(left: list[float] | str, right: list[float] | str, seat: list[float] | str) -> str:
-    """A room that is open to the camera, with a mirror and a lamp in view, and no id anywhere."""
+    """Return a room that is open to the camera. A mirror and a lamp are in view, and no element has an id."""
     shapes = [
         wall('<rotate x="1" angle="-90"/><translate y="-1"/>', paint("0.5, 0.45, 0.4")),
         wall('<rotate x="1" angle="90"/><translate y="1"/>', paint("0.8, 0.8, 0.8")),
@@ -367,7 +375,7 @@ def room(left: list[float] | str, right: list[float] | str, seat: list[float] | 
 
 
 def write_room(folder: Path, size: int, spp: int) -> None:
-    """`room/scene.xml` with the guesses, and `photo.png`, 8 bits of the true room, by a camera's light."""
+    """Write `room/scene.xml` with the guesses, and `photo.png`, an 8-bit image of the true room rendered by `path`."""
     (folder / "room").mkdir()
     (folder / "room/scene.xml").write_text(room(GUESS, GUESS, GUESS))
     true = room(LEFT, RIGHT, SEAT).replace('value="256"', f'value="{size}"')
@@ -377,7 +385,7 @@ def write_room(folder: Path, size: int, spp: int) -> None:
 
 
 def keep(file: Path, keys: list[str]) -> None:
-    """Take out of a configuration's parameters all but `keys`: the others are known."""
+    """Remove all parameters except `keys` from a configuration. The other values are known."""
     lines = file.read_text().splitlines()
     entries = [line for line in lines if re.match(r"  - \{key: ", line)]
     assert all(any(key in line for line in entries) for key in keys), entries
@@ -386,7 +394,9 @@ def keep(file: Path, keys: list[str]) -> None:
 
 
 def misses(run: Path, most: float = COLOUR, colours: Mapping[str, list[float]] = TRUE) -> list[str]:
-    """What a run missed: true `colours` by more than `most`, and the exposure, relative to the truth."""
+    """Return the keys whose colours miss the true `colours` by more than `most`, and a wrong exposure. Errors are
+    relative to the truth.
+    """
     recovered = json.loads((run / "parameters/parameters.json").read_text())
     found = []
     for key, true in colours.items():
@@ -402,7 +412,9 @@ def misses(run: Path, most: float = COLOUR, colours: Mapping[str, list[float]] =
 
 
 def three_commands(*changes: str) -> Path:
-    """The run: `init`, an edit that leaves what is unknown, and `optimize` with what `init` wrote but for `changes`."""
+    """Run `init`, remove the known parameters, and run `optimize` with `changes` to the generated configuration. Return
+    the run's folder.
+    """
     done("init", "room/scene.xml", "--target", "photo.png")
     keep(Path("room.yaml"), list(TRUE))
     done("optimize", "room.yaml", *settings(*changes))
@@ -410,7 +422,7 @@ def three_commands(*changes: str) -> Path:
 
 
 def check_mask(run: Path) -> None:
-    """Lamp and mirror are in view, and left out of the loss."""
+    """Check that the mask leaves out the lamp and the mirror in view."""
     manifest = read_manifest(run)
     assert manifest is not None
     [view] = manifest["views"]
@@ -437,7 +449,7 @@ def test_colours_and_exposure_from_a_photograph(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.usefixtures("llvm")
 def test_the_same_in_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of fewer pixels and fewer, larger iterations."""
+    """The run has fewer pixels, and fewer but larger iterations."""
     write_room(tmp_path, 20, 1024)
     monkeypatch.chdir(tmp_path)
     few = ("run.iterations=60", "run.spp=64", "run.final_spp=8", "run.certainty=false", "integrator.estimator=stack")
@@ -456,7 +468,7 @@ WIDTH, HEIGHT, SPP, PARTS = 320, 180, 128, 4
 
 
 def photograph_room(scene_file: Path, path: Path) -> None:
-    """The room in its true colours, by camera paths of any length."""
+    """Render the room in its true colours with camera paths of any length, and write the image."""
     scene = load_scene(scene_file, size=(WIDTH, HEIGHT))
     params = mi.traverse(scene)
     for key, true in TRUE_OF_ROOM.items():

@@ -1,4 +1,6 @@
-"""How a run ends, of itself, by a signal, or because its folder goes: nothing lost, and the truth in the folder."""
+"""Every way in which a run ends: by itself, by a signal, or because its folder disappears. Nothing is lost, and the
+folder states how the run ended.
+"""
 
 from __future__ import annotations
 
@@ -189,7 +191,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def start(script: str, *, shell: str = "", argv0: str = "") -> subprocess.Popen[str]:
-    """A process that runs `script` and has printed `ready`."""
+    """Start a process that runs `script`, and wait until it prints `ready`."""
     command = [sys.executable, "-c", f"import os, signal, sys, threading, time\n{script}"]
     if shell:
         command = ["sh", "-c", f'{shell}; exec "$@"', "sh", *command]
@@ -246,7 +248,7 @@ def test_other_threads_are_unaffected():
 
 
 def test_a_signal_during_a_recording_does_not_break_it(llvm):
-    """Raised as an exception there, it becomes an error that looks like a call that cannot be recorded."""
+    """If the signal raised an exception there, the resulting error would look like a call that cannot be recorded."""
     import drjit as dr
     import mitsuba as mi
 
@@ -294,7 +296,7 @@ with Interrupts(last_act=act, notice="stopping"):
 
 
 def test_two_signals_during_a_kernel_count_as_two():
-    """Python's own handler would see one, when the kernel has ended."""
+    """Python's own handler would count only one signal, after the end of the kernel."""
     script = (
         WITHIN
         + """
@@ -423,7 +425,9 @@ def test_removing_the_folder_ends_the_run(optimize, during):
 
 
 def test_removing_the_contents_of_a_folder_keeps_what_it_can(optimize, during):
-    """As by `rm -rf` that has not come to the folder itself: what is then written is what the last line names."""
+    """The test imitates an `rm -rf` that has not yet removed the folder itself. The last line names the files that the
+    run writes afterwards.
+    """
 
     def remove(record):
         if record.iteration == 1:

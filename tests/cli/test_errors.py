@@ -1,4 +1,4 @@
-"""Errors of commands: one line, its exit code; sizes that no machine holds are refused at once."""
+"""Errors of commands are one line with a specific exit code. Sizes that no machine can hold are refused at once."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ COMMANDS = main.list_commands(click.Context(main))
 
 
 def call(*args: str) -> int:
-    """Runs the command line in this process and returns its exit code."""
+    """Run the command line in this process and return its exit code."""
     with pytest.raises(SystemExit) as ended:
         main(list(args), prog_name="reslrb")
     assert isinstance(ended.value.code, int)
@@ -48,7 +48,7 @@ def call(*args: str) -> int:
 
 @pytest.fixture
 def raising(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Makes every command raise the error that a test puts into `failing.error`."""
+    """Make every command raise the error that a test puts into `failing`."""
 
     @click.command("failing")
     def command() -> None:
@@ -141,7 +141,9 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
 
 
 def test_help_of_a_command_loads_nothing_heavy() -> None:
-    """Whatever takes a tenth of a second to import is imported where it is called. The first that loads it is named."""
+    """Modules that take a tenth of a second to import are imported where they are used. On failure, the first command
+    with a module loaded it.
+    """
     script = (
         "import contextlib, json, sys\nfrom reslrb_cli.cli import main\nfound = {}\n"
         "for name in sys.argv[1:]:\n"
@@ -220,7 +222,7 @@ def experiment(tmp_path: Path) -> Path:
 
 
 def refused(folder: Path, *sets: str) -> tuple[str, float]:
-    """The one line that `optimize` ends with, exit code 2, and the seconds of the processor that it took."""
+    """Run `optimize`, check for exit code 2, and return the single error line and the processor time in seconds."""
     import resource
 
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
@@ -249,7 +251,9 @@ def test_refused_before_mitsuba_is_loaded(case: str, experiment: Path) -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_refused_within_seconds(experiment: Path) -> None:
-    """The slowest way: the film's size stands in the scene's file, so that Mitsuba and the scene are loaded first."""
+    """The size of the film is in the scene file, so Mitsuba and the scene are loaded before the refusal. This case is
+    the slowest.
+    """
     (experiment / "scene.xml").write_text(SCENE.replace('name="width" value="8"', 'name="width" value="65536"'))
     line, seconds = refused(experiment, "run.spp=1000000")
     assert line.startswith("tiny.yaml: run.spp: 1000000 makes ")
@@ -271,7 +275,7 @@ def obstacle(folder: Path, *sets: str) -> str:
 
 @pytest.fixture
 def little(monkeypatch: pytest.MonkeyPatch) -> int:
-    """A machine on which so many bytes are free."""
+    """Free bytes of a simulated machine with little memory."""
     free = 2**30
     monkeypatch.setattr(room, "free_bytes", lambda variant: free)
     return free
@@ -291,7 +295,7 @@ def test_requirements_beyond_the_free_memory(experiment: Path, little: int) -> N
 
 @pytest.mark.usefixtures("llvm")
 def test_a_step_beyond_the_free_memory(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the estimate that `memory_budget` goes by, of which a step takes a part at the least."""
+    """The check uses the estimate of `memory_budget`. A step takes at least a share of this estimate."""
 
     def find(*sets: str) -> None:
         room.fit_memory(assemble_scene(load(experiment / "tiny.yaml", ["scene.size=[512, 512]", "run.spp=64", *sets])))
@@ -318,7 +322,7 @@ def test_a_step_beyond_the_free_memory(experiment: Path, monkeypatch: pytest.Mon
 
 @pytest.fixture
 def unbuilt(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is said has to be said before anything is made of the scene."""
+    """Make the building of a scene fail. The program must print its message before it builds the scene."""
 
     def never(*args: object) -> None:
         raise AssertionError("the scene is built")
@@ -435,7 +439,7 @@ def test_large_but_fitting_sizes_are_accepted(sets: list[str], experiment: Path)
 
 @pytest.mark.usefixtures("llvm")
 def test_a_too_large_texture(experiment: Path) -> None:
-    """Its head says that it is large, and it takes no room on the disk."""
+    """The texture's header states the large size. The file takes no space on the disk."""
     import struct
 
     attributes = b"dataWindow\0box2i\0" + struct.pack("<i4i", 16, 0, 0, 59999, 59999)

@@ -1,4 +1,6 @@
-"""Every plugin of Mitsuba's, in a scene of its own: it works, or is refused in one line, as every_plugin.py says."""
+"""Every plugin of Mitsuba in a separate scene. The plugin works or is refused in one line, as every_plugin.py
+states.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,7 @@ run: {iterations: 1, spp: 4}
 
 @pytest.fixture(scope="module")
 def files(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the scenes name."""
+    """Folder with the files that scenes name."""
     folder = tmp_path_factory.mktemp("files")
     write_files(folder)
     return folder
@@ -44,7 +46,7 @@ def files(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory, with all of that in it."""
+    """Working directory with links to all files that the scenes name."""
     for file in files.iterdir():
         (tmp_path / file.name).symlink_to(file)
     monkeypatch.chdir(tmp_path)
@@ -53,7 +55,7 @@ def folder(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 
 def said(*arguments: object, code: int = 0) -> str:
-    """What a command said, as one line; it is to end with this exit code."""
+    """Run a command, check its exit code, and return its output as one line."""
     result = reslrb(*arguments)
     text = " ".join(result.output.split())
     ended, error = result.exit_code, repr(result.exception)
@@ -65,7 +67,7 @@ def said(*arguments: object, code: int = 0) -> str:
 
 
 def check(row: Row, folder: Path, to_the_end: bool) -> None:
-    """Take the row's scene through the commands, and see that each says what the row says."""
+    """Run the commands on the row's scene, and check that each prints what the row states."""
     (folder / "scene.xml").write_text(row.xml())
     if row.loading:
         for command in ("inspect", "init"):

@@ -1,4 +1,4 @@
-"""What goes on from a run: `initial: {run: RUN}`, `render --run RUN`, `export`."""
+"""Uses of a finished run: `initial: {run: RUN}`, `render --run RUN`, `export`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PARAMETERS = f"""[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAM
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
-    """An experiment, and its run in `runs/tiny`."""
+    """Folder with an experiment and its run in `runs/tiny`."""
     folder = tmp_path_factory.mktemp("from-a-run")
     tiny.write_experiment(folder)
     config = (folder / "tiny.yaml").read_text()
@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
 
 
 def start(folder: Path, parameters: str) -> dict[str, np.ndarray]:
-    """The values with which an optimisation of these `parameters` would begin."""
+    """Return the values with which an optimisation of these `parameters` would begin."""
     return assemble_scene(load(folder / "tiny.yaml", [f"parameters={parameters}"])).values()
 
 
@@ -85,7 +85,7 @@ def test_values_of_a_run_respect_the_bounds(folder: Path) -> None:
 
 
 def read_into(folder: Path, run: str, texture: np.ndarray) -> None:
-    """Start a scene whose own texture is `texture` from a run."""
+    """Load a scene, set its texture to `texture`, and start from a run."""
     scene = load_scene(folder / "scene.xml")
     params = mi.traverse(scene)
     params[tiny.KEY] = mi.TensorXf(texture)
@@ -248,7 +248,7 @@ EYES = ((-0.8, 0.0, 3.5), (0.9, 0.5, 3.2))
 
 
 def look_at_origin(eye: tuple[float, ...]) -> list[list[float]]:
-    """A camera's pose in `transforms.json`: it looks along its -z, with y upwards."""
+    """Return a camera's pose for `transforms.json`. The camera looks along its -z, with y upwards."""
     z = np.array(eye) / np.linalg.norm(eye)
     x = np.cross([0, 1, 0], z)
     x /= np.linalg.norm(x)
@@ -269,7 +269,7 @@ def write_sheet(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
-    """A finished run with two cameras, `left` and `right`, whose images are of a sheet that bulges."""
+    """Folder of a finished run with two cameras, `left` and `right`. The run recovers the relief of a sheet."""
     folder = tmp_path_factory.mktemp("other-runs")
     write_sheet(folder / "sheet.obj")
     (folder / "scene.xml").write_text(SCENE)

@@ -1,4 +1,4 @@
-"""What a run says and does where silhouettes and edges of shadows are missing in the derivative of what it moves."""
+"""Messages and behaviour of a run that moves a parameter whose derivative lacks silhouettes and shadow edges."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ ACCEPT = "run.accept_incomplete=true"
 
 @pytest.fixture(scope="module")
 def experiment(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The configuration; in its target the box is 0.25 further along x."""
+    """Path of the configuration. In the target, the box is 0.25 further along x."""
     import mitsuba as mi
 
     folder = tmp_path_factory.mktemp("box")
@@ -55,7 +55,7 @@ def experiment(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(experiment: Path) -> tuple[str, Path]:
-    """What a run says that was told to go on all the same, and its folder."""
+    """Output and folder of a run that accepts an incomplete derivative."""
     folder = experiment.parent / "runs"
     return done("optimize", experiment, *settings(f"run.output={folder}", ACCEPT)).output, folder / "box"
 
@@ -96,14 +96,16 @@ def test_a_continued_run_remembers_the_missing_share(run: tuple[str, Path]):
 
 
 def test_an_unmeasured_share_is_reported(experiment: Path):
-    """Also by a dry run."""
+    """A dry run reports an unmeasured share."""
     result = done("optimize", experiment, "--dry-run", *settings("run.measuring=0"))
     assert "box.x: the derivative lacks silhouettes and shadow edges; their share was not measured" in result.output
     assert "--set integrator.type=prb_projective includes all of it" in result.output
 
 
 def test_light_without_edges_has_a_complete_derivative(llvm: str, tmp_path: Path):
-    """A spot lamp whose light ends smoothly, through glass: its caustic is all in the derivative."""
+    """The light of a spot lamp falls off smoothly and passes through glass. The derivative contains the whole
+    caustic.
+    """
     heights = "parameters=[{motion: {of: lamp, free: [translation]}}, {heightmap: {mesh: slab, resolution: [5, 4]}}, "
     heights += "{key: floor.bsdf.reflectance.value}]"
     path = glass.write_experiment(tmp_path)
@@ -117,7 +119,7 @@ def test_light_without_edges_has_a_complete_derivative(llvm: str, tmp_path: Path
 
 
 def test_shares_have_standard_errors():
-    """The share of samples with known means is right on average, and scatters by its standard error."""
+    """Samples with known means give the right share on average. The scatter of the share matches its standard error."""
     random, found = np.random.default_rng(1), []
     for _ in range(400):
         whole = np.array([4.0, 0.0]) + random.normal(size=(8, 2))
@@ -150,7 +152,7 @@ def test_consequences_of_a_share(found: MissingRecord, incomplete: bool, refused
 
 
 def test_a_rising_loss_is_explained_by_the_missing_part():
-    """No lower rate is proposed, of other parameters that still move either."""
+    """The program then proposes no lower rate, not even for other parameters that still move."""
     level = {"start": {"mean": 1.0, "error": 0.01}, "end": {"mean": 2.0, "error": 0.01}, "change": "rose"}
     moving = {"verdict": "still moving", "shares": {"still moving": 1.0}, "moved": 0.1, "rate": 0.01, "reach": 10.0}
     lacking = {"verdict": "derivative incomplete", "shares": {"derivative incomplete": 1.0}}

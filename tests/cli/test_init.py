@@ -1,4 +1,4 @@
-"""`init`: a configuration that `optimize` takes, from a scene and a photograph."""
+"""`init` writes a configuration for `optimize` from a scene and a photograph."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A scene in a folder `room` of the working directory."""
+    """Working directory with a scene in its folder `room`."""
     (tmp_path / "room").mkdir()
     tiny.write_experiment(tmp_path / "room")
     (tmp_path / "room/tiny.yaml").unlink()
@@ -128,7 +128,7 @@ def test_exposure_is_recovered_if_the_photograph_clips(folder: Path) -> None:
 
 
 def test_an_8_bit_texture_is_offered_recovered_and_exported(folder: Path) -> None:
-    """As most textures are: read as floats while loading, and the scene's file stays as it is."""
+    """Most textures have 8 bits. They are read as floats while loading, and the scene file does not change."""
     pixels = np.random.default_rng(6).integers(0, 256, (4, 4, 3), dtype=np.uint8)
     mi.Bitmap(pixels).write(str(folder / "room/poster.png"))
     scene = folder / "room/scene.xml"
@@ -229,7 +229,7 @@ RECOVERED = {
 
 
 def write_bulb(folder: Path, name: str) -> None:
-    """`bulb.xml` with wrong values, and `bulb.exr` of it with right ones."""
+    """Write `bulb.xml` with wrong values, and `bulb.exr`, the scene's image with the right values."""
     wrong, right, _ = RECOVERED[name]
     (folder / "bulb.xml").write_text(BULB.format(plate=wrong, radiance=WRONG))
     (folder / "right.xml").write_text(BULB.format(plate=right, radiance=RIGHT))
@@ -240,7 +240,9 @@ def write_bulb(folder: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", a_few(RECOVERED, ["a lamp and a wall"]))
 def test_the_generated_configuration_recovers_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Unedited, within 5 %: the lamp is to be far brighter than it is, in a unit that no learning rate can know."""
+    """The unedited configuration is accurate within 5 %. The lamp must become far brighter. No learning rate can
+    anticipate the lamp's unit.
+    """
     monkeypatch.chdir(tmp_path)
     write_bulb(tmp_path, name)
     assert reslrb("init", "bulb.xml", "--target", "bulb.exr").exit_code == 0
@@ -284,7 +286,7 @@ def test_lamps_of_a_clipped_photograph_are_left_out(tmp_path: Path, monkeypatch:
 
 
 def test_only_the_front_of_a_lamp_is_in_view(tmp_path: Path) -> None:
-    """The back of an area light is dark, whatever it emits."""
+    """The back of an area light is dark at any radiance."""
     shares = []
     for angle in (0, 180):
         lamp = '<shape type="rectangle" id="panel"><transform name="to_world"><scale value="0.5"/>'
@@ -343,7 +345,7 @@ def test_one_of_several_sensors_is_named(choices: Path) -> None:
 
 
 def test_a_photograph_is_oriented_as_a_person_sees_it(choices: Path) -> None:
-    """A phone that was held upright writes lying pixels, and EXIF beside them."""
+    """A phone that is held upright stores landscape pixels and an EXIF orientation."""
     from PIL import Image, ImageOps  # comes with matplotlib
 
     def photograph(width: int, height: int, orientation: int) -> None:
@@ -438,7 +440,7 @@ def test_emitters_without_samples_are_left_to_camera_paths(tmp_path: Path, monke
 
 
 def test_the_reason_for_camera_paths_is_given(choices: Path) -> None:
-    """In the file, in comments that are left whole, and where it is called."""
+    """`init` prints the reason, and writes the reason as a complete comment into the file."""
     (choices / "hall.xml").write_text(CHOICES.replace('"perspective" id="floor"', '"orthographic" id="the # floor"'))
     made = reslrb("init", "hall.xml")
     reason = "sensor the # floor is a OrthographicCamera; light paths connect to `perspective` and `thinlens` sensors"

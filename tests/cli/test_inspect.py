@@ -1,4 +1,4 @@
-"""`reslrb inspect` shows what a step is planned to do."""
+"""`reslrb inspect` shows the plan for a step."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ TINY = ["--set", "scene.options={resx: 16, resy: 16}", "--set", "integrator.max_
 
 
 def inspect(*arguments: str) -> str:
-    """What the command prints."""
+    """Return the output of `inspect`."""
     result = CliRunner().invoke(main, ["inspect", str(CONFIG), *TINY, *arguments])
     assert result.exit_code == 0, result.output
     return result.stdout
 
 
 def plan_lines(text: str) -> list[str]:
-    """The lines below `plan`."""
+    """Return the lines below `plan`."""
     lines = text.splitlines()
     return lines[lines.index("plan") + 1 : lines.index("parameters")]
 
@@ -70,7 +70,7 @@ SCENE = """<scene version="3.0.0">
 
 @pytest.fixture
 def scene(tmp_path, monkeypatch):
-    """A scene file without ids at its shapes and lights, in the working directory."""
+    """Path of a scene file in the working directory. Its shapes and lights have no ids."""
     import mitsuba as mi
 
     mi.Bitmap(np.full((4, 4, 3), 99, np.uint8)).write(str(tmp_path / "8bit.png"))
@@ -82,7 +82,7 @@ def scene(tmp_path, monkeypatch):
 
 
 def lines_of(*arguments: str) -> list[str]:
-    """What the command prints, line by line, blanks apart."""
+    """Return the output lines of `inspect`, with single blanks."""
     result = CliRunner().invoke(main, ["inspect", *arguments])
     assert result.exit_code == 0, result.output
     return [" ".join(line.split()) for line in result.stdout.splitlines()]
@@ -233,7 +233,7 @@ STIFF = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 
 
 def conditioning(*arguments: str) -> str:
-    """What `inspect --conditioning` prints of the stiff lamp, small."""
+    """Return the output of `inspect --conditioning` for a small stiff lamp."""
     small = ["scene.options={resx: 12, resy: 12}", "integrator={max_depth: 2}", "run.spp=32", "target.render.spp=64"]
     sets = [word for each in small for word in ("--set", each)]
     result = CliRunner().invoke(main, ["inspect", str(STIFF), "--conditioning", *sets, *arguments])

@@ -1,4 +1,4 @@
-"""Planted faults that are not finite: what a run does, and `inspect --nonfinite` of it."""
+"""Planted faults that give non-finite values: the behaviour of the run, and of `inspect --nonfinite` on the run."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ KEY = "poster.reflectance.value"
 
 @pytest.fixture
 def spoilt_experiment(llvm, tmp_path, monkeypatch):
-    """A folder with a scene, textures, a target and a configuration, and the working directory in it."""
+    """Working directory with a scene, textures, a target and a configuration."""
     import mitsuba as mi
 
     wall = np.full((8, 8, 3), 0.5, np.float32)
@@ -66,7 +66,7 @@ def spoilt_experiment(llvm, tmp_path, monkeypatch):
 
 
 def reslrb_nonfinite(capsys, *args):
-    """Run the command line in this process; return exit code, standard output and standard error."""
+    """Run the command line in this process, and return the exit code, standard output and standard error."""
     with pytest.raises(SystemExit) as end:
         main.main([str(arg) for arg in args])
     out, err = capsys.readouterr()
@@ -74,7 +74,7 @@ def reslrb_nonfinite(capsys, *args):
 
 
 def optimize(capsys, *sets, code=5):
-    """A run that ends with this code; its standard output and error."""
+    """Run `optimize`, check the exit code, and return its output and errors."""
     arguments = [argument for setting in sets for argument in ("--set", setting)]
     found, out, err = reslrb_nonfinite(capsys, "optimize", "config.yaml", *arguments)
     assert found == code, err
@@ -83,7 +83,7 @@ def optimize(capsys, *sets, code=5):
 
 
 def inspect(capsys, err):
-    """What the command that stands in `err` finds, as JSON."""
+    """Run the `inspect` command in `err`, and return iteration, offenders and text."""
     [command] = set(re.findall(r"where: (reslrb inspect .* --nonfinite)", err))
     program, *arguments = shlex.split(command)
     assert program == "reslrb"
@@ -145,7 +145,7 @@ def test_an_overflowing_sum(spoilt_experiment, capsys):
 
 
 def test_a_non_finite_derivative(spoilt_experiment, capsys):
-    """A reflectance of 0.5 + sqrt(x) at x = 0."""
+    """The reflectance is 0.5 + sqrt(x), and x is 0."""
     _register_root()
     Path("scene.xml").write_text(SCENE.replace("REFLECTANCE", '<texture type="root" name="reflectance"/>'))
     _, err = optimize(capsys, STOP, "parameters=[{key: poster.reflectance.x, initial: 0.0, bounds: [0, 1]}]")
@@ -156,7 +156,7 @@ def test_a_non_finite_derivative(spoilt_experiment, capsys):
 
 
 def test_the_replay_uses_the_parameters_of_that_iteration(spoilt_experiment, capsys):
-    """A reflectance that is not a number once x has moved by more than 0.015, in iteration 2."""
+    """The reflectance is NaN once x has moved by more than 0.015, which happens in iteration 2."""
     import drjit as dr
 
     _register_root(lambda x: dr.select(dr.abs(x - 0.5) > 0.015, dr.nan, x))
@@ -194,7 +194,7 @@ def _register_root(function=None):
 
 
 def root_of_pixel(image, target, weights=None):
-    """A loss whose value is finite and whose derivative is not, in one entry."""
+    """Return a loss with a finite value. One entry of its derivative is not finite."""
     import drjit as dr
 
     index = (3 * 8 + 5) * 3 + 1
@@ -217,7 +217,7 @@ def test_a_loss_with_a_non_finite_derivative(spoilt_experiment, capsys, monkeypa
 
 
 def test_finished_work_is_kept(spoilt_experiment, capsys, monkeypatch):
-    """A fault in the second iteration: the run folder is whole, and the parameters are those of then."""
+    """After a fault in the second iteration, the run folder is complete and holds the parameters of that iteration."""
     calls = []
 
     def sometimes(image, target, weights=None):
@@ -280,7 +280,9 @@ def test_without_a_fault_there_is_nothing_to_show(spoilt_experiment, capsys):
 
 
 def test_the_step_of_the_run_is_traced_again(spoilt_experiment, capsys):
-    """Its files have to be those of the run, its state whole, and its settings are its own."""
+    """The replay needs the files and the complete state of the run. The replay uses the run's own settings and refuses
+    `--set`.
+    """
     optimize(capsys, STOP, "scene.options={wall: spoilt.exr}")
     command = ("inspect", "runs/config/config.yaml", "--nonfinite")
     code, _, err = reslrb_nonfinite(capsys, *command, "--set", "run.spp=4")
@@ -301,7 +303,7 @@ def test_the_step_of_the_run_is_traced_again(spoilt_experiment, capsys):
 
 @pytest.mark.parametrize("sequence", ["independent", "low_discrepancy", "auto"])
 def test_paths_use_the_sequence_of_the_run(spoilt_experiment, capsys, sequence):
-    """Where it was measured, of the sequence that was measured to pay."""
+    """If the sequence was measured, the paths use the sequence that the measurement chose."""
     sets = ("scene.options={wall: spoilt.exr}", f"integrator.sequence={sequence}", "run.measuring=1000")
     optimize(capsys, STOP, *sets)
     problem, _ = problem_before_nonfinite(Path("runs/config"), print)
@@ -313,7 +315,7 @@ def test_paths_use_the_sequence_of_the_run(spoilt_experiment, capsys, sequence):
 
 
 def test_a_clamp_reports_its_bias(spoilt_experiment, capsys):
-    """At 1 sample per pixel gradients scatter: with k = 1 the clamp acts."""
+    """At 1 sample per pixel the gradients are noisy. With k = 1 the clamp takes effect."""
     sets = ("optimizer.clamp_gradient=1", "run.spp=1", "run.iterations=6")
     out, _ = optimize(capsys, *sets, code=0)
     tally = manifest()["results"]["clamped"]
@@ -359,7 +361,7 @@ def test_other_paths_from_the_sensor_are_not_checked(spoilt_experiment, capsys):
 
 
 def test_visible_emitters_are_checked(spoilt_experiment, capsys):
-    """The lamp, turned towards the camera beside the poster, at a depth of 1: there are no light paths at all."""
+    """The lamp in front of the poster faces the camera. At a depth of 1 there are no light paths."""
     at_camera = SCENE.replace('<rotate x="1" angle="180"/><translate z="5"/>', '<scale value="0.1"/>')
     Path("scene.xml").write_text(
         at_camera.replace("REFLECTANCE", PLAIN).replace('<translate z="0"/>', '<translate z="-0.5"/>')
@@ -414,7 +416,9 @@ Drawn = list[tuple[int, dict[str, np.ndarray] | None]]
 
 
 def note(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Drawn:
-    """The seed of all samples that `module` makes from now on, and the table that they are drawn from, if any."""
+    """Return a list that records each later sampling by `module`: the seed, and the table for drawing the samples, if
+    any.
+    """
     drawn: Drawn = []
     passes = module.passes
 
@@ -429,7 +433,7 @@ def note(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Drawn:
 
 
 def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], way: str) -> list[str]:
-    """What is not of the run's last step in what its replay looked at."""
+    """Return the differences between the run's last step and the step that its replay examines."""
     taken, looked_at = note(monkeypatch, reslrb), note(monkeypatch, nonfinite_trace)
     for seed in SEEDS:
         taken.clear()
@@ -466,7 +470,7 @@ def test_it_is_the_step_of_the_run(spoilt_experiment, capsys, monkeypatch, way):
 
 @pytest.mark.parametrize("fault", ["untaught", "not learned on", "out of order"])
 def test_differing_tables_are_detected(spoilt_experiment, capsys, fault, monkeypatch):
-    """Tables that know nothing, that do not learn between the batches of a step, or that are those of another batch."""
+    """The replay's tables were not restored, do not learn between a step's batches, or belong to another batch."""
     if fault == "untaught":
         monkeypatch.setattr(state, "restore_tables", lambda problem, calls, learned: None)
     elif fault == "not learned on":

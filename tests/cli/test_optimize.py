@@ -1,4 +1,6 @@
-"""`optimize`, `render`, `inspect` on small scenes: one view and several, textures and what moves light."""
+"""`optimize`, `render` and `inspect` on small scenes: one view and several, textures, and parameters that move
+light.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,7 @@ KEY = "poster.reflectance.data"
 
 @pytest.fixture
 def experiment(llvm, tmp_path, monkeypatch):
-    """A folder with a scene and a configuration, and the working directory in it; returns the texture, (4, 4, 3)."""
+    """Texture of shape (4, 4, 3). The working directory holds its scene and a configuration."""
     import mitsuba as mi
 
     texture = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
@@ -63,7 +65,7 @@ def experiment(llvm, tmp_path, monkeypatch):
 
 
 def reslrb(capsys, *args):
-    """Run the command line in this process; return exit code, standard output and standard error."""
+    """Run the command line in this process, and return the exit code, standard output and standard error."""
     with pytest.raises(SystemExit) as end:
         main.main([str(arg) for arg in args])
     out, err = capsys.readouterr()
@@ -162,7 +164,9 @@ def test_several_sensors_share_the_parameters(experiment, capsys):
 
 
 def test_a_target_without_light_is_refused(experiment, capsys):
-    """Where one sensor of two looks away it is said; where all do there is nothing to recover anything from."""
+    """If one of two sensors looks away, the run prints a warning. If all sensors look away, the program refuses the
+    run.
+    """
     away = SCENE.replace('origin="1, 0, 4" target="0, 0, 0"', 'origin="1, 0, 4" target="9, 0, 4"')
     Path("scene.xml").write_text(away.replace('<float name="fov" value="50"/>', '<float name="fov" value="20"/>'))
     sets = ["--set", "run.iterations=1", "--set"]
@@ -269,7 +273,7 @@ def test_scenes_that_cannot_work_are_refused_before_rendering(experiment, capsys
 
 @pytest.mark.parametrize("name", ["orthographic", "glass alone"])
 def test_camera_paths_render_scenes_that_light_paths_cannot(experiment, capsys, name):
-    """By default; `paths: auto` then is `camera`, or `both`."""
+    """The default `paths: auto` then selects `camera` or `both`."""
     part, other, *_ = BAD_SCENES[name]
     Path("scene.xml").write_text(SCENE.replace(part, other))
     small = ["run.iterations=2", "run.certainty=false", "integrator={type: reslrb, max_depth: 4}"]
@@ -324,7 +328,9 @@ def optimize(config: str, *settings: str) -> dict:
 
 @pytest.mark.long
 def test_eight_cameras_with_two_held_out(llvm, tmp_path, monkeypatch):
-    """The walls from six of eight cameras, three of them an iteration: what the other two see comes closer as well."""
+    """The run recovers the walls from six of eight cameras, with three cameras in each iteration. The error of the two
+    held-out views decreases as well.
+    """
     (tmp_path / "scene.xml").write_text(cornell_box(24, eyes=EYES))
     true = ", ".join(f"{key}: {value}" for key, value in WALLS.items())
     (tmp_path / "box.yaml").write_text(
@@ -350,7 +356,7 @@ run: {{iterations: 120, spp: 16, views_per_iteration: 3, held_out: [2, 5]}}
 
 
 def test_a_run_reports_its_views(llvm, tmp_path, monkeypatch, capsys):
-    """Mask, exposure and shares are in the manifest, in `images/` and on the page."""
+    """The manifest, `images/` and the page contain the mask, the exposure and the shares."""
     import mitsuba as mi
 
     write_experiment(tmp_path)

@@ -1,4 +1,4 @@
-"""`reslrb report`, and a run's page while the run is at work."""
+"""`reslrb report`, and the page of a run during the run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ from reslrb_cli.runs import recorder as recording
 
 @pytest.fixture
 def report(capsys, tmp_path, monkeypatch):
-    """A function that runs `reslrb report` in `tmp_path`; returns exit code, standard output and standard error."""
+    """Function that runs `reslrb report` in `tmp_path` and returns the exit code, standard output and standard
+    error.
+    """
     monkeypatch.chdir(tmp_path)
 
     def call(*args):
@@ -100,7 +102,9 @@ REFRESH = 'http-equiv="refresh"'
 
 @pytest.fixture
 def optimize(llvm, tmp_path, monkeypatch, capsys):
-    """A function that runs `reslrb optimize tiny.yaml`, with a page after every iteration; returns standard error."""
+    """Function that runs `reslrb optimize tiny.yaml`, writes the page after each iteration, and returns standard
+    error.
+    """
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(measurement_files, "PAGE_SECONDS", 0.0)
@@ -116,7 +120,7 @@ def optimize(llvm, tmp_path, monkeypatch, capsys):
 
 
 def test_writing_the_page_is_not_timed(optimize, monkeypatch):
-    """A page that takes 0.2 s, before and after each iteration."""
+    """Writing the page takes 0.2 s, at the start, after each iteration and at the end."""
     written = []
 
     def slowly(folder, *now):
@@ -189,7 +193,9 @@ def test_no_page_claims_that_an_ended_run_is_running(optimize, monkeypatch):
 
 
 def test_pages_keep_to_their_share_of_the_time(monkeypatch):
-    """One that takes 1 s is written every 20 s, a quick one every 5 s; one that fails is not tried again."""
+    """The next write follows 20 s after a write of 1 s, and 5 s after a quick write. A page that fails is not tried
+    again.
+    """
     now, cost, written = [100.0], [1.0], []
     monkeypatch.setattr(recorder.time, "monotonic", lambda: now[0])
 

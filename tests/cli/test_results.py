@@ -1,4 +1,4 @@
-"""What a run says of itself at its end: on the terminal, in the manifest and in its images."""
+"""The results that a run reports at its end: on the terminal, in the manifest and in its images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LAMP, WALL = "lamp.emitter.radiance.value", "wall.reflectance.value"
 
 @pytest.fixture(autouse=True)
 def _experiment(llvm, tmp_path, monkeypatch):
-    """A folder with a scene and a configuration, and the working directory in it."""
+    """Working directory with a scene and a configuration."""
     import mitsuba as mi
 
     texture = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
@@ -30,7 +30,7 @@ def _experiment(llvm, tmp_path, monkeypatch):
 
 
 def optimize(capsys, *settings, options=(), name="box.yaml"):
-    """Run `reslrb optimize`; return its last line, all of standard output, and the manifest's results."""
+    """Run `reslrb optimize`, and return the last line, all of standard output, and the manifest's results."""
     sets = [word for setting in settings for word in ("--set", setting)]
     code, out, err = reslrb(capsys, "optimize", name, "--force", *options, *sets)
     assert code == 0, err
@@ -95,7 +95,7 @@ def test_a_truth_of_another_resolution_has_an_error(capsys):
 
 
 def test_a_loss_that_does_not_fall_is_reported(capsys):
-    """A learning rate of nothing: the parameters stay where they are."""
+    """With a learning rate of almost zero, the parameters keep their values."""
     sets = ["optimizer.learning_rate=1e-12", "run.iterations=40", "run.spp=512"]
     last, _, results = optimize(capsys, *sets)
     assert results["loss_trend"]["change"] == "flat"
@@ -108,7 +108,7 @@ def test_a_loss_that_does_not_fall_is_reported(capsys):
 
 
 def test_a_worse_parameter_is_reported(capsys):
-    """Far too large a learning rate, from close to the truth."""
+    """The parameter starts close to the truth, and the learning rate is far too large."""
     wall = f"parameters=[{{key: {WALL}, initial: 0.42, bounds: [0, 1]}}]"
     last, out, results = optimize(
         capsys, wall, "optimizer.learning_rate=30", "optimizer.beta_2=0.999", "run.iterations=30"
@@ -132,7 +132,9 @@ def test_a_good_run_has_no_complaints(capsys):
 
 
 def test_a_short_worse_run_is_reported_with_the_reason(capsys):
-    """Images of many samples, and known errors, tell it where the losses of a few iterations do not."""
+    """Images of many samples and known errors show that the run got worse. The losses of a few iterations do not show
+    it.
+    """
     wall = f"parameters=[{{key: {WALL}, initial: 0.42, bounds: [0, 1]}}]"
     last, out, results = optimize(capsys, wall, "optimizer.learning_rate=30", "run.iterations=5")
     assert results["loss_trend"] is None
@@ -149,7 +151,9 @@ def test_a_short_worse_run_is_reported_with_the_reason(capsys):
 
 
 def test_a_noisy_loss_is_not_a_failure(capsys):
-    """The images of the iterations are too noisy to tell, those of more samples are not."""
+    """The images of the iterations are too noisy to show the improvement. Images with more samples show the
+    improvement.
+    """
     _, _, results = optimize(capsys, "run.adjoint=independent", "run.certainty=false")
     assert results["loss_trend"]["change"] == "flat"
     assert results["image_loss"]["final"] < 0.5 * results["image_loss"]["initial"]
@@ -224,7 +228,9 @@ SKY = scene(
 
 
 def test_an_environment_map_has_an_error_and_a_picture(capsys):
-    """Its tensor has columns that its image has not, and its film an alpha that the target has not."""
+    """The tensor of the environment map has columns that its image lacks. The film has an alpha channel that the target
+    lacks.
+    """
     Path("scene.xml").write_text(SKY)
     _, out, results = optimize(
         capsys, "parameters=[{key: sky.data, initial: 3.0}]", "integrator={type: prb}", "run.iterations=2"

@@ -1,4 +1,6 @@
-"""Every experiment that is shipped, run to its end as it stands: it recovers what it promises, in the README's time."""
+"""Every shipped experiment runs to its end unchanged. The run recovers the stated parameters within the README's
+time.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ MOST_OF = {"painting.reflectance.data": 0.5}
 
 
 def stated_seconds(name: str) -> float:
-    """The time that the README's table of results states for an experiment; its row begins with the name."""
+    """Return the time that the README's table of results states for an experiment. The row begins with the experiment's
+    name.
+    """
     found = re.search(rf"^\| `{re.escape(name)}`.*\| (\d+) s \|", (ROOT / "README.md").read_text(), re.MULTILINE)
     assert found is not None, f"{name} has no row with a time in the README's table of results"
     return float(found[1])
@@ -39,7 +43,9 @@ def test_the_readme_states_the_time(config: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("config", CONFIGS, ids=name_of)
 def test_it_recovers_the_stated_parameters(config: Path, tmp_path: Path) -> None:
-    """The time is that of the iterations, four times what is stated at most: the README's machine is not this one."""
+    """The time of the iterations is at most four times the stated time. The README's times come from another
+    machine.
+    """
     main.main(
         ["optimize", str(config), "--set", f"run.output={tmp_path}", "--set", "run.name=it"], standalone_mode=False
     )

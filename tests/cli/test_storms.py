@@ -1,4 +1,6 @@
-"""Runs and measurements that are killed, or whose disk is full: what is left is whole, and enough to go on from."""
+"""Runs and measurements that are killed, or whose disk is full. The remaining files are complete and sufficient for a
+continuation.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,7 @@ def experiment(tmp_path: Path) -> Path:
 
 
 def wait_for(process: subprocess.Popen[str], folder: Path, moment: str) -> str:
-    """Wait until a run has come to `moment`; return what it printed on the way."""
+    """Wait until a run has reached `moment`, and return the text that it printed until then."""
     assert process.stderr is not None
     printed = ""
     if not moment:
@@ -62,7 +64,7 @@ def wait_for(process: subprocess.Popen[str], folder: Path, moment: str) -> str:
 
 
 def hit(process: subprocess.Popen[str], number: int, times: int) -> tuple[int, str]:
-    """Send a signal, or several; return exit code and standard error."""
+    """Send a signal once or `times` times, and return the exit code and standard error."""
     for _ in range(times):
         process.send_signal(number)
         time.sleep(random.uniform(0, 0.1) if times > 1 else 0)
@@ -105,7 +107,7 @@ def test_a_killed_run_can_be_read_and_replaced(experiment: Path, monkeypatch: py
 
 
 def storm(experiment: Path, number: int, count: int, times: int = 1) -> Counter[tuple[int, str | None]]:
-    """Hit so many runs with a signal at random moments after every stage, and look at what they leave."""
+    """Send a signal to `count` runs at random moments after every stage, and check the files that they leave."""
     chance = random.Random(int(number))
     seen: Counter[tuple[int, str | None]] = Counter()
     stages = ["", *MOMENTS.values()]
@@ -148,7 +150,7 @@ def test_many_pairs_of_signals(experiment: Path, number: int) -> None:
 
 
 def mount(place: Path, kib: int) -> None:
-    """Mount a disk of so many KiB there; skip the test where that is not allowed."""
+    """Mount a disk of `kib` KiB at `place`. Skip the test where mounting is not allowed."""
     command = ["mount", "-t", "tmpfs", "-o", f"size={kib}k", "tmpfs", str(place)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -166,7 +168,9 @@ ALL_SIZES = [16, 48, 96, 128, 256, 512, 1024]
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("kib", [*SIZES, *(pytest.param(kib, marks=pytest.mark.long) for kib in ALL_SIZES)])
 def test_a_small_disk(experiment: Path, disk: Path, kib: int) -> None:
-    """The run ends with one line and exit code 6, and the last state that was written is whole."""
+    """Up to 512 KiB, the run ends with one line and exit code 6. The last written state is complete. Runs on 1024 KiB
+    finish.
+    """
     mount(disk, kib)
     process = start(experiment, "--set", f"run.output={disk}/runs", *(LONG if kib <= 512 else []), "--quiet")
     out, err = process.communicate()
@@ -211,7 +215,7 @@ def test_a_run_without_a_terminal(experiment: Path, streams: str) -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_a_closed_terminal(experiment: Path) -> None:
-    """Its progress bar goes nowhere, and the hang-up ends the run in order."""
+    """The progress bar then has no terminal. The hang-up signal ends the run in order."""
     fcntl, pty, termios = (pytest.importorskip(name) for name in ("fcntl", "pty", "termios"))
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
@@ -238,14 +242,14 @@ def lines(*words: str) -> list[SummaryRecord]:
 
 
 def read(path: Path) -> list[str]:
-    """What stands in the lines after the first, which says what measured."""
+    """Return the text of all lines after the first line. The first line states where the measurement comes from."""
     origin, *others = [json.loads(line) for line in path.read_text().splitlines()]
     assert origin == {"kind": "summary", "line": "here"}
     return [line["line"] for line in others]
 
 
 class Measurement:
-    """A measurement whose lines and samples a test changes as it goes on."""
+    """Measurement whose lines and samples a test can change while the measurement goes on."""
 
     def __init__(self, file: Path) -> None:
         self.final, self.now, self.rows = lines(), lines(), np.zeros(0)
@@ -375,7 +379,9 @@ def repeats(file: Path) -> set[int]:
 def test_a_killed_measurement_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str], steps: int
 ) -> None:
-    """It is killed as soon as its first rounds are on the disk; of some thousands only a few are taken then."""
+    """A measurement of 1000000 rounds is killed once its first rounds are on the disk. The same command with 4 rounds
+    continues to exactly 4 rounds.
+    """
     write_experiment(tmp_path)
     file, kept = tmp_path / "c.jsonl", tmp_path / "c.samples.npz"
     process = start_measuring(tmp_path, *command, "--rounds", "1000000", "--json", file.name)

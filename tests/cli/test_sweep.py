@@ -1,4 +1,6 @@
-"""`reslrb sweep`: what it plans and refuses, what it goes on with after a kill, its table, and who is told apart."""
+"""Tests of `reslrb sweep`: its plan, its errors, how it continues after a kill, its table, and which settings it
+distinguishes.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ RATES = "optimizer.learning_rate=[0.02, 0.2]"
 
 @pytest.fixture
 def folder(llvm, tmp_path, monkeypatch):
-    """The working directory, with `tiny.yaml`; runs are called in this process, and draw no pages."""
+    """Working directory with `tiny.yaml`. Runs are called in this process and write no real report pages."""
     tiny.write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
@@ -51,18 +53,18 @@ def folder(llvm, tmp_path, monkeypatch):
 
 
 def call(arguments, interrupts, verbose=False, fresh=False):
-    """What `sweep.call` does, in this process."""
+    """Call the command in this process, in place of `sweep.call`."""
     result = CliRunner().invoke(main, list(arguments))
     return result.exit_code, result.output.strip().splitlines()[-1]
 
 
 def made(*arguments, seeds=2):
-    """The plan of `tiny.yaml`, each argument varied."""
+    """Return the plan that varies the settings of `tiny.yaml` given by `arguments`."""
     return make_plan(Path("tiny.yaml"), arguments, seeds, [])
 
 
 def table(folder):
-    """What is in the table, but for times and memory, and what is said of it."""
+    """Return the rows of the table without times and memory, and the printed lines about the lowest medians."""
     source = read_sweep_runs(Path(folder))
     runs = [json.loads(run.to_json()) for run in run_records(source)]
     said = [line for line in lines(source.sweep, run_records(source)) if line.startswith("lowest")]
@@ -196,8 +198,9 @@ def test_damage_is_located(folder):
 
 
 def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
-    """At four moments what a kill would have left is copied: in the midst of a run, before one has kept anything, over
-    its final images, and between two runs."""
+    """The test copies what a kill would leave at four moments: in the middle of a run, before a run has saved a
+    checkpoint, while final images are written, and between two runs.
+    """
     show, begin, calls, moments = progress.Progress.show, recording.Recording._begin, [], []
     end = recording.Recording._write_final_images
 
@@ -329,7 +332,7 @@ def test_a_sweep_locks_its_folder(folder, monkeypatch):
 
 
 def start(folder, *arguments):
-    """`reslrb sweep` in a process of its own, whose runs have processes of theirs."""
+    """Start `reslrb sweep` in its own process. Each of its runs also has its own process."""
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
     return subprocess.Popen([sys.executable, "-c", script, "sweep", *arguments], cwd=folder, env=environment,
@@ -337,7 +340,7 @@ def start(folder, *arguments):
 
 
 def count_lines(run):
-    """How many iterations the metrics of a run have."""
+    """Return the number of iterations in the metrics of a run."""
     path = run / "metrics.jsonl"
     try:
         return len(path.read_text().splitlines())
@@ -346,7 +349,7 @@ def count_lines(run):
 
 
 def wait_for(happened, seconds=60.0):
-    """Wait until something has happened."""
+    """Wait until `happened()` is true. Fail after `seconds`."""
     end = time.monotonic() + seconds
     while not happened():
         assert time.monotonic() < end
@@ -447,7 +450,9 @@ def test_a_run_ends_with_its_killed_sweep(llvm, tmp_path):
 
 @pytest.mark.long
 def test_killed_five_times(llvm, tmp_path):
-    """2 x 3 settings and 4 seeds, in processes of their own, which have all threads: equal but for rounding."""
+    """A sweep of 2 x 3 settings and 4 seeds has the same table after five kills, up to rounding. Its runs have their
+    own processes with all threads.
+    """
     tiny.write_experiment(tmp_path)
     words = ["tiny.yaml", *tiny.settings(*QUICK, "run.iterations=20"), "--vary", "optimizer.learning_rate=[0.01, 0.1]",
              "--vary", "run.spp=[4, 8, 16]", "--seeds", "4"]  # fmt: skip
@@ -527,7 +532,9 @@ def test_pairs_reveal_differences_that_the_spread_over_seeds_hides():
 
 
 def pretended(losses, key="run.spp", **about):
-    """A sweep of so many settings and seeds (settings, seeds), and its finished runs of these losses."""
+    """Return a sweep with as many settings and seeds as `losses` (settings, seeds), and its finished runs with these
+    losses.
+    """
     combinations = [Combination(f"spp={k}", {key: k}) for k in range(len(losses))]
     sweep = SweepPlan("a.yaml", [], combinations, list(range(len(losses[0]))))
     done = {"status": "finished", "error": 0.5, "elapsed_s": 2.0, "peak_mib": 3.0}
@@ -567,7 +574,9 @@ RATE = "optimizer.learning_rate"
 
 
 def pretended_rates(errors, rates, seeds=8):
-    """A sweep of integrators by learning rates: the error of each, by name and rate, times the same noise by seed."""
+    """Return a sweep of integrators by learning rates, and its runs. Each error is the error given for integrator and
+    rate, times noise that depends only on the seed.
+    """
     settings = [{"integrator": name, RATE: rate} for name in errors for rate in rates]
     if len(errors) == 1:
         settings = [{RATE: rate} for rate in rates]
@@ -583,7 +592,7 @@ def pretended_rates(errors, rates, seeds=8):
 
 
 def test_settings_are_compared_at_their_best_learning_rates():
-    """The second is better at its best rate alone, which is the greatest that was tried."""
+    """The second integrator is better only at its best learning rate, which is the largest rate in the sweep."""
     sweep, runs = pretended_rates({"prb": [1.0, 0.6, 0.9], "reslrb:stack": [2.0, 1.0, 0.3]}, [0.01, 0.1, 1.0])
     (best,) = best_records(sweep, runs)
     assert (best.of, best.best, best.second, best.beats) == ("error", "5", "1", ["1"])
@@ -610,7 +619,9 @@ def test_a_sweep_of_learning_rates_compares_them():
 
 
 def coverage(count, seeds, spread, true, levels):
-    """How often the interval of a ratio contains the truth, where errors scatter by `spread`; `levels` are rates."""
+    """Return how often the interval of a ratio contains the true ratio when errors scatter by `spread`. `levels` has
+    one factor of the error for each learning rate.
+    """
     random = np.random.default_rng(3)
     hit = 0
     for _ in range(count):
@@ -645,7 +656,7 @@ def test_invalid_ratios():
 
 
 def test_equal_settings_are_rarely_distinguished():
-    """Of four equal ones any is told from the best with a probability of at most 5 %."""
+    """Among four equal settings, any setting is distinguished from the best one with a probability of at most 5 %."""
     rng = np.random.default_rng(9)
     wrong = 0
     for _ in range(400):
@@ -656,7 +667,9 @@ def test_equal_settings_are_rarely_distinguished():
 
 
 def test_curves_are_medians_with_minimum_and_maximum():
-    """Of runs of 1, 2 and 4 iterations; by time from where all have one, and where each ended from then on."""
+    """Runs have 1, 2 and 4 iterations. The curve by time begins when every run has an iteration. Each ended run keeps
+    its last value.
+    """
     runs = []
     for number, (times, losses) in enumerate(
         [([1.0], [9.0]), ([2.0, 3.0], [7.0, 5.0]), ([0.5, 1.5, 4.0, 5.0], range(4))]

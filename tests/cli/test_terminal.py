@@ -1,4 +1,6 @@
-"""What reaches the terminal: text and never commands, a bar of any width, and nothing where it cannot be written."""
+"""Tests of output on the terminal. Names appear as text and never as commands, progress bars fit any width, and a run
+continues if the terminal cannot be written.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ ESC, TURNED = "\x1b[31m", "\u202e"
 
 @pytest.fixture
 def experiment(llvm, tmp_path, monkeypatch):
-    """An experiment of which folder, file, surface and material have escape sequences in their names."""
+    """Experiment with an escape sequence in its folder's name. The name of its material has a character that turns the
+    writing direction.
+    """
     import mitsuba as mi
 
     folder = tmp_path / f"f{ESC}"
@@ -194,7 +198,7 @@ def record(number, units):
 
 
 def shown(monkeypatch, width, units, iterations=30, resize=None):
-    """What stood on a terminal of that width, frame by frame."""
+    """Return the frames that a progress bar shows on a terminal of `width` columns."""
     master, slave = os.openpty()
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, width, 0, 0))
     with os.fdopen(slave, "w") as terminal:

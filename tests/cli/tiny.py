@@ -1,4 +1,4 @@
-"""Commands called within the tests' own process, and an experiment of 8x8 pixels that takes a second."""
+"""Calls of commands within the tests' own process, and an experiment of 8x8 pixels that takes a second."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from reslrb_cli.runs import recorder as recording
 
 
 def reslrb(*arguments: object) -> Result:
-    """What `reslrb ARGUMENTS` said, and its exit code."""
+    """Run `reslrb ARGUMENTS` and return its output and exit code."""
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def done(*arguments: object) -> Result:
-    """The same of a call that has to succeed."""
+    """Run `reslrb ARGUMENTS`, which has to succeed, and return the result."""
     result = reslrb(*arguments)
     assert result.exit_code == 0, result.output
     return result
 
 
 def settings(*given: str) -> list[str]:
-    """`--set` for each of them."""
+    """Return `--set SETTING` for each of the settings."""
     return [word for setting in given for word in ("--set", setting)]
 
 
 def read_metrics(folder: Path | str) -> list[dict[str, Any]]:
-    """The lines of a run's metrics, oldest first."""
+    """Return the lines of a run's metrics, oldest first."""
     return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
 
 
 def manifest(folder: Path | str = "runs/tiny") -> dict[str, Any]:
-    """The manifest of a run."""
+    """Return the manifest of a run."""
     content: dict[str, Any] = json.loads((Path(folder) / "manifest.json").read_text())
     return content
 
@@ -61,14 +61,16 @@ def full(*args, **options):
 
 
 def lines(text):
-    """The lines of standard error that are no progress."""
+    """Return the lines of standard error that do not report progress."""
     return [
         line for line in text.splitlines() if not line.startswith(("variant ", "rendering ", "finding ", *"123456789"))
     ]
 
 
 def failing_last(monkeypatch, name, failure=full, calls=1):
-    """Have `recording.<name>`, or what keeps the state, fail, but for its first `calls` calls."""
+    """Make `recording.<name>` fail after its first `calls` calls. The name `save_checkpoint` stands for the function in
+    `prepare` instead.
+    """
     holder = prepare if name == "save_checkpoint" else recording
     real, seen = getattr(holder, name), []
 
@@ -88,7 +90,7 @@ EYES = ("0, 0, 4", "1, 0.5, 4", "-1, 1, 3")
 
 
 def scene_seen(*eyes: str, rfilter: str = "box") -> str:
-    """Return the scene with a sensor at each of these places."""
+    """Return the scene with a sensor at each of the positions `eyes`."""
     return scene(
         *(sensor(eye, rfilter=rfilter) for eye in eyes), POSTER_BSDF, shape("rectangle", "wall", ref("poster")),
         """<shape type="rectangle" id="lamp">
@@ -118,7 +120,7 @@ COMPLETE = {
 
 
 def write_experiment(folder: Path, text: str = SCENE) -> None:
-    """Put scene, texture and `tiny.yaml` into `folder`; a variant must be set."""
+    """Write scene, texture and `tiny.yaml` to `folder`. A variant must be set."""
     import mitsuba as mi
     import numpy as np
 
@@ -129,7 +131,7 @@ def write_experiment(folder: Path, text: str = SCENE) -> None:
 
 
 def start(folder: Path, *args: str, **options: Any) -> subprocess.Popen[str]:
-    """`reslrb optimize tiny.yaml` in a process of its own, with `folder` as its working directory."""
+    """Start `reslrb optimize tiny.yaml` in its own process, with `folder` as its working directory."""
     # As the program is started, which is called `reslrb` from its first line on.
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     command = [sys.executable, "-c", script, "optimize", "tiny.yaml", *args]
@@ -139,12 +141,14 @@ def start(folder: Path, *args: str, **options: Any) -> subprocess.Popen[str]:
 
 
 def files(folder: Path) -> set[str]:
-    """All files in `folder`, relative to it."""
+    """Return all files in `folder`, with relative paths."""
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
 def faults(folder: Path, code: int, err: str) -> list[str]:
-    """What is wrong with a run folder after its process ended with `code` and printed `err`; `[]` where nothing is."""
+    """Return the faults of a run folder whose process ended with `code` and printed `err`. The list is empty if there
+    are none.
+    """
     found = ["a traceback"] if "Traceback" in err or "Exception ignored" in err else []
     found += [] if code in (0, 130, 6, -signal.SIGKILL) or not folder.exists() else [f"exit code {code}"]
     if not folder.exists():

@@ -1,4 +1,6 @@
-"""Configurations that are nearly right: a good one, changed as text, as tokens or as data, and `--set` with it."""
+"""Nearly correct configurations. Each comes from a correct configuration by changes of its text, tokens or data, and
+may have `--set` overrides.
+"""
 
 from __future__ import annotations
 
@@ -65,13 +67,15 @@ LONG_VALUES = (
 
 
 def good_texts() -> list[str]:
-    """The shipped configurations, the reference's example, and two that have all kinds of settings."""
+    """Return the shipped configurations, which include the reference's example, and two configurations with all kinds
+    of settings.
+    """
     shipped = sorted((DOCS.parent / "configs").rglob("*.yaml"))
     return [FULL, RENDERED, *(path.read_text(encoding="utf-8") for path in shipped)]
 
 
 def mutate(rng: random.Random, texts: Sequence[str]) -> tuple[bytes, list[str]]:
-    """A configuration's bytes, and overrides, most of which are wrong somewhere."""
+    """Return the bytes of a configuration, and overrides. Most results have an error somewhere."""
     text, overrides = rng.choice(texts), []
     for _ in range(rng.choice((0, 1, 1, 1, 1, 1, 2, 4))):
         [change] = rng.choices((_as_text, _as_tokens, _as_data, _as_bomb), (2, 4, 8, 1))
@@ -147,7 +151,9 @@ def _as_data(rng: random.Random, text: str) -> str:
 
 
 def _places(data: Any) -> Any:
-    """Every place in the data: a list or mapping, and an index or key of it; no more than some hundreds."""
+    """Yield places in the data: a list or mapping, and one of its indices or keys. Stop after some hundreds of
+    places.
+    """
     waiting, count = [data], 0
     while waiting and count < 300:
         value = waiting.pop()
@@ -164,7 +170,9 @@ def _depth(data: Any) -> int:
 
 
 def _as_bomb(rng: random.Random, text: str) -> str:
-    """Aliases of aliases, plain or merged: a few hundred bytes that stand for billions of values."""
+    """Return the text with aliases of aliases, plain or merged. These few hundred bytes stand for billions of
+    values.
+    """
     width, depth, merged = rng.choice((2, 5, 9)), rng.choice((3, 6, 12, 40)), rng.random() < 0.5
     lines = ["b0: &b0 {x: 1, y: 2}"]
     for i in range(depth):

@@ -1,4 +1,6 @@
-"""What is wrong with a configuration is said in one line, with the place and what would be right."""
+"""Tests of the error lines for wrong configurations. Each error is one line that names the place and a correct
+value.
+"""
 
 from __future__ import annotations
 

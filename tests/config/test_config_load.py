@@ -1,4 +1,6 @@
-"""What a configuration may hold: values, defaults, paths, options, parameters, and its reference in docs/."""
+"""Tests of the contents of a configuration: values, defaults, paths, options, parameters, and the reference in
+docs/.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Configurations that are nearly right, or too large: each loads, or is one located line, at once."""
+"""Tests of configurations that are nearly correct or too large. Each of them loads, or gives one error line with a
+location, at once.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ SECONDS, MIB = 5.0, 200.0
 
 
 def _memory(name: str) -> float:
-    """MiB of this process's memory: `VmRSS` now, `VmHWM` at most so far."""
+    """Return a value of this process's memory in MiB. `VmRSS` is the current size, and `VmHWM` is the largest size so
+    far.
+    """
     status = Path("/proc/self/status").read_text()
     return int(next(line for line in status.splitlines() if line.startswith(name)).split()[1]) / 1024
 

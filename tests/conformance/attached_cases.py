@@ -1,4 +1,4 @@
-"""The cases of test_attached.py, and faults to break attached derivatives with."""
+"""Cases of test_attached.py, and faults that break attached derivatives."""
 
 from __future__ import annotations
 
@@ -36,10 +36,11 @@ SMOOTH, ROUGH = 5e-5, 5e-4
 
 @dataclass(frozen=True)
 class AttachedCase:
-    """One scene and what is differentiated, as `Moving` takes them; `scene` is a function, since it needs Mitsuba.
+    """One scene and its differentiated parameters, in the form that `Moving` takes. `scene` is a function because it
+    needs Mitsuba.
 
-    `stock`: Mitsuba's own `ptracer` has these derivatives too. `both` are options of all integrators, `ours` of
-    `reslrb` alone. `quick`: part of the default suite.
+    If `stock` is true, Mitsuba's own `ptracer` has these derivatives too. `both` holds options of all integrators, and
+    `ours` holds options of `reslrb` alone. If `quick` is true, the case is part of the default suite.
     """
 
     name: str
@@ -56,17 +57,19 @@ class AttachedCase:
     quick: bool = False
 
     def moving(self) -> Moving:
-        """The scene, loaded."""
+        """Load the scene and return it as a `Moving`."""
         return Moving(self.scene(), self.start, self.place, self.sensor)
 
 
 def rough(alpha: float = 0.1) -> dict[str, Any]:
-    """Rough glass."""
+    """Return the BSDF of rough glass."""
     return {"type": "roughdielectric", "distribution": "ggx", "alpha": alpha, "int_ior": 1.5}
 
 
 def mirrored(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """Slanted parallel light off a rippled mirror, which faces up, onto a receiver above; the camera is between."""
+    """Return a scene with slanted parallel light on a rippled mirror, which faces up. The mirror reflects the light to
+    a receiver above. The camera is between them.
+    """
     down = mi.ScalarTransform4f().look_at([-2, 2, 0], [0, 0, 0], [0, 1, 0]) @ mi.ScalarTransform4f().scale(0.5)
     receiver = {"type": "rectangle", "to_world": transform(translate=[2, 2, 0], rotate=([1, 0, 0], 90)), "bsdf": WHITE}
     up = mi.ScalarTransform4f().look_at([2, 1, 0], [2, 2, 0], [0, 0, -1])
@@ -75,27 +78,29 @@ def mirrored(bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 def two_lenses() -> dict[str, Any]:
-    """A ball of glass between the slab and the receiver."""
+    """Return the scene with a ball of glass between the slab and the receiver."""
     ball = {"type": "sphere", "center": [0.1, 1.2, 0.05], "radius": 0.3, "bsdf": GLASS}
     return under_glass(ball=ball, camera=camera() | {"to_world": mi.ScalarTransform4f().look_at(
         [0.9, 0.9, 0.9], [0, 0, 0], [0, 1, 0])})  # fmt: skip
 
 
 def move_ball(params: mi.SceneParameters, latents: Latents) -> None:
-    """The ball to the side, and larger."""
+    """Shift the ball to the side, and scale the ball."""
     moved = mi.AffineTransform4f().translate(mi.Vector3f(latents["x"], 0, 0))
     ball = mi.AffineTransform4f(transform(translate=[0.1, 1.2, 0.05], scale=0.3).matrix)
     params["ball.to_world"] = moved @ ball @ mi.AffineTransform4f().scale(latents["size"])
 
 
 def tilt_receiver(params: mi.SceneParameters, latents: Latents) -> None:
-    """The receiver turned about z and lifted."""
+    """Turn the receiver about z, and lift it."""
     moved = turned(latents["angle"], [0, 0, 1], [0, latents["y"], 0])
     params["receiver.to_world"] = moved @ mi.AffineTransform4f(transform(rotate=([1, 0, 0], -90)).matrix)
 
 
 def mapped() -> dict[str, Any]:
-    """The receiver with a normal map: a part of what it scatters is not drawn by its BSDF."""
+    """Return the receiver with a normal map. The BSDF does not sample a part of the light that this receiver
+    scatters.
+    """
     normals = np.random.default_rng(3).uniform(0.35, 0.65, (4, 4, 3))
     normals[..., 2] = 1
     bsdf = {"type": "normalmap", "normalmap": bitmap(normals, "bilinear"), "bsdf": diffuse(0.7, 0.5, 0.6)}
@@ -103,7 +108,7 @@ def mapped() -> dict[str, Any]:
 
 
 def stretch_slab(params: mi.SceneParameters, latents: Latents) -> None:
-    """The slab's ripples times a number, and the slab lifted."""
+    """Multiply the slab's ripples by a number, and lift the slab."""
     heights, rest = (mi.Float(rippled(2.0, 12, ripples).astype(np.float32).ravel()) for ripples in (1.0, 0.0))
     up = np.tile(np.array([0, 1, 0], np.float32), 13 * 13)
     params["slab.vertex_positions"] = rest + (heights - rest) * latents["size"] + mi.Float(up) * latents["lift"]
@@ -168,9 +173,10 @@ CASES = [
 
 @dataclass(frozen=True)
 class AttachedFault:
-    """`right`, in the source of the function `where`, becomes `wrong`; `case` then fails.
+    """Fault that replaces `right` by `wrong` in the source of the function `where`. `case` then fails.
 
-    `stock`: naive AD of our walk shares it, so that `ptracer` has to find it. `quick`: part of the default suite.
+    If `stock` is true, naive AD of our walk shares the fault, so that only `ptracer` can find it. If `quick` is true,
+    the fault is part of the default suite.
     """
 
     name: str

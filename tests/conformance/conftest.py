@@ -1,4 +1,4 @@
-"""The conformance tests run in one variant; scenes are in scenes.py and gradient_cases.py."""
+"""The conformance tests run in one variant. Their scenes are in scenes.py and gradient_cases.py."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture(autouse=True, scope="session")
 def _variant(llvm: str) -> None:
-    """Sets the variant, and keeps Mitsuba from warning about what a test does on purpose."""
+    """Set the variant, and stop Mitsuba's warnings about deliberate actions of the tests."""
     import mitsuba as mi
 
     mi.set_log_level(mi.LogLevel.Error)
@@ -15,9 +15,10 @@ def _variant(llvm: str) -> None:
 
 @pytest.fixture(params=["quarter", pytest.param("all", marks=pytest.mark.long)])
 def samples(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """How many of its samples `scenes.agreement` takes: a quarter shows the faults that were planted, in seconds.
+    """Share of its samples that `scenes.agreement` uses. A quarter of the samples shows the planted faults within
+    seconds.
 
-    All of them, which halve the noise, are for `-m long`.
+    All samples, which halve the noise, are for `-m long`.
     """
     from conformance import scenes
 

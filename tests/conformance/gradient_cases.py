@@ -1,8 +1,9 @@
-"""The cases of the gradient conformance tests: which scene, which parameters, against which reference.
+"""Cases of the gradient conformance tests. Each case has a scene, parameters and a reference.
 
-References: `ptracer` (naive AD; not where sampling depends on the parameter, since it differentiates densities but not
-the choice of lobe), `prb` (not for delta lobes, which it does not differentiate, nor where only light paths see), and
-`fd`, finite differences of our own image, which the image tests hold to `path` and `ptracer`.
+- `ptracer` is naive AD. It is not used where sampling depends on the parameter, because `ptracer` differentiates
+    densities but not the choice of lobe.
+- `prb` is not used for delta lobes, which `prb` does not differentiate, or where only light paths find the light.
+- `fd` means finite differences of our own image. The image tests compare this image with `path` and `ptracer`.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, rgb, 
 
 @dataclass(frozen=True)
 class GradientCase:
-    """One scene and its parameters; `scene` is a function, since it may need Mitsuba.
+    """One scene and its parameters. `scene` is a function because it may need Mitsuba.
 
-    `step` and `sides` are of finite differences; `options` are of `reslrb` alone, `both` of both integrators.
+    `step` and `sides` are settings of finite differences. `options` holds options of `reslrb` alone, and `both` holds
+    options of both integrators.
     """
 
     name: str
@@ -35,7 +37,7 @@ class GradientCase:
 
 
 def floor(bsdf: dict, **changes: Any) -> dict:
-    """The room with this BSDF on its floor, as it is, whose parameters are named `floor.*`."""
+    """Return the room with the unchanged `bsdf` on its floor. The BSDF's parameters are named `floor.*`."""
     return room(floor=bsdf, **changes)
 
 
@@ -44,7 +46,7 @@ def _tiles(low: float = 0.2, high: float = 0.8, channels: int = 3, seed: int = 1
 
 
 def _pane(bsdf: dict, **to_world: Any) -> dict:
-    """A small sheet that hangs in the room, by default between light and floor."""
+    """Return a small sheet that hangs in the room. By default, the sheet is between the light and the floor."""
     placed = to_world or {"translate": [0.1, 0.2, 0.2], "rotate": ([1, 0, 0], -80), "scale": 0.5}
     return {"type": "rectangle", "to_world": transform(**placed), "bsdf": bsdf}
 

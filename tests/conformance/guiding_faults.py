@@ -1,4 +1,4 @@
-"""Faults of guided emission, each planted by a function that patches it in."""
+"""Faults of guided emission. A function patches each fault into the code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 
 def hole(patch: pytest.MonkeyPatch) -> None:
-    """The cells of a hundredth that would be drawn most are never drawn; others have their slots."""
+    """The hundredth of cells with the most slots is never sampled. The cell with the fewest slots gets their slots."""
     from reslrb_cli.guiding import tables
 
     whole = tables.apportion
@@ -27,17 +27,17 @@ def hole(patch: pytest.MonkeyPatch) -> None:
 
 
 def without_weight(patch: pytest.MonkeyPatch) -> None:
-    """The density does not enter the weight."""
+    """The weight does not include the density."""
     _weigh(patch, lambda grid, counts, weights: weights * 0 + 1)
 
 
 def not_normalised(patch: pytest.MonkeyPatch) -> None:
-    """The weight is that of the density before a quarter was shared out evenly."""
+    """The weight belongs to the density before a quarter is distributed evenly."""
     _weigh(patch, lambda grid, counts, weights: 0.75 / np.maximum(1 / weights - 0.25, 0.01))
 
 
 def of_the_neighbour(patch: pytest.MonkeyPatch) -> None:
-    """The weight is that of another cell."""
+    """The weight belongs to another cell."""
     _weigh(patch, lambda grid, counts, weights: np.roll(weights, 1))
 
 
@@ -57,7 +57,7 @@ def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
 
 
 def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
-    """Lanes share the slots as if there were twice as many of them."""
+    """The lanes share the slots as if there were twice as many lanes."""
     from reslrb_cli.transport import guide
 
     right = guide.Guide.of
@@ -65,7 +65,7 @@ def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
 
 
 def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
-    """The choosing number lies where emitters of other shares have it."""
+    """The number that selects the emitter lies in an interval for emitters with other shares."""
     from reslrb_cli.transport import guide
 
     right = guide.Table.of
@@ -80,12 +80,14 @@ def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
 
 
 def in_one_corner(patch: pytest.MonkeyPatch) -> None:
-    """Numbers within a cell are not evenly spread."""
+    """The numbers of the direction are squared, so that numbers within a cell are not uniform."""
     _redraw(patch, lambda drawn: replace(drawn, direction=drawn.direction * drawn.direction))
 
 
 def with_its_own_weight(patch: pytest.MonkeyPatch) -> None:
-    """The weight is that of a table which the path has helped to make: what is dear is drawn more often by it."""
+    """The weight depends on the path's own numbers, as if the path had contributed to its table. Such a table samples
+    expensive paths more often.
+    """
     import drjit as dr
 
     _redraw(patch, lambda drawn: replace(drawn, weight=drawn.weight * dr.minimum(1, 0.5 + drawn.direction.x)))
@@ -99,14 +101,16 @@ def _redraw(patch: pytest.MonkeyPatch, change: Any) -> None:
 
 
 def same_numbers(patch: pytest.MonkeyPatch) -> None:
-    """Tables learn from the numbers of the step itself."""
+    """The tables learn from the same random numbers that the step uses."""
     from reslrb_cli.integrators import reslrb
 
     patch.setattr(reslrb, "learning_seed", lambda seed: seed)
 
 
 def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
-    """Tables learn from an image's samples before these are replayed, and so with another table."""
+    """The tables learn from an image's samples before these samples are replayed. The replay therefore uses another
+    table.
+    """
     from reslrb_cli.guiding.collect import hear
     from reslrb_cli.guiding.tables import Purpose
     from reslrb_cli.integrators import reslrb as lt

@@ -1,7 +1,8 @@
-"""Scenes in which something moves light, and what of them is differentiated: for test_attached.py and test_moving_*.py.
+"""Scenes in which something moves light, and their differentiated parameters, for test_attached.py and
+test_moving_*.py.
 
-Light leaves in parallel or in a cone, goes through glass or off a mirror, and falls on a receiver that a camera looks
-down on. y is up; the camera sees the receiver alone, and no emitter.
+Light starts in parallel or in a cone. It passes through glass or is reflected by a mirror, and reaches a receiver. A
+camera looks down on the receiver. y is up. The camera sees only the receiver, and no emitter.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ Place = Callable[[mi.SceneParameters, Latents], None]
 
 @dataclass
 class Moving:
-    """A scene whose parameters are a function of `start`, a number or a row of them for each name.
+    """Scene whose parameters are a function of `start`, which has a number or a row of numbers for each name.
 
-    Names that are keys of the scene are set as they are, and start where the scene has them if `start` says None. With
-    all others, as Dr.Jit arrays, `place(params, latents)` sets parameters of the scene, which follow their derivatives.
+    If a name is a key of the scene, its value is set directly. If `start` has None for this name, the scene's own value
+    is the start. `place(params, latents)` gets all other values as Dr.Jit arrays. It sets parameters of the scene,
+    which follow the derivatives of these values.
     """
 
     scene: dict[str, Any]
@@ -58,12 +60,12 @@ class Moving:
         self.weigh(np.random.default_rng(self.seed).uniform(0.2, 1.8, shape))
 
     def weigh(self, weights: np.ndarray) -> None:
-        """Set dL/dI, (H, W, C)."""
+        """Set dL/dI, with shape (H, W, C)."""
         self.weights = mi.TensorXf(np.ascontiguousarray(weights, np.float32)) + dr.opaque(mi.Float, 0)
         dr.make_opaque(self.weights)
 
     def set(self, latents: Latents) -> None:
-        """Move what moves."""
+        """Set the scene's parameters to the values of the latents."""
         for key in latents.keys() & self.params.properties.keys():
             self.params[key] = _as(self.params[key], latents[key])
         if self.place is not None:
@@ -71,7 +73,7 @@ class Moving:
         self.params.update()
 
     def gradient(self, integrator: StepIntegrator, seed: int = 1, spp: int = 16) -> dict[str, np.ndarray]:
-        """The derivative of sum(image * weights) by each of the latents, from one step."""
+        """Return the derivative of sum(image * weights) with respect to each latent, from one step."""
         leaves = {name: _leaf(value) for name, value in self.start.items()}
         dr.enable_grad(list(leaves.values()))
         # Copies: a parameter may be what a latent is, and `update` may put something else in its place.
@@ -83,13 +85,15 @@ class Moving:
         return result
 
     def value(self, integrator: StepIntegrator, seed: int, spp: int, **shifts: float) -> float:
-        """The objective, with some of the latents shifted."""
+        """Return the objective, with some of the latents shifted."""
         self.set({name: _leaf(value + shifts.get(name, 0.0)) for name, value in self.start.items()})
         image = np.array(render_image(integrator, self.loaded, self.sensor, seed, spp), np.float64)
         return float(np.sum(image * np.array(self.weights, np.float64)))
 
     def difference(self, integrator: StepIntegrator, name: str, step: float, seed: int = 1, spp: int = 16) -> float:
-        """Central difference by one latent, at common random numbers; of fourth order, from two steps."""
+        """Return the central difference for one latent, at common random numbers. The difference is of fourth order,
+        from two step sizes.
+        """
         near, far = (
             (self.value(integrator, seed, spp, **{name: h}) - self.value(integrator, seed, spp, **{name: -h})) / (2 * h)
             for h in (step, 2 * step)
@@ -99,14 +103,16 @@ class Moving:
 
 
 def _leaf(value: Any) -> mi.Float:
-    """A number or a row in memory of its own: NumPy's would have kernels depend on how it is aligned."""
+    """Return a number or a row as an array in its own memory. With NumPy's memory, kernels would depend on the
+    alignment of this memory.
+    """
     leaf = mi.Float(np.atleast_1d(np.asarray(value, np.float32))) + dr.opaque(mi.Float, 0)
     dr.make_opaque(leaf)
     return leaf
 
 
 def _as(current: Any, value: mi.Float) -> Any:
-    """A row as the type that a parameter has."""
+    """Return a row as the type of the parameter's current value."""
     if dr.is_tensor_v(current):
         return type(current)(value, current.shape)
     return dr.unravel(type(current), value, order="C") if dr.depth_v(current) > 1 else value
@@ -116,12 +122,12 @@ def _as(current: Any, value: mi.Float) -> Any:
 
 
 def height(x: Any, z: Any) -> Any:
-    """The height of a rippled surface."""
+    """Return the height of a rippled surface."""
     return sum(a * np.sin(kx * x + kz * z + phase) for a, (kx, kz), phase in WAVES)
 
 
 def rippled(y: float, cells: int, ripples: float = 1.0, side: float = 1.0) -> np.ndarray:
-    """The vertices of a `sheet`, (N, 3)."""
+    """Return the vertices of a `sheet`, with shape (N, 3)."""
     axis = np.linspace(-1, 1, cells + 1)
     x, z = np.meshgrid(axis, axis, indexing="ij")
     return np.stack([side * x, y + ripples * height(x, z), side * z], -1).reshape(-1, 3)
@@ -129,8 +135,9 @@ def rippled(y: float, cells: int, ripples: float = 1.0, side: float = 1.0) -> np
 
 def sheet(name: str, bsdf: dict[str, Any], y: float, cells: int = 12, ripples: float = 1.0, side: float = 1.0,
           **things: Any) -> mi.Mesh:  # fmt: skip
-    """A horizontal mesh that faces up, a square of `cells` x `cells`, rippled, with interpolated normals and texture
-    coordinates; `things` go into its dictionary (an emitter)."""
+    """Return a horizontal mesh that faces up. The mesh is a rippled square of `cells` x `cells`, with interpolated
+    normals and texture coordinates. `things` are added to its dictionary, for example an emitter.
+    """
     axis = np.linspace(-1, 1, cells + 1)
     x, z = np.meshgrid(axis, axis, indexing="ij")
     positions = rippled(y, cells, ripples, side)
@@ -150,7 +157,7 @@ def sheet(name: str, bsdf: dict[str, Any], y: float, cells: int = 12, ripples: f
 
 
 def camera(rfilter: str = "gaussian", size: int = SIZE, sensor: str = "perspective", **film: Any) -> dict[str, Any]:
-    """A camera that looks down on the receiver."""
+    """Return a camera that looks down on the receiver."""
     lens = {"aperture_radius": 0.1, "focus_distance": 1.2} if sensor == "thinlens" else {}
     return {
         "type": sensor, "fov": 90, **lens,
@@ -162,13 +169,13 @@ def camera(rfilter: str = "gaussian", size: int = SIZE, sensor: str = "perspecti
 
 
 def flat(bsdf: dict[str, Any], y: float = 0.0, scale: float = 1.0, **things: Any) -> dict[str, Any]:
-    """A rectangle that faces up."""
+    """Return a rectangle that faces up."""
     return {"type": "rectangle", "to_world": transform(translate=[0, y, 0], rotate=([1, 0, 0], -90), scale=scale),
             "bsdf": bsdf} | things  # fmt: skip
 
 
 def beam(scale: float = 0.8, y: float = 3.0) -> dict[str, Any]:
-    """Parallel light, straight down."""
+    """Return an emitter of parallel light that shines straight down."""
     return {"type": "rectangle", "to_world": transform(translate=[0, y, 0], rotate=([1, 0, 0], 90), scale=scale),
             "emitter": {"type": "directionalarea", "radiance": rgb(3.2, 3.0, 2.6)}}  # fmt: skip
 
@@ -178,9 +185,10 @@ WHITE = diffuse(0.8, 0.7, 0.6)
 
 
 def under_glass(bsdf: dict[str, Any] | None = None, cells: int = 12, **changes: Any) -> dict[str, Any]:
-    """Parallel light through a slab, flat above and rippled below (`slab`), onto the receiver.
+    """Return a scene in which parallel light passes through a slab onto the receiver. The slab is flat above and
+    rippled below (`slab`).
 
-    `changes` replace or add objects; None takes one away.
+    `changes` replace or add objects. The value None removes an object.
     """
     bsdf = bsdf or GLASS
     scene = {
@@ -196,17 +204,19 @@ def under_glass(bsdf: dict[str, Any] | None = None, cells: int = 12, **changes: 
 
 
 def textured() -> dict[str, Any]:
-    """A receiver with a texture of its own, `receiver.bsdf.reflectance.data`."""
+    """Return a receiver with its own texture, `receiver.bsdf.reflectance.data`."""
     return flat({"type": "diffuse", "reflectance": texture(4, 4)})
 
 
 def enclosed(bsdf: dict[str, Any] | None = None, albedo: float = 0.7, **changes: Any) -> dict[str, Any]:
-    """The same inside a sphere, where light goes on after it has met the receiver."""
+    """Return the scene of `under_glass` inside a sphere, where light continues after it has met the receiver."""
     shell = {"type": "sphere", "center": [0, 1.3, 0], "radius": 2.0, "flip_normals": True,
              "bsdf": diffuse(albedo, 0.9 * albedo, albedo)}  # fmt: skip
     return under_glass(bsdf, shell=shell, **changes)
 
 
 def turned(angle: Any, axis: Any, shift: list[Any]) -> Any:
-    """A rotation by `angle` (degrees), then a translation, whose derivatives those of the numbers are."""
+    """Return a rotation by `angle` (degrees), followed by a translation. The result follows the derivatives of `angle`
+    and `shift`.
+    """
     return mi.AffineTransform4f().translate(mi.Vector3f(*shift)) @ mi.AffineTransform4f().rotate(axis, angle)

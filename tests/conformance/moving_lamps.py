@@ -1,7 +1,7 @@
-"""Lamps that move over a floor, one of each kind: the cases of test_moving_emitters.py.
+"""Lamps that move over a floor, one of each kind. They are the cases of test_moving_emitters.py.
 
-A camera looks straight down on the middle of the floor, and dL/dI falls to zero towards the film's border: what light
-does there, where derivatives are cut off, has no part. Nothing casts a shadow.
+A camera looks straight down on the middle of the floor. dL/dI falls to zero towards the film's border. Light near the
+border, where derivatives are cut off, therefore has no effect. Nothing casts a shadow.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ BLACK = diffuse(0, 0, 0)
 
 @dataclass(frozen=True)
 class LampCase:
-    """What `Moving` takes, and how it is measured: `step` of the differences, samples, seeds, and the integrators'
-    options. `quick`: part of the default suite."""
+    """Arguments of `Moving` and the settings of its measurement. The settings are the `step` of the differences, the
+    samples, the seeds, and the integrators' options. If `quick` is true, the case is part of the default suite.
+    """
 
     name: str
     scene: Callable[[], dict[str, Any]]
@@ -38,7 +39,7 @@ class LampCase:
     quick: bool = False
 
     def moving(self) -> Moving:
-        """The scene, loaded."""
+        """Load the scene and return it as a `Moving`."""
         initial: list[Any] = []
 
         def place(params: mi.SceneParameters, latents: Latents) -> None:
@@ -52,7 +53,7 @@ class LampCase:
 
 
 def smooth_weights(size: int = 32) -> np.ndarray:
-    """A smooth dL/dI (H, W, 3) that is zero at the border."""
+    """Return a smooth dL/dI (H, W, 3) that is zero at the border."""
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size
     inside = np.clip((np.minimum.reduce([x, 1 - x, y, 1 - y]) - 0.1) / 0.2, 0, 1)
     fade = inside * inside * (3 - 2 * inside)
@@ -60,14 +61,16 @@ def smooth_weights(size: int = 32) -> np.ndarray:
 
 
 def _resting(value: Any) -> Any:
-    """A copy of where something is before it moves."""
+    """Return a copy of an object's place before the object moves."""
     if isinstance(value, mi.Point3f):
         return mi.Point3f(value)
     return mi.Float(value) if isinstance(value, mi.Float) else mi.AffineTransform4f(value.matrix)
 
 
 def _moved(latents: Latents, initial: Any) -> Any:
-    """`initial` larger, turned about an axis that is none of the scene's, and shifted, about the pivot."""
+    """Return `initial` scaled and turned about the pivot, and then shifted. The axis of the rotation is none of the
+    scene's axes.
+    """
     pivot = mi.Vector3f(*PIVOT)
     identity = mi.AffineTransform4f()
     shift = mi.Vector3f(*(latents.get(name, mi.Float(0)) for name in "xyz")) + pivot
@@ -83,27 +86,29 @@ def _moved(latents: Latents, initial: Any) -> Any:
 
 
 def over_floor(light: dict[str, Any] | mi.Mesh, **changes: Any) -> dict[str, Any]:
-    """A wide floor, and a light above it."""
+    """Return a scene with a wide floor and a light above the floor."""
     above = mi.ScalarTransform4f().look_at([0, 3, 0], [0, 0, 0], [0, 0, -1])
     return {"type": "scene", "camera": camera() | {"fov": 60, "to_world": above},
             "floor": flat(diffuse(0.8, 0.7, 0.6), scale=40), "light": light} | changes  # fmt: skip
 
 
 def within(light: dict[str, Any]) -> dict[str, Any]:
-    """A light and the camera within a diffuse sphere, which has no edge."""
+    """Return a scene with a light and the camera within a diffuse sphere, which has no edge."""
     shell = {"type": "sphere", "center": [0, 3, 0], "radius": 4, "flip_normals": True, "bsdf": diffuse(0.6, 0.5, 0.7)}
     return over_floor(light, floor=shell)
 
 
 def surface(kind: str, emitter: str = "area", radiance: Any = None) -> dict[str, Any]:
-    """A shape that shines down."""
+    """Return a shape that shines down."""
     down = {"rotate": ([0.97, 0.1, 0.2], 88)} if kind in ("rectangle", "disk", "cylinder") else {}
     return {"type": kind, "to_world": transform(translate=PIVOT, **down, scale=0.4), "bsdf": BLACK,
             "emitter": {"type": emitter, "radiance": radiance or RADIANCE}}  # fmt: skip
 
 
 def mesh(emitter: str = "area", radiance: Any = None, name: str = "light", at: Sequence[float] = PIVOT) -> mi.Mesh:
-    """A rippled sheet that shines down, with faces of different areas, in the middle of what moves or elsewhere."""
+    """Return a rippled sheet that shines down. Its faces have different areas. By default, the sheet is at the pivot of
+    the movement.
+    """
     light = sheet(name, BLACK, 0.0, 5, 4.0, 0.5, emitter={"type": emitter, "radiance": radiance or RADIANCE})
     params = mi.traverse(light)
     x, y, z = np.array(params["vertex_positions"]).reshape(-1, 3).T
@@ -114,12 +119,12 @@ def mesh(emitter: str = "area", radiance: Any = None, name: str = "light", at: S
 
 
 def texture() -> dict[str, Any]:
-    """What a lamp may show."""
+    """Return a texture for the emission of a lamp."""
     return bitmap(np.random.default_rng(4).uniform(1, 4, (4, 4, 3)), "bilinear")
 
 
 def looking_down(**emitter: Any) -> dict[str, Any]:
-    """An emitter above the floor, a little aslant."""
+    """Return an emitter above the floor that looks down, slightly tilted."""
     return emitter | {"to_world": mi.ScalarTransform4f().look_at(list(PIVOT), [0.1, 0, 0.4], [0, 0, 1])}
 
 

@@ -1,4 +1,6 @@
-"""Operations of a step's kernels, by plan: shows that kernels lack what a scene does not need."""
+"""Counts of operations in a step's kernels, for a given plan. They show that kernels lack code that a scene does not
+need.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,13 @@ LARGE = 100  # operations; smaller kernels develop images and prepare textures
 
 
 def even_table(grid: Grid, film: Blocks | None = None) -> Table:
-    """Return the table of a run that has learned nothing; paths are aimed at all of the `film`, if any."""
+    """Return the table of a run that has learned nothing. If `film` is given, paths are aimed at all of the film."""
     aim = None if film is None else Aim.of(film, film.areas())
     return Table.of(grid, apportion(grid, grid.measures()), aim=aim)
 
 
 def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> list[int]:
-    """Count the operations of each large kernel of a step by this plan, with dL/dI known before it."""
+    """Count the operations of each large kernel of a step with this plan. dL/dI is known before the step."""
     with dr.suspend_grad():
         table = None if plan.grid is None else even_table(plan.grid, film_blocks(sensor) if plan.aimed else None)
         emitters = integrator.preparation.emitters(plan, scene) if plan.weighs else None
@@ -50,7 +52,7 @@ def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) ->
 
 @contextmanager
 def tracking(params: mi.SceneParameters, keys: Iterable[str]) -> Iterator[None]:
-    """Have parameters `keys` of the scene track derivatives for as long as the context lasts."""
+    """Make parameters `keys` of the scene track derivatives within the context."""
     values = {key: type(params[key])(dr.detach(params[key])) for key in keys}
     for key, value in values.items():
         leaf = type(value)(value)
@@ -66,16 +68,16 @@ def tracking(params: mi.SceneParameters, keys: Iterable[str]) -> Iterator[None]:
 
 
 def with_change(plan: Plan, **members: Any) -> Plan:
-    """Return the plan with other values of its members, or of those of its `needs`."""
+    """Return the plan with other values of its members, or of the members of its `needs`."""
     needs = {name: value for name, value in members.items() if hasattr(plan.needs, name)}
     own = {name: value for name, value in members.items() if name not in needs}
     return replace(plan, needs=replace(plan.needs, **needs), **own)
 
 
 def nothing_is_compiled_without(feature: str, scene: Any, ours: Any, plain: Any) -> None:
-    """Check that the operations of a step depend on `feature` alone, and are fewer without it.
+    """Check that the number of operations of a step depends only on `feature`, and is smaller without `feature`.
 
-    `feature` is a member of the plan that is None in the plan of `plain`, and not in that of `ours`.
+    `feature` is a member of the plan. It is None in the plan of `plain`, but not in the plan of `ours`.
     """
     sensor = scene.scene.sensors()[0]
     with tracking(scene.params, scene.keys):
@@ -91,7 +93,9 @@ def nothing_is_compiled_without(feature: str, scene: Any, ours: Any, plain: Any)
 
 
 def _update(params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Have textures do their work of the first look-up now: the step is not to count it."""
+    """Update the parameters and have textures do the work of their first look-up now. The step must not count this
+    work.
+    """
     params.update()
     for key in keys:
         node = params.properties[key][2]

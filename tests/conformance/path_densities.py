@@ -1,8 +1,11 @@
-"""Weights of paths from both sides are ratios of densities, which are written down here a second time.
+"""Second, independent computation of the densities whose ratios are the weights of paths from both sides.
 
-Two walks note what they meet, and what weight the kernel gave each contribution. Of these vertices, and of the scene's
-own shapes and numbers, `Densities` makes how many paths of each kind would find that very path: a camera path that
-meets the light (H), one whose last vertex samples it (N), a light path that connects to the sensor (L).
+Two walks record their vertices, and the weight that the kernel gave to each contribution. `Densities` uses these
+vertices and the scene's own shapes and numbers. It computes how many paths of each kind would find the same path.
+
+- H is a camera path that meets the light.
+- N is a camera path whose last vertex samples the light.
+- L is a light path that connects to the sensor.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ FIELDS = {"p": 3, "n": 3, "come": 3, "go": 3, "f": 1, "b": 1, "ok": 1, "to": 3, 
 
 
 class Notes:
-    """Buffers by field, and whether a vertex is there at all."""
+    """Buffers for each field of a walk's vertices. The buffers also show which vertices exist."""
 
     def __init__(self, samples: Any) -> None:
         self.samples, self.lanes = samples, samples.width
@@ -56,8 +59,10 @@ class Notes:
                 dr.scatter(self.buffers[name, k], mi.Float(one), lane * DEPTH + (depth - 1), active)
 
     def event(self, vertex: Any, wo: Any, camera: bool) -> tuple[Any, Any, Any]:
-        """Densities of a direction (local) of this walk, as camera and light paths have them, and whether light paths
-        go there: as seen from both sides of the surface, its shading normals agree with its own."""
+        """Return the densities of a local direction of this walk for camera paths and for light paths, and whether
+        light paths take it. Light paths take the direction if the shading normal and the surface's own normal agree
+        about the side of both directions at the vertex.
+        """
         si, bsdf = vertex.si, vertex.bsdf
         turned = mi.SurfaceInteraction3f(si)
         turned.wi = wo
@@ -81,7 +86,7 @@ class Notes:
                   ok=ok, flags=vertex.bsdf.flags(), mirror=mirror)  # fmt: skip
 
     def taken(self) -> dict[str, np.ndarray]:
-        """The fields, (lanes, DEPTH) or (lanes, DEPTH, n)."""
+        """Return the fields, with shape (lanes, DEPTH) or (lanes, DEPTH, n)."""
         dr.eval(self.buffers)
         found = {}
         for name, n in FIELDS.items():
@@ -91,17 +96,17 @@ class Notes:
 
 
 def emitter_number(emitter: Any) -> int:
-    """One emitter's."""
+    """Return the number of one emitter."""
     return int(number(mi.EmitterPtr(emitter))[0])
 
 
 def number(emitter: Any) -> Any:
-    """Emitters' numbers in Dr.Jit's registry."""
+    """Return the emitters' numbers in Dr.Jit's registry."""
     return dr.reinterpret_array(mi.UInt32, emitter)
 
 
 class CameraNotes(CameraHooks, Notes):
-    """What camera paths meet."""
+    """Records of the vertices and light that camera paths meet."""
 
     def start(self, first: Any) -> Any:
         return dr.arange(mi.UInt32, self.lanes)
@@ -120,7 +125,7 @@ class CameraNotes(CameraHooks, Notes):
 
 
 class LightNotes(Hooks, Notes):
-    """What light paths meet."""
+    """Records of the vertices that light paths meet."""
 
     def start(self, product: Any) -> Any:
         return dr.arange(mi.UInt32, self.lanes)
@@ -137,8 +142,10 @@ class LightNotes(Hooks, Notes):
 
 @dataclass
 class Emission:
-    """Rays that left emitters, (lanes,) or (lanes, n): which, from where, normal and texture coordinates there, where
-    to, their weight, and what light of one channel there is along each, but for the cosine at a lamp."""
+    """Rays that left emitters, with shape (lanes,) or (lanes, n). Each ray has its emitter's number, its origin with
+    normal and texture coordinates, its direction, and its weight. `light` is the light of one channel along each
+    ray, without the cosine at a lamp.
+    """
 
     id: np.ndarray
     z: np.ndarray
@@ -150,7 +157,7 @@ class Emission:
 
     @staticmethod
     def of(samples: Any) -> Emission:
-        """The rays of these light paths."""
+        """Return the emitted rays of these light paths."""
         e, scene = sample_emission(samples, samples.sampler()), samples.scene
         ray, emitter = e.ray, e.emitter
         # They begin a little off the lamp, above the point that was drawn.
@@ -175,11 +182,12 @@ class Emission:
 
 @dataclass
 class Paths:
-    """Paths that one way has found, (P,) or (P, DEPTH) from the sensor on, null events left out: `count` vertices.
+    """Paths that one way has found, from the sensor on and without null events. Shapes are (P,) or (P, DEPTH), and
+    `count` is the number of vertices.
 
-    `x`, `n`, `f`, `b`, `ok` are those of the fields, `delta` whether a vertex is, `come` the direction of the segment
-    before it. The last segment ends at `z` on an emitter (number `id`, normal `nz`, coordinates `uv`), and `d` is its
-    direction from the last vertex.
+    `x`, `n`, `f`, `b` and `ok` come from the walk's fields. `delta` shows whether a vertex is delta, and `come` is the
+    direction of the segment before the vertex. The last segment ends at `z` on an emitter (number `id`, normal `nz`,
+    coordinates `uv`). `d` is the direction of `z` from the last vertex.
     """
 
     way: str
@@ -199,12 +207,12 @@ class Paths:
     d: np.ndarray
 
     def patterns(self) -> list[tuple[bool, ...]]:
-        """Which vertices are delta, of each path."""
+        """Return which vertices of each path are delta."""
         return [tuple(bool(x) for x in row[:m]) for row, m in zip(self.delta, self.count, strict=True)]
 
 
 def paths_of(way: str, notes: dict[str, np.ndarray], emission: Emission | None = None) -> Paths:
-    """The paths that ended in one way, of what their walk noted."""
+    """Return the paths that ended in the way `way`, from the notes of their walk."""
     lane, last = np.nonzero(notes[way] >= 0)
     index = np.arange(DEPTH)
     length = last if way == "H" else last + 1
@@ -235,7 +243,9 @@ def paths_of(way: str, notes: dict[str, np.ndarray], emission: Emission | None =
 
 
 def singular(own: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Which events are delta, and which pass straight through: by what the BSDF can do, and what came of it."""
+    """Return which events are delta, and which events pass straight through. The BSDF's flags and the resulting
+    direction decide.
+    """
     flags = own["flags"].astype(np.int64)
     straight = np.linalg.norm(own["go"] - own["come"], axis=-1) < 1e-4
     null = (flags & int(mi.BSDFFlags.Null) > 0) & straight
@@ -253,8 +263,9 @@ def cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class Densities:
-    """How many paths of each kind find a path: of one scene, seen by one sensor, with so many of them; `cutoff` and
-    `fov` are those of its spots and projectors, in degrees."""
+    """Number of paths of each kind that find a given path, for one scene, one sensor and given numbers of samples.
+    `cutoff` and `fov` are the angles of the scene's spots and projectors, in degrees.
+    """
 
     def __init__(self, samples: Any, camera: Any, cutoff: float, fov: float) -> None:
         self.cutoff, self.fov = np.radians(cutoff), np.radians(fov)
@@ -287,7 +298,9 @@ class Densities:
         self.choice = weights / weights.sum()
 
     def of(self, paths: Paths) -> dict[str, np.ndarray]:
-        """H, N, and L of each path, of more than 0 vertices, and `fit`: whether rounding leaves its weight alone."""
+        """Return H, N and L of each path with more than 0 vertices, and `fit`. `fit` is true if rounding does not
+        affect the path's weight.
+        """
         rows, last = np.arange(len(paths.count)), paths.count - 1
         x_m, n_m = paths.x[rows, last], paths.n[rows, last]
         # From the aperture: the plane through the sensor's origin.
@@ -328,10 +341,13 @@ class Densities:
         }
 
     def ends(self, light: Paths | Emission, x: np.ndarray, d: np.ndarray) -> dict[str, np.ndarray]:
-        """Of the light's end, for vertices `x` from which it lies in the direction `d`: `met` brings a density of
-        directions to the measure that the others are of (area on lamps, solid angle of what surrounds, points),
-        `sampled` is next event's density, `sent` that of the rays, with what brings it to `x` (but for the cosine
-        there)."""
+        """Return quantities of the light's end, for vertices `x` from which the light lies in the direction `d`.
+
+        - `met` converts a density of directions to the measure of the other densities. That measure is area on lamps,
+            solid angle for surrounding emitters, or points.
+        - `sampled` is the density of next-event estimation.
+        - `sent` is the density of the emitted rays, converted to `x` without the cosine at `x`.
+        """
         z = np.zeros(len(x))
         result = {"met": z, "sampled": z, "sent": z, "near": z + 1e9, "cos": z + 1}
         for k, emitter in enumerate(self.scene.emitters()):
@@ -347,7 +363,7 @@ class Densities:
     def end(
         self, emitter: Any, z: np.ndarray, nz: np.ndarray, uv: np.ndarray, d: np.ndarray, x: np.ndarray
     ) -> dict[str, Any]:
-        """The same for one emitter, and its choice left out."""
+        """Return the quantities of `ends` for one emitter, without the probability of choosing the emitter."""
         kind, far = emitter.class_name(), length(z - x)
         if kind == "ConstantBackgroundEmitter":
             return {"met": 1, "sampled": 1 / (4 * np.pi), "sent": self.disk / (4 * np.pi)}
@@ -388,7 +404,7 @@ class Densities:
         return {"met": cos / far**2, "sampled": sampled / area, "sent": sent, "near": far, "cos": cos}
 
     def beam(self, emitter: Any, kind: str, d: np.ndarray) -> Any:
-        """The density of directions of the rays of a light at a point."""
+        """Return the density of ray directions for a light at a point."""
         params = mi.traverse(emitter)
         if kind == "PointLight":
             return 1 / (4 * np.pi)

@@ -1,7 +1,7 @@
-"""Small scenes for the conformance tests: a stage (floor, wall, an object) that any emitter can light.
+"""Small scenes for the conformance tests. A stage has a floor, a wall and an object, and any emitter can light it.
 
-y is up. The camera stands in front of the stage, looks slightly down on it, and sees floor, wall, object, and, above,
-what is behind the stage.
+y is up. The camera stands in front of the stage and looks slightly down on it. The camera sees the floor, the wall, the
+object and, above them, the background behind the stage.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.3, 0.2
 
 
 def transform() -> Any:
-    """An identity transformation to build on."""
+    """Return an identity transformation, from which others are built."""
     return mi.ScalarTransform4f()
 
 
 def rgb(*value: float) -> dict[str, Any]:
-    """A colour."""
+    """Return a colour."""
     return {"type": "rgb", "value": list(value)}
 
 
 def bitmap(width: int, height: int, seed: int = 1, low: float = 0.1, high: float = 1.0, channels: int = 3) -> Any:
-    """A random texture."""
+    """Return a random texture."""
     data = np.random.default_rng(seed).uniform(low, high, (height, width, channels)).astype(np.float32)
     return {"type": "bitmap", "raw": True, "data": mi.TensorXf(data)}
 
 
 def camera(width: int = 32, height: int = 24, rfilter: str = "box", film: dict[str, Any] | None = None,
            **changes: Any) -> dict[str, Any]:  # fmt: skip
-    """A camera in front of the stage; `changes` replaces its entries."""
+    """Return a camera in front of the stage. `changes` replace its entries."""
     result = {
         "type": "perspective",
         "fov": 50,
@@ -59,30 +59,36 @@ def camera(width: int = 32, height: int = 24, rfilter: str = "box", film: dict[s
 
 
 def floor_camera(**changes: Any) -> dict[str, Any]:
-    """A camera that looks straight down on the floor before the ball: it sees what the ball throws there alone."""
+    """Return a camera that looks straight down on the floor in front of the ball. Of the ball, the camera sees only the
+    light that the ball throws there.
+    """
     to_world = transform().look_at(origin=[0, 1.5, 1.2], target=[0, 0, 1.2], up=[0, 0, -1])
     return camera(to_world=to_world, fov=40) | changes
 
 
 def rectangle(bsdf: Any, to_world: Any, **changes: Any) -> dict[str, Any]:
-    """A square of side 2, facing +z before `to_world`."""
+    """Return a square of side 2. It faces +z before `to_world` is applied."""
     return {"type": "rectangle", "bsdf": bsdf, "to_world": to_world} | changes
 
 
 def ball(bsdf: Any, center: Any = (0, 0.7, 0), radius: float = 0.5) -> dict[str, Any]:
-    """A sphere above the floor."""
+    """Return a sphere above the floor."""
     return {"type": "sphere", "center": list(center), "radius": radius, "bsdf": bsdf}
 
 
 def lamp(side: float = 0.5, position: Any = (0.5, 1.9, 0.6), target: Any = (0, 0, 0), **emitter: Any) -> dict[str, Any]:
-    """A square area light that looks at the stage, out of the camera's view unless `position` puts it there."""
+    """Return a square area light that looks at the stage. The light is outside the camera's view unless `position`
+    places it in the view.
+    """
     emitter = {"type": "area", "radiance": rgb(8, 7, 6)} | emitter
     to_world = transform().look_at(origin=list(position), target=list(target), up=[0.1, 0.9, 0.2])
     return rectangle(WHITE, to_world @ transform().scale(side / 2), emitter=emitter)
 
 
 def stage(emitters: dict[str, Any] | None = None, sensor: Any = None, **things: Any) -> Any:
-    """The scene: floor and wall, a white ball unless `ball` replaces it (None: none), a lamp unless `emitters`."""
+    """Return the scene with a floor and a wall. A white ball is present unless `ball` replaces it or is None. A lamp is
+    present unless `emitters` is given.
+    """
     flat = transform().rotate([1, 0, 0], -90) @ transform().scale(2)
     scene = {
         "type": "scene",
@@ -97,23 +103,24 @@ def stage(emitters: dict[str, Any] | None = None, sensor: Any = None, **things: 
 
 
 def plugin(name: str, max_depth: int = 4, rr_depth: int = 1000, **options: Any) -> Any:
-    """An integrator as Mitsuba's users get it, without roulette unless asked for."""
+    """Return an integrator as Mitsuba's users load it. Roulette is off by default."""
     reslrb_cli.register()
     return mi.load_dict({"type": name, "max_depth": max_depth, "rr_depth": rr_depth, **options})
 
 
 def images(scene: Any, integrator: str, seeds: range, spp: int, sensor: int = 0, **options: Any) -> np.ndarray:
-    """Renders with each of `seeds`, (N, H, W, C)."""
+    """Return images rendered with each of the `seeds`, with shape (N, H, W, C)."""
     renderer = make_integrator(integrator, **options)
     return np.stack([np.array(render_image(renderer, scene, sensor, s, spp), np.float64) for s in seeds])
 
 
 def agreement(scene: Any, reference: str = "path", *, spp: int = 256, seeds: int = 8, border: int = 0,
               reslrb: dict[str, Any] | None = None, **options: Any) -> Agreement:  # fmt: skip
-    """`reslrb`'s image against `reference`'s, from independent seeds.
+    """Compare the image of `reslrb` with the image of `reference`, from independent seeds.
 
-    `options` go to both integrators (max_depth 5 and no roulette unless they say otherwise), `reslrb` to ours alone;
-    a `border` of so many pixels is left out, and so is alpha, where light tracing has nothing to say.
+    `options` go to both integrators. The defaults are max_depth 5 and no roulette. The options `reslrb` go to our
+    integrator alone. The comparison leaves out a `border` of this many pixels. It also leaves out alpha, for which
+    light tracing gives no result.
     """
     options = {"max_depth": 5, "rr_depth": 100} | options
     spp = round(SHARE * spp)
@@ -127,9 +134,11 @@ def agreement(scene: Any, reference: str = "path", *, spp: int = 256, seeds: int
 def difference_from_ptracer(
     scene: Any, *, spp: int = 16, reslrb: dict[str, Any] | None = None, **options: Any
 ) -> float:
-    """Mean absolute difference from `ptracer`'s image of the same random numbers, over its mean.
+    """Return the mean absolute difference from `ptracer`'s image with the same random numbers, divided by that image's
+    mean.
 
-    Not exactly zero, since `ptracer` takes the direction of its shadow ray from a point a little off the surface.
+    The difference is not exactly zero. `ptracer` takes the direction of its shadow ray from a point slightly off the
+    surface.
     """
     options = {"max_depth": 6, "rr_depth": 3, "hide_emitters": True} | options
     ours = images(scene, "reslrb", range(2), spp, **options, **(reslrb or {}))

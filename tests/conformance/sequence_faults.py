@@ -1,4 +1,4 @@
-"""Faults of numbers of low discrepancy, each planted by a function that patches it in."""
+"""Faults of low-discrepancy numbers. A function patches each fault into the code."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 
 def never_scrambled(patch: pytest.MonkeyPatch) -> None:
-    """Points are those of the sequence itself, in every pass."""
+    """In every pass, the points are the points of the sequence itself, without a scramble."""
     from reslrb_cli.transport import sobol
 
     patch.setattr(sobol, "scrambled", lambda point, shift, key: point)
@@ -29,7 +29,7 @@ def scrambled_once(patch: pytest.MonkeyPatch) -> None:
 
 
 def not_shifted(patch: pytest.MonkeyPatch) -> None:
-    """Digits are permuted, but the permutation leaves the first point where it is."""
+    """The digits are permuted, but the permutation does not move the first point."""
     from reslrb_cli.transport import sobol
 
     right = sobol.scrambled
@@ -42,7 +42,7 @@ def one_scramble_for_all(patch: pytest.MonkeyPatch) -> None:
 
 
 def used_twice(patch: pytest.MonkeyPatch) -> None:
-    """Each two numbers are one coordinate, under one scramble."""
+    """Each pair of successive numbers uses the same coordinate with the same scramble."""
     _renumbered(patch, scramble=lambda number: number // 2, coordinate=lambda number: number // 2)
 
 
@@ -67,7 +67,7 @@ def _renumbered(
 
 
 def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
-    """Lanes share the first number as if there were twice as many of them."""
+    """The lanes share the first number as if there were twice as many lanes."""
     from reslrb_cli.transport import sobol
 
     right = sobol.Net.of
@@ -75,7 +75,7 @@ def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
 
 
 def without_jitter(patch: pytest.MonkeyPatch) -> None:
-    """The first number is always where its stratum begins."""
+    """The first number is always at the start of its stratum."""
     from reslrb_cli.transport import sobol
 
     right = sobol.Net.stratified
@@ -83,7 +83,7 @@ def without_jitter(patch: pytest.MonkeyPatch) -> None:
 
 
 def squeezed(patch: pytest.MonkeyPatch) -> None:
-    """Numbers end below 1."""
+    """The range of the numbers ends below 1."""
     from reslrb_cli.transport import sobol
 
     right = sobol._float
@@ -91,7 +91,7 @@ def squeezed(patch: pytest.MonkeyPatch) -> None:
 
 
 def of_emission_again(patch: pytest.MonkeyPatch) -> None:
-    """The first vertices have the coordinates that emission had."""
+    """The first vertices use the same coordinates as emission."""
     from reslrb_cli.transport.samples import Samples
 
     right = Samples._points
@@ -105,7 +105,7 @@ def of_emission_again(patch: pytest.MonkeyPatch) -> None:
 
 
 def shared_by_passes(patch: pytest.MonkeyPatch) -> None:
-    """All passes of an image have the first one's seed."""
+    """All passes of an image have the seed of the first pass."""
     from reslrb_cli.integrators import reslrb
 
     right = reslrb.passes
@@ -120,7 +120,7 @@ def shared_by_passes(patch: pytest.MonkeyPatch) -> None:
 
 
 def swapped_in_replays(patch: pytest.MonkeyPatch) -> None:
-    """Every second walk has the numbers of its first two vertices the other way round."""
+    """Every second walk uses the numbers of its first vertices in reverse order."""
     from reslrb_cli.transport.samples import Samples
 
     right, calls = Samples.early_numbers, [0]

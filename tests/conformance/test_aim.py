@@ -1,4 +1,6 @@
-"""Scattering that is aimed at what the sensor sees, and guided emission where light is followed: means stay."""
+"""Tests of scattering that is aimed at points that the sensor sees, and of guided emission in scenes with moving light.
+The means do not change.
+"""
 
 from __future__ import annotations
 
@@ -49,20 +51,21 @@ FEW = ["roughplastic", "crop", "plastic_beside_mask"]
 
 @pytest.fixture
 def everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Aim in scenes without glossy surfaces, too."""
+    """Aiming also in scenes without glossy surfaces."""
     monkeypatch.setattr(context, "worthwhile", lambda needs, max_depth: max_depth > 2)
 
 
 def aimed(name: str, **options: Any) -> tuple[Case, Any, Any]:
-    """A case, an integrator that has learned from one gradient, and is aimed by a table of large contrasts that has
-    nothing to do with the scene; and one that is not guided."""
+    """Return a case, a guided integrator, and an integrator that is not guided. The guided integrator has learned from
+    one gradient. A table of large contrasts, which has nothing to do with the scene, aims its paths.
+    """
     scene, ours, plain = guided(name, 1, **options)
     askew(scene, ours)
     return scene, ours, plain
 
 
 def askew(scene: Case, ours: Any, factor: float = 1.5) -> None:
-    """Have the samples of the first sensor be aimed by such a table."""
+    """Aim the samples of the first sensor by a random table of large contrasts."""
     tables = ours.preparation.guiding
     areas = tables.films[0].areas()
     loud = np.random.default_rng(1).lognormal(0, factor, len(areas)) * areas
@@ -102,7 +105,7 @@ def test_low_discrepancy_sequences_have_the_same_means() -> None:
 
 
 def without_factor(patch: pytest.MonkeyPatch) -> None:
-    """Paths that were not aimed count as if none were."""
+    """The factor of a path that is not aimed is never less than 1."""
     right = Pending.factor
 
     def wrong(self: Pending, *rest: Any) -> Any:
@@ -115,7 +118,7 @@ def without_factor(patch: pytest.MonkeyPatch) -> None:
 
 
 def of_even_density(patch: pytest.MonkeyPatch) -> None:
-    """The density is that of a film whose positions are drawn evenly."""
+    """The density is the density of a film with uniformly sampled positions."""
     right = Aim.of
 
     def wrong(blocks: Blocks, wanted: Any) -> Aim:
@@ -126,12 +129,12 @@ def of_even_density(patch: pytest.MonkeyPatch) -> None:
 
 
 def behind_others(patch: pytest.MonkeyPatch) -> None:
-    """A path that meets something on its way to its point goes on as if it had arrived."""
+    """An aimed path that meets another surface before its target point continues as if it had arrived."""
     patch.setattr(aim, "REACHED", 0.0)
 
 
 def seen_through_others(patch: pytest.MonkeyPatch) -> None:
-    """What the sensor does not see has the density of what it sees."""
+    """Points that the sensor does not see have the density of visible points."""
     right = Pending.factor
 
     def wrong(self: Pending, table: Any, sensor: Any, si: Any, ray: Any, connection: Any, visible: Any) -> Any:
@@ -141,7 +144,7 @@ def seen_through_others(patch: pytest.MonkeyPatch) -> None:
 
 
 def with_delta_lobes(patch: pytest.MonkeyPatch) -> None:
-    """A mirror's direction counts as one that paths are aimed at."""
+    """The direction of a mirror counts as a direction at which paths can be aimed."""
     from reslrb_cli.transport.aim import Pending
 
     right = Pending.of
@@ -150,7 +153,7 @@ def with_delta_lobes(patch: pytest.MonkeyPatch) -> None:
 
 
 def from_everywhere(patch: pytest.MonkeyPatch) -> None:
-    """The share that glass keeps for itself is missing."""
+    """The share of aimed paths is `SHARE` everywhere, even on glass, from which no paths are aimed."""
     from reslrb_cli.transport import walk
 
     patch.setattr(walk, "choose", lambda *args: _with_share(aim.choose(*args)))
@@ -192,7 +195,7 @@ def test_a_replay_follows_the_traced_paths(name: str, fault: bool, monkeypatch: 
 
 @pytest.mark.usefixtures("everywhere")
 def test_a_recorded_step_equals_the_step() -> None:
-    """Recordings have the table that there is, not the one that they were made with."""
+    """A recording uses the current table, not the table with which it was made."""
     (scene, ours, _), (_, frozen, _) = (guided("roughplastic", 0, freeze=freeze) for freeze in (False, True))
     for factor in (0.0, 1.0, 2.0):
         for each in (ours, frozen):
@@ -330,7 +333,7 @@ def means_of_motion_hold(name: str, estimator: str, harsh: bool = False) -> None
 
 
 def learn(moving: Any, ours: Any) -> None:
-    """Four steps that the tables learn from, after which they learn no more."""
+    """Run four steps from which the tables learn, and then stop the learning."""
     for seed in range(4):
         moving.gradient(ours, 9000 + seed, 16)
     guiding = ours.preparation.guiding

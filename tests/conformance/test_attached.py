@@ -1,4 +1,4 @@
-"""Derivatives of what moves light: against naive AD of the same paths, forward mode, and at edges."""
+"""Tests of derivatives of light that moves: against naive AD of the same paths, in forward mode, and at edge cases."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ DEEP = {"slab.vertex_positions": None, "shell.bsdf.reflectance.value": None}
 
 
 def tracer(case: AttachedCase, name: str) -> StepIntegrator:
-    """One of the integrators of a case."""
+    """Return the integrator `name` of a case."""
     options: dict[str, Any] = {"hide_emitters": True} | case.both
     if name != "ptracer":
         options |= {"filter_normalization": "detached"}
@@ -56,10 +56,10 @@ def tracer(case: AttachedCase, name: str) -> StepIntegrator:
 
 
 def distances(case: AttachedCase) -> Iterator[tuple[str, float, float]]:
-    """Of each comparison: what it is, the distance, and the largest that may be.
+    """Yield the name of each comparison, its distance, and the largest allowed distance.
 
-    Medians over seeds: rounding sends a path of rough glass another way now and then, on some processors more often
-    than on others, and its seed then says nothing. A fault of the code is there at every seed.
+    Distances are medians over seeds. Rounding sometimes sends a path of rough glass another way, on some processors
+    more often than on others. The seed of this path then shows nothing. A fault of the code is present at every seed.
     """
     moving = case.moving()
     tracers = {name: tracer(case, name) for name in ("reslrb", "walk_ad", *(["ptracer"] if case.stock else []))}
@@ -78,7 +78,7 @@ def distances(case: AttachedCase) -> Iterator[tuple[str, float, float]]:
 
 
 def check(case: AttachedCase) -> None:
-    """Assert that every distance is within its limit, and that the references themselves agree."""
+    """Assert that every distance is within its limit, and that the references agree with each other."""
     for what, distance, limit in distances(case):
         print(f"{case.name}: {what}: {distance:.1e}, at most {limit:.1e}")
         assert distance <= limit, f"{what}: {distance:.1e} > {limit:.1e}"
@@ -93,7 +93,9 @@ def test_equal_seeds(name: str):
 @pytest.mark.long
 @pytest.mark.parametrize("name", [case.name for case in CASES if case.stock])
 def test_means_over_seeds_agree_with_ptracer(name: str):
-    """By gradcheck's tests: they would see a fault that the distances at one seed are too coarse for."""
+    """The tests of gradcheck compare the means. They would find a fault for which the distances at one seed are too
+    coarse.
+    """
     case, many = BY_NAME[name], seeds(8)
     moving = case.moving()
     ours, stock = (
@@ -114,7 +116,7 @@ def test_means_over_seeds_agree_with_ptracer(name: str):
 
 
 def deep(depth: int, stack_size: int, **options: Any) -> dict[str, np.ndarray]:
-    """The gradient through long paths, with a stack of this size."""
+    """Return the gradient through long paths, with a stack of size `stack_size`."""
     moving = Moving(enclosed(albedo=0.95), DEEP)
     return moving.gradient(integrator("reslrb", depth, estimator="stack", stack_size=stack_size, **options), 3, 4)
 
@@ -140,7 +142,7 @@ def test_a_small_stack_equals_a_large_one(depth: int, sizes: tuple[int, ...], op
 
 @pytest.mark.long
 def test_normalization_of_the_filter_has_an_effect():
-    """Else that it is attached or detached would not show in any of these tests."""
+    """Without this effect, none of these tests would show whether the normalization is attached or detached."""
     case = BY_NAME["slab"]
     moving = case.moving()
     attached, detached = (
@@ -179,7 +181,7 @@ SAMPLING = ("follow", "stay")
 
 
 def distance(name: str, sampling: str) -> float:
-    """The largest deviation of all derivatives, relative to the largest of them."""
+    """Return the largest deviation of the first three derivatives, relative to the largest entry of the gradient."""
     case, options = SCENES[name].case(), dict(SCENES[name].options)
     options |= {"attached_sampling": sampling}
     tracer = integrator("reslrb", **options, estimator="stack")
@@ -202,7 +204,7 @@ def test_forward_against_backward_in_other_scenes(name: str, sampling: str):
 
 
 def assert_forward_is_backward(name: str, sampling: str) -> None:
-    """Up to rounding."""
+    """Assert that forward mode and the gradient agree up to rounding."""
     found = distance(name, sampling)
     print(name, sampling, found)
     assert found < ROUNDING
@@ -210,7 +212,7 @@ def assert_forward_is_backward(name: str, sampling: str) -> None:
 
 @dataclass(frozen=True)
 class Fault:
-    """As `plant` takes it."""
+    """Fault in the form that `plant` takes."""
 
     right: str
     wrong: str
@@ -238,7 +240,9 @@ def test_fault_of_forward_mode(name: str, monkeypatch: pytest.MonkeyPatch):
 
 
 class Script:
-    """As Mitsuba's users write it: a slab under `mi.render`, whose ripples grow by an amplitude."""
+    """Script as Mitsuba's users write it. The script renders a slab with `mi.render`, and the slab's ripples grow with
+    an amplitude.
+    """
 
     def __init__(self, normalization: str) -> None:
         register()
@@ -247,7 +251,7 @@ class Script:
         self.shared = {"max_depth": 5, "hide_emitters": True, "filter_normalization": normalization}
 
     def render(self, **plugin: Any) -> tuple[mi.Float, mi.TensorXf]:
-        """The amplitude, which tracks derivatives, and the image."""
+        """Return the amplitude, which tracks derivatives, and the image."""
         positions, rest = (mi.Float(rippled(2.0, 12, ripples).astype(np.float32).ravel()) for ripples in (1.0, 0.0))
         amplitude = mi.Float(1)
         dr.enable_grad(amplitude)
@@ -257,7 +261,7 @@ class Script:
         return amplitude, mi.render(self.scene, self.params, integrator=integrator, spp=16, seed=1)
 
     def tangent(self, **plugin: Any) -> np.ndarray:
-        """The image's derivative."""
+        """Return the derivative of the image by the amplitude."""
         amplitude, image = self.render(**plugin)
         dr.forward(amplitude)
         return np.array(dr.grad(image))
@@ -265,7 +269,7 @@ class Script:
 
 @pytest.mark.parametrize("normalization", ["attached", pytest.param("detached", marks=pytest.mark.long)])
 def test_as_a_plugin(normalization: str):
-    """`dr.forward` of a script against its `dr.backward`, for a random dL/dI: a wrong pixel shows."""
+    """`dr.forward` and `dr.backward` of a script agree for a random dL/dI, so that a wrong pixel shows."""
     script, plugin = Script(normalization), {"type": "reslrb", "estimator": "stack"}
     tangent = np.float64(script.tangent(**plugin))
     weights = np.random.default_rng(1).uniform(-1, 1, tangent.shape)
@@ -300,7 +304,7 @@ SLAB = {"slab.vertex_positions": None}
 
 @dataclass(frozen=True)
 class Edge:
-    """As `Moving` takes it; with `dark` no light arrives, and every derivative is zero."""
+    """Edge case with the arguments of `Moving`. With `dark`, no light arrives and every derivative is zero."""
 
     scene: Callable[[], dict[str, Any]]
     start: dict[str, Any] = field(default_factory=lambda: dict(SLAB))
@@ -311,7 +315,7 @@ class Edge:
 
 
 def slanted(degrees: float) -> dict[str, Any]:
-    """Parallel light that comes at this angle from the vertical."""
+    """Return parallel light that comes at this angle from the vertical."""
     angle = np.deg2rad(degrees)
     origin = [1.2 * float(np.sin(angle)), 2.0 + 1.2 * float(np.cos(angle)), 0.0]
     to_world = mi.ScalarTransform4f().look_at(origin, [0, 2, 0], [0, 0, 1]) @ mi.ScalarTransform4f().scale(0.3)
@@ -319,12 +323,12 @@ def slanted(degrees: float) -> dict[str, Any]:
 
 
 def glass(index: float) -> dict[str, Any]:
-    """Smooth glass."""
+    """Return smooth glass with this index of refraction."""
     return {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
 
 
 def lit_from_within(bsdf: dict[str, Any], intensity: float = 5.0) -> dict[str, Any]:
-    """A point between the slab's two sides: most of its light is reflected whole."""
+    """Return a scene with a point light between the two sides of the slab. Most of this light is totally reflected."""
     light = {"type": "point", "position": [0.05, 2.1, 0], "intensity": rgb(*[intensity] * 3)}
     return enclosed(bsdf, lamp=light)
 
@@ -380,7 +384,7 @@ def test_at_the_border(name: str):
 
 
 def bending(bsdf: dict[str, Any]) -> Moving:
-    """A flat mesh that reflects parallel light from the side, and bends by `size` times the ripples."""
+    """Return a scene with a flat mesh in parallel light from the side. The mesh bends by `size` times the ripples."""
     flat_, rippled = (sheet("slab", bsdf, 2.0, ripples=ripples) for ripples in (0.0, 1.0))
     first, last = (np.array(mesh.vertex_positions_buffer()) for mesh in (flat_, rippled))
 
@@ -391,7 +395,9 @@ def bending(bsdf: dict[str, Any]) -> Moving:
 
 
 def test_a_flat_mesh_that_bends_has_its_shading_normals():
-    """An image without parameters, of the same integrator, before and after: the plan is renewed."""
+    """One integrator renders an image without parameters before and after the mesh bends. The integrator renews its
+    plan in between.
+    """
     moving = bending(glass(1.5))
     ours, options = integrator("reslrb", 5, hide_emitters=True), {"seed": 1, "spp": 32}
     sensor = moving.loaded.sensors()[0]

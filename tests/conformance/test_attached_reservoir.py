@@ -1,4 +1,4 @@
-"""Derivatives of what moves light by `reservoir`, and by light that follows a surface."""
+"""Derivatives of moving light with `reservoir`, and with light that follows a surface."""
 
 from __future__ import annotations
 
@@ -59,7 +59,9 @@ def test_specular_chains_equal_naive_ad(name: str):
 
 @dataclass
 class Bias:
-    """Of N gradients, as a fraction of that of `stack` along itself: mean difference and its standard error."""
+    """Bias of N gradients, as a fraction of the gradient of `stack`. `value` is the mean difference along this
+    gradient, and `error` its standard error.
+    """
 
     value: float
     error: float
@@ -71,14 +73,16 @@ class Bias:
 
 @cache
 def exact_gradients(name: str, sampling: str, count: int) -> np.ndarray:
-    """Those of `stack` in the scene of this name, once for all tests: nothing that they break takes part in it."""
+    """Return the gradients of `stack` in the scene of this name. The gradients are computed once for all tests, and do
+    not use any code that the tests break.
+    """
     [scene] = [scene for scene in (ONE, TWO, BOTH) if scene.name == name]
     tracer = integrator("reslrb", **scene.options, attached_sampling=sampling, estimator="stack")
     return scene.case().gradients(tracer, seeds(count), scene.spp)
 
 
 def bias(scene: AttachedScene, sampling: str, count: int, **options: Any) -> Bias:
-    """That of `reservoir` at equal seeds."""
+    """Return the bias of `reservoir` relative to `stack` at equal seeds."""
     exact = exact_gradients(scene.name, sampling, count)
     tracer = integrator("reslrb", **scene.options, attached_sampling=sampling, estimator="reservoir", **options)
     ours = scene.case().gradients(tracer, seeds(count), scene.spp)
@@ -110,7 +114,7 @@ def test_no_bias_whatever_the_damping(scene: AttachedScene, damping: float, samp
 
 @pytest.mark.long
 def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
-    """As long paths are taken, of which one block alone counts, times their number."""
+    """A long path is divided into blocks. Only one block counts, multiplied by the number of blocks."""
     monkeypatch.setattr(chain, "BLOCK", 1)
     found = bias(ONE, "stay", 24)
     print(found)
@@ -120,7 +124,7 @@ def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.long
 def test_without_a_random_sign_it_is_biased(monkeypatch: pytest.MonkeyPatch):
-    """Else that there is none would show nothing."""
+    """Without the random sign, a bias is found. Tests that find no bias are therefore meaningful."""
     monkeypatch.setattr(chain, "sign", lambda numbers: 1)
     found = bias(ONE, "follow", 12, jacobian_damping=0.5)
     print(found)
@@ -135,7 +139,9 @@ def test_without_a_random_sign_it_is_biased(monkeypatch: pytest.MonkeyPatch):
     ids=str,
 )
 def test_bounces_with_several_connections(options: dict[str, Any]):
-    """Selection adds its noise; parameters of emission and of BSDFs beside those that move."""
+    """Selection adds noise and no bias. Parameters of emission and of BSDFs are differentiated together with moving
+    parameters.
+    """
     case = BY_NAME["bounces"]
     moving = case.moving()
     shared = {"hide_emitters": True} | case.both
@@ -153,8 +159,9 @@ def test_bounces_with_several_connections(options: dict[str, Any]):
 
 @pytest.mark.parametrize("name", ["spot", pytest.param("point", marks=pytest.mark.long)])
 def test_a_single_lamp_moves(name: str):
-    """No vertex then has anything to differentiate, only the ray that leaves the lamp. Over a floor alone, at whatever
-    depth, a path has one connection."""
+    """If only a lamp moves, vertices have nothing to differentiate. Only the ray that leaves the lamp does. Over a
+    floor alone, a path has one connection at any depth.
+    """
     [lamp] = [case for case in LAMPS if case.name == name]
     moving = lamp.moving()
     exact, ours = (
@@ -170,8 +177,9 @@ def test_a_single_lamp_moves(name: str):
 @pytest.mark.long
 @pytest.mark.parametrize("options", [{}, {"capacity": 3}], ids=str)
 def test_a_single_lamp_moves_within_walls(options: dict[str, Any]):
-    """The same with several connections a path, of which some are selected: in expectation. (Of a point, whose light
-    goes everywhere, 16 seeds leave a tenth of noise.)"""
+    """Within walls, a path has several connections, and some of them are selected. The gradients of a moving lamp then
+    agree in expectation. A point light shines in all directions, and 16 seeds would leave noise of a tenth.
+    """
     [lamp] = [case for case in LAMPS if case.name == "spot_bounces"]
     moving = lamp.moving()
     exact, ours = (
@@ -193,7 +201,9 @@ def test_a_single_lamp_moves_within_walls(options: dict[str, Any]):
 
 @pytest.mark.parametrize("name", ["bounces", pytest.param("rough_slab", marks=pytest.mark.long)])
 def test_two_kernels_equal_one(name: str):
-    """Where dL/dI is known before, chain and replay are one kernel; else what is kept goes through memory."""
+    """If dL/dI is known beforehand, chain and replay are one kernel. Otherwise, the kept state goes through memory.
+    Both ways give the same gradient.
+    """
     scene = replace(ONE, spp=16)
     case = scene.case()
     tracer = integrator("reslrb", **scene.options, estimator="reservoir", jacobian_damping=0.01)
@@ -223,7 +233,7 @@ FAULTS = {
 
 
 def distance(name: str) -> float:
-    """Of `reservoir` from `stack` at equal seeds, where rounding alone is to be between them."""
+    """Return the largest distance between `reservoir` and `stack` at equal seeds, which must be rounding alone."""
     case = BY_NAME[name]
     depth = 4 if name == "receiver" else case.depth  # one connection a path
     moving = case.moving()
@@ -265,14 +275,16 @@ BRUSHED = {"type": "roughconductor", "material": "none", "alpha": 0.4, "sample_v
 
 
 def lit_wall(bsdf: dict[str, Any] = WHITE) -> dict[str, Any]:
-    """A point light over a floor that lights a wall; the camera sees the wall alone, and not its edges."""
+    """Return a scene with a point light over a floor that lights a wall. The camera sees only the wall, without its
+    edges.
+    """
     scene = room(wall=wall(WHITE), lamp=point((0.1, 0.7, 0.2)))
     floor = scene["floor"] | {"bsdf": bsdf}
     return {name: thing for name, thing in scene.items() if name not in ("top", "bottom")} | {"floor": floor}
 
 
 def ball() -> dict[str, Any]:
-    """A point light inside of a ball, and a camera there."""
+    """Return a scene with a point light and a camera inside a ball."""
     scene = lit_wall()
     shell = {"type": "sphere", "center": [0, 1, 0], "radius": 2.0, "flip_normals": True, "bsdf": WHITE}
     return {name: scene[name] for name in ("type", "camera", "lamp")} | {"shell": shell}
@@ -311,7 +323,7 @@ FEWEST = ("bounce",)
 
 
 def gradients(scene: AttachedScene, sampling: str, count: int, first: int = 1) -> np.ndarray:
-    """At `count` seeds from the `first` on: (N, K)."""
+    """Return gradients (N, K) at `count` seeds, starting with seed number `first`."""
     tracer = integrator("reslrb", **dict(scene.options) | {"attached_sampling": sampling}, estimator="stack")
     return scene.case().gradients(tracer, seeds(count, first), scene.spp)
 
@@ -330,8 +342,9 @@ def test_both_agree(name: str):
 
 @pytest.mark.long
 def test_a_corner_that_does_not_move():
-    """Directions that turn sweep over it, which `auto` leaves alone: finite differences hold with it, and fail
-    without."""
+    """With `follow`, turning directions sweep over the corner. With `auto`, directions do not. Only the gradients with
+    `auto` agree with finite differences.
+    """
     scene = SCENES["bounce_corner"]
     right = compare_with_differences(scene, count=4)
     # Differences are of the image alone, which is the same for both.

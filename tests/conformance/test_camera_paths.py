@@ -1,6 +1,7 @@
-"""`paths: camera` and `both`: images against `path` in every pixel, gradients against naive AD and in expectation.
+"""`paths: camera` and `both`. Images are compared with `path` in every pixel, and gradients with naive AD and in
+expectation.
 
-Mirrors and glass are in view, lamps are hidden, and the film's border counts: what light paths alone lack is there.
+Mirrors and glass are in view, lamps are hidden, and the film's border counts. Light paths alone lack these effects.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ SMALL = {"width": 20, "height": 16}
 
 
 def seen(**bsdf: Any) -> dict[str, Any]:
-    """A ball of this material in view."""
+    """Return a ball of this material in the camera's view."""
     return {"ball": ball(bsdf)}
 
 
@@ -61,7 +62,7 @@ def looks(**changes: Any) -> Any:
 
 
 def sheet() -> Any:
-    """A perforated sheet between camera and stage."""
+    """Return a perforated sheet between camera and stage."""
     to_world = transform().look_at(origin=[0.2, 1.3, 2.0], target=[0.4, 1.5, 4], up=[0, 1, 0]) @ transform().scale(0.5)
     bsdf = {"type": "mask", "opacity": bitmap(6, 6, channels=1, low=0), "bsdf": {"type": "twosided", "bsdf": RED}}
     return rectangle(bsdf, to_world)
@@ -102,7 +103,7 @@ def test_images_equal_path_in_every_pixel(name: str, way: int):
 
 
 def unevenly(tracer: Any, scene: Any) -> Any:
-    """The same with camera paths that are shared out over the pixels at random."""
+    """Return the same tracer with camera paths that are randomly distributed over the pixels."""
     size = scene.sensors()[0].film().crop_size()
     return tracer.shared_out({"0": np.random.default_rng(5).exponential(size=(size[1], size[0])).astype(np.float32)})
 
@@ -156,8 +157,9 @@ def test_gradients_are_independent_of_the_distribution_of_paths(paths: str):
 
 
 def test_the_pilot_finds_pixels_that_only_a_mirror_shows():
-    """A red wall behind the camera is seen in a mirror; its colour is known from the mirror's pixels alone, and all
-    else has few paths. Noted anew it is the same."""
+    """A camera sees a red wall behind it only in a mirror. The mirror's pixels alone depend on the wall's colour, and
+    the other pixels get few paths. A second recording gives the same result.
+    """
     size = {"width": 48, "height": 48, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     at = transform().look_at(origin=[0, 0, 0], target=[0, 0, -1], up=[0, 1, 0])
     back = transform().translate([0, 0, -3]).scale(3)
@@ -192,8 +194,9 @@ def test_the_pilot_finds_pixels_that_only_a_mirror_shows():
 
 @pytest.mark.parametrize("image", ["lamp", "texture"])
 def test_edges_do_not_count_as_noise(image: str):
-    """Beside a bright lamp without noise the gradient has no more variance than with even shares. With a flat noisy
-    half and a clean textured one it has at most 0.8 of that."""
+    """Beside a bright lamp without noise, the gradient's variance is at most 1.02 times the variance with even shares.
+    For a flat noisy half beside a clean textured half, the factor is at most 0.8.
+    """
     means, deviations, signal = np.ones((48, 48)), np.full((48, 48), 0.5), np.ones((48, 48))
     if image == "lamp":
         means[20:26, 20:26], deviations[20:26, 20:26], signal[20:26, 20:26] = 50, 0, 0
@@ -208,8 +211,9 @@ def test_edges_do_not_count_as_noise(image: str):
 
 @pytest.mark.parametrize("left_out", [False, True])
 def test_noise_outside_the_loss_gets_no_paths(left_out: bool):
-    """A lamp's bright surroundings are noisy, and have a small curvature by relative_l2, or are left out: the gradient
-    has less variance with the loss's curvature than without."""
+    """A bright, noisy area around a lamp has a small curvature under relative_l2, or is left out of the loss. The
+    gradient has less variance with the loss's curvature than without.
+    """
     means, signal = np.ones((48, 48)), np.ones((48, 48))
     means[10:30, 10:30] = 30
     curvature = 1 / np.square(means)
@@ -226,13 +230,13 @@ def test_noise_outside_the_loss_gets_no_paths(left_out: bool):
 
 
 def grid(n: int) -> mi.Point2f:
-    """The middles of n x n pixels."""
+    """Return the centres of n x n pixels."""
     pixel = dr.arange(mi.UInt32, n * n)
     return mi.Point2f((pixel % n + 0.5) / n, (pixel // n + 0.5) / n)
 
 
 def test_light_paths_alone_can_have_the_border_of_both():
-    """Where they are what `paths: auto` makes of both."""
+    """If `paths: auto` turns `both` into light paths alone, the border of the image stays right."""
     film = {"film": {"rfilter": {"type": "gaussian", "stddev": 1.5}}}
     scene = stage(None, looks(**film))
     ours = make_integrator("reslrb", estimator="stack", max_depth=3, rr_depth=100)
@@ -243,7 +247,9 @@ def test_light_paths_alone_can_have_the_border_of_both():
 
 
 def test_light_that_camera_paths_cannot_find_is_left_to_light_paths():
-    """Parallel light through a ball of glass: next event estimation is blocked, and no path meets the lamp."""
+    """Parallel light passes through a ball of glass. Next event estimation is blocked, and no camera path meets the
+    lamp.
+    """
     scene = stage({"sun": {"type": "directional", "direction": [0, -1, -0.2], "irradiance": rgb(3, 3, 3)}}, looks(),
                   ball=ball({"type": "dielectric"}))  # fmt: skip
     sizes = {"max_depth": 5, "rr_depth": 100, "estimator": "stack"}
@@ -259,7 +265,7 @@ def test_light_that_camera_paths_cannot_find_is_left_to_light_paths():
 
 @pytest.mark.parametrize("paths", ["camera", "both"])
 def test_fewer_paths_than_pixels(paths: str):
-    """At one sample per pixel, and where but a few paths are light paths, means are what they are."""
+    """Means do not change with one sample per pixel, even if only a few paths are light paths."""
     scene = stage(None, looks())
     options = {"max_depth": 3, "rr_depth": 100, "estimator": "stack", "paths": paths}
     usual = images(scene, "reslrb", range(16), 256, **options)
@@ -290,7 +296,9 @@ def options_of(case: GradientCase, paths: str, **more: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("paths", ["camera", "both"])
 @pytest.mark.parametrize("case", a_few(BOTH, [case.name for case in BOTH if case.name in SOME]))
 def test_gradients_equal_naive_ad(case: GradientCase, paths: str):
-    """Known before the image, of one traversal; after it; beyond a stack that has room for one vertex."""
+    """dL/dI becomes known before the image, in one traversal, or after the image. A small stack (one vertex) and
+    recordings are also tested.
+    """
     scene = Case(case.scene(), case.keys)
     reference = scene.gradient(integrator("walk_ad", **case.both, paths=paths), 5, case.spp)
     ways: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
@@ -353,7 +361,7 @@ def test_every_estimator_handles_weighted_connections(estimator: str):
 
 
 def peak(depth: int, spp: int, paths: str) -> float:
-    """MiB that a step holds at most, its kernels known."""
+    """Return the peak memory of a step in MiB, after its kernels are compiled."""
     case = next(case for case in CASES if case.name == "texture")
     options = options_of(case, paths) | {"max_depth": depth, "rr_depth": 1000}
     scene, work = Case(case.scene(), case.keys), integrator("reslrb", **options)
@@ -392,7 +400,7 @@ def test_impossible_options(options: dict[str, Any], words: str):
 
 
 def test_sensors_that_light_paths_cannot_connect_to():
-    """`camera` renders them; `both` is refused with what to take."""
+    """`camera` renders with these sensors. `both` is refused, with the advice to use `camera`."""
     sensor = {"type": "orthographic", "to_world": transform().look_at([0, 1, 4], [0, 0.7, 0], [0, 1, 0]),
               "film": {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}}}  # fmt: skip
     scene = stage(None, mi.load_dict(sensor) if not isinstance(sensor, dict) else sensor)

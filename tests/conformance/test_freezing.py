@@ -1,4 +1,6 @@
-"""Steps from a recording (`freeze`) are the steps themselves: same image and gradient, also after parameters change."""
+"""Steps from a recording (`freeze`) equal plain steps. Image and gradient are the same, also after parameters
+change.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ KINDS = {
 
 
 def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list[np.ndarray], list[dict[str, int]]]:
-    """Gradients of four steps, between which seed and parameters change, and recordings after each."""
+    """Return the gradients of four steps, and the counts of recordings after each step. Seed and parameters change
+    between the steps.
+    """
     scene = Case(case.scene(), case.keys)
     own = {key: value for key, value in case.options.items() if key != "samples_per_pass"}
     chosen = integrator("reslrb", **{**case.both, **own, **options})
@@ -59,7 +63,7 @@ def test_a_recorded_step_of_other_cases_equals_the_step(name: str, estimator: st
 
 
 def recorded_step_is_the_step(case: GradientCase, estimator: str) -> None:
-    """Of one way to come by dL/dI, which case and estimator choose."""
+    """Check recorded steps for one kind of dL/dI, which depends on case and estimator."""
     adjoint = list(KINDS)[(ESTIMATORS.index(estimator) + len(case.name)) % len(KINDS)]
     expected, none = gradients(case, adjoint, estimator=estimator, freeze=False)
     gc.collect()  # the scene: none but its own may be alive
@@ -84,7 +88,7 @@ def test_unrecordable_calls_are_computed_plainly(estimator: str, adjoint: str) -
 
 def test_an_outdated_recording_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     class Stale:
-        """Works while it is tried, twice, and not later."""
+        """Replacement for `drjit.freeze` that fails after its first two calls, which are the trial."""
 
         def __init__(self, function: object, **options: object) -> None:
             self.n_recordings, self.calls = 1, 0
@@ -102,7 +106,9 @@ def test_an_outdated_recording_is_an_error(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize("adjoint", a_few(KINDS, ("batched",)))
 def test_sensors_have_their_own_recordings(adjoint: str, capfd: pytest.CaptureFixture[str]) -> None:
-    """One for all was made anew for each of three sensors in each step, and Dr.Jit warned every time."""
+    """A single recording for all sensors was made again for each of three sensors in each step. Dr.Jit warned every
+    time.
+    """
     case = BY_NAME["texture"]
     cameras = {f"camera_{n}": camera(sensor="thinlens" if n == 3 else "perspective") for n in range(4)}
     scene = Case({**case.scene(), "camera": cameras.pop("camera_0"), **cameras}, case.keys)
@@ -123,7 +129,7 @@ def test_sensors_have_their_own_recordings(adjoint: str, capfd: pytest.CaptureFi
 
 def test_frequently_recorded_calls_are_no_longer_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     class Restless:
-        """Is recorded anew in each call."""
+        """Replacement for `drjit.freeze` that makes a recording in each call."""
 
         calls = 0
 
@@ -187,7 +193,9 @@ def test_large_steps_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_image_is_the_same_alone_and_in_a_step() -> None:
-    """Of what derivatives ask of a walk, an image knows nothing: else it would carry that, and be recorded twice."""
+    """The walk of an image ignores what derivatives require. Otherwise, the image would carry these requirements and be
+    recorded twice.
+    """
     case = BY_NAME["texture"]
     scene, chosen = Case(case.scene(), case.keys), integrator("reslrb", estimator="stack", freeze=True)
     scene.image(chosen, 3, 8)

@@ -1,4 +1,6 @@
-"""Gradients of every estimator: at equal seeds, in expectation, by forward mode, and where factors are zero."""
+"""Gradients of every estimator are tested at equal seeds, in expectation, in forward mode, and where factors are
+zero.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ BY_ADJOINT = {
 
 
 def estimator(case: GradientCase, name: str, options: dict):
-    """The integrator of a case with this estimator."""
+    """Return the integrator of a case with this estimator."""
     return integrator("reslrb", **case.both | case.options | {"estimator": name} | options)
 
 
@@ -65,7 +67,7 @@ def test_exact_estimators_equal_naive_ad(case: GradientCase, adjoint: str):
 
 
 def agree(case: GradientCase, count: int, candidates: dict[str, dict], adjoint: str) -> None:
-    """Compare each candidate with `gather` over `count` other seeds."""
+    """Compare each candidate with `gather` at other seeds, over `count` seeds each."""
     scene = Case(case.scene(), case.keys)
     reference = scene.gradients(estimator(case, "gather", {}), seeds(count, 1), case.spp, adjoint=adjoint)
     for name, options in candidates.items():
@@ -113,7 +115,7 @@ RESOLUTION = 0.1
 
 
 def agreement(case: GradientCase, count: int) -> Agreement:
-    """Compare gradients over `count` seeds each."""
+    """Compare gradients with the case's reference over `count` seeds each."""
     scene = Case(case.scene(), case.keys)
     ours = scene.gradients(integrator("reslrb", **case.both | case.options), seeds(count), case.spp)
     if case.reference == "fd":
@@ -170,7 +172,9 @@ def test_walk_ad_equals_ptracer(name: str):
 
 
 def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
-    """The image's derivative along the first of the random directions of the parameters, as Mitsuba's users get it."""
+    """Return the image's derivative along the first of the random parameter directions. The derivative comes from
+    `mi.render`, as for Mitsuba's users.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -201,7 +205,7 @@ def test_forward_mode_equals_walk_ad(name: str):
 
 @pytest.mark.parametrize("name", a_few(["texture", "roulette", "glass", "blend", "visible_lamp"], ["texture"]))
 def test_forward_against_backward(name: str):
-    """<weights, J v> against <J^T weights, v>, where J^T is the reservoir's."""
+    """<weights, J v> agrees with <J^T weights, v>, where J^T comes from the reservoir."""
     case = BY_NAME[name]
     scene = Case(case.scene(), case.keys)
     options = case.both | case.options
@@ -222,7 +226,7 @@ def test_forward_against_backward(name: str):
 
 
 def tiles(*texels: tuple[float, ...]) -> dict:
-    """A texture with these columns; two rows and columns is the least that Mitsuba takes."""
+    """Return a texture with these columns. Mitsuba requires at least two rows and columns."""
     return bitmap(
         np.broadcast_to(np.array(texels, float).reshape(1, len(texels), -1), (2, len(texels), len(texels[0])))
     )
@@ -238,7 +242,9 @@ def blend(weight: dict) -> dict:
 
 @dataclass(frozen=True)
 class ZeroCase:
-    """`sides`: which way the domain goes on. `fixed_paths`: paths do not depend on the parameters."""
+    """Case of `test_zero`. `sides` is the direction in which the domain continues. With `fixed_paths`, paths do not
+    depend on the parameters.
+    """
 
     name: str
     scene: Callable[[], dict]
@@ -297,13 +303,15 @@ ZERO_CASES = [
 
 
 def directions(case: ZeroCase, scene: Case) -> np.ndarray:
-    """The parameters' axes, or a few directions into the domain where there are many parameters: (K, P)."""
+    """Return directions (K, P). These are the parameters' axes, or a few directions into the domain if paths depend on
+    many parameters.
+    """
     size = sum(len(value) for value in scene.initial.values())
     return np.eye(size) if case.fixed_paths or size <= 2 else np.abs(scene.directions(2))
 
 
 def differences(case: ZeroCase, scene: Case, along: np.ndarray, count: int, block: int) -> np.ndarray:
-    """Finite differences: (N, K)."""
+    """Return finite differences (N, K) along K directions at N seeds."""
     image = integrator("walk_ad", case.max_depth)
     return np.array([
         [scene.difference(image, direction, seed, case.spp, case.step, case.sides) for direction in along]
@@ -316,7 +324,7 @@ QUICK_ZERO = ("texel_zero_in_one_channel", "lamp_texture_zero_in_all", "blend_1"
 
 
 def parameters() -> list:
-    """The cases; those whose derivative is known to be lost have to fail."""
+    """Return the cases. Cases whose derivative is known to be lost must fail."""
     return [
         pytest.param(case, id=case.name,
                      marks=[*([pytest.mark.xfail(reason=case.lost, strict=True)] if case.lost else []),
@@ -435,7 +443,7 @@ def case_of_two() -> Case:
 
 @pytest.fixture(scope="module")
 def reference(case_of_two: Case) -> tuple:
-    """Target, and the gradient of the L2 loss: delta at the mean image, over many samples."""
+    """Target, and gradients of the L2 loss. For these gradients, delta is taken from the mean image of many samples."""
     import mitsuba as mi
 
     tracer = integrator("reslrb")
@@ -452,7 +460,7 @@ def reference(case_of_two: Case) -> tuple:
 
 
 def l2(target):
-    """Mean square difference from the target."""
+    """Return the mean square difference from the target, as a function of the image."""
     import drjit as dr
 
     return lambda image: dr.mean(dr.square(image - target), axis=None)

@@ -1,4 +1,4 @@
-"""Guided emission is unbiased: also where the scene changes."""
+"""Guided emission is unbiased, also if the scene changes."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ LANES = 2**14
 
 
 def guided(name: str, steps: int, **options: Any) -> tuple[Case, Any, Any]:
-    """A case, an integrator whose tables have learned from `steps` gradients and learn no more, and one that is not
-    guided."""
+    """Return a case, a guided integrator and an unguided one. The guided integrator's tables have learned from `steps`
+    gradients and learn no more.
+    """
     case = BY_NAME[name]
     scene = Case(case.scene(), case.keys)
     own = case.options | case.both | options
@@ -46,13 +47,15 @@ def guided(name: str, steps: int, **options: Any) -> tuple[Case, Any, Any]:
 
 
 def learn(scene: Case, ours: Any, seed: int) -> None:
-    """One step that the tables learn from."""
+    """Run one step from which the tables learn."""
     ours.preparation.guiding.due = lambda number: True
     sample(scene, ours, 9000 + seed)
 
 
 def sample(scene: Case, ours: Any, seed: int) -> np.ndarray:
-    """Gradient and image of a step whose dL/dI is known, means over blocks of pixels, in a row."""
+    """Return the gradient of a step with known dL/dI, followed by its image's means over blocks of pixels, as
+    one row.
+    """
     images = []
 
     def step(integrator: Any, film: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
@@ -65,13 +68,13 @@ def sample(scene: Case, ours: Any, seed: int) -> np.ndarray:
 
 
 def tiles(image: np.ndarray) -> np.ndarray:
-    """Means over tiles of 4 x 4 pixels, (T,); what is left over counts too."""
+    """Return means over tiles of 4 x 4 pixels, (T,). Smaller tiles at the edge count too."""
     rows, columns = (range(0, size, 4) for size in image.shape[:2])
     return np.concatenate([image[y : y + 4, x : x + 4].mean((0, 1)) for y in rows for x in columns])
 
 
 def samples(scene: Case, ours: Any, count: int, block: int = 0) -> np.ndarray:
-    """Of so many seeds, one row each."""
+    """Return one row of samples for each of `count` seeds."""
     return np.stack([sample(scene, ours, seed) for seed in seeds(count, block)])
 
 
@@ -96,7 +99,7 @@ def means_hold(name: str, steps: int, count: int) -> None:
 
 
 def strength(ours: Any) -> float:
-    """How much more often the cell that is drawn most is drawn than it would be evenly."""
+    """Return how much more often the most frequent cell is drawn than in a uniform distribution."""
     from reslrb_cli.guiding.tables import Purpose
 
     guiding = ours.preparation.guiding
@@ -107,7 +110,7 @@ def strength(ours: Any) -> float:
 @pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["stack"]))
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
 def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) -> None:
-    """The replay draws the numbers that were traced, whatever is learned in between."""
+    """The replay draws the same numbers as the trace, whatever the tables learn in between."""
     scene, ours, plain = guided("two_emitters", 3, estimator=estimator)
     del ours.preparation.guiding.due  # as it comes: some of the steps learn
     found = [scene.gradients(each, seeds(24, block), SPP, adjoint=adjoint) for block, each in enumerate((ours, plain))]
@@ -128,7 +131,7 @@ def test_an_image_alone_has_the_unguided_mean() -> None:
 
 @pytest.mark.parametrize("name", a_few(["two_emitters", "mask_texture_in_view"], ["two_emitters"]))
 def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
-    """A replay that drew other cells than the trace, or another weight, would not."""
+    """Estimators would disagree if a replay drew other cells than the trace, or used another weight."""
     scene, ours, _ = guided(name, 2)
     learned = ours.preparation.guiding.learned
     others = [guided(name, 0, estimator=kind, stack_size=2) if kind == "stack" else guided(name, 0, estimator=kind)
@@ -159,7 +162,7 @@ def test_a_recorded_step_equals_the_step() -> None:
 
 
 def test_renders_of_a_script_learn_from_each_other() -> None:
-    """`mi.render`, forward and backward: the tables live in the integrator."""
+    """The renders are forward and backward passes of `mi.render`. The tables are kept in the integrator."""
     import drjit as dr
     import mitsuba as mi
 
@@ -180,7 +183,9 @@ def test_renders_of_a_script_learn_from_each_other() -> None:
 
 @pytest.mark.parametrize("fault", [None, *FAULTS])
 def test_samples_are_stratified_by_weight(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the table: weighted means of functions of the numbers are those of even ones. No fault passes."""
+    """With any table, weighted means of functions of the numbers equal the means of uniform numbers. The test detects
+    every planted fault.
+    """
     if fault is not None:
         fault(monkeypatch)
     result = drawn_evenly()
@@ -189,8 +194,9 @@ def test_samples_are_stratified_by_weight(fault: Any, monkeypatch: pytest.Monkey
 
 
 def drawn_evenly() -> Any:
-    """Weighted sums over the numbers' intervals, of a grid of three emitters with a table of large contrasts, against
-    those of even numbers."""
+    """Compare weighted sums over the numbers' intervals with sums of uniform numbers. The grid has three emitters and a
+    table of large contrasts.
+    """
     import mitsuba as mi
 
     from reslrb_cli.guiding import tables as guiding
@@ -212,7 +218,7 @@ def drawn_evenly() -> Any:
 
 
 def histogram(numbers: list[Any], weights: np.ndarray) -> np.ndarray:
-    """Sums of weights over eighths of each number, and over pairs of halves of each two."""
+    """Return sums of weights over eighths of each number, and over pairs of halves of each two numbers."""
     values = np.stack([np.array(number, np.float64) for number in numbers])
     assert values.min() >= 0
     assert values.max() < 1
@@ -232,7 +238,7 @@ def test_tables_use_their_own_random_numbers_and_change_between_steps(
 
 
 def learns_apart(patch: pytest.MonkeyPatch) -> bool:
-    """Whether the walks of two steps have one table each, and what is learned has seeds that no other walk has."""
+    """Return True if the walks of each of two steps use one table, and learning uses seeds that no other walk has."""
     from reslrb_cli.estimators import base
     from reslrb_cli.guiding import collect
 
@@ -283,12 +289,12 @@ KEY = "ground.reflectance.data"
 
 
 def place(x: float) -> Any:
-    """Where the shutter hangs, closely below the ceiling."""
+    """Return the position of the shutter, closely below the ceiling."""
     return transform(translate=[x, 0.98, 0], rotate=([1, 0, 0], 90), scale=[0.25, 0.35, 1])
 
 
 def chamber() -> dict[str, Any]:
-    """A closed room under a sky, with two openings in its ceiling, of which a shutter covers the one on the right."""
+    """Return a closed room under a sky, with two openings in its ceiling. A shutter covers the opening on the right."""
     import mitsuba as mi
 
     grey = {"type": "twosided", "bsdf": diffuse(0.6, 0.6, 0.6)}
@@ -320,7 +326,7 @@ def chamber() -> dict[str, Any]:
 
 
 def slide(scene: Case, x: float) -> None:
-    """Move the shutter."""
+    """Move the shutter to the horizontal position `x`."""
     import mitsuba as mi
 
     scene.params["shutter.to_world"] = mi.Transform4f(place(x).matrix)
@@ -328,7 +334,7 @@ def slide(scene: Case, x: float) -> None:
 
 
 def rows(scene: Case, ours: Any, count: int, block: int) -> np.ndarray:
-    """Gradients of so many steps from which no table learns, (count, P)."""
+    """Return the gradients of `count` steps from which no table learns, (count, P)."""
     tables = ours.preparation.guiding
     if tables is not None:
         tables.held = True
@@ -339,8 +345,9 @@ def rows(scene: Case, ours: Any, count: int, block: int) -> np.ndarray:
 
 
 def errors(count: int, before: int = BEFORE) -> tuple[tuple[float, float], ...]:
-    """Root mean square errors of guided steps, in those of unguided ones, with their standard errors: before the
-    shutter slides, in the first step after that, and WITHIN steps later."""
+    """Return root mean square errors of guided steps relative to unguided steps, with standard errors. The errors are
+    measured before the shutter slides, in the first step afterwards, and WITHIN steps later.
+    """
     scene = Case(chamber(), [KEY])
     ours, plain = (integrator("reslrb", 5, 1000, estimator="stack", guiding=tables) for tables in ("on", "off"))
     found, blocks = [], iter(range(100))
@@ -367,7 +374,7 @@ def errors(count: int, before: int = BEFORE) -> tuple[tuple[float, float], ...]:
 
 
 def holds(found: tuple[tuple[float, float], ...]) -> bool:
-    """Whether what is asked for is found: no error is beyond its limit by more than three of its standard errors."""
+    """Return True if no error exceeds its limit by more than three of its standard errors."""
     print(found)
     assert found[0][0] + 3 * found[0][1] < 1, "the table has learned nothing"
     assert found[1][0] - 3 * found[1][1] > 1, "what has changed does not matter to the table"

@@ -1,4 +1,4 @@
-"""What guided emission learns: its tables, how they learn, their state, and what they cost."""
+"""Guided emission: what the tables contain, how they learn, their state, and their cost."""
 
 from __future__ import annotations
 
@@ -91,7 +91,9 @@ def test_scenes_without_emitters_are_traced() -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_roulette_ignores_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Paths that are drawn often would else end for being many: a hundredth of the weight leaves just that."""
+    """Roulette must not end paths only because they are drawn often. With weights scaled to a hundredth, the image
+    changes only by this factor.
+    """
     import mitsuba as mi
 
     from reslrb_cli.transport import guide
@@ -144,7 +146,7 @@ def test_no_group_dominates_and_non_finite_values_are_dropped() -> None:
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", GRIDS)
 def test_cells_partition_the_cube_and_merge_into_coarser_ones(name: str) -> None:
-    """Each cell lies in one coarser cell, and all that do are drawn alike."""
+    """Each cell lies in one coarser cell. All cells of a coarser cell are sampled alike."""
     grid = GRIDS[name]
     values = np.random.default_rng(2).random(grid.cells)
     for cells in (grid.cells, grid.cells / 3, 5000, 300, 1):
@@ -168,7 +170,9 @@ def test_cells_partition_the_cube_and_merge_into_coarser_ones(name: str) -> None
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("weights", [[1.0], [1.0, 0.0, 2.0, 0.5]])
 def test_cells_are_sampled_by_weight(weights: list[float]) -> None:
-    """Of three lanes for each slot a cell has exactly three times its slots; p is that share, with no rounding."""
+    """With three lanes for each slot, a cell is sampled exactly three times as often as it has slots. The probability p
+    is the cell's share of slots, without rounding.
+    """
     import mitsuba as mi
 
     grid = make_grid([True, True, False, True], weights, 10)
@@ -192,7 +196,9 @@ def test_cells_are_sampled_by_weight(weights: list[float]) -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_cells_are_as_fine_as_the_paths_allow() -> None:
-    """A few paths say nothing of single cells; what many say of one is not spread over others."""
+    """A few paths give no information about single cells. With many paths, one cell's contributions reach only its
+    direct neighbours.
+    """
     from reslrb_cli.guiding.tables import FINE, Learned
 
     grid = GRIDS["one"]
@@ -243,7 +249,7 @@ SIDE = 16  # pixels of the film
 
 
 def taught(name: str, steps: int, **options: Any) -> Any:
-    """The tracer of a case after so many gradients, each of which its tables learned from."""
+    """Return the tracer of a case after `steps` gradients. Its tables have learned from each of these gradients."""
     scene, ours, _ = guided(name, 0, **options)
     ours.preparation.guiding.due = lambda number: True
     for seed in range(steps):
@@ -254,7 +260,7 @@ def taught(name: str, steps: int, **options: Any) -> Any:
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", ["two_emitters", "envmap"])
 def test_a_recorded_walk_collects_the_same_as_a_plain_one(name: str) -> None:
-    """Bit by bit with one thread, as tests have it; and tables that have changed are no reason to record anew."""
+    """With one thread, as in the tests, both walks agree bit by bit. Changed tables do not cause a new recording."""
     plain, recorded = (taught(name, 7, freeze=freeze) for freeze in (False, True))
     for one, other in zip(*(each.preparation.guiding.learned.values() for each in (plain, recorded)), strict=True):
         assert relative(one.sums, other.sums) < 1e-3
@@ -276,7 +282,7 @@ def test_walks_of_many_paths_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.usefixtures("llvm")
 def test_tables_have_the_same_alignment_in_every_kernel() -> None:
-    """In memory that Dr.Jit aligns, wherever NumPy has what they are made of."""
+    """Dr.Jit aligns the memory of the tables, wherever NumPy stores the arrays that the tables are made from."""
     grid, kept = make_grid([True] * 4, [1.0, 2.0], 8), []
     for number in range(20):
         counts = apportion(grid, np.random.default_rng(number).random(grid.cells))
@@ -288,7 +294,7 @@ def test_tables_have_the_same_alignment_in_every_kernel() -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_tables_learn_often_at_first_and_regularly_later() -> None:
-    """What a run is told that it pays for is what it has."""
+    """The number of updates that `learnings` returns equals the actual number."""
     scene, ours, _ = guided("two_emitters", 0)
     guiding = ours.preparation.guiding
     del guiding.due
@@ -301,7 +307,9 @@ def test_tables_learn_often_at_first_and_regularly_later() -> None:
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("worse", [0.3, 1.0, 3.0])
 def test_harmful_tables_learn_as_often_as_at_first(worse: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """But no oftener where they go on to do harm: only what learns rarely begins anew."""
+    """Tables that remain harmful do not learn more often than at first. The schedule restarts only when tables learn
+    rarely.
+    """
     scene, ours, _ = guided("two_emitters", 0)
     guiding, right = ours.preparation.guiding, Learned.with_more
     del guiding.due
@@ -318,7 +326,9 @@ def test_harmful_tables_learn_as_often_as_at_first(worse: float, monkeypatch: py
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("weight", [0.5, 1.0, 4.0])
 def test_the_worth_of_a_table_is_its_effect_on_the_second_moment(weight: float) -> None:
-    """Of a voice that speaks where paths weigh so much, and beside one that speaks where they weigh nothing of note."""
+    """A quantity from paths with equal weights has this weight as its effect. A second quantity, from paths with
+    weights close to 1, makes the effect the mean of both.
+    """
     grid, paths = make_grid([True] * 4, [1.0], 8), 1e4
     rare = np.arange(grid.cells) < 8
     others = (1 - (rare * grid.measures()).sum() / weight) / (~rare * grid.measures()).sum()
@@ -349,7 +359,9 @@ def test_a_grid_is_as_fine_as_its_walks_can_resolve(paths: int, weights: list[fl
 
 @pytest.mark.usefixtures("llvm")
 def test_a_coarse_grid_agrees_with_the_finest() -> None:
-    """Of the same paths, heard by either: each of its cells is drawn as those are that it is made of."""
+    """Both grids learn from the same paths. Each coarse cell is sampled as often as the fine cells that it
+    consists of.
+    """
     finest, paths = make_grid([True] * 4, [1.0, 3.0], 14), 500
     grid = finest.coarser(most_cells(paths))
     assert grid.cells < finest.cells
@@ -370,8 +382,9 @@ def test_a_coarse_grid_agrees_with_the_finest() -> None:
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 @pytest.mark.parametrize("bits", [(3, 2, 4, 3), (0, 1, 0, 2), (2, 0, 0, 0), (0, 0, 0, 0)])
 def test_cells_are_smoothed_over_their_neighbours(bits: Any, kind: Any) -> None:
-    """With their weights along each number, the last cell counted again beyond the end; nothing goes from one emitter
-    to another, and a sum stays what it was."""
+    """Cells are smoothed with the weights of `BLUR` along each number. The last cell counts again beyond the end.
+    Nothing passes from one emitter to another, and sums do not change.
+    """
     grid = Grid(bits, (0.0, 0.3, 1.0))
     values = np.random.default_rng(5).gamma(0.1, size=grid.cells).astype(kind)
     expected, before = values.reshape(grid.shape), values.copy()
@@ -388,7 +401,7 @@ def test_cells_are_smoothed_over_their_neighbours(bits: Any, kind: Any) -> None:
 
 
 def cells_after(*calls: Any, told: int | None = None) -> list[Grid]:
-    """The grid after each of some calls on a tracer, which may be told the samples of its passes."""
+    """Return the grid after each of some calls on a tracer. The tracer may expect `told` samples in its passes."""
     scene, ours, _ = guided("two_emitters", 0)
     del ours.preparation.guiding.due
     if told is not None:
@@ -434,7 +447,7 @@ GRID = make_grid([True] * 4, [1.0, 3.0], 9)
 
 
 def learned() -> Guiding:
-    """For two sensors, something each."""
+    """Return `Guiding` with different learned contributions for two sensors."""
     guiding, random = Guiding(), np.random.default_rng(1)
     guiding.grid = GRID
     for number in (0, 3):
@@ -507,7 +520,7 @@ def test_without_a_guide_its_code_is_not_compiled() -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_later_steps_compile_nothing() -> None:
-    """Though they learn: neither table nor seed reaches a kernel as a literal."""
+    """Later steps learn, but compile no large kernel. Neither tables nor seeds reach such a kernel as literals."""
     scene, ours, _ = guided("two_emitters", 0)
     kernels = Kernels()
     kernels.new(lambda: learn(scene, ours, 0))
@@ -519,7 +532,7 @@ def test_later_steps_compile_nothing() -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_a_step_stays_recorded_while_its_tables_learn() -> None:
-    """A step that is recorded anew for each new table would, after a few of them, not be recorded any more."""
+    """If each new table caused a new recording, the step would no longer be recorded after a few tables."""
     scene, ours, _ = guided("two_emitters", 0, freeze=True)
     for seed in range(2):
         learn(scene, ours, seed)

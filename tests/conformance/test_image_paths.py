@@ -1,4 +1,4 @@
-"""Image: depth, roulette, passes, masks, shapes, sensors, films: `reslrb` against `path` and `ptracer`."""
+"""Images of `reslrb` against `path` and `ptracer`: depth, roulette, passes, masks, shapes, sensors and films."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TWO_SIDED = {"type": "twosided", "bsdf": RED}
 
 
 def visible():
-    """A lamp that the camera sees."""
+    """Return a lamp that the camera sees."""
     return {"lamp": lamp(position=(0, 1.6, -0.8), target=(0, 0.3, 2))}
 
 
@@ -41,7 +41,9 @@ def large():
 
 
 def leaf(opacity=None, distance: float = 2.0, size: float = 0.5):
-    """A perforated sheet between camera and stage, that also covers a part of the background and of `visible()`."""
+    """Return a perforated sheet between camera and stage. The sheet also covers a part of the background and of
+    `visible()`.
+    """
     bsdf = {"type": "mask", "opacity": opacity or bitmap(6, 6, channels=1, low=0), "bsdf": TWO_SIDED}
     to_world = transform().look_at(origin=[0.2, 1.3, distance], target=[0.4, 1.5, 4], up=[0, 1, 0])
     return rectangle(bsdf, to_world @ transform().scale(size))
@@ -49,7 +51,7 @@ def leaf(opacity=None, distance: float = 2.0, size: float = 0.5):
 
 @pytest.fixture(scope="module")
 def facets(tmp_path_factory):
-    """A coarse ball, whose smooth normals are up to 20 degrees off its faces: path of a PLY file."""
+    """Path of a PLY file with a coarse ball. The ball's smooth normals are up to 20 degrees off its faces."""
     n, m = 5, 9
     polar, azimuth = np.linspace(0, np.pi, n + 1), np.linspace(0, 2 * np.pi, m, endpoint=False)
     normals = np.array([[np.sin(t) * np.cos(p), np.cos(t), np.sin(t) * np.sin(p)] for t in polar for p in azimuth])
@@ -191,7 +193,7 @@ FORMATS = ("rgba", "luminance", "luminance_alpha", "xyz", "xyza")
 
 
 def seen(sensor, **things):
-    """The stage under a lamp that the camera sees, over a checkered floor."""
+    """Return the stage under a lamp that the camera sees, over a checkered floor."""
     flat = transform().rotate([1, 0, 0], -90) @ transform().scale(2)
     floor = rectangle({"type": "diffuse", "reflectance": bitmap(16, 16)}, flat)
     light = lamp(side=0.8, position=(-0.4, 1.7, -0.6), target=(0, 0.3, 2))

@@ -1,4 +1,4 @@
-"""Image, for each BSDF and emitter of Mitsuba and for whole scenes: against `path` and `ptracer`."""
+"""Images of each BSDF and emitter of Mitsuba, and of whole scenes, against `path` and `ptracer`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from reslrb_cli.scene.visibility import interior, sees_specular
 
 
 def normals():
-    """A normal map, tilted by up to 30 degrees."""
+    """Return a normal map that is tilted by up to 30 degrees."""
     data = np.random.default_rng(1).uniform(-0.4, 0.4, (8, 8, 3)).astype(np.float32)
     data[..., 2] = 1
     data /= np.linalg.norm(data, axis=-1, keepdims=True)
@@ -131,7 +131,9 @@ THROWN = ("conductor", "dielectric", "plastic", "normalmap of dielectric")
 
 
 def scene_with(bsdf, holder: str, sensor=None):
-    """The stage with a ball, or a sheet that is seen from its front, of this BSDF, under a large lamp."""
+    """Return the stage under a large lamp. The stage holds a ball of this BSDF, or a sheet that the camera sees from
+    its front.
+    """
     tilted = transform().translate([0.2, 0.8, 0.3]) @ transform().rotate([1, 0, 0], -60) @ transform().scale(0.6)
     thing = ball(bsdf) if holder == "ball" else rectangle(bsdf, tilted)
     return stage({"lamp": lamp(side=1.5, radiance=rgb(2, 3, 4))}, sensor, ball=thing)
@@ -193,7 +195,7 @@ def two_axes():
 
 
 def sky(to_world=None, peak: float = 10.0):
-    """An environment map with one bright texel."""
+    """Return an environment map with one bright texel."""
     data = np.random.default_rng(3).uniform(0.1, 1, (8, 16, 3)).astype(np.float32)
     data[2, 3] = peak
     return {"type": "envmap", "bitmap": mi.Bitmap(data)} | ({} if to_world is None else {"to_world": to_world})
@@ -373,7 +375,7 @@ def test_real_room(hide_emitters):
 
 @pytest.mark.usefixtures("samples")
 def test_a_mirrored_mesh():
-    """Its faces wind the other way than its normals: `ptracer` has it black."""
+    """The faces of a mirrored mesh wind opposite to its normals. `ptracer` renders this mesh black."""
     import mitsuba as mi
 
     look = mi.ScalarTransform4f().look_at([0, 2, 5], [0, 0.5, 0], [0, 1, 0])

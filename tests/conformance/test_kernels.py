@@ -1,4 +1,4 @@
-"""The second step compiles nothing: no seed, parameter value or adjoint image reaches a kernel as a literal."""
+"""The second step compiles nothing. No seed, parameter value or adjoint image reaches a kernel as a literal."""
 
 from __future__ import annotations
 
@@ -27,13 +27,15 @@ SHIPPED = {
 
 
 class Kernels:
-    """The kernels that were launched, told apart by their hash: `cache_hit` is also set for those found on the disk."""
+    """Launched kernels, identified by their hash. `cache_hit` cannot identify new kernels, because `cache_hit` is also
+    set for kernels found on the disk.
+    """
 
     def __init__(self) -> None:
         self.known: set[str] = set()
 
     def new(self, step: Callable[[], Any]) -> list[dict]:
-        """The kernels of `step` that no earlier one launched."""
+        """Return the kernels of `step` that no earlier step launched."""
         import drjit as dr
 
         dr.kernel_history_clear()
@@ -48,7 +50,9 @@ class Kernels:
 
 
 def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
-    """Steps 2 to 4, each with another seed and, from step 3, other parameter values."""
+    """Assert that steps 2 to 4 compile nothing. Each step has another seed. From step 3 on, parameter values also
+    differ.
+    """
     kernels = Kernels()
     scene.set(scene.initial)
     kernels.new(lambda: step(1))
@@ -85,7 +89,7 @@ def test_independent_second_step_of_other_cases_compiles_nothing(name: str):
 
 
 def case_compiles_nothing(name: str, adjoint: str) -> None:
-    """Steps of one of the gradient cases, whose dL/dI changes with the image."""
+    """Assert that steps of a gradient case compile nothing. Their dL/dI changes with the image."""
     case = next(case for case in CASES if case.name == name)
     scene = Case(case.scene(), case.keys)
     ours = integrator("reslrb", **case.both | case.options)
@@ -120,7 +124,7 @@ def test_second_step_compiles_nothing_on_shipped_scenes(name: str, adjoint: str)
 
 
 def test_zero_texels_come_and_go():
-    """A texel that reaches zero asks for other kernels once, and for none when it leaves zero."""
+    """A texel that reaches zero requires new kernels once. The texel requires no new kernels when it leaves zero."""
     case = next(case for case in CASES if case.name == "texture")
     scene = Case(case.scene(), case.keys)
     ours = integrator("reslrb")

@@ -1,4 +1,4 @@
-"""Peak memory of a gradient step: flat in depth for the reservoir, linear for naive AD."""
+"""Peak memory of a gradient step is flat in depth for the reservoir, and linear for naive AD."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPP = 256
 
 @pytest.fixture(scope="module")
 def case(llvm: str) -> Case:
-    """Bright walls all around, so that paths do reach the depth limit."""
+    """Scene with bright walls all around, so that paths reach the depth limit."""
     bright = {"type": "twosided", "bsdf": diffuse(0.95, 0.95, 0.95)}
     floor = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture(8, 8, 0.8, 0.95)}}
     cave = {"type": "sphere", "radius": 8.0, "flip_normals": True, "bsdf": diffuse(0.95, 0.95, 0.95)}
@@ -24,7 +24,9 @@ def case(llvm: str) -> Case:
 
 
 def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **step: str) -> int:
-    """Most bytes that the allocator gave out at any time of a second step, above what stood before it."""
+    """Return the maximum number of bytes that the allocator gave out during a second step, beyond the number before
+    this step.
+    """
     import drjit as dr
     import mitsuba as mi
 

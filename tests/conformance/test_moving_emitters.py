@@ -1,4 +1,4 @@
-"""Emitters that move, and light that moves at the film's border."""
+"""Emitters that move, and moving light at the film's border."""
 
 from __future__ import annotations
 
@@ -37,13 +37,15 @@ FAMILY = Family(len(CASES), 5 * len(CASES))
 
 
 def tracer(case: LampCase, name: str = "reslrb", **options: Any) -> StepIntegrator:
-    """`stack`, or naive AD of the same walk."""
+    """Return an integrator with `stack`, or with naive AD of the same walk."""
     own: dict[str, Any] = {"estimator": "stack"} if name == "reslrb" else {"attached": True}
     return integrator(name, **{"max_depth": 2, "hide_emitters": True} | own | case.options | options)
 
 
 def compare(case: LampCase, count: int) -> Any:
-    """Derivatives by each latent, in units in which they are alike, and differences, at the same seeds."""
+    """Compare derivatives by each latent with finite differences at the same seeds. Units are chosen so that the
+    derivatives are similar.
+    """
     moving, ours = case.moving(), tracer(case)
     units = {name: 10.0 if name == "angle" else 1.0 for name in case.start}
     steps, differences = [], []
@@ -59,7 +61,7 @@ def compare(case: LampCase, count: int) -> Any:
 
 
 def check(case: LampCase, count: int) -> None:
-    """Assert that derivatives and differences agree, and well enough to say so."""
+    """Assert that derivatives and differences agree, and that their relative L2 distance is below 0.05."""
     found = compare(case, count)
     print(case.name, found)
     assert found.verdict is not Verdict.FAILS, found
@@ -83,7 +85,7 @@ def test_naive_ad(case: LampCase):
 
 
 def image(scene: Any, name: str = "reslrb", spp: int = 64, **options: Any) -> np.ndarray:
-    """The image of a scene, without emitters that are seen directly."""
+    """Return the image of a scene, without directly visible emitters."""
     options = {"max_depth": 2, "hide_emitters": True} | options
     return np.array(render_image(integrator(name, **options), scene, 0, 5, spp), np.float64)
 
@@ -97,7 +99,7 @@ SKIES = {
 
 
 def tiles(x: float, sky: dict[str, Any]) -> dict[str, Any]:
-    """Two squares, one of them `x` aside, under a sky."""
+    """Return two squares under a sky. One square is shifted by `x`."""
     if sky["type"] == "envmap":
         sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
     above = mi.ScalarTransform4f().look_at([0, 12, 0], [0, 0, 0], [0, 0, -1])
@@ -154,7 +156,7 @@ def test_a_flipped_sphere_emits_outward():
 
 
 def seen(lamp: Any, **changes: Any) -> Moving:
-    """A lamp that faces the camera from the floor."""
+    """Return a lamp near the floor that faces the camera and can move."""
 
     def place(params: mi.SceneParameters, latents: dict[str, Any]) -> None:
         shift = mi.AffineTransform4f().translate(mi.Vector3f(latents["x"], latents["y"], 0))
@@ -174,7 +176,9 @@ LAMPS = {
 
 @pytest.mark.parametrize("kind", a_few(LAMPS, ["sphere"]))
 def test_the_outline_of_a_visible_lamp_moves(kind: str):
-    """Differences of primary rays, which hit it or not, are noisy: large steps, many samples."""
+    """Primary rays either hit the lamp or miss it, so their differences are noisy. The test uses large steps and many
+    samples.
+    """
     moving = seen(LAMPS[kind])
     ours, naive = integrator("reslrb", 1, estimator="stack"), integrator("walk_ad", 1, attached=True)
     gradients = [moving.gradient(ours, seed, 64) for seed in seeds(3)]
@@ -195,7 +199,7 @@ def test_a_hidden_lamp_has_no_effect():
 
 
 def test_walk_ad_shows_a_moving_lamp():
-    """Its derivative is splatted twice, and must not show in the image."""
+    """`walk_ad` splats the lamp's derivative twice. This derivative must not show in the image."""
     moving = seen(LAMPS["rectangle"])
     results = []
     for name, options in (("walk_ad", {"attached": True}), ("reslrb", {"estimator": "stack"})):
@@ -207,7 +211,9 @@ def test_walk_ad_shows_a_moving_lamp():
 @pytest.mark.parametrize("kind", ["rectangle", "sphere"])
 @pytest.mark.parametrize("emitter", ["area", "directionalarea"])
 def test_one_kernel_contains_everything(kind: str, emitter: str):
-    """The derivative by a number of a transformation is a sum over all paths; none is traced again for it."""
+    """The derivative by an entry of a transformation is a sum over all paths. No path is traced again for this
+    derivative.
+    """
     scene = load(over_floor(surface(kind, emitter)))
     params, sensor = mi.traverse(scene), scene.sensors()[0]
     ours = integrator("reslrb", 3, estimator="stack")
@@ -288,7 +294,9 @@ RADIUS = 2.0  # of Mitsuba's gaussian filter, pixels
 
 
 def moving(scale: float, film: dict[str, Any] | None = None, **things: Any) -> Moving:
-    """A parallel lamp that lights a square of this size, straight below it, of a floor that is seen to 1.73."""
+    """Return a scene with a parallel lamp straight above a floor. The lamp lights a square of this size, and the camera
+    sees the floor up to 1.73.
+    """
     lamp = surface("rectangle", "directionalarea")
     down = mi.ScalarTransform4f().translate([0, 4, 0]) @ mi.ScalarTransform4f().rotate([1, 0, 0], 90)
     lamp["to_world"] = down @ mi.ScalarTransform4f().scale(scale)
@@ -303,14 +311,14 @@ def moving(scale: float, film: dict[str, Any] | None = None, **things: Any) -> M
 
 
 def tracked(case: Moving) -> None:
-    """Have the lamp's place track derivatives."""
+    """Make the lamp's position track derivatives."""
     x = dr.opaque(mi.Float, 0)
     dr.enable_grad(x)
     case.set({"x": x})
 
 
 def share(case: Moving) -> float:
-    """The measured share."""
+    """Return the measured share of moving light at the film's border."""
     ours = integrator("reslrb", 2, estimator="stack")
     return border_share(ours, Job(case.loaded, case.loaded.sensors()[0], dr.opaque(mi.UInt32, 3), 64, case.params))
 

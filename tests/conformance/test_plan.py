@@ -1,4 +1,4 @@
-"""What a scene does not need is left out: kernels shrink, and no result changes."""
+"""Features that a scene does not need are left out. Kernels become smaller, and no result changes."""
 
 from __future__ import annotations
 
@@ -37,35 +37,35 @@ RADIANCE = "lamp.emitter.radiance.value"
 
 
 def plain(**changes: Any) -> dict:
-    """The room with a textured floor."""
+    """Return the room with a textured floor."""
     return room(floor={"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture(3, 4)}}, **changes)
 
 
 def in_the_dark(**changes: Any) -> dict:
-    """The same, lit by a point."""
+    """Return the room of `plain`, lit by a point light."""
     return plain(lamp=None, light={"type": "point", "position": [0.2, 1.2, 0.3], "intensity": rgb(3, 4, 5)}, **changes)
 
 
 def through_a_lens() -> dict:
-    """The same as `plain`, seen through a lens."""
+    """Return the room of `plain`, seen through a lens."""
     return plain(camera=camera(sensor="thinlens"))
 
 
 def with_glass() -> dict:
-    """The same with a ball of glass in it, of which nothing is differentiated."""
+    """Return the room of `plain` with a ball of glass. Nothing of the ball is differentiated."""
     bsdf = {"type": "dielectric"}
     return plain(ball={"type": "sphere", "center": [0.1, 0, 0.1], "radius": 0.35, "bsdf": bsdf})
 
 
 def with_veil() -> dict:
-    """The same with a mask in it, of which nothing is differentiated."""
+    """Return the room of `plain` with a mask. Nothing of the mask is differentiated."""
     bsdf = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
     placed = transform(translate=[0.1, 0.2, 0.2], rotate=([1, 0, 0], -80), scale=0.5)
     return plain(veil={"type": "rectangle", "to_world": placed, "bsdf": bsdf})
 
 
 def step(case: Case, ours: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Image and gradient of one step whose dL/dI is known."""
+    """Return image and gradient of one step with known dL/dI."""
     import drjit as dr
     import mitsuba as mi
 
@@ -79,7 +79,7 @@ def step(case: Case, ours: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def both_ways(make: Callable[[], dict], keys: tuple[str, ...], feature: str, estimator: str) -> tuple[Any, Any]:
-    """Return (operations, image, gradient) of the step as planned, and with the feature by force."""
+    """Return (operations, image, gradient) of the planned step, and of the step with `feature` switched on by force."""
     results = []
     for forced in (False, True):
         case = Case(make(), keys)
@@ -96,7 +96,7 @@ def both_ways(make: Callable[[], dict], keys: tuple[str, ...], feature: str, est
 
 
 def differs(a: np.ndarray, b: np.ndarray) -> float:
-    """Largest difference relative to the largest entry."""
+    """Return the largest difference relative to the largest entry."""
     return float(np.abs(a - b).max() / np.abs(b).max())
 
 
@@ -154,7 +154,9 @@ ASKED = {
 
 @taking_turns("asked", list(ASKED), "estimator", ESTIMATORS)
 def test_only_requested_parameters_are_differentiated(asked: str, estimator: str):
-    """What is differentiated beside a parameter does not change its derivative, and makes the kernels larger."""
+    """Differentiating another parameter does not change a parameter's derivative with `gather` and `stack`. With every
+    estimator, the kernels become larger.
+    """
     keys, more = ASKED[asked]
     results = []
     for chosen in (keys, keys + more):
@@ -174,7 +176,7 @@ def test_only_requested_parameters_are_differentiated(asked: str, estimator: str
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_emitters_alone_need_no_replay(estimator: str):
-    """Beside the walk that makes the image, there is only the small kernel of emission."""
+    """Besides the walk that makes the image, a step needs only the small kernel of emission."""
     case = Case(plain(), (RADIANCE,))
     ours = integrator("reslrb", 5, estimator=estimator)
     with tracking(case.params, case.keys):
@@ -192,7 +194,9 @@ def test_rows_explain_needed_features() -> None:
 
 
 def test_a_step_makes_one_plan(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not once a batch: for the image of the first batch, and for all that is differentiated."""
+    """A batched step makes one plan for the image of the first batch, and one plan for everything that is
+    differentiated. The step does not make a plan for each batch.
+    """
     original, asked = Preparation.plan, []
 
     def noting(self: Preparation, scene: Any, sensor: Any, params: Any, spp: int, image: bool) -> Any:
@@ -218,7 +222,7 @@ MAX_DEPTH, SPP = 8, 16
 
 @pytest.fixture(scope="module")
 def scene(llvm: str) -> dict:
-    """The corner of a room in a bright cave: few vertices of a path are on the floor."""
+    """Corner of a room in a bright cave. Only a few vertices of a path are on the floor."""
     return room(cave={"type": "sphere", "radius": 8.0, "flip_normals": True, "bsdf": diffuse(0.9, 0.9, 0.9)})
 
 
@@ -291,7 +295,7 @@ def test_without_an_image_other_vertices_are_not_connected(scene: dict, monkeypa
 
 
 def lit_from_behind() -> mi.Scene:
-    """A wall, and a lamp that shines the other way."""
+    """Return a scene with a wall, and a lamp that faces away from it."""
     lamp = mi.ScalarTransform4f().translate([0, 0, 5])
     return mi.load_dict({
         "type": "scene",

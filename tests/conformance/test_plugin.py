@@ -1,4 +1,4 @@
-"""reslrb as a Mitsuba plugin and through our own step, as a script would use it; every option changes something."""
+"""`reslrb` as a Mitsuba plugin and in our own step, as in a script. Every option has an effect."""
 
 from __future__ import annotations
 
@@ -77,7 +77,9 @@ print(mi.load_dict({"type": "reslrb", "max_depth": 3}).max_depth)
 
 
 def test_unsupported_variants_are_refused_with_the_supported_ones():
-    """None is no variant either. One that is set later is refused, too, under which nothing was ever registered."""
+    """A missing variant is refused too. A variant that is set later is also refused, even if no plugin was ever
+    registered under it.
+    """
     run = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True, timeout=120, cwd=ROOT)
     assert run.returncode == 0, run.stderr
     none, *others = run.stdout.splitlines()
@@ -86,7 +88,7 @@ def test_unsupported_variants_are_refused_with_the_supported_ones():
 
 
 def test_the_script_of_the_docs_runs():
-    """Run the blocks of docs/integrator.md, one after the other."""
+    """The Python blocks of docs/integrator.md run one after the other, and reduce the loss."""
     text = (ROOT / "docs" / "integrator.md").read_text(encoding="utf-8")
     script = "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL))
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, cwd=ROOT)
@@ -99,13 +101,13 @@ def test_the_script_of_the_docs_runs():
 
 @pytest.fixture(scope="module")
 def case(llvm: str) -> Case:
-    """The textured room."""
+    """Case with the textured room."""
     return Case(_textured(), (FLOOR,))
 
 
 @pytest.fixture(scope="module")
 def shown(llvm: str) -> Case:
-    """The textured room with an emitter in view."""
+    """Case with the textured room and an emitter in view."""
     sign = lamp(radiance=rgb(0.5, 0.6, 0.7)) | {"to_world": _facing()}
     return Case(_textured(sign=sign), (FLOOR,))
 
@@ -210,7 +212,9 @@ def test_mi_render_with_samples_out_of_range_raises(case: Case):
 
 
 def test_mi_render_backward_through_a_latent_variable(case: Case):
-    """Parameters that are a function of something else: gradients arrive there, and are those of our own step."""
+    """The parameters are a function of a latent variable. Gradients reach this variable, and agree with the gradients
+    of our own step.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -248,7 +252,7 @@ def test_mi_render_adds_to_existing_gradients(case: Case):
 
 
 def test_several_sensors_accumulate(llvm: str):
-    """Two views of one scene: gradients add up, and each is that of a scene with that view alone."""
+    """Two views of one scene add up their gradients. The sum equals the sum of each view's own gradient."""
     import drjit as dr
     import mitsuba as mi
 
@@ -272,7 +276,7 @@ def test_several_sensors_accumulate(llvm: str):
 
 
 def test_one_latent_for_several_sensors(llvm: str):
-    """A view's propagation may not take the edges above the parameters from the next one."""
+    """Propagation for one view must not remove the edges above the parameters. The next view needs these edges."""
     import drjit as dr
     import mitsuba as mi
 
@@ -322,7 +326,7 @@ def test_an_emitter_without_samples_is_refused():
 
 
 def test_correlated_and_independent(case: Case):
-    """Equal in expectation for a linear objective; a nonlinear one shows which samples delta comes from."""
+    """Both agree in expectation for a linear objective. A nonlinear objective shows which samples determine delta."""
     import drjit as dr
 
     ours = integrator("reslrb")
@@ -361,7 +365,9 @@ def test_step_returns_image_and_loss(case: Case):
 
 
 def test_max_depth(case: Case):
-    """0: nothing; 1: directly visible emission alone; more: more light, and derivatives."""
+    """Depths 0 and 1 give no light, because no emitter is in view, and no derivatives. Larger depths give more
+    light.
+    """
     totals = [case.value(integrator("reslrb", depth), 1, 64) for depth in (0, 1, 2, 3, 6)]
     assert totals[:2] == [0, 0]
     assert all(low < high for low, high in pairwise(totals[1:]))
@@ -391,7 +397,9 @@ def test_samples_per_pass(case: Case):
 
 
 def test_a_plan_is_not_reused_for_another_scene(llvm: str):
-    """Scenes come and go, and their addresses are used again: what one needs may not be read off another."""
+    """Scenes are created and deleted, and their addresses are used again. A scene's needs must not be read from another
+    scene.
+    """
     import gc
 
     tracer, plain = integrator("reslrb"), room()

@@ -1,4 +1,6 @@
-"""Replays stand where the image pass stood; dL/dI that is not finite is taken for 0, and counted."""
+"""A replay visits the same vertices as the image pass. Values of dL/dI that are not finite are replaced by 0, and
+counted.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ NONE = 0xFFFFFFFF
 
 @dataclass
 class Kept:
-    """The reservoir's state, which of the path's vertices it holds (0: none), and where that stands."""
+    """State of the reservoir, with the index and position of the kept vertex. Index 0 means that the reservoir holds no
+    vertex.
+    """
 
     state: Any
     I: Any  # noqa: E741
@@ -42,7 +46,9 @@ class Kept:
 
 
 class Recording(ReservoirSelection):
-    """The reservoir's image pass among all connections, which also keeps index and position of the kept vertex."""
+    """Image pass of the reservoir, with all connections as candidates. The pass also keeps index and position of the
+    kept vertex.
+    """
 
     def start(self, product: Any) -> Kept:
         import mitsuba as mi
@@ -71,7 +77,7 @@ class Recording(ReservoirSelection):
 
 
 class Rewalk(Hooks):
-    """A replay that differentiates nothing: it multiplies all factors up to the kept connection anew."""
+    """Replay that differentiates nothing. The replay multiplies all factors up to the kept connection again."""
 
     replaying = True
     connects = True
@@ -131,7 +137,7 @@ def test_a_replay_visits_the_same_vertices(name: str):
 
 
 def test_without_light_there_is_no_replay():
-    """A scene whose light reaches nothing keeps nothing, and its gradient is zero."""
+    """If a scene's light reaches nothing, the reservoir keeps nothing and the gradient is zero."""
     from reslrb_cli.measure.scenes.small import rgb, transform
 
     lamp = room()["lamp"] | {"to_world": transform(translate=[0, 5, 0], rotate=([1, 0, 0], -90))}
@@ -173,7 +179,9 @@ def case() -> Case:
 
 
 def spoilt(case: Case, bad: float) -> tuple:
-    """Weights of a linear objective with `bad` in a channel each of some pixels, and with 0 there."""
+    """Return two sets of weights of a linear objective. In one channel of each of some pixels, the first set has `bad`
+    and the second set has 0.
+    """
     import mitsuba as mi
 
     weights = np.array(case.weights)
@@ -185,7 +193,7 @@ def spoilt(case: Case, bad: float) -> tuple:
 
 
 def linear(weights):
-    """sum(image * weights)."""
+    """Return the objective sum(image * weights)."""
     import drjit as dr
 
     return lambda image: dr.sum((first_channels(image, 3) * weights).array)
@@ -249,7 +257,7 @@ def test_finite_values_are_not_refused(case):
 
 @pytest.mark.parametrize("pixel_format", ["rgb", "rgba"])
 def test_non_finite_light_shows_in_the_image(pixel_format):
-    """On a CPU atomic sums drop a NaN that is alone at its address: it must not vanish from films with alpha."""
+    """On a CPU, atomic sums drop a NaN that is alone at its address. A NaN must not vanish from films with alpha."""
     data = np.full((4, 4, 3), 0.5, np.float32)
     data[1, 2, 0] = np.nan
     bsdf = {"type": "diffuse", "reflectance": bitmap(data)}
@@ -261,7 +269,7 @@ def test_non_finite_light_shows_in_the_image(pixel_format):
 
 @pytest.mark.parametrize("name", [name for name in INTEGRATORS if name != "prb"])
 def test_a_non_finite_contribution_shows_in_the_gradient(name):
-    """Its weight in a reservoir is infinite: it must not be passed over."""
+    """A non-finite contribution has an infinite weight in a reservoir, which must not skip this contribution."""
     scene = floor(diffuse(0.5, 0.4, 0.3), lamp=lamp(radiance=rgb(3e38, 3e38, 3e38)))
     case = Case(scene, ["floor.reflectance.value"])
     kind, options = INTEGRATORS[name]

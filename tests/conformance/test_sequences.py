@@ -1,4 +1,4 @@
-"""Numbers of low discrepancy: evenly spread, and unbiased in every way of a step."""
+"""Low-discrepancy numbers are evenly distributed, and unbiased in every kind of step."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LANES = 5
 
 
 def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
-    """A case, an integrator with such numbers, and one with independent ones."""
+    """Return a case, an integrator with low-discrepancy numbers, and an integrator with independent numbers."""
     case = BY_NAME[name]
     own = {"estimator": "stack"} | case.options | case.both | options
     return Case(case.scene(), case.keys), integrator("reslrb", **own, **ON), integrator("reslrb", **own)
@@ -55,7 +55,7 @@ def test_means_equal_those_of_independent_numbers(name: str) -> None:
 @pytest.mark.parametrize("guiding", ["off", "on"])
 @pytest.mark.parametrize("name", ["texture", "two_emitters", "glass"])
 def test_means_over_many_seeds_agree(name: str, guiding: str) -> None:
-    """Of independent numbers, and of the stock integrator that is right for the case."""
+    """Means agree with independent numbers, and with the stock integrator that is right for the case."""
     scene, ours, plain = both(name, freeze=True)
     if guiding == "on":
         _, ours, _ = guided(name, 4, **ON)
@@ -129,7 +129,7 @@ def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -
 
 
 def evenly(guiding: str) -> Any:
-    """Counts of the numbers of two passes of a few lanes, against what they are expected to be."""
+    """Compare counts of the numbers with the expected counts. The numbers come from two passes with a few lanes."""
     import drjit as dr
     import mitsuba as mi
 
@@ -157,7 +157,7 @@ def evenly(guiding: str) -> Any:
 
 
 def counts(numbers: list[Any]) -> np.ndarray:
-    """How many are in each eighth, and how many of each two in each quarter of the square."""
+    """Return how many numbers are in each eighth, and how many pairs of numbers are in each quarter of the square."""
     values = np.stack([np.array(number, np.float64) for number in numbers])
     assert values.min() >= 0
     assert values.max() < 1
@@ -167,14 +167,16 @@ def counts(numbers: list[Any]) -> np.ndarray:
 
 
 def expected(numbers: int) -> np.ndarray:
-    """The same of numbers that are evenly distributed, and independent of one another within a lane."""
+    """Return the expected counts for numbers that are evenly distributed, and independent of one another within
+    a lane.
+    """
     pairs = numbers * (numbers - 1) // 2
     return np.concatenate([np.full(8 * numbers, LANES / 8), np.full(4 * pairs, LANES / 4)])
 
 
 @pytest.mark.parametrize("name", a_few(["two_emitters", "glass", "mask_texture_in_view", "passes"], ["glass"]))
 def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
-    """A replay that drew other numbers than the trace would not."""
+    """Estimators would disagree if a replay drew other numbers than the trace."""
     assert worst_of_replays(name) < 1e-4
 
 
@@ -184,7 +186,7 @@ def test_a_replay_with_other_numbers_is_found(monkeypatch: pytest.MonkeyPatch) -
 
 
 def worst_of_replays(name: str, ways: Sequence[str] = ("correlated", "independent")) -> float:
-    """How far gradients of `gather`, which traces twice, are from those of `stack`, at most."""
+    """Return the largest distance between gradients of `gather`, which traces twice, and gradients of `stack`."""
     scene, ours, _ = both(name)
     _, other, _ = both(name, estimator="gather")
     return max(relative(*(scene.gradient(each, 5, 64, adjoint=way) for each in (other, ours))) for way in ways)
@@ -224,7 +226,7 @@ COORDINATES = 10
 
 
 def coordinates(seed: int, width: int) -> np.ndarray:
-    """All coordinates of a pass's points, (COORDINATES, width), the stratified one left out."""
+    """Return all coordinates of a pass's points, (COORDINATES, width), without the stratified coordinate."""
     import drjit as dr
     import mitsuba as mi
 
@@ -235,7 +237,7 @@ def coordinates(seed: int, width: int) -> np.ndarray:
 
 
 def test_points_match_sobol() -> None:
-    """Of 2^15 points in a row all are among SciPy's, which come in another order."""
+    """The first 2^15 points are the same as SciPy's first 2^15 points, in another order."""
     import drjit as dr
     import mitsuba as mi
 
@@ -255,7 +257,9 @@ def test_boxes_of_the_first_two_dimensions_hold_one_point_each(k: int, seed: int
 
 
 def fills(points: np.ndarray, k: int) -> bool:
-    """Whether of each 2^k points in a row each box of area 2^-k holds one, along the first two and along each alone."""
+    """Return True if, of each 2^k points in a row, each box of area 2^-k holds one. Boxes cover the first two
+    coordinates together, and each coordinate alone.
+    """
     for part in points.reshape(COORDINATES, -1, 2**k).transpose(1, 0, 2):
         boxes = [
             (part[0] * 2**a).astype(int) * 2 ** (k - a) + (part[1] * 2 ** (k - a)).astype(int) for a in range(k + 1)
@@ -267,14 +271,14 @@ def fills(points: np.ndarray, k: int) -> bool:
 
 
 def unnested(point: Any, shift: Any, key: Any) -> Any:
-    """Sums carry from later digits to those before them."""
+    """Return a scramble in which sums carry from later digits to earlier digits."""
     import drjit as dr
 
     return dr.brev(dr.brev(point) * (key | 1) + shift)
 
 
 def independent(point: Any, shift: Any, key: Any) -> Any:
-    """Points have nothing to do with one another."""
+    """Return points that are unrelated to one another."""
     import mitsuba as mi
 
     return mi.sample_tea_32(point, shift)[0]
@@ -289,7 +293,7 @@ def test_another_scramble_is_found(scramble: Any, monkeypatch: pytest.MonkeyPatc
 
 
 def test_scrambles_differ() -> None:
-    """From seed to seed, and from one coordinate to the next: first digits agree as often as not."""
+    """Scrambles differ between seeds and between neighbouring coordinates. First digits agree in half of the cases."""
     same = []
     for seed in range(128):
         first = coordinates(seed, 1)[:, 0] < 0.5

@@ -1,4 +1,6 @@
-"""One tracer, used on scenes and parameters in any order, has the results of a new one, bit by bit on one thread."""
+"""One tracer is used on scenes and parameters in any order. Its results equal the results of a new tracer, bit by bit
+on one thread.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +30,17 @@ LAMP, SLAB, SHEET = "lamp.emitter.radiance.value", "slab.vertex_positions", "she
 
 
 def small(make: Callable[..., dict[str, Any]], **changes: Any) -> dict[str, Any]:
-    """A scene with something that moves, on a tiny film. Its lamp shines in all directions.
+    """Return a scene with something that moves, on a tiny film. The scene's lamp shines in all directions.
 
-    Next event estimation in another scene would ask a `directionalarea` for what it has not.
+    With a `directionalarea` instead, next event estimation in another scene would ask the lamp for properties that it
+    lacks.
     """
     light = flat(diffuse(0, 0, 0), 3.0, -0.8, emitter={"type": "area", "radiance": rgb(3.2, 3.0, 2.6)})
     return make(camera=above(size=12), lamp=light, **changes)
 
 
 def rippling() -> mi.Mesh:
-    """Something in a room that may move."""
+    """Return a rippled sheet that may move, for a room."""
     return sheet("sheet", diffuse(0.5, 0.4, 0.3), -0.6, 4, 1.0, 0.3)
 
 
@@ -70,13 +73,15 @@ Visit = tuple[str, int | None]
 
 @functools.cache
 def case_of(name: str, number: int) -> Case:
-    """A scene, which all of its cases share, with one set of parameters."""
+    """Return a case with one set of parameters. All cases of a scene share the scene."""
     scene, sets = SCENES[name]
     return Case(scene() if number == 0 else case_of(name, 0).scene, sets[number])
 
 
 def visit(tracer: Any, name: str, number: int | None) -> list[np.ndarray]:
-    """What a tracer finds: an image, and with parameters the gradient of a step, whose way goes by their number."""
+    """Return the image that a tracer renders. With parameters, return image and gradient of a step. The number of the
+    parameter set selects the kind of step.
+    """
     case = case_of(name, number or 0)
     if number is None:
         return [np.array(render_image(tracer, case.scene, 0, 3, SPP))]
@@ -92,7 +97,7 @@ def visit(tracer: Any, name: str, number: int | None) -> list[np.ndarray]:
 
 
 def visits_of(way: str, names: tuple[str, ...]) -> list[Visit]:
-    """What can be asked for of these scenes."""
+    """Return all visits that these scenes allow with this configuration."""
     found = [(name, number) for name in names for number in (None, *range(len(SCENES[name][1])))]
     able = ("stack", "reservoir")
     return [
@@ -104,9 +109,9 @@ def visits_of(way: str, names: tuple[str, ...]) -> list[Visit]:
 
 
 def differing(way: str, names: tuple[str, ...], orders: Iterator[np.random.Generator], length: int) -> list[str]:
-    """Visits in random orders whose results are not those of a new tracer.
+    """Return visits in random orders whose results differ from the results of a new tracer.
 
-    Where tables learn, the new tracer makes the visits to the same scene that came just before.
+    If tables learn, the new tracer first makes the visits to the same scene that immediately preceded.
     """
     make = functools.partial(integrator, "reslrb", 4, **WAYS[way])
     expected: dict[tuple[Visit, ...], list[np.ndarray]] = {}
@@ -141,7 +146,7 @@ def test_results_do_not_depend_on_200_orders_of_earlier_work(way: str) -> None:
 
 
 def test_weights_of_emitters_may_change() -> None:
-    """Light of both sides is weighed by how often lamps are drawn now."""
+    """Light paths and camera paths are weighted by the current probabilities of the emitters."""
     scene, image = load(SCENES["lamps"][0]()), functools.partial(render_image, sensor=0, seed=3, spp=SPP)
     params, tracer = mi.traverse(scene), integrator("reslrb", 4, **WAYS["both"])
     before = np.array(image(tracer, scene))
@@ -154,7 +159,7 @@ def test_weights_of_emitters_may_change() -> None:
 
 @pytest.mark.parametrize("name", ["reslrb", "ptracer"])
 def test_a_scene_at_a_reused_address_is_another_one(name: str) -> None:
-    """The sphere that a sky lights is that of each scene."""
+    """The directional light uses the bounding sphere of the current scene."""
 
     def mean(tracer: Any, size: float) -> tuple[float, int]:
         scene = load(room(lamp=None, far={"type": "sphere", "center": [0, size, 0], "radius": 0.1},
@@ -171,7 +176,9 @@ def test_a_scene_at_a_reused_address_is_another_one(name: str) -> None:
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_the_derivative_of_film_positions_is_the_same_in_both_modes(whole: bool) -> None:
-    """By splats under naive AD, by their taps, and by a look-up of dL/dI, also on a film that divides by no sum."""
+    """Naive AD of splats, of their taps, and a lookup of dL/dI give the same derivatives. With `whole`, the film does
+    not divide filter weights by their sum.
+    """
     film = Film(load(room(camera=camera("gaussian"))).sensors()[0], whole)
     shape = film.block().tensor().shape
     weights = mi.Float(np.random.default_rng(1).random(int(np.prod(shape)), np.float32))

@@ -1,4 +1,6 @@
-"""Lamps in view that are smaller than a pixel: found by points on them, and by no ray through a pixel as well."""
+"""Visible lamps smaller than a pixel. Sampled points on the lamps find their light, and rays through pixels do not find
+the light again.
+"""
 
 from __future__ import annotations
 
@@ -27,31 +29,33 @@ SPECKS = ("speck.emitter.radiance.value", "other.emitter.radiance.value")
 
 
 def third() -> Any:
-    """A lamp of a quarter of a pixel: large enough for primary rays to show what they add."""
+    """Return a lamp that covers about a quarter of a pixel. The lamp is large enough for primary rays to show their
+    contribution.
+    """
     return speck_in_view(0.06)
 
 
 def speck(at: list[float], kind: str = "sphere", **emitter: Any) -> dict[str, Any]:
-    """A bright thing of size 0.01."""
+    """Return a small lamp with scale 0.01."""
     return {"type": kind, "to_world": transform(translate=at, scale=0.01), "bsdf": diffuse(0, 0, 0),
             "emitter": {"type": "area", "radiance": rgb(900, 600, 400)} | emitter}  # fmt: skip
 
 
 def two(**changes: Any) -> dict[str, Any]:
-    """A room lit by two specks of light alone, which the camera sees."""
+    """Return a room lit only by two small lamps, which the camera sees."""
     specks = {"speck": speck([0.1, 0.8, 0.4]), "other": speck([-0.3, 0.3, 0.5], radiance=rgb(100, 300, 900))}
     return room(lamp=None, **specks | changes)
 
 
 def veiled() -> dict[str, Any]:
-    """The same with a mask, through which something else is seen."""
+    """Return the room of `two` with a mask, through which other objects are seen."""
     bsdf = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
     placed = transform(translate=[0.6, -0.3, 0.2], rotate=([1, 0, 0], -80), scale=0.3)
     return two(veil={"type": "rectangle", "to_world": placed, "bsdf": bsdf})
 
 
 def through_a_lens() -> dict[str, Any]:
-    """The same out of focus."""
+    """Return the room of `two` with a camera that is out of focus."""
     return two(camera=camera() | {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0})
 
 
@@ -66,7 +70,7 @@ CASES = {
 
 
 def failures(name: str) -> set[str]:
-    """References that do not hold, of `stack`."""
+    """Return the references that do not hold for `stack`."""
     records = list(run_case(CASES[name], ["stack"]))
     for record in records:
         print(record.to_json())
@@ -103,7 +107,7 @@ def test_a_recorded_step_equals_the_step_and_later_ones_compile_nothing():
 
 
 def found(scene: dict[str, Any]) -> tuple[Any, ...]:
-    """The small lamps of a plan."""
+    """Return the small lamps of a scene's plan."""
     loaded = load(scene)
     return integrator("reslrb", 4).plan(loaded, loaded.sensors()[0]).small_lamps
 
@@ -113,7 +117,7 @@ def looking(origin: list[float], target: list[float]) -> mi.ScalarTransform4f:
 
 
 def behind() -> dict[str, Any]:
-    """The specks behind a screen before the camera."""
+    """Return the room of `two`, with a screen that hides both small lamps from the camera."""
     placed = looking([1.0, 0.5, 3.3], [1.2, 0.6, 4]) @ mi.ScalarTransform4f().scale(9)
     return two(screen={"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5), "to_world": placed})
 
@@ -140,7 +144,7 @@ def test_too_many_lamps_are_left_to_primary_rays(monkeypatch: pytest.MonkeyPatch
 
 
 def test_scenes_without_small_lamps_have_no_extra_operations():
-    """And those with some have."""
+    """Scenes with small lamps have extra operations."""
     operations = {}
     for name, make in {"none": room, "some": two}.items():
         scene = load(make())
@@ -156,7 +160,9 @@ def test_scenes_without_small_lamps_have_no_extra_operations():
 
 
 def radiance_gradient(key: str, moves: bool, size: float) -> np.ndarray:
-    """The derivative by the radiance of a lamp that is seen, which is a parameter alone or beside where the lamp is."""
+    """Return the derivative by the radiance of a visible lamp. The radiance is the only parameter, or with `moves` also
+    the lamp's position.
+    """
     rest = mi.AffineTransform4f(transform(rotate=([1, 0, 0], -80), scale=size).matrix)
 
     def place(params: mi.SceneParameters, latents: dict[str, Any]) -> None:
@@ -172,7 +178,7 @@ def radiance_gradient(key: str, moves: bool, size: float) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [0.4, 0.01])
 def test_radiance_counts_once_if_its_lamp_moves_too(size: float):
-    """It did twice: once by primary rays, and once by points on the lamp that show where it goes."""
+    """Primary rays and the points that follow the moving lamp must not both count the radiance."""
     key = "light.emitter.radiance.value"
     alone, beside = (radiance_gradient(key, moves, size) for moves in (False, True))
     assert alone.all()

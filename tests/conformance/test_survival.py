@@ -1,4 +1,4 @@
-"""Roulette by what paths can still say: what is learned, and that means stay."""
+"""Learned roulette: the learned table, and unchanged means."""
 
 from __future__ import annotations
 
@@ -31,14 +31,18 @@ BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat
 
 
 def harsh(scene: Case, ours: Any, factor: float = 1.0) -> Any:
-    """Have an integrator play roulette by a table of large contrasts, which has nothing to do with the scene."""
+    """Let an integrator play roulette with a table of large contrasts that is unrelated to the scene. Return the
+    integrator.
+    """
     ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params)
     by_harsh_table(ours.preparation.guiding, factor)
     return ours
 
 
 def by_harsh_table(guiding: Guiding, factor: float = 1.0) -> None:
-    """The same of its tables, from which the first sensor's samples are drawn until they next learn."""
+    """Give the guiding tables a roulette with large contrasts. Samples of the first sensor use it until the tables
+    learn again.
+    """
     onward = guiding.learned[0].onward if 0 in guiding.learned else None
     light = 1.0 if onward is None else onward.light
     survival = Survival.of(guiding.box, factor / light * np.random.default_rng(1).lognormal(-1, 1.5, CELLS))
@@ -71,14 +75,14 @@ def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) 
 
 
 def without_weight(patch: pytest.MonkeyPatch) -> None:
-    """What lives on counts for no more than before."""
+    """Do not raise the weight of paths that survive roulette."""
     from reslrb_cli.transport.factors import Product
 
     patch.setattr(Product, "scaled", lambda self, scale: self)
 
 
 def of_another_cell(patch: pytest.MonkeyPatch) -> None:
-    """The weight is that of one probability, what is ended that of another."""
+    """Compute the weight of surviving paths from a probability that differs from the survival probability."""
     import drjit as dr
 
     from reslrb_cli.transport import walk
@@ -99,7 +103,9 @@ BOUNCES = next(case for case in MOVING if case.name == "bounces")
 
 @pytest.mark.parametrize("rr_depth", [2, 5])
 def test_means_hold_with_moving_light(rr_depth: int) -> None:
-    """For parameters before and behind what moves, with roulette on throughput (2) and without it (5)."""
+    """Guided and unguided means agree for parameters before and behind the moving object. Roulette on throughput is on
+    (`rr_depth` 2) or off (5).
+    """
     assert moving_means_hold("stack", "harsh", rr_depth, 8, 16)
 
 
@@ -112,7 +118,9 @@ def test_means_hold_with_moving_light_over_many_seeds(estimator: str, table: str
 
 
 def moving_means_hold(estimator: str, table: str, rr_depth: int, count: int, spp: int) -> bool:
-    """Whether guided gradients over unguided ones, along the mean of the latter, are 1 for each parameter."""
+    """Return True if guided and unguided gradients agree for each parameter. The comparison projects both onto the
+    unguided mean gradient.
+    """
     moving, holds = BOUNCES.moving(), True
     ours, plain = (
         integrator("reslrb", 6, rr_depth, estimator=estimator, guiding=guiding, hide_emitters=True)
@@ -135,7 +143,7 @@ def moving_means_hold(estimator: str, table: str, rr_depth: int, count: int, spp
 
 
 def test_a_lost_weight_of_learned_roulette_is_found_with_moving_light(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The walk back asks for roulette on throughput alone, as it once did."""
+    """The fault applies the weights of learned roulette only together with roulette on throughput."""
     from reslrb_cli.estimators.attached import AttachedSweep
 
     right = AttachedSweep.survived
@@ -148,7 +156,7 @@ def test_a_lost_weight_of_learned_roulette_is_found_with_moving_light(monkeypatc
 
 
 def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) -> None:
-    """The replay draws from what `other` makes of its table."""
+    """Let the replay use the table that `other` makes from its own table."""
     from reslrb_cli.integrators import reslrb as lt
     from reslrb_cli.integrators.reslrb import Reslrb
 
@@ -163,9 +171,11 @@ def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) ->
 
 
 def replays_agree(make: Callable[[str], tuple[Case, Any]]) -> bool:
-    """At equal seeds `gather`, which traces twice, has the gradient of `stack` by dL/dI that is known beforehand.
+    """Return True if the correlated gradient of `gather`, which traces twice, equals the gradient of `stack` for a
+    known dL/dI. All use the same seed.
 
-    `make` makes a case and an integrator of an estimator. A `stack` that traces twice has it, too, or `gather` has not.
+    `make` returns a case and an integrator for an estimator. The function also asserts that `stack` with two traversals
+    has the same gradient, unless `gather` differs.
     """
     found = {}
     for kind in ("gather", "stack"):
@@ -193,7 +203,7 @@ def test_a_replay_follows_the_traced_paths(name: str, fault: bool, monkeypatch: 
 
 
 def test_a_recorded_step_equals_the_step() -> None:
-    """Recordings have the table that there is, not the one that they were made with."""
+    """Recorded steps use the current table, not the table of the recording."""
     (scene, ours, _), (_, frozen, _) = (guided("envmap", 0, freeze=freeze) for freeze in (False, True))
     for factor in (1.0, 0.3, 3.0):
         both = [sample(scene, harsh(scene, each, factor), 5) for each in (ours, frozen)]
@@ -222,7 +232,7 @@ def test_cells_are_indexed_by_position_and_octant() -> None:
 
 
 def test_the_probability_is_bounded_on_both_sides() -> None:
-    """Of what is not a number too, which has to be seen."""
+    """The bounds also hold for NaN, which gets the lower bound."""
     import mitsuba as mi
 
     throughput = mi.Float([0.0, 1e-30, 0.1, 0.5, 1e30, np.inf, np.nan])
@@ -248,7 +258,9 @@ def cell_of(x: int, y: int, z: int) -> int:
 
 
 def test_cells_share_with_their_neighbours_and_none_is_zero() -> None:
-    """The formula of the docstring where a cell is well known; of one that nobody has met, that of its neighbours."""
+    """A well-sampled cell has the value of the formula in the docstring. A cell without samples has the value of its
+    neighbours.
+    """
     left = np.zeros(CELLS)
     loud, near, quiet, far = (cell_of(*cube) for cube in ((10, 10, 10), (10, 10, 11), (1, 1, 1), (1, 14, 1)))
     left[[loud, quiet]] = 1e6
@@ -274,7 +286,7 @@ def test_walks_without_contributions_change_nothing() -> None:
 
 
 def test_without_data_all_paths_survive() -> None:
-    """As in a scene whose paths are not followed beyond their first surface."""
+    """No table ends paths in a scene whose paths do not continue beyond the first surface."""
     known = Onward.nothing(BOX).with_more(walked())
     assert known.light > 0
     for share in (0.0, 0.5, 1.0):
@@ -282,7 +294,7 @@ def test_without_data_all_paths_survive() -> None:
 
 
 def test_learned_state_does_not_depend_on_the_unit_of_light() -> None:
-    """Throughputs are as bright as the light is: s is in proportion to one over that."""
+    """Throughputs are proportional to the light. The learned s is therefore inversely proportional to the light."""
     random = np.random.default_rng(3)
     squares, left = random.gamma(0.2, size=(2, CELLS)), random.integers(0, 300, CELLS).astype(float)
     known = walked(squares=squares, followed=2 * left, left=left)
@@ -293,7 +305,7 @@ def test_learned_state_does_not_depend_on_the_unit_of_light() -> None:
 
 
 def walk_of(scene: Case, ours: Any, seed: int) -> Walked:
-    """What a walk shows that a table would learn from."""
+    """Return the data of one walk, from which a table would learn."""
     from reslrb_cli.guiding.collect import hear
 
     leaves = scene.leaves()
@@ -305,8 +317,9 @@ def walk_of(scene: Case, ours: Any, seed: int) -> Walked:
 
 
 def heard(name: str, change: Callable[[Case, Any], None], count: int, block: int) -> np.ndarray:
-    """What walks of two bounces show of what follows the first, by the octant that rays leave into: squares of each
-    voice, vertices, rays; one row for each seed."""
+    """Return the data that walks of two bounces collect after the first vertex, by octant of the outgoing ray. Each
+    seed has one row. A row holds the squared contributions of each quantity, the later vertices, and the rays.
+    """
     scene, ours, _ = guided(name, 3, max_depth=3)
     change(scene, ours)
     rows = []
@@ -318,13 +331,15 @@ def heard(name: str, change: Callable[[Case, Any], None], count: int, block: int
 
 
 def certain(scene: Case, ours: Any) -> None:
-    """Have all paths go on."""
+    """Let all paths survive."""
     harsh(scene, ours, np.inf)
 
 
 @pytest.mark.parametrize("fault", [None, "square", "length"])
 def test_collected_values_do_not_depend_on_roulette(fault: str | None, monkeypatch: Any) -> None:
-    """Weights of roulette are taken out again: a table that learned its own weights would feed on itself."""
+    """The collected values do not contain the weights of roulette. Otherwise, a table would learn from its own
+    weights.
+    """
     from reslrb_cli.guiding import collect
 
     if fault is not None:
@@ -337,14 +352,18 @@ def test_collected_values_do_not_depend_on_roulette(fault: str | None, monkeypat
 
 
 def test_later_contributions_are_collected_at_the_ray_of_the_bounce() -> None:
-    """Against sums in NumPy over the paths of the same seed, vertex by vertex, of what they say about the image."""
+    """The numbers of rays and later vertices, and the squared contributions, equal sums in NumPy over the paths of the
+    same seed.
+    """
     import drjit as dr
     import mitsuba as mi
 
     from reslrb_cli.transport.walk import Hooks, walk
 
     class Keeping(Hooks):
-        """Of each path: where it leaves the first vertex, its throughput then, and what the second one says."""
+        """Records for each path the ray that leaves the first vertex, its throughput, and the contribution of the
+        second vertex.
+        """
 
         def __init__(self, width: int) -> None:
             self.kept = dr.zeros(mi.Float, 10 * width)
@@ -380,7 +399,9 @@ def test_later_contributions_are_collected_at_the_ray_of_the_bounce() -> None:
 
 
 def test_vertices_beyond_the_capacity_are_summed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of walks of two bounces rays leave the first vertex alone: there is room for that, or for both."""
+    """The result is the same if one vertex or both vertices fit into the storage. In walks of two bounces, rays leave
+    only the first vertex.
+    """
     from reslrb_cli.guiding import collect
 
     scene, ours, _ = guided("two_emitters", 1, max_depth=3)
@@ -394,7 +415,7 @@ def test_vertices_beyond_the_capacity_are_summed(monkeypatch: pytest.MonkeyPatch
 
 
 def test_trained_tables_end_paths_with_small_contributions() -> None:
-    """Walks of equal seeds get shorter."""
+    """With the trained table, walks of equal seeds are shorter than walks without roulette."""
     scene, ours, _ = guided("roulette", 4, rr_depth=100)
     lengths = []
     for table in ("learned", "certain"):

@@ -1,4 +1,4 @@
-"""Weights of paths from both sides: those that the kernels used are ratios of explicit densities."""
+"""Path weights with light paths and camera paths. The weights in the kernels are ratios of explicit densities."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ ROUGH = {"type": "roughconductor", "alpha": 0.3}
 
 
 def bumpy() -> dict[str, Any]:
-    """A rough conductor whose normals are perturbed."""
+    """Return a rough conductor with perturbed normals."""
     return {"type": "bumpmap", "texture": {"type": "bitmap", "bitmap": bitmap(8, 8, 1), "raw": True}, "scale": 0.3,
             "bsdf": ROUGH}  # fmt: skip
 
@@ -78,7 +78,9 @@ def plate(bsdf: Any, *at: float, scale: Any = 2, rotate: Any = None) -> dict[str
 
 
 def sheet(at: Any, bsdf: Any = WHITE, emitter: Any = None, leaning: float = 0, size: float = 0.6) -> Any:
-    """A mesh of two faces that faces down; its vertices' normals are `leaning` outwards, if any."""
+    """Return a mesh of two faces that faces down. If `leaning` is above 0, the vertex normals lean outwards by
+    `leaning`.
+    """
     import mitsuba as mi
 
     properties = mi.Properties()
@@ -98,7 +100,7 @@ def sheet(at: Any, bsdf: Any = WHITE, emitter: Any = None, leaning: float = 0, s
 
 
 def room(lights: dict[str, Any], sensor: Any = None, film: Any = None, walls: Any = WHITE, **things: Any) -> Any:
-    """The scene; of these BSDF are the floor and the wall behind, that to the left is white."""
+    """Return the scene. The floor and the back wall have the BSDF `walls`. The left wall is white."""
     import mitsuba as mi
 
     size = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
@@ -115,7 +117,7 @@ def glow(radiance: Any = None, kind: str = "area") -> dict[str, Any]:
 
 
 def lamp(emitter: Any = None) -> dict[str, Any]:
-    """A rectangle that shines down."""
+    """Return a rectangular lamp that shines down."""
     return plate(WHITE, 0.4, 3.9, 0.2, rotate=([1, 0, 0], 90), scale=[0.5, 0.4, 1]) | {"emitter": emitter or glow()}
 
 
@@ -149,7 +151,7 @@ EMITTERS: dict[str, Callable[[], Any]] = {
 
 
 def lights(*names: str, **weights: float) -> dict[str, Any]:
-    """These emitters, sampled in proportion to their weights (1)."""
+    """Return the named emitters. Sampling is proportional to `weights` (default 1)."""
     made = {f"light_{name}": EMITTERS[name]() for name in names}
     for name, weight in weights.items():
         one = made[f"light_{name}"]
@@ -165,8 +167,9 @@ EVENED = ("light_textured.emitter.radiance.data", "light_textured_mesh.emitter.r
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, what of it is differentiated, and options of the integrator; `guided` by what a random dL/dI says, with
-    camera paths `shared` out over the pixels at random."""
+    """A scene, the keys of its differentiated parameters, and options of the integrator. If `guided`, the tables learn
+    from a random dL/dI. If `shared`, a random density distributes the camera paths over the pixels.
+    """
 
     scene: Callable[[], Any]
     keys: tuple[str, ...] = ()
@@ -221,7 +224,7 @@ CASES |= {f"only_{name}": Case(partial(lambda name: room(lights(name), walls=HAL
 
 
 def prepared(case: Case) -> Any:
-    """Samples of light paths, which know of the camera paths beside them; or of camera paths alone."""
+    """Return samples of light paths together with their camera paths, or samples of camera paths only."""
     import drjit as dr
     import mitsuba as mi
 
@@ -253,7 +256,7 @@ def prepared(case: Case) -> Any:
 
 
 def found(samples: Any) -> dict[str, Any]:
-    """The paths that each way has found."""
+    """Return the paths that each way has found."""
     import drjit as dr
     from conformance.path_densities import CameraNotes, Emission, LightNotes, paths_of
 
@@ -274,8 +277,10 @@ def found(samples: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of one way, over paths that rounding leaves alone: how far weights are off ratios of densities, relative to
-    these, patterns of delta vertices, and emitters that no path has found."""
+    """Result of one way, over paths that rounding does not affect. `error` is the error of the weights relative to the
+    ratios of densities. `patterns` are the patterns of delta vertices. `missed` are the emitters that no path has
+    found.
+    """
 
     error: np.ndarray
     patterns: list[tuple[bool, ...]]
@@ -290,7 +295,7 @@ TOLERANCE = 1e-3
 
 
 def compared(case: Case) -> dict[str, Comparison]:
-    """The weights of a case and its densities, by way."""
+    """Return for each way the comparison of a case's weights with its densities."""
     from conformance.path_densities import Densities, emitter_number
 
     samples = prepared(case)
@@ -310,7 +315,7 @@ def compared(case: Case) -> dict[str, Comparison]:
 
 @cache
 def as_it_stands(name: str) -> dict[str, Comparison]:
-    """Of a case, once for all tests."""
+    """Return the comparison of a case. The result is cached for all tests."""
     return compared(CASES[name])
 
 
@@ -344,7 +349,9 @@ def test_every_pattern_of_delta_vertices_is_covered():
     ),
 )
 def test_the_density_of_rays_matches_the_sampled_ones(name: str):
-    """Which a ray's weight tells: it is the light along it, times the cosine at a lamp, over that density."""
+    """The weight of a ray determines its density. The weight is the light along the ray, times the cosine at a lamp,
+    divided by the density.
+    """
     import drjit as dr
     from conformance.path_densities import Densities, Emission, cosine
 
@@ -431,7 +438,9 @@ WALKS_BACK = {
 
 
 def gradient(**options: Any) -> np.ndarray:
-    """Derivatives by all colours of a room, of camera paths, which are the same whatever takes them."""
+    """Return the derivatives by all colours of a room, estimated with camera paths. All integrators use the same camera
+    paths.
+    """
     import drjit as dr
     import mitsuba as mi
 

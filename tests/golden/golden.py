@@ -1,9 +1,9 @@
-"""Golden values: what three iterations of a score of experiments come to, bit by bit, and what commands print.
+"""Golden values: the exact bits of three iterations of each run in `RUNS`, and the output of commands.
 
-They are for changes that are to change nothing: files that are merged, moved or named anew. This file, as a program,
-writes `values.json` beside it anew, for this processor and libLLVM; on another machine it is to be run on the commit
-before the change. `tests/test_golden.py` compares. Kernels are computed by one thread, since sums over several are not
-the same twice.
+The golden values protect changes that must not change any result, for example merged, moved or renamed files. Run as a
+program, this file rewrites `values.json` in the same folder for this processor and libLLVM. On another machine, run it
+on the commit before the change. `tests/test_golden.py` compares the values. One thread computes the kernels, because
+sums over several threads are not reproducible.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ main.main(sys.argv[1:], prog_name="reslrb")
 
 
 def machine() -> str:
-    """Return what bits depend on: the processor, by its name, family and model, and the version of libLLVM."""
+    """Return what the bits depend on: the name, family and model of the processor, and the version of libLLVM."""
     sys.path.insert(0, str(ROOT))
     import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Dr.Jit
 
@@ -121,8 +121,9 @@ def machine() -> str:
 
 
 def reslrb(*words: str, alone: bool = False, recorded: bool = True) -> subprocess.CompletedProcess[str]:
-    """What the command line says, in a process of its own; with `alone` kernels are computed by one thread, and what
-    steps launch is recorded or not."""
+    """Run the command line in a separate process, and return the finished process. With `alone`, one thread computes
+    the kernels, and `recorded` turns the recording of steps on or off.
+    """
     program = ["-c", _ALONE.format(tests=str(ROOT / "tests"), recorded=recorded)] if alone else ["-m", "reslrb_cli"]
     environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
     return subprocess.run(
@@ -131,13 +132,15 @@ def reslrb(*words: str, alone: bool = False, recorded: bool = True) -> subproces
 
 
 def bits(array: np.ndarray[Any, Any]) -> str:
-    """A short name of an array's shape and bits."""
+    """Return a short text with an array's shape and a hash of its bits."""
     array = np.ascontiguousarray(array)
     return f"{'x'.join(map(str, array.shape))} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
 
 
 def values_of(name: str, other_seed: bool = False) -> dict[str, Any]:
-    """Loss and gradient norm of each iteration, and the bits of parameters and image after the last."""
+    """Return the loss and gradient norm of each iteration, and the bits of parameters and images after the last
+    iteration.
+    """
     config, seed, settings = RUNS[name]
     own = [word for setting in settings for word in setting.split("|")]
     with tempfile.TemporaryDirectory() as folder:
@@ -169,12 +172,12 @@ def values_of(name: str, other_seed: bool = False) -> dict[str, Any]:
 
 
 def size(config: str) -> list[int]:
-    """Pixels of the film: few, and as wide as high only where the scene's are."""
+    """Return the film size in pixels. The film is small, and is square unless the scene's film is not."""
     return [24, 18] if config == "grey_room" else [16, 16]
 
 
 def form(value: Any) -> Any:
-    """The names and types in a JSON value; of a list those of all its entries together."""
+    """Return the names and types in a JSON value. Lists give the set of the forms of all entries."""
     if isinstance(value, dict):
         return {key: form(inner) for key, inner in sorted(value.items())}
     if isinstance(value, list):
@@ -183,7 +186,7 @@ def form(value: Any) -> Any:
 
 
 def form_of(name: str) -> list[str]:
-    """The forms of all lines of a tiny measurement's JSON."""
+    """Return the forms of all JSON lines of a tiny measurement."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "lines.json"
         words = [] if name == "inspect" else ["--json", str(file)]
@@ -197,14 +200,16 @@ def form_of(name: str) -> list[str]:
 
 
 def texts() -> dict[str, str]:
-    """The help of each command, and the schema of the configuration, by their digests."""
+    """Return digests of the help of each command, and of the configuration schema."""
     found = {f"help {command}".strip(): reslrb(*command.split(), "--help").stdout for command in COMMANDS}
     found["schema"] = SCHEMA.read_text(encoding="utf-8")
     return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in found.items()}
 
 
 def main() -> None:
-    """Write the values anew: this machine's, and what is the same on all; with `--texts` what is printed alone."""
+    """Rewrite the values of this machine and the values of all machines. With `--texts`, rewrite only the values of the
+    printed output.
+    """
     content = json.loads(VALUES.read_text()) if VALUES.exists() else {"machines": {}}
     if "--texts" in sys.argv[1:]:
         content["texts"], content["forms"] = texts(), {name: form_of(name) for name in MEASUREMENTS}

@@ -1,4 +1,4 @@
-"""What tests of lenses share: fewer samples of what no test measures."""
+"""Shared setup of the lens tests: fewer samples for quantities that no test measures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from reslrb_cli.runs import export
 
 @pytest.fixture(autouse=True, scope="module")
 def _few_samples() -> Iterator[None]:
-    """Of the rays that tell where light goes, and of the solid's picture, which take seconds of every run."""
+    """Reduce the rays that measure where light goes, and the samples of the solid's picture. Otherwise, they take
+    seconds in every run.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tolerance, "RAYS", 2**16)
         patch.setattr(export, "PICTURE_SPP", 4)

@@ -1,4 +1,4 @@
-"""What `reslrb lens` writes: the scene throws the picture the right way round, as bright as the target says."""
+"""Output of `reslrb lens`: the scene casts the picture upright, with the brightness of the target."""
 
 from __future__ import annotations
 
@@ -36,14 +36,16 @@ OPTIONS = {
 
 
 def picture(rows: int, columns: int) -> np.ndarray:
-    """One that no turn and no mirroring maps to itself: a bright blob in the upper left, a weaker one on the right."""
+    """Return a picture that no rotation and no reflection maps to itself. It has a bright blob in the upper left and a
+    weaker blob on the right.
+    """
     y, x = np.mgrid[:rows, :columns] / np.array([rows, columns])[:, None, None]
     blob = np.exp(-((x - 0.25) ** 2 + (y - 0.2) ** 2) / 0.02) + 0.5 * np.exp(-((x - 0.8) ** 2 + (y - 0.4) ** 2) / 0.02)
     return 0.3 + 0.7 * blob
 
 
 def flattened(heights: np.ndarray, folder: Path) -> mi.Scene:
-    """The scene in `folder` with `heights` (ny, nx) on its face."""
+    """Return the scene in `folder` with `heights` (ny, nx) as the heights of its face."""
     scene = mi.load_file(str(folder / "scene.xml"), optimize=False)
     params = mi.traverse(scene)
     at = np.array(params["face.vertex_positions"]).reshape(-1, 3)
@@ -191,7 +193,9 @@ def test_invalid_input_is_refused_in_one_line_without_output(
 
 
 def test_a_run_continues_with_its_momentum_and_measured_steepness(tmp_path: Path, llvm: str) -> None:
-    """Both are of what the optimiser moves, which is rougher than the heights; a rate that is measured stays."""
+    """Momentum and steepness refer to the optimiser's variable, which is rougher than the heights. A resumed run keeps
+    the measured rate.
+    """
     write_file(tmp_path / "p.exr", np.repeat(picture(16, 16)[:, :, None], 3, 2).astype(np.float32), linear=True)
     done("lens", tmp_path / "p.exr", "-o", tmp_path / "lens", "--pixels", "16")
     sets = [f"run.output={tmp_path}/runs", "run.spp=4", "run.final_spp=4", "optimizer.schedule=constant"]

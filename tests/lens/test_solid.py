@@ -1,4 +1,6 @@
-"""Solids: closed, of the volume that the heights have, read back by other code; what cannot be is refused."""
+"""Solids are closed, have the volume that the heights define, and can be read by other code. Impossible solids are
+refused.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,7 @@ def ripples(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def grid(heights: Heights, nx: int = 61, ny: int = 41, size: tuple[float, float] = SIZE) -> tuple[Any, Any]:
-    """Vertices and triangles of a face."""
+    """Return the vertices and triangles of a face."""
     x, y = np.meshgrid(*(np.linspace(-s / 2, s / 2, n) for s, n in zip(size, (nx, ny), strict=True)))
     at = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
     cells = [np.stack([at, at + 1, at + nx + 1], 1), np.stack([at, at + nx + 1, at + nx], 1)]
@@ -54,7 +56,7 @@ def plan(**options: Any) -> Fabrication:
 
 
 def under(height: Heights) -> Heights:
-    """A free back 8 mm below, of another shape."""
+    """Return the heights of a free back of another shape, 8 mm below the face."""
     return lambda x, y: -8 - 0.7 * height(y, x)
 
 
@@ -73,7 +75,7 @@ SHAPES: dict[str, tuple[dict[str, Any], bool, float]] = {
 
 
 def integral(heights: Heights, outline: str) -> float:
-    """That of the heights over the face, in mm^3: by the middles of fine cells."""
+    """Return the integral of the heights over the face in mm^3, by the midpoint rule on fine cells."""
     x, y = np.meshgrid(*((np.arange(1500) + 0.5) / 1500 * s - s / 2 for s in SIZE))
     inside = (2 * x / SIZE[0]) ** 2 + (2 * y / SIZE[1]) ** 2 <= 1 if outline == "round" else np.ones_like(x)
     return float(np.mean(heights(x, y) * inside) * SIZE[0] * SIZE[1])
@@ -224,7 +226,7 @@ def test_invalid_solids_are_refused() -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
-    """The folder of a run of a lens, one iteration from its start."""
+    """Folder of a lens run with one iteration from its start."""
     folder = tmp_path_factory.mktemp("solid")
     image = np.repeat(picture(16, 12)[:, :, None], 3, 2).astype(np.float32)
     write_file(folder / "p.exr", image, linear=True)
@@ -264,7 +266,7 @@ def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: P
 
 
 def read_back(path: Path) -> trimesh.Trimesh:
-    """The solid in a file, by a library that wrote none of it."""
+    """Return the solid in a file. The library that reads the solid did not write the file."""
     if path.suffix == ".3mf":
         pytest.importorskip("lib3mf")  # without it that file is left out
         pytest.importorskip("lxml")
@@ -272,7 +274,7 @@ def read_back(path: Path) -> trimesh.Trimesh:
 
 
 def write_mesh(read: trimesh.Trimesh, path: Path) -> None:
-    """Its vertices and triangles as Mitsuba writes them."""
+    """Write the vertices and triangles of `read` as a PLY file with Mitsuba."""
     made = mi.Mesh("solid", len(read.vertices), len(read.faces))
     values = mi.traverse(made)
     values["vertex_positions"] = np.asarray(read.vertices, np.float32).ravel()

@@ -1,4 +1,6 @@
-"""Faces of lenses and mirrors, judged by rays that are traced apart (`tracer.py`); what cannot be is refused."""
+"""Faces of lenses and mirrors, checked with rays from an independent tracer (`tracer.py`). Impossible faces are
+refused.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Tolerances: what was moved is moved, as in a scene's file, and is put back; balls cut what they can."""
+"""Tolerances: displaced parts match a scene file with the same displacement, and are put back afterwards. Tool balls
+cut the hollows that they fit into.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,7 @@ def test_shift_and_figures_match_a_known_change_of_a_picture() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
-    """A lens at its start, a run of one iteration from there, and that exported with its tolerances."""
+    """Folder with a lens at its start, a run of one iteration, and an export of this run with tolerances."""
     folder = tmp_path_factory.mktemp("tolerance")
     write_file(folder / "p.exr", np.repeat(picture(32, 32)[:, :, None], 3, 2).astype(np.float32), linear=True)
     done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "32")
@@ -101,7 +103,9 @@ def bench(folder: Path) -> OpticalBench:
 
 
 def in_file(folder: Path, id: str, before: str) -> mi.Scene:
-    """The exported scene with a transform more for the shape or sensor `id`, at the end of its own."""
+    """Return the exported scene with one more transform for the shape or sensor `id`. The transform is added at the end
+    of its `to_world`.
+    """
     text = (folder / "out/scene.xml").read_text()
     place = re.search(rf'id="{id}">.*?</transform>', text, re.DOTALL)
     assert place is not None
@@ -111,7 +115,7 @@ def in_file(folder: Path, id: str, before: str) -> mi.Scene:
 
 
 def with_face(folder: Path, heights: Callable[[np.ndarray], np.ndarray]) -> OpticalBench:
-    """The exported lens whose face is a function of x."""
+    """Return the exported lens with heights of the face that are a function of x."""
     made = bench(folder)
     points = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
     points[:, 2] = heights(points[:, 0])
@@ -129,7 +133,9 @@ def light_of(made: OpticalBench) -> dict[str, float]:
 
 
 def test_light_is_classified_by_its_destination(folder: Path) -> None:
-    """A flat lens, of whose width one tenth or so sends its light aside: beside the picture, or off the film."""
+    """In a flat lens, about one tenth of the width deflects light. The deflected light lands beside the picture or off
+    the film.
+    """
     assert light_of(with_face(folder, np.zeros_like)) == {"inside": 1, "beside": 0, "beyond": 0}
     wide = 100 / 95  # of its 95 columns of triangles ten are a wedge
     for aside, name, share in ((8.0, "beside", 8 / 100), (30.0, "beyond", 10 * wide / 100)):
@@ -145,7 +151,9 @@ def test_light_is_classified_by_its_destination(folder: Path) -> None:
 
 
 def test_shares_match_a_film_that_sees_the_whole_receiver(folder: Path) -> None:
-    """Mitsuba's light tracer with as many reflections, a receiver so dark that none comes back from it."""
+    """The reference is Mitsuba's light tracer with as many reflections. The receiver is so dark that no light returns
+    from it.
+    """
     made = with_face(folder, lambda x: 0.3 * np.sin(x / 3))
     made.params["screen.bsdf.reflectance.value"] = mi.Color3f(1e-3)
     made.params.update()
@@ -274,7 +282,9 @@ def test_the_command_reports_all_figures(folder: Path) -> None:
 def test_the_page_of_a_run_has_the_figures_for_the_maker(
     tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At its end, and what `export --tolerances` finds afterwards, with what was found at the end still there."""
+    """The page has the figures at the end of the run. `export --tolerances` adds further figures, and keeps the earlier
+    figures.
+    """
     tones = np.kron(np.random.default_rng(2).uniform(0, 1, (4, 4)), np.ones((4, 4)))
     write_file(tmp_path / "p.exr", np.repeat(tones[:, :, None], 3, 2).astype(np.float32), linear=True)
     done("lens", tmp_path / "p.exr", "--pixels", 16, "--floor", 0.2, "-o", tmp_path / "l")

@@ -1,4 +1,4 @@
-"""The transport of light against maps that are known, its derivative, and its floor."""
+"""Light transport compared with known maps, its derivative, and its floor."""
 
 from __future__ import annotations
 

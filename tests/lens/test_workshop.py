@@ -1,4 +1,4 @@
-"""The sheet for a workshop: its figures against closed forms, and set-ups against the scenes that `lens` writes."""
+"""Workshop sheet: its figures are compared with closed forms, and its set-ups with the scenes from `lens`."""
 
 from __future__ import annotations
 

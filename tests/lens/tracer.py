@@ -1,4 +1,4 @@
-"""Rays through a face, traced one by one with other formulas than the face was made with."""
+"""Rays through a face, traced one by one. The formulas differ from the formulas that shaped the face."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ Array = NDArray[np.float64]
 
 
 def turned(vector: list[float], degrees: float) -> Array:
-    """`vector` turned about y, z towards x."""
+    """Return `vector` rotated about y, from z towards x."""
     a = np.radians(degrees)
     x, y, z = vector
     return np.array([x * np.cos(a) + z * np.sin(a), y, z * np.cos(a) - x * np.sin(a)])
 
 
 def bent(d: Array, normal: Array, ratio: float) -> tuple[Array, Array]:
-    """Directions (3, n) after Snell's law, and what passes; `ratio`: index before over index behind.
+    """Return directions (3, n) after Snell's law, and the transmitted fraction. `ratio` is the index before over the
+    index behind.
 
-    By angles: the tangent's part of a direction grows by `ratio`.
+    The tangential part of a direction grows by `ratio`. The transmitted fraction follows from the angles.
     """
     along = np.sum(d * normal, axis=0)
     tangent = ratio * (d - along * normal)
@@ -35,9 +36,10 @@ def bent(d: Array, normal: Array, ratio: float) -> tuple[Array, Array]:
 
 
 def caustic(made: Surface, shape: tuple[int, int], rays: int = 400, wider: float = 1.0) -> Array:
-    """The picture (rows, columns) that light makes on the receiver, as it is looked at, of light per pixel.
+    """Return the picture (rows, columns) that light casts on the receiver, as an observer sees the receiver. Values are
+    light per pixel.
 
-    `wider`: of a receiver that many times larger, in `shape` pixels.
+    With `wider`, the receiver is larger by this factor and is divided into `shape` pixels.
     """
     s = made.setting
     width, height = s.size

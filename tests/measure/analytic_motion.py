@@ -1,12 +1,13 @@
-"""Motions whose derivatives are known in closed form: a tilted surface of glass, a ball lens, a lamp over a plane.
+"""Motions whose derivatives are known in closed form: a tilted glass surface, a ball lens, and a lamp over a plane.
 
-The receiver is the plane y = 0 of `moving_light.setting`, which its camera sees from x, z = -1 to 1. Of every path
-that lands there the image shows, in all pixels together,
+The receiver is the plane y = 0 of `moving_light.setting`. Its camera sees the range -1 to 1 of x and z. Each path that
+lands in this range contributes to the sum over all pixels:
 
     sum_p A I_p = rho / pi * flux          A: area of a pixel on the receiver
 
-whatever the place: cosines and distance to a pinhole that looks straight down cancel. So the mean place at which light
-lands is that of the image's centre of gravity, and its derivative is one of geometrical optics.
+This holds at every position. The reason is that the cosines and the distance to a pinhole that looks straight down
+cancel. The mean position of the landing light is therefore the image's centre of gravity. Geometrical optics gives its
+derivative.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ PIXEL = (2 / SIZE) ** 2
 
 @dataclass(frozen=True)
 class KnownMotion:
-    """A scene, dL/dI `weights` (H, W, 3), and the derivative of the objective by each amplitude, (K,).
+    """A scene, dL/dI `weights` (H, W, 3), and the derivatives of the objective by each amplitude (K,).
 
-    `tolerance` is what the formula leaves out, relative to the largest derivative.
+    `tolerance` is the error of the formula, relative to the largest derivative.
     """
 
     scene: AttachedScene
@@ -46,22 +47,26 @@ class KnownMotion:
 
 
 def centre_of_gravity() -> Array:
-    """Weights by which the objective is the integral of x over the light that lands: (H, W, 3)."""
+    """Return weights (H, W, 3) for which the objective is the integral of x over the light that lands."""
     x = 2 * (np.arange(SIZE) + 0.5) / SIZE - 1
     return np.broadcast_to(PIXEL * x[None, :, None], (SIZE, SIZE, 3)).copy()
 
 
 def parallel(half: float, x: float, y: float, radiance: float) -> dict:
-    """Light straight down from a square around (x, 0), whose flux is `radiance` * (2 half)^2."""
+    """Return a lamp with parallel light straight down from a square around (x, 0). Its flux is `radiance` * (2
+    half)^2.
+    """
     place = transform(translate=[x, y, 0], rotate=([1, 0, 0], 90), scale=half)
     return lit_square(rgb(radiance, radiance, radiance), place, "directionalarea")
 
 
 def tilted_surface(tilt: float = 0.3, ior: float = 1.5, height: float = 1.4, half: float = 0.2) -> KnownMotion:
-    """Parallel light on a flat surface of glass, tilted by `tilt` about z, over a receiver inside of the glass.
+    """Return the motion of a flat glass surface under parallel light. The surface is tilted by `tilt` about z, and the
+    receiver is inside the glass.
 
-    What falls on it at (0, height) leaves at an angle of a = tilt - arcsin(sin(tilt) / ior) from the vertical, and
-    lands at height * tan(a); the mean of a beam does, since the others' distances cancel. By Snell and Fresnel,
+    A ray that hits the surface at (0, height) leaves at the angle a = tilt - arcsin(sin(tilt) / ior) from the vertical.
+    It lands at height * tan(a). The mean of a beam lands there too, since the distances of the other rays cancel. By
+    Snell and Fresnel,
 
         objective = rho / pi * flux * (1 - R(tilt)) * height * tan(a)
     """
@@ -84,10 +89,11 @@ def tilted_surface(tilt: float = 0.3, ior: float = 1.5, height: float = 1.4, hal
 
 
 def ball_lens(radius: float = 2.4, ior: float = 1.5, offset: float = 0.04, half: float = 0.016) -> KnownMotion:
-    """A thin parallel beam near the axis of a ball of glass whose focus is on the receiver.
+    """Return the motion of a glass ball with its focus on the receiver, and a thin parallel beam near the axis.
 
-    A ray at x from the axis lands at x (1 - d / f), d from the ball's centre, f = n R / (2 (n - 1)) (E. Hecht, Optics,
-    Section 5.2). Of a ball that moves by t across, s along the axis, and grows by 1 + g, at d = f:
+    A ray at x from the axis lands at x (1 - d / f). Here, d is the distance from the ball's centre, and f = n R / (2 (n
+    - 1)) (E. Hecht, Optics, Section 5.2). The ball moves by t across the axis and by s along the axis, and grows by 1 +
+    g. At d = f:
 
         dx/dt = d / f = 1        dx/ds = -x / f        dx/dg = x d / f
     """
@@ -106,9 +112,10 @@ def ball_lens(radius: float = 2.4, ior: float = 1.5, offset: float = 0.04, half:
 
 
 def lamp_over_plane(position: tuple[float, float, float] = (0.1, 0.7, 0.2), nodes: int = 8) -> KnownMotion:
-    """A point light over the receiver: E = I h / d^3 by Lambert's laws, moved along each axis.
+    """Return the motion of a point light over the receiver along each axis. Lambert's laws give E = I h / d^3.
 
-    The objective is the integral of what E reflects times g(u) = sum_p filter_p(u) G_p, by quadrature over the film.
+    The objective is the integral of the light reflected from E, times g(u) = sum_p filter_p(u) G_p. A quadrature over
+    the film computes the integral.
     """
     G = smooth_weights(SIZE, SIZE)
     at, weight = np.polynomial.legendre.leggauss(nodes)
@@ -129,9 +136,10 @@ def lamp_over_plane(position: tuple[float, float, float] = (0.1, 0.7, 0.2), node
 
 
 def _filter(u: Array) -> Array:
-    """Weights (N, SIZE) of a row of pixels for film positions (N,), with the film's filter.
+    """Return the film filter's weights (N, SIZE) of a row of pixels for film positions (N,).
 
-    A Gaussian that ends, without a step, at four standard deviations; normalised over all pixels, off the film too.
+    The filter is a Gaussian that ends at four standard deviations without a step. The weights are normalised over all
+    pixels, including pixels off the film.
     """
     sigma = float(str(FILTER["stddev"]))
     pixels = np.arange(-8, SIZE + 8) + 0.5

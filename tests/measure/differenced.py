@@ -1,4 +1,6 @@
-"""Scenes whose parameters move light (`AttachedScene`), and what finite differences find there (`Differenced`)."""
+"""Scenes whose parameters move light (`AttachedScene`), and their comparison with finite differences
+(`Differenced`).
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,13 @@ ONE_IN, EXTRAPOLATED = 4, 3
 
 @dataclass(frozen=True)
 class AttachedScene:
-    """One scene. `scene` and `moves` are functions, since they need Mitsuba; the first of the amplitudes says most.
+    """One scene. `scene` and `moves` are functions, because they need Mitsuba. The first amplitude is the most
+    informative.
 
-    Finite differences hold: no silhouette, no edge of a shadow and no edge at rest that moved paths sweep over;
-    dL/dI is smooth and vanishes at the film's border. `step` is that of the amplitudes, `options` the integrators'.
-    Less noise comes by `seeds`, not by `spp`: from a thousand on, what sums of an image lose in single precision shows
-    in its differences.
+    Finite differences hold. Moved paths meet no silhouettes, shadow edges or edges at rest, and dL/dI is smooth and
+    vanishes at the film's border. `step` is the step of the amplitudes, and `options` are the integrators' options. To
+    reduce noise, increase `seeds` and not `spp`. From 1000 samples per pixel on, single-precision rounding in image
+    sums affects their differences.
     """
 
     name: str
@@ -38,17 +41,19 @@ class AttachedScene:
     options: Mapping[str, Any] = field(default_factory=lambda: {"max_depth": 4})
 
     def case(self) -> Case:
-        """The scene, loaded, with its amplitudes as the one parameter."""
+        """Return the loaded scene with its amplitudes as the only parameter."""
         return moving_case(self.scene(), self.moves)
 
 
 @dataclass(frozen=True)
 class Differenced:
-    """Derivatives of the objective along K amplitudes, ours and by finite differences: (N, K) at N seeds.
+    """Derivatives of the objective along K amplitudes at N seeds (N, K), from our estimator and from finite
+    differences.
 
-    `differences` are central ones, `correction` (M, K) what Richardson's extrapolation to a step of 0 adds to them, at
-    the first seeds. The rest is relative to the root mean square of the reference: `error` the largest deviation of the
-    means, `standard_error` the largest one of these deviations, `truncation` the largest correction.
+    `differences` are central differences. `correction` (M, K) is added by Richardson's extrapolation to a step of 0, at
+    the first M seeds. The other values are relative to the root mean square of the reference. `error` is the largest
+    deviation of the means, `standard_error` the largest standard error of these deviations, and `truncation` the
+    largest correction.
     """
 
     ours: np.ndarray
@@ -57,7 +62,7 @@ class Differenced:
 
     @property
     def reference(self) -> np.ndarray:
-        """The means of the differences, extrapolated: (K,)."""
+        """Extrapolated means of the differences (K,)."""
         mean: np.ndarray = self.differences.mean(0) + self.correction.mean(0)
         return mean
 
@@ -67,7 +72,7 @@ class Differenced:
 
     @property
     def errors(self) -> np.ndarray:
-        """Of each amplitude, signed: (K,)."""
+        """Signed error of each amplitude (K,), relative to `scale`."""
         errors: np.ndarray = (self.ours.mean(0) - self.reference) / self.scale
         return errors
 
@@ -77,7 +82,7 @@ class Differenced:
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Of each amplitude: (K,)."""
+        """Standard error of each amplitude (K,), relative to `scale`."""
         sides = self.ours - self.differences, self.correction
         variance = sum(side.var(0, ddof=1) / len(side) for side in sides)
         errors: np.ndarray = np.sqrt(variance) / self.scale
@@ -99,7 +104,9 @@ class Differenced:
 
 
 def compare_with_differences(scene: AttachedScene, estimator: str = "stack", count: int | None = None) -> Differenced:
-    """Differentiate a scene by an estimator, and by finite differences of its image at the same random numbers."""
+    """Differentiate a scene with an estimator, and with finite differences of its image at the same random numbers.
+    Return both.
+    """
     case = scene.case()
     tracer = integrator("reslrb", **scene.options, estimator=estimator)
     chosen = seeds(count or scene.seeds)

@@ -1,5 +1,6 @@
-"""Faults to break the code with, one line each, and the check that is to find it: gradcheck, or a case of the extreme
-suite."""
+"""Single-line faults that break the code, and the check that must find each fault. The check is gradcheck or a case of
+the extreme suite.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ SMALL += ["integrator.guiding=off", "run.adjoint=correlated"]  # what is kept be
 
 
 def room(name: str, *keys: str, overrides: Iterable[str] = ()) -> Config:
-    """The experiment of finding the parameters of a room that stands beside this file."""
+    """Return the experiment that finds the parameters of a room. The scene file is in this file's folder."""
     parameters = "".join(f"  - {{key: {key}}}\n" for key in keys)
     text = f"""\
 scene: {{file: {Path(__file__).with_name(name)}}}
@@ -37,24 +38,24 @@ run: {{spp: 64}}
 
 
 def checked(config: Config, estimators: str, seeds: int) -> list[GradcheckRecord]:
-    """The records of `reslrb gradcheck`."""
+    """Return the records of `reslrb gradcheck`."""
     made = Gradcheck(CheckSettings(config, parse_estimators(estimators), 0, seeds))
     return [result.record for result in made.run(lambda: False, lambda line: None)]
 
 
 def cornell(*overrides: str, estimators: str, seeds: int = 8) -> Check:
-    """`reslrb gradcheck` on the built-in Cornell box, small."""
+    """Return `reslrb gradcheck` on the small built-in Cornell box as a check."""
     return lambda: checked(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *overrides]), estimators, seeds)
 
 
 def stack_of_2() -> list[GradcheckRecord]:
-    """The same with `stack` where a stack holds two vertices."""
+    """Return the records of `cornell` with `stack`, where a stack holds two vertices."""
     with patch.object(Stack.__init__, "__defaults__", (2,)):
         return list(cornell(estimators="stack")())
 
 
 def moving(name: str, key: str) -> Check:
-    """The same of a parameter that moves light in a scene that stands beside this file."""
+    """Return `reslrb gradcheck` for a parameter that moves light. The scene file is in this file's folder."""
 
     def check() -> list[GradcheckRecord]:
         return checked(room(name, key), "stack", 6)
@@ -63,7 +64,7 @@ def moving(name: str, key: str) -> Check:
 
 
 def extreme(case: str, *estimators: str) -> Check:
-    """A case of the extreme suite, with these estimators, or all."""
+    """Return a check with a case of the extreme suite, for these estimators or for all."""
     return lambda: run_suite([case], estimators or None)
 
 
@@ -106,10 +107,11 @@ CHECKS: dict[str, Check] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """`right`, in the source of the function `where`, becomes `wrong`; `check` then fails in these records at least.
+    """A fault in the source of the function `where` that replaces `right` by `wrong`. Then `check` fails at least in
+    the records in `fails`.
 
-    `fails` are pairs of an estimator and a reference; the estimator is None in an image's record. Estimators that are
-    not in it are free of the fault, and their records hold.
+    `fails` are pairs of an estimator and a reference. In an image's record, the estimator is None. Estimators that are
+    not in `fails` do not have the fault, and their records hold.
     """
 
     name: str
@@ -121,7 +123,7 @@ class Fault:
 
 
 def by(estimators: str, *references: str) -> frozenset[tuple[str | None, str]]:
-    """All pairs of these estimators with these references; `image` is none of the estimators."""
+    """Return all pairs of these estimators with these references. The name `image` gives the estimator None."""
     return frozenset((None if e == "image" else e, r) for e in estimators.split() for r in references)
 
 

@@ -1,11 +1,11 @@
-"""Scenes in which parameters move light, so made that finite differences hold.
+"""Scenes in which parameters move light, built so that finite differences hold.
 
-- `GLASS_SCENES`: light through glass onto a receiver: what bends it is displaced, tilted and moved.
-- `MIRRORS_SCENES`: light by way of mirrors onto a receiver: what reflects it is displaced, and rough.
-- `PLACES_SCENES`: lamps and receivers that move.
-- `ROOMS_SCENES`: rooms: light through glass onto a floor, and from there onto walls that alone are seen: what follows a
-  diffuse bounce. On the wall there are edges at rest, over which a direction that turns with the floor, from a point
-  that moves on it, sweeps.
+- `GLASS_SCENES`: light passes through glass to a receiver. The glass is displaced, tilted and moved.
+- `MIRRORS_SCENES`: light reaches a receiver by mirrors. The mirrors are displaced or rough.
+- `PLACES_SCENES`: lamps and receivers move.
+- `ROOMS_SCENES`: light passes through glass to a floor, and from there to walls. Only the walls are seen. The scenes
+    test the path after a diffuse bounce. The walls have edges at rest. A direction that turns with the floor, starting
+    from a moving point on the floor, sweeps over these edges.
 """
 
 from __future__ import annotations
@@ -46,27 +46,29 @@ ROUGH = {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.1
 
 
 def setting(size: int = SIZE, **objects: Any) -> dict:
-    """A receiver at y = 0, and a camera at y = 1 that sees the part within 1 of the axis; the rest are `objects`."""
+    """Return a scene with a receiver at y = 0 and a camera at y = 1. The camera sees the part within 1 of the axis. The
+    other objects are `objects`.
+    """
     seen = pinhole([0, 1, 0], [0, 0, 0], [0, 0, -1], 90, size, rfilter=FILTER)
     floor = rectangle(diffuse(0.8, 0.7, 0.6), rotate=([1, 0, 0], -90), scale=50)
     return {"type": "scene", "camera": seen, "floor": floor} | objects
 
 
 def spot(origin: tuple = (0.05, 3.2, -0.04), target: tuple = (0, 0, 0), cutoff: float = 14) -> dict:
-    """A lamp whose light ends smoothly."""
+    """Return a spot light whose intensity ends smoothly."""
     return {"type": "spot", "intensity": rgb(9, 8, 7), "cutoff_angle": cutoff, "beam_width": cutoff / 3,
             "to_world": look_at(origin, target)}  # fmt: skip
 
 
 def sheet(y: float, up: bool, bsdf: dict, tilt: float = 0, scale: float = 3) -> dict:
-    """A flat surface; light that comes through it from the side that it faces enters the glass."""
+    """Return a flat surface. Light enters the glass if it comes from the side that the surface faces."""
     turn = (-90 if up else 90) + tilt
     return rectangle(bsdf, translate=[0, y, 0], rotate=([1, 0, 0], turn), scale=scale)
 
 
 def slab(bsdf: dict = GLASS, cells: int = 64, half: float = 1.0, wide: float = 0, lamp: Any = None, y: float = 1.8,
          **objects: Any) -> dict:  # fmt: skip
-    """A slab whose upper surface, at `y`, has waves, under a lamp."""
+    """Return a scene with a slab under a lamp. The slab's upper surface at `y` has waves."""
     positions, faces, uv = grid(cells, lambda x, z: y + waves(x, z), half, wide)
     return setting(
         lamp=spot() if lamp is None else lamp,
@@ -77,14 +79,14 @@ def slab(bsdf: dict = GLASS, cells: int = 64, half: float = 1.0, wide: float = 0
 
 
 def rough_surface() -> dict:
-    """Rough glass with waves, and the receiver inside of it."""
+    """Return a scene with rough glass with waves, and the receiver inside the glass."""
     scene = slab(ROUGH)
     del scene["bottom"]
     return scene
 
 
 def waving(scene: Any, name: str = "top", height: float = 1.8, count: int = 10) -> list[Move]:
-    """The waves of a sheet by their size, and smooth displacements."""
+    """Return the moves of a sheet: the size of its waves, and smooth displacements."""
     positions = vertices(scene, name)
     amplitude = np.zeros_like(positions)
     amplitude[:, 1] = (positions[:, 1] - height) * 3
@@ -96,25 +98,27 @@ def moving_sphere(name: str, pivot: tuple[float, float, float]) -> list[Move]:
 
 
 def beam(half: float = 0.3) -> dict:
-    """Parallel light from a square, at thirty degrees."""
+    """Return a lamp with parallel light from a square, at thirty degrees."""
     aim = look_at([0.9, 3.2, -0.04], [0.05, 1.8, 0])
     return lit_square(rgb(9, 8, 7), aim @ transform(scale=half), "directionalarea")
 
 
 def square_lamp(half: float = 0.25, y: float = 3.2) -> dict:
-    """An area light that shines down."""
+    """Return a square area light that shines down."""
     return lit_square(rgb(9, 8, 7), translate=[0.05, y, -0.04], rotate=([1, 0, 0], 90), scale=half)
 
 
 def sphere_lens(radius: float = 0.8, y: float = 1.95, cutoff: float = 18, bsdf: dict = GLASS) -> dict:
-    """A ball of glass in a cone of light that it contains."""
+    """Return a scene with a glass ball in a cone of light that the ball contains."""
     return setting(lamp=spot(cutoff=cutoff, origin=(0.1, 3.6, -0.08), target=(0.05, y, 0)),
                    lens={"type": "sphere", "center": [0, y, 0], "radius": radius, "bsdf": bsdf})  # fmt: skip
 
 
 def ball(radius: float, center: tuple[float, float, float], levels: int = 4, inward: bool = False
          ) -> tuple[Array, Array]:  # fmt: skip
-    """A sphere of 20 * 4^levels triangles that faces outward, or `inward`: vertices and triangles."""
+    """Return the vertices and triangles of a sphere with 20 * 4^levels triangles. The triangles face outward, or inward
+    if `inward`.
+    """
     golden = (1 + 5**0.5) / 2
     corners = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
     points = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners], float)
@@ -131,7 +135,7 @@ def ball(radius: float, center: tuple[float, float, float], levels: int = 4, inw
 
 
 def _divided(points: Array, faces: Array) -> tuple[Array, Array]:
-    """Each triangle divided into four, all vertices on the unit sphere."""
+    """Return the mesh with each triangle divided into four. All vertices lie on the unit sphere."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
     unique, number = np.unique(edges, axis=0, return_inverse=True)
     middles = points[unique].sum(1)
@@ -143,13 +147,13 @@ def _divided(points: Array, faces: Array) -> tuple[Array, Array]:
 
 
 def mesh_lens(radius: float = 0.8, y: float = 1.95) -> dict:
-    """The same as a mesh."""
+    """Return the scene of `sphere_lens` with the ball as a mesh."""
     return setting(lamp=spot(cutoff=18, origin=(0.1, 3.6, -0.08), target=(0.05, y, 0)),
                    lens=mesh(*ball(radius, (0, y, 0), 5), GLASS))  # fmt: skip
 
 
 def bent(scene: Any, name: str = "lens", count: int = 10, span: float = 0.8) -> list[Move]:
-    """A mesh by its size along x, about its middle, and smooth displacements."""
+    """Return the moves of a mesh: its size along x about its middle, and smooth displacements."""
     positions = vertices(scene, name)
     wider = np.zeros_like(positions)
     wider[:, 0] = positions[:, 0] - positions[:, 0].mean()
@@ -157,18 +161,18 @@ def bent(scene: Any, name: str = "lens", count: int = 10, span: float = 0.8) -> 
 
 
 def prism() -> dict:
-    """A slab whose flat upper surface is tilted."""
+    """Return a scene with a slab whose flat upper surface is tilted."""
     return setting(lamp=spot(), top=sheet(1.9, True, GLASS, tilt=12), bottom=sheet(1.6, False, GLASS))
 
 
 def two_lenses() -> dict:
-    """A slab with waves over a ball: four surfaces of glass in a row."""
+    """Return a scene with a slab with waves over a ball, that is four glass surfaces in a row."""
     scene = slab(lamp=spot(cutoff=7, origin=(0.03, 4.4, -0.02)), y=2.8)
     return scene | {"lens": {"type": "sphere", "center": [0, 1.55, 0], "radius": 0.5, "bsdf": GLASS}}
 
 
 def smooth_texture() -> dict:
-    """A receiver whose colours change without a step."""
+    """Return a receiver with a smooth texture."""
     at = np.linspace(0, 2 * np.pi, 65)
     x, y = np.meshgrid(at, at)
     texels = np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * x + y), 0.5 + 0.3 * np.sin(4 * y)], -1)
@@ -213,14 +217,14 @@ BRUSHED = {"type": "roughconductor", "material": "none", "alpha": 0.1, "sample_v
 
 
 def ceiling(bsdf: dict = MIRROR) -> dict:
-    """A mirror with waves that faces down, lit from below."""
+    """Return a scene with a mirror with waves that faces down and is lit from below."""
     positions, faces, uv = grid(64, lambda x, z: 1.9 + waves(x, z))
     return setting(lamp=spot(origin=(0.03, 0.6, -0.02), target=(0, 1.9, 0)),
                    mirror=mesh(positions, faces[:, ::-1], bsdf, uv))  # fmt: skip
 
 
 def convex(bsdf: dict = MIRROR) -> dict:
-    """A mirror that is a ball, lit from below by a cone that it contains."""
+    """Return a scene with a spherical mirror, lit from below by a cone that the mirror contains."""
     return setting(lamp=spot(origin=(0.03, 0.6, -0.02), target=(0, 2, 0), cutoff=9),
                    mirror={"type": "sphere", "center": [0, 2.1, 0], "radius": 0.6, "bsdf": bsdf})  # fmt: skip
 
@@ -245,19 +249,19 @@ def point(position: tuple = (0.1, 1.5, 0.2)) -> dict:
 
 
 def bulb(radius: float = 0.3) -> dict:
-    """A ball that glows."""
+    """Return a ball that emits light."""
     return {"type": "sphere", "center": [0.1, 2.2, 0.2], "radius": radius, "bsdf": diffuse(0, 0, 0),
             "emitter": {"type": "area", "radiance": rgb(3, 2, 4)}}  # fmt: skip
 
 
 def hills() -> dict:
-    """A receiver that is bent a little, under a point light."""
+    """Return a scene with a slightly curved receiver under a point light."""
     positions, faces, uv = grid(128, lambda x, z: 0.05 * np.sin(2 * x + 1) * np.cos(3 * z), 4, 1.5)
     return setting(floor=mesh(positions, faces, diffuse(0.8, 0.7, 0.6), uv), lamp=point())
 
 
 def rolling(scene: Any, name: str = "floor", y: float = 0) -> list[Move]:
-    """A sheet by smooth displacements that end beyond the film, and before the sheet does."""
+    """Return the moves of a sheet: smooth displacements that vanish beyond the film and before the sheet's edge."""
     positions = vertices(scene, name)
     about = positions - [0, y, 0]
     near = np.exp(-np.square(about / 1.5).sum(1))[:, None]
@@ -285,34 +289,37 @@ PLACES_SCENES = [
 
 
 def wall(bsdf: dict[str, Any], turn: float = -90, x: float = 1.0) -> dict[str, Any]:
-    """A wall at `x`, which faces back to the axis; `turn` is its angle about the vertical."""
+    """Return a wall at `x` that faces the axis. `turn` is its angle about the vertical."""
     return rectangle(bsdf, translate=[x, 1, 0], rotate=([0, 1, 0], turn), scale=3)
 
 
 def room(**changes: Any) -> dict[str, Any]:
-    """A slab with waves over the floor of a room, and a camera over the caustic that looks at what is at x = 1.
+    """Return a scene with a slab with waves over the floor of a room. The camera is above the caustic and looks at x =
+    1.
 
-    `changes` are objects beside these, or in place of them.
+    `changes` add objects, or replace objects of the scene.
     """
     seen = pinhole([-0.6, 0.8, 0], [1, 0.8, 0], [0, 1, 0], 40, SIZE, rfilter=FILTER)
     return slab(lamp=spot(cutoff=8), camera=seen) | changes
 
 
 def steps() -> dict[str, Any]:
-    """A texture of 24 stripes and blocks, light and dark."""
+    """Return a diffuse BSDF with a texture of 24 x 24 light and dark texels."""
     texels = np.random.default_rng(2).choice([0.1, 0.9], (24, 24, 1)) * np.ones(3)
     return {"type": "diffuse", "reflectance": bitmap(texels, "nearest")}
 
 
 def corner() -> dict[str, Any]:
-    """Two walls that meet in the middle of the view, one light and one dark."""
+    """Return a room with two walls that meet in the middle of the view. One wall is light, and one is dark."""
     return room(light=wall(diffuse(0.9, 0.9, 0.9), -50), dark=wall(diffuse(0.15, 0.15, 0.15), -130))
 
 
 def shelf() -> dict[str, Any]:
-    """A panel that faces the wall and fills the view: each path to it has two diffuse vertices and one connection.
+    """Return a scene with a panel that faces the wall and fills the view. Each path to the panel has two diffuse
+    vertices and one connection.
 
-    It hangs above the floor: light passes below it to the wall, and comes back. Its shadow's edge is missing.
+    The panel hangs above the floor. Light passes below the panel to the wall, and returns from there. The derivatives
+    do not include the edge of the panel's shadow.
     """
     seen = pinhole([0.95, 0.8, 0], [0, 0.8, 0], [0, 1, 0], 50, SIZE, rfilter=FILTER)
     panel = rectangle(diffuse(0.7, 0.8, 0.9), translate=[0.45, 0.8, 0], rotate=([0, 1, 0], 90), scale=0.3)
@@ -320,7 +327,7 @@ def shelf() -> dict[str, Any]:
 
 
 def moved(scene: Any) -> list[Move]:
-    """The waves of the slab by their size, and a few smooth displacements."""
+    """Return the moves of the slab: the size of its waves, and two smooth displacements."""
     return waving(scene, count=2)
 
 

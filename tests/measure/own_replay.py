@@ -1,6 +1,6 @@
-"""An integrator such as users write: replay of camera paths that meet lamps by next event estimation alone.
+"""An integrator like users' integrators: a replay of camera paths that finds lamps only with next event estimation.
 
-`fault` plants one of many mistakes in the pass that differentiates, `primal_fault` one in both passes.
+`fault` plants one of many faults in the differentiating pass. `primal_fault` plants a fault in both passes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from mitsuba.ad.integrators.common import RBIntegrator
 
 
 class Replay(RBIntegrator):
-    """For scenes without mirrors and clear glass: lamps are met by the first segment, and sampled from then on."""
+    """Integrator for scenes without mirrors and clear glass. The first segment can hit lamps. From then on, next event
+    estimation samples the lamps.
+    """
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -104,7 +106,7 @@ class Replay(RBIntegrator):
 
 
 class Black(RBIntegrator):
-    """Its image has the wrong shape, or is a list, or none at all: `what`."""
+    """Integrator whose image has the wrong shape, is a list, or does not exist, depending on `what`."""
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -123,5 +125,5 @@ NONE = 3
 
 
 def makes_none(_: mi.Properties) -> str:
-    """No integrator."""
+    """Return a text instead of an integrator."""
     return "none"

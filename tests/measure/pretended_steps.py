@@ -1,4 +1,4 @@
-"""Methods of known cost, noise and bias in place of processes that measure."""
+"""Methods of known cost, noise and bias that replace measuring processes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from reslrb_cli.records.measurements import BenchStatus, MethodRecord
 
 
 class Pretended:
-    """A process that writes down what it is asked, and ends at the question that `ends` gives for (type, depth)."""
+    """A process that logs all questions. It ends at the question that `ends` gives for (type, depth)."""
 
     log: list[tuple[int, str, Any]] = []  # noqa: RUF012 (shared by all, as the machine is)
     ends: dict[tuple[str, int], int] = {}  # noqa: RUF012
@@ -68,10 +68,11 @@ TRUTH = np.concatenate([np.random.default_rng(3).uniform(0.5, 1.5, 60), [2.0, -1
 
 @dataclass
 class Pretence:
-    """One method: seconds of a step, and of the first; standard deviation of each entry, and bias, relative to it.
+    """One method with its cost and errors. `step_s` and `cold_s` are the seconds of a warm step and of a cold step.
+    `noise` and `bias` are the standard deviation and bias of each entry, relative to the entry.
 
-    `image_noise` is shared by all steps with one dL/dI. The first step of a turn takes `late_s` more. It ends at
-    question number `ends`, if that is given.
+    All steps with one dL/dI share `image_noise`. The first step of a turn takes `late_s` longer. The method ends at
+    question number `ends`, if given.
     """
 
     step_s: float = 0.1
@@ -89,7 +90,7 @@ class Pretence:
     steps: list[int] = field(default_factory=list)
 
     def sample(self, purpose: str, number: int, image: int) -> np.ndarray:
-        """One step, (63,) float32."""
+        """Return one step's gradient (63,) as float32."""
         random = np.random.default_rng([zlib.crc32(purpose.encode()), number])
         shared = np.random.default_rng([7, image]).standard_normal(len(TRUTH)) * self.image_noise
         noise = self.noise * (self.outlier if number in self.outliers else 1.0)
@@ -98,7 +99,7 @@ class Pretence:
 
 
 class Stage:
-    """All methods, by `role label` (or `label`), with a clock that only they move; `start` starts their processes."""
+    """All methods by `role label` or `label`. Only the methods advance the clock. `start` starts their processes."""
 
     def __init__(self, facts: dict[str, Any] | None = None, **methods: Pretence) -> None:
         self.now, self.alive, self.survey_s = 0.0, 0, 2.0
@@ -121,7 +122,9 @@ class Stage:
         return Player(self, first, does)
 
     def pretence(self, name: str) -> Pretence:
-        """That of `case reslrb:stack`, say: by role and label, by label, or the plain one."""
+        """Return the method of a name such as `case reslrb:stack`. The key is role and label, or label. The default is
+        a plain method.
+        """
         short = name.partition(" ")[2]
         found = self.methods.get(_plain(name)) or self.methods.get(_plain(short))
         return found or self.methods.setdefault(_plain(name), Pretence())
@@ -132,7 +135,7 @@ def _plain(name: str) -> str:
 
 
 class Player:
-    """Stands in for a `Process`."""
+    """Replacement for a `Process`."""
 
     def __init__(self, stage: Stage, first: dict[str, Any], does: str) -> None:
         self.stage, self.first, self.does, self.closed, self.questions = stage, first, does, False, 0

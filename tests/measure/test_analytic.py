@@ -1,4 +1,4 @@
-"""Scenes and motions with known images and derivatives."""
+"""Scenes and motions with known images and known derivatives."""
 
 from __future__ import annotations
 
@@ -38,14 +38,16 @@ LIGHT = (0.4, 0.8, -0.3)
 
 
 def irradiance(light: tuple[float, float, float], height: float, fov: float, size: int) -> np.ndarray:
-    """Mean over each pixel, (H, W, 1), of what a point light of unit power gives to the plane y = 0; J. H. Lambert."""
+    """Return the mean irradiance of each pixel (H, W, 1) from a point light of unit power on the plane y = 0 (J. H.
+    Lambert).
+    """
     points, weights = plane_points(height, fov, size)
     to_light = np.array(light) - points
     return (to_light[..., 1] / np.linalg.norm(to_light, axis=-1) ** 3 @ weights)[..., None]
 
 
 def plane_scene() -> KnownScene:
-    """A point light over a plane, off the camera's axis."""
+    """Return a point light over a plane. The light is off the camera's axis."""
     intensity = (2, 3, 4)
 
     def scene() -> dict:
@@ -72,7 +74,7 @@ SCENES = {
 
 
 def twice(exact: np.ndarray) -> np.ndarray:
-    """A sample of two without noise."""
+    """Return a sample of two equal values without noise."""
     return np.stack([exact, exact])
 
 

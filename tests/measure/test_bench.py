@@ -1,4 +1,4 @@
-"""`reslrb bench`: from the command line, its processes, and where parameters move light."""
+"""`reslrb bench`: the command line, its processes, and scenes where parameters move light."""
 
 from __future__ import annotations
 
@@ -86,7 +86,9 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_l2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And a cold step finds no kernel that was compiled before, wherever those are kept."""
+    """The L2 objective works, and a cold step finds no compiled kernels. It does not use the folder in
+    `DRJIT_CACHE_DIR`.
+    """
     monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path / "kernels"))
     file = tmp_path / "bench.json"
     names = "trajectory,prb"
@@ -225,7 +227,7 @@ MASKED = """<scene version="3.0.0">
 
 
 def peak(name: str, depth: int) -> float:
-    """Of a cold step, in MiB, beyond what the scene and what was loaded before it take."""
+    """Return the memory peak of a cold step in MiB, without the memory of the scene and of everything loaded before."""
     [case] = parse_cases(name)
     stepper = Stepper(case.at(room("wavy_glass.xml", "top.vertex_positions"), depth, known=True), "fixed")
     gc.collect()

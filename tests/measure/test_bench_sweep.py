@@ -1,4 +1,4 @@
-"""Sweeps of `bench`: their order, what they vary, what becomes of cases that end, and going on."""
+"""Sweeps of `bench`: their order, the varied quantities, ended cases, and continued sessions."""
 
 from __future__ import annotations
 
@@ -183,9 +183,10 @@ def test_pace_divides_the_budget() -> None:
     ],
 )
 def test_the_budget_covers_compilation(budget_s: float, measured: dict[int, list[str]], left: list[str]) -> None:
-    """A first step takes 30 s, later ones a tenth; what is waited for ends when time is up.
+    """The first step of a method takes 30 s, and each later step takes 0.1 s. The step in progress ends when the budget
+    is spent.
 
-    What all of it would take is said as soon as anything has compiled, and is enough.
+    As soon as a method has compiled, the message names a budget for all measurements, and that budget is enough.
     """
     found, said, seconds = spent(budget_s)
     assert found == measured
@@ -202,7 +203,7 @@ def test_the_budget_covers_compilation(budget_s: float, measured: dict[int, list
 
 
 def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
-    """What a budget suffices for, by depth, what is said, and the time that it takes."""
+    """Return the measured methods for each depth, the messages, and the time of a session with this budget."""
     now = [0.0]
 
     class Slow(Pretended):
@@ -309,7 +310,7 @@ def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool
 
 
 class Sized(Pretended):
-    """Costs as many milliseconds as it has samples, pixels and texels; at the first depth that is asked for."""
+    """Process whose steps cost as many milliseconds as the product of samples, film width and texture width."""
 
     firsts: list[dict[str, Any]] = []  # noqa: RUF012 (shared by all)
 
@@ -432,7 +433,7 @@ def measure(what: Sweep, before: Earlier | None = None, stop: Callable[[], bool]
 
 
 def again(made: Bench) -> Earlier:
-    """What a session keeps, as it comes back from the disk."""
+    """Return the kept content of a session as it is read from the disk."""
     kept = made.kept()
     assert kept is not None
     head, arrays = kept
@@ -441,7 +442,7 @@ def again(made: Bench) -> Earlier:
 
 @pytest.mark.usefixtures("_clean")
 def test_continued_rounds_give_the_records_of_one_session() -> None:
-    """The pretended steps take longer from round to round, so that every figure shows which rounds it is of."""
+    """Pretended steps become slower from round to round, so that every figure shows the rounds that it covers."""
     short = measure(sweep(rounds=3))
     Pretended.log.clear()
     whole = measure(sweep(rounds=7), again(short))
@@ -530,7 +531,7 @@ def test_a_changed_scene_is_another_one(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("_clean")
 def test_running_work_is_saved_between_rounds() -> None:
-    """So that a process that is killed in the midst of a depth leaves all rounds but the last."""
+    """Saving after each round ensures that a process killed within a depth loses only its last round."""
     made, seen = session(sweep(values=[2])), []
     for rows in made.run():
         kept = made.kept()

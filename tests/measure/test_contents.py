@@ -1,4 +1,6 @@
-"""What is kept of an experiment counts for the contents of all files that it reads, whatever their times and sizes."""
+"""Kept results of an experiment depend on the contents of all files that the experiment reads, not on their times and
+sizes.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +88,7 @@ def write_image(path: Path, size: int, seed: int) -> None:
 
 @pytest.fixture
 def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """`photo.yaml` and `cameras.yaml`, which read a file of every kind."""
+    """Folder with `photo.yaml` and `cameras.yaml`, which together read a file of every kind."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
     for name in ("parts", "shots", "data/ior"):
@@ -118,7 +120,9 @@ def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def change(path: Path) -> Callable[[], object]:
-    """Change a file, whose time stays, and its size if it is no image; returns what changes it back."""
+    """Change a file, and return a function that restores the file. The change keeps the file's time, and also its size
+    unless the file is an image.
+    """
     data, times = path.read_bytes(), (path.stat().st_atime_ns, path.stat().st_mtime_ns)
     if path.suffix == ".exr":
         write_image(path, len(mi.TensorXf(mi.Bitmap(str(path)))), 99)
@@ -135,7 +139,7 @@ CASES = [("photo.yaml", OF_PHOTO), ("cameras.yaml", OF_CAMERAS)]
 
 
 def measurements(config: Config, ours: str = "reslrb:stack", reference: str = "path") -> dict[str, Any]:
-    """What has to be the same for each command to go on, by its name."""
+    """Return, for each command, the settings that must be equal for its measurement to continue."""
     cases = parse_cases(ours)
     shared: dict[str, Any] = {"config": config, "variant": "llvm_ad_rgb", "cases": cases, "objective": "fixed",
                               "memory_limit": None, "memory": 2**40, "budget_s": 0.0}  # fmt: skip
@@ -180,7 +184,9 @@ def test_code_named_by_a_command_counts(folder: Path) -> None:
 
 
 def test_a_run_continues_with_its_original_files(folder: Path) -> None:
-    """But for those of its initial values, which its state has; and whoever begins with its values sees it go on."""
+    """A resumed run refuses changed files, except files of initial values, which its state has. A measurement that
+    starts from its values detects the run's progress.
+    """
     list(rl.optimize("photo.yaml", folder="first", overrides={"run.measuring": 0}, allow_code=True))
     for file, place in OF_PHOTO.items():
         restore = change(folder / file)

@@ -1,4 +1,6 @@
-"""What `convergence` makes of methods whose cost, noise and bias are known; references, curves, scenes."""
+"""Results of `convergence` for methods whose cost, noise and bias are known, with tests of references, curves and
+scenes.
+"""
 
 from __future__ import annotations
 
@@ -65,9 +67,10 @@ def test_a_planted_bias_of_three_percent_is_reported(tmp_path: Path) -> None:
 
 
 def test_too_heavy_tails_for_intervals_are_reported(tmp_path: Path) -> None:
-    """One step in 64 that is a hundred times as noisy as the others: it has all of the variance.
+    """One step in 64 is a hundred times as noisy as the others, and causes nearly all of the variance.
 
-    A sample without it has a hundredth of the error, and an interval that says nothing of it.
+    A sample without this step has less than a hundredth of the variance, and its interval does not include the
+    outlier's effect.
     """
     heavy = Pretence(0.1, 0.1, outliers=(30,))
     session, results, _ = play(tmp_path, Stage(case_reslrb_stack=heavy, case_reslrb_event=Pretence(0.1, 0.1)), plan())
@@ -85,7 +88,9 @@ def test_too_heavy_tails_for_intervals_are_reported(tmp_path: Path) -> None:
 
 
 def test_ordinary_tails_are_not_reported(tmp_path: Path) -> None:
-    """Every fourth step ten times as noisy: many steps dominate the variance, and intervals hold."""
+    """Every fourth step is ten times as noisy as the others. Many steps dominate the variance, and the intervals are
+    valid.
+    """
     stage = Stage(case_reslrb_stack=Pretence(0.1, 0.05, outliers=tuple(range(0, 200, 4)), outlier=10.0))
     _, results, _ = play(tmp_path, stage, plan())
     record = of(results, "reslrb:stack")
@@ -95,7 +100,9 @@ def test_ordinary_tails_are_not_reported(tmp_path: Path) -> None:
 
 
 def test_references_of_errors_are_checked_too(tmp_path: Path) -> None:
-    """With a biased one, errors of unbiased methods are wrong: said, and they are not called biased."""
+    """With a biased reference, the errors of unbiased methods are wrong. The reference is reported as biased, and the
+    unbiased methods are not.
+    """
     stage = Stage(reference_reslrb_stack=Pretence(0.1, 0.1, bias=0.1), case_reslrb_stack=Pretence(0.1, 0.1),
                   case_ptracer=Pretence(0.1, 0.1), case_reslrb_event=Pretence(0.1, 0.1, bias=0.1))  # fmt: skip
     _, results, _ = play(tmp_path, stage, plan())
@@ -120,7 +127,9 @@ def test_a_missing_independent_reference_is_reported(tmp_path: Path) -> None:
 
 
 def test_the_noise_of_one_image_is_not_a_bias(tmp_path: Path) -> None:
-    """With the configuration's loss dL/dI is held at several images; their noise is in the reference's error."""
+    """With the configuration's loss, dL/dI is fixed at several images, and the reference's error includes the noise of
+    these images.
+    """
     quiet = Pretence(0.1, 0.02, image_noise=0.1)
     stage = Stage(reference_reslrb_stack=quiet, independent_ptracer=Pretence(0.1, 0.02, image_noise=0.1),
                   case_reslrb_stack_adjoint_batched_=Pretence(0.1, 0.05),
@@ -135,7 +144,7 @@ def test_the_noise_of_one_image_is_not_a_bias(tmp_path: Path) -> None:
 
 
 def test_a_sweep_of_samples(tmp_path: Path) -> None:
-    """Each number of samples is a method of its own; the reference has those of the configuration."""
+    """Each sample count is a separate method. The reference has the sample count of the configuration."""
     four, sixteen = Pretence(0.1, 1.0), Pretence(0.3, 0.5)
     stage = Stage(case_reslrb_stack__4_spp=four, case_reslrb_stack__16_spp=sixteen)
     session, results, _ = play(tmp_path, stage, plan("reslrb:stack", spps=(4, 16)))
@@ -178,7 +187,9 @@ SECONDS = 0.2
 
 
 def noise(random: np.random.Generator, count: int) -> np.ndarray:
-    """(count, 40) with a variance of 3 and 0.2 in each entry, the larger part common to many."""
+    """Return noise of shape (count, 40). Each entry has a variance of 3 from factors that entries share, and 0.2 of its
+    own.
+    """
     common = np.random.default_rng(1).standard_normal((4, 40))
     common *= np.sqrt(3.0 / np.square(common).sum(0))
     return random.standard_normal((count, 4)) @ common + np.sqrt(0.2) * random.standard_normal((count, 40))
@@ -198,7 +209,9 @@ def make(
 
 
 def test_errors_are_those_of_averages_without_that_of_the_reference() -> None:
-    """Of a reference as noisy as averages of 6 steps, which unsubtracted makes averages of 32 look twice as bad."""
+    """The reference is as noisy as averages of 6 steps. Unless this noise is subtracted, averages of 32 steps look at
+    least twice as bad.
+    """
     made = [make(seed, steps=64, rows=6, per_row=1) for seed in range(REPETITIONS)]
     for level in range(6):
         found = [samples.points()[level] for samples in made]
@@ -238,7 +251,9 @@ def test_omissions_of_a_reference() -> None:
 
 @pytest.mark.parametrize(("steps", "rows"), [(48, 24), (16, 8), (192, 48)])
 def test_the_intervals_have_their_coverage(steps: int, rows: int) -> None:
-    """By 200 repetitions: of efficiency, which 1 / (relative variance * seconds) is, and of the slope, -1/2."""
+    """200 repetitions check the intervals of the efficiency, 1 / (relative variance * seconds), and of the
+    slope, -1/2.
+    """
     truth, covered, slopes = SIGNAL / VARIANCE / SECONDS, 0, 0
     for seed in range(REPETITIONS):
         samples = make(seed, steps, rows)
@@ -254,7 +269,7 @@ def test_the_intervals_have_their_coverage(steps: int, rows: int) -> None:
 
 @pytest.mark.parametrize("steps", [16, 32, 64])
 def test_the_intervals_of_a_single_colour_have_their_coverage(steps: int) -> None:
-    """Its three channels deviate together, so that every error is the square of one normal number."""
+    """The three channels of the colour deviate together, so that every error is the square of one normal number."""
     covered, slopes = 0, 0
     for seed in range(REPETITIONS):
         random = np.random.default_rng(seed)
@@ -300,7 +315,9 @@ def test_repeated_seeds_flatten_the_slope() -> None:
 
 
 def test_times() -> None:
-    """As sqrt(variance / steps) says; beyond the steps, or below the floor, extrapolated; never less than a step."""
+    """Times follow sqrt(variance / steps), and are at least one step. Times beyond the measured steps or below the
+    floor are extrapolated.
+    """
     samples = make(5, steps=64, rows=200)
     relative = samples.variance
     for target in (0.5, 0.2, 0.01):
@@ -342,7 +359,7 @@ CONFIDENCE = 0.99
 
 
 def methods(folder: Path, scene: str, size: tuple[int, int], *args: str) -> list[dict]:
-    """The lines of all methods, of a film of this size."""
+    """Run `convergence` on a film of this size. Return all methods' lines."""
     file = folder / "c.jsonl"
     film = [f"--set=scene.options.resx={size[0]}", f"--set=scene.options.resy={size[1]}"]
     with pytest.raises(SystemExit) as ended:
@@ -366,7 +383,7 @@ def methods(folder: Path, scene: str, size: tuple[int, int], *args: str) -> list
     ],
 )
 def test_unbiased_methods(tmp_path: Path, scene: str, size: tuple[int, int], spp: int, rounds: int, cases: str) -> None:
-    """Slopes are -1/2 within their intervals, and no method deviates from an independent one."""
+    """Slopes are -1/2 within their intervals, and no method deviates from an independent reference."""
     args = [f"--set=run.spp={spp}", "--integrators", cases, "--rounds", str(rounds)]
     found = methods(tmp_path, scene, size, *args)
     assert {line["label"] for line in found} == set(cases.split(","))
@@ -399,7 +416,7 @@ def test_effect_of_correlated_samples_on_the_loss(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
 def test_the_intervals_have_their_coverage_on_a_scene(tmp_path: Path) -> None:
-    """200 repetitions with the noise of real steps; the truth is that of all steps together. No clock takes part."""
+    """200 repetitions use the noise of real steps, and all steps together give the true value. No time is measured."""
     from reslrb_cli.measure.convergence.setup import Sampler, survey
     from reslrb_cli.optimization.assemble import assemble_scene
 

@@ -1,4 +1,6 @@
-"""Who takes turns in a `convergence`, for how long, and what becomes of those that end: with pretended processes."""
+"""The turns of methods in `convergence`, their lengths, and the treatment of methods that end, tested with pretended
+processes.
+"""
 
 from __future__ import annotations
 
@@ -126,7 +128,7 @@ def begin(what: Plan, earlier: Earlier) -> Session:
 
 
 def test_continuing(tmp_path: Path) -> None:
-    """Steps of both calls count, dL/dI is made once, and no seed comes twice."""
+    """The steps of both calls count, dL/dI is computed once, and no seed is used twice."""
     stage = Stage()
     session, _, _ = play(tmp_path, stage, plan(rounds=4))
     kept = session.kept()
@@ -159,7 +161,7 @@ def test_saved_rounds_are_not_repeated(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("after", [188, 212, 236])
 def test_an_interrupted_round_is_restarted(tmp_path: Path, after: int) -> None:
-    """With new seeds, and none of its steps twice: the figures are those of whole rounds."""
+    """The restarted round uses new seeds and no earlier step of that round, so that figures cover whole rounds only."""
     answers = iter(range(10**6))
     session, _, _ = play(tmp_path, Stage(), plan(rounds=8), stop=lambda: next(answers) > after)
     assert len({len(member.rows) // member.count for member in session.members}) == 2
@@ -271,7 +273,7 @@ def test_too_few_steps_for_a_slope_name_the_needed_time(tmp_path: Path) -> None:
 
 
 def test_no_budget_is_exceeded(tmp_path: Path) -> None:
-    """Steps of seconds: a round would take longer than what some of these leave after compiling."""
+    """Each step takes seconds. For some of these budgets, a round takes longer than the time left after compilation."""
     for budget_s in range(8, 60, 4):
         stage = Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
         play(tmp_path, stage, plan(rounds=None, budget_s=float(budget_s)))

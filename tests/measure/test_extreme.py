@@ -1,4 +1,4 @@
-"""The extreme suite: a part of it by default, all of it with `-m long`; what it found once, it finds again."""
+"""The extreme suite, a part of it by default and all of it with `-m long`. The suite finds earlier faults again."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _quiet(llvm: str) -> None:
 
 
 def failures(records: Iterable[GradcheckRecord]) -> list[str]:
-    """Records that do not hold, one line each."""
+    """Return the failing records as JSON, one line each."""
     return [record.to_json() for record in records if record.holds is False]
 
 
@@ -60,7 +60,9 @@ def test_camera_paths_are_left_out_of_light_that_they_cannot_find(name: str, rea
 
 
 def test_along_the_border_camera_paths_are_compared_with_a_complete_reference():
-    """`ptracer` does, and is no reference of theirs: the light that it lacks there would be found missing."""
+    """`ptracer` loses light along the film's border, and is therefore no reference for camera paths. The comparison
+    would report the missing light.
+    """
     records = list(run_suite(["film_crop"], WAYS))
     assert {record.reference.value for record in records} == {"walk_ad", "prb", "path"}
     assert {record.paths for record in records} == {"both", "camera"}

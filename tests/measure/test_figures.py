@@ -1,4 +1,4 @@
-"""Figures 1 and 5 of the paper: their checks see what they are to see."""
+"""Figures 1 and 5 of the paper. The tests show that the figures' checks detect planted faults."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def config() -> Config:
 
 
 def pretended(*, naive_factor: float = 1.0, many_factor: float = 1.0, fits: bool = False) -> list[Kind]:
-    """Kinds with normal noise around one gradient; `many_factor` is on the noise of many samples."""
+    """Return kinds with normal noise around one gradient. `many_factor` scales the noise of the kind with many
+    samples.
+    """
     random, mean = np.random.default_rng(1), np.random.default_rng(2).normal(size=(16, 16, 1))
 
     def kind(spp: int, by: str, count: int, factor: float, noise: float) -> Kind:
@@ -53,7 +55,7 @@ def pretended(*, naive_factor: float = 1.0, many_factor: float = 1.0, fits: bool
 
 
 def judged(kinds: list[Kind]) -> dict[str, Any]:
-    """The record of figure 1, as its file has it."""
+    """Return the record of figure 1 as its file contains it."""
     record = {"origin": ORIGIN} | figure1.judge(figure1.Plan(), kinds, 6000.0)
     return json.loads(json.dumps(record, allow_nan=False))
 
@@ -66,7 +68,7 @@ def test_a_correct_result_holds() -> None:
 
 @pytest.mark.parametrize("planted", [1.2, 0.8])
 def test_a_planted_difference_from_naive_ad_is_found(planted: float) -> None:
-    """In both comparisons with it, and not in that of ours with ours."""
+    """Both comparisons with naive AD fail, and the comparison between our two sample counts holds."""
     record = judged(pretended(naive_factor=planted))
     assert [row["verdict"] for row in record["comparisons"]] == ["fails", "fails", "holds"]
     assert not record["holds"]
@@ -83,7 +85,7 @@ def test_naive_ad_that_fits_is_found() -> None:
 
 
 def test_the_interval_has_its_coverage() -> None:
-    """95 of 100 times or so."""
+    """About 95 of 100 intervals cover the truth."""
     random, inside = np.random.default_rng(3), 0
     for _ in range(200):
         found = fall(random.normal(size=(16, 40)), random.normal(size=(8, 40)) / 4, 4.0)
@@ -116,7 +118,7 @@ def test_written_files(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.long
 def test_compared_methods_have_one_expectation(config: Config) -> None:
-    """Whatever of ours naive AD does not have is left out."""
+    """The comparison disables every part of our method that naive AD lacks."""
     from paper.gradients import comparable
 
     y, x = np.mgrid[0:16, 0:16] / 16
@@ -136,7 +138,9 @@ def test_compared_methods_have_one_expectation(config: Config) -> None:
 
 @pytest.mark.usefixtures("llvm")
 def test_a_process_ends_at_its_limit() -> None:
-    """It loads the scene, and has no room for the paths of a sample count that naive AD keeps."""
+    """The process loads the scene, but its memory limit is too small for the paths that naive AD stores at this sample
+    count.
+    """
     kind = Kind("naive AD", 2**16, "ptracer")
     sample(kind, 1, load(figure1.CONFIG, SMALL), np.ones((16, 16, 3), np.float32), "test", 3 << 29)
     assert kind.end is not None
@@ -171,7 +175,7 @@ SMALL_ROOM = [
 
 
 def pretended_room(naive_factor: float = 1.0, prb_factor: float = 1.0) -> list[Kind]:
-    """Kinds with normal noise around one gradient, those of naive AD and `prb` so many times as large."""
+    """Return kinds with normal noise around one gradient. The factors scale the gradients of naive AD and `prb`."""
     random = np.random.default_rng(1)
     mean = random.normal(1.0, 1.0, size=(16, 36, 3))
 

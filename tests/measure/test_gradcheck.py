@@ -1,4 +1,4 @@
-"""Gradcheck: it holds as the code stands, finds what is broken on purpose, goes on from another one."""
+"""Gradcheck holds for the unchanged code, finds planted faults, and continues an earlier check."""
 
 from __future__ import annotations
 
@@ -108,7 +108,9 @@ def test_differently_sampled_paths_agree_with_naive_ad_in_expectation(drawn: str
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("guiding", a_few(["on", "auto"], ["auto"]))
 def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch: pytest.MonkeyPatch):
-    """Wherever a run is guided, or may be: also with a table by which half of all paths end at each vertex."""
+    """Runs with guiding, or with `auto`, are compared with unguided steps. The comparison also covers a table by which
+    half of all paths end at each vertex.
+    """
     from reslrb_cli.guiding import tables
     from reslrb_cli.transport import walk
     from reslrb_cli.transport.roulette import CELLS, Survival
@@ -130,7 +132,9 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
 
 @pytest.mark.usefixtures("llvm")
 def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
-    """The reservoir alone is wrong, by a fifth: all references of it say so, and none of the others'."""
+    """Only the reservoir is wrong, by a fifth. All of its references fail, and no reference of the other estimator
+    fails.
+    """
     from reslrb_cli.estimators import reservoir
 
     right = reservoir.slot_adjoint
@@ -157,7 +161,9 @@ def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.usefixtures("llvm")
 def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.MonkeyPatch):
-    """Connections that are a third too strong: image and stock reference differ, naive AD and differences do not."""
+    """Connections are too strong by 30 %. The image and the gradient differ from the stock reference, and agree with
+    naive AD and finite differences.
+    """
     from reslrb_cli.transport import walk as segment
 
     right = segment.connect
@@ -173,7 +179,9 @@ def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.
 
 @pytest.mark.usefixtures("llvm")
 def test_rows_are_printed_as_they_are_measured():
-    """The first is there before the last estimator has taken a step, and what one row measured the next one uses."""
+    """The first row is available before the last estimator takes a step, and later rows reuse the measurements of
+    earlier rows.
+    """
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     made = Gradcheck(CheckSettings(config, parse_estimators("event,stack"), 0, 3))
     said: list[str] = []
@@ -242,7 +250,9 @@ def test_estimators_have_the_options_of_the_configuration():
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_references_match_the_conformance_tests(case):
-    """The rules allow what each case was judged by, and refuse both stock integrators where differences alone were."""
+    """The rules permit the reference of each case. Where a case has only differences, the rules refuse `ptracer`, and
+    also `prb` except for keys of `floor.brdf`.
+    """
     scene = Case(case.scene(), case.keys)
     at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, case.both.get("max_depth", 4), False)
     reasons = {"ptracer": ptracer_gradient, "prb": prb_gradient}
@@ -289,7 +299,9 @@ def test_ptracer_is_no_reference_with_cutting_clip_planes():
 
 @pytest.mark.usefixtures("llvm")
 def test_path_loses_light_reflected_by_masks():
-    """A veil of opacity 0.4 and a lamp: the stock `path` shows 0.4 of what it is to show, `prb` and ours all of it."""
+    """The scene has a lamp and a mask of opacity 0.4. The stock `path` renders 0.4 of the correct image. `prb` and ours
+    render all of it.
+    """
     veil = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
     pane = {"type": "rectangle", "to_world": transform(rotate=([1, 0, 0], -45)), "bsdf": veil}
     scene = Case(room(floor_shape=None, wall_shape=None, side_shape=None, pane=pane), [])
@@ -324,7 +336,7 @@ def test_images_are_compared_without_the_border(dark):
 
 @pytest.mark.usefixtures("llvm")
 def test_a_step_has_the_stated_truncation_error():
-    """The image is a cubic in the albedo, whose differences are wrong by h^2 times the third derivative."""
+    """The image is cubic in the albedo, so that differences have an error of h^2 times the third derivative."""
     key = "side.brdf_0.reflectance.value"
     scene, walk = Case(room(), [key]), integrator("walk_ad", 4)
     [first, second] = directions(scene, key, (0.0, 1.0), 2)
@@ -341,7 +353,7 @@ def test_a_step_has_the_stated_truncation_error():
 
 @pytest.mark.usefixtures("llvm")
 def test_a_step_lost_in_rounding_is_not_used():
-    """Rounding of the scene, the same for all seeds, is no truncation: it grows as the step shrinks."""
+    """Rounding of the scene is equal for all seeds and grows as the step shrinks, so this error is not truncation."""
 
     class Rounded:
         def difference(self, _integrator, _vector, seed, _spp, step, _sides):
@@ -394,7 +406,7 @@ def test_paths_are_compared_with_their_naive_ad_at_equal_seeds():
 
 @pytest.mark.usefixtures("llvm")
 def test_a_wrong_weight_of_camera_paths_is_found(monkeypatch: pytest.MonkeyPatch):
-    """Light paths count in full beside camera paths: naive AD has the same fault, `path` has not."""
+    """Beside camera paths, light paths keep their full weight. Naive AD has the same fault, but `path` does not."""
     monkeypatch.setattr("reslrb_cli.transport.walk.weight_of_connection", lambda *_: mi.Float(1))
     results = check("scene.options.size=8", "run.spp=64", estimators="stack(paths=both)", seeds=4)
     failed = {(result.record.parameter, result.record.reference) for result in results if result.record.holds is False}
@@ -415,7 +427,7 @@ def test_moving_light_has_only_light_paths():
 
 
 def _lit(view: str, **more: Any) -> Situation:
-    """A small room as a sensor sees it; its references are those of these paths."""
+    """Return the situation of a small room seen by a sensor. The paths `view` decide which references are valid."""
     made = Case(room(**more), [])
     return Situation.of(made.scene, made.scene.sensors()[0], made.params, 4, False, paths=view)
 
@@ -475,7 +487,9 @@ def test_participants():
 
 @pytest.mark.usefixtures("llvm")
 def test_derivatives_of_the_film():
-    """Beside differences the filter's normalisation has its derivative, beside `ptracer` none; naive AD follows."""
+    """The filter's normalisation is differentiated for comparison with differences, and detached for `ptracer`. Naive
+    AD is compared with the option `follow`.
+    """
     parts = Gradcheck(
         CheckSettings(room_moving("wavy_glass.xml", "top.vertex_positions"), parse_estimators("stack"), 0, 3)
     ).participants
@@ -490,7 +504,9 @@ def test_derivatives_of_the_film():
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", ["caustic_heightmap", pytest.param("lens_pose", marks=pytest.mark.long)])
 def test_forward_mode_of_functions(name: str):
-    """Heights and motions are not in the scene: tangents have to reach what is, as gradients come back from there."""
+    """Heights and motions are not scene parameters. Tangents must reach the scene's parameters, from which gradients
+    return to heights and motions.
+    """
     small = ["scene.options={resx: 16, resy: 16}", "run.spp=4", "target.render.spp=4"]
     parts = Participants(CheckSettings(load(CONFIGS / f"{name}.yaml", small), parse_estimators("stack"), 0, 3))
     [label] = (case.label for case in parts.listed)
@@ -523,7 +539,7 @@ def test_references_of_moving_scenes():
 
 @pytest.mark.usefixtures("llvm")
 def test_smooth_directions():
-    """Neighbours move alike: otherwise the least step would fold a mesh."""
+    """Neighbouring entries move alike, because even a very small step would otherwise fold a mesh."""
     points = np.stack(np.meshgrid(np.linspace(0, 1, 50), [0.0], np.linspace(0, 1, 50)), -1).reshape(-1)
     for row in smooth_rows("top.vertex_positions", points, 5.0, 3):
         field = row.reshape(50, 50, 3)
@@ -544,7 +560,9 @@ def test_smooth_directions():
 def check_again(
     seeds: int, file: Path, earlier: Earlier | None = None, after: int = 10**6
 ) -> tuple[list[GradcheckRecord], Earlier]:
-    """The records, and what the check keeps, by way of the disk; it is stopped after so many looks at the clock."""
+    """Return the records and the check's kept content, which is written to a file and read back. The check stops after
+    `after` looks at the clock.
+    """
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     what = CheckSettings(config, parse_estimators("stack"), 0, seeds)
     made, looks = Gradcheck(what, earlier=earlier), iter(range(10**6))
@@ -556,7 +574,7 @@ def check_again(
 
 
 def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One was interrupted in the midst of its differences, whose step had been chosen."""
+    """The earlier check stopped during its differences, after the choice of their step."""
     whole, _ = check_again(6, tmp_path / "a.npz")
     part, earlier = check_again(4, tmp_path / "b.npz", after=15)
     assert {record.seeds for record in part if record.reference is Reference.FINITE_DIFFERENCE} < {3, 4}
@@ -607,7 +625,7 @@ def test_samples_of_other_code_are_not_continued(monkeypatch: pytest.MonkeyPatch
 
 
 class Directed(Pretended):
-    """Participants that write down which seeds they are asked for."""
+    """Participants that record the seeds of the requested gradients."""
 
     seeds: dict[str, list[int]] = {}  # noqa: RUF012 (looked at by the test)
 

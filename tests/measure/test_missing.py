@@ -1,4 +1,6 @@
-"""The share of a derivative that attached gradients lack, and those gradients against finite differences."""
+"""The share of a derivative that attached gradients lack, and comparisons of these gradients with finite
+differences.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ def missing(case: Case, along: list[Direction], options: dict, count: int = SEED
 
 
 def share(scene: AttachedScene, count: int = SEEDS) -> tuple[float, float]:
-    """Along the scene's one amplitude, of the centre of gravity of the light that lands."""
+    """Return the missing share and its error for the centre of gravity of the landing light, along the scene's only
+    amplitude.
+    """
     case = scene.case()
     case.weigh(centre_of_gravity())
     found = missing(case, [Direction(np.ones(1), "both")], dict(scene.options), count).share()
@@ -64,7 +68,9 @@ def share(scene: AttachedScene, count: int = SEEDS) -> tuple[float, float]:
 
 
 def half_covered(moved: str) -> AttachedScene:
-    """A black sheet over one part of a parallel beam, from x = -HALF to EDGE of -HALF to HALF; either can move."""
+    """Return a scene with a black sheet over a part of a parallel beam. The beam covers -HALF to HALF in x, and the
+    sheet covers -HALF to EDGE. Either can move.
+    """
     cover = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.0},
              "to_world": transform(translate=[EDGE - 1, HEIGHT, 0], rotate=([1, 0, 0], -90), scale=1)}  # fmt: skip
     return AttachedScene(
@@ -75,7 +81,9 @@ def half_covered(moved: str) -> AttachedScene:
 
 
 def slab_in_a_beam() -> AttachedScene:
-    """A tilted surface of glass narrower than the beam, over a receiver in the glass: light passes by its edges."""
+    """Return a scene with a tilted glass surface narrower than the beam, above a receiver in the glass. Light passes by
+    the surface's edges.
+    """
     glass = {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}
     place = transform(translate=[0, HEIGHT, 0]) @ transform(rotate=([0, 0, 1], float(np.rad2deg(TILT))))
     size = transform(rotate=([1, 0, 0], -90), scale=[SLAB, 2, 1])
@@ -88,7 +96,9 @@ def slab_in_a_beam() -> AttachedScene:
 
 
 def slab_share() -> float:
-    """Of what falls on the surface, SLAB cos(tilt) each way of its middle, (1 - R) passes, displaced by H tan(a)."""
+    """Return the known share for the slab. The surface receives light over SLAB cos(tilt) on each side of its middle.
+    The part (1 - R) passes, displaced by H tan(a).
+    """
 
     def displaced(tilt: float) -> float:
         away = tilt - np.arcsin(np.sin(tilt) / IOR)
@@ -103,7 +113,7 @@ def slab_share() -> float:
 @pytest.mark.usefixtures("_quiet")
 @pytest.mark.long
 def test_a_texture_has_a_complete_derivative():
-    """Neither do colours: nothing moves."""
+    """Colours are complete, because nothing moves."""
     config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
     check = MissingCheck(config, 0, 6, 16, 2)
     [record] = check.run(lambda: False)
@@ -134,7 +144,7 @@ def test_known_shares(scene: Callable[[], AttachedScene], known: float):
 
 @pytest.mark.usefixtures("_quiet")
 def test_a_fault_is_found(monkeypatch: pytest.MonkeyPatch):
-    """Of a gradient without what lands elsewhere, that is missing too."""
+    """The check finds a gradient that also lacks the light's shift to other positions."""
     right = AdjointImage.lookup
     monkeypatch.setattr(AdjointImage, "lookup", lambda self, u, *a, **k: right(self, dr.detach(u), *a, **k))
     found, error = share(half_covered("lamp"), SEEDS // 3)
@@ -143,10 +153,10 @@ def test_a_fault_is_found(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.usefixtures("_quiet")
 def test_steps_lost_in_rounding():
-    """Rounding that is the same for all seeds is seen in how the extrapolation changes."""
+    """Rounding that is equal for all seeds shows as a change of the extrapolation."""
 
     class Rounded:
-        """A smooth objective, wrong by 1e-4 at random, though the same for all seeds."""
+        """Smooth objective with a pseudo-random error of 1e-4 that is equal for all seeds."""
 
         def difference(self, _integrator, vector, seed, _spp, step, _sides):
             noise = np.random.default_rng(seed).normal(scale=1e-5)
@@ -171,7 +181,7 @@ def test_a_part_lost_in_noise_has_no_share():
 
 @pytest.mark.usefixtures("_quiet")
 def test_errors_are_correct():
-    """Over many made measurements, the deviation from the known share is of the size of the stated error."""
+    """Over many simulated measurements, the deviation from the known share is about as large as the stated error."""
     random, z = np.random.default_rng(1), []
     for _ in range(300):
         found = Missing([Direction(np.ones(3), "both")] * 3)
@@ -206,7 +216,9 @@ run: {{iterations: 3, spp: 16}}
 def test_the_command_and_more_seeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Two calls come to what one call comes to, around the same steps; another measurement is not gone on from."""
+    """Two calls give the result of one call, around the same steps. The command refuses to continue another
+    measurement.
+    """
     monkeypatch.setattr(missing_check, "IMAGE_PATHS", 2**16)  # of noise in dL/dI, which is the same for all
     config = tmp_path / "lamp.yaml"
     config.write_text(LAMP.format(folder=Path(__file__).parent))
@@ -253,7 +265,9 @@ def test_incompatible_options(arguments: list[str], message: str, tmp_path: Path
 
 @pytest.mark.usefixtures("_quiet")
 def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
-    """Without a segment to the floor all images are black, the target too, which is refused before."""
+    """Without a segment to the floor, all images are black, including the target. The earlier check for black targets
+    is disabled here.
+    """
     monkeypatch.setattr(targets, "_check_light", lambda problem, say: None)
     config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
     config = config.model_copy(update={"integrator": config.integrator.model_copy(update={"max_depth": 1})})
@@ -287,7 +301,9 @@ def test_every_scene(name: str):
 
 
 def beam(only: tuple[float, float, float], seeds: int = 2) -> Differenced:
-    """A slab in parallel light, of which some coordinates move, by a few directions."""
+    """Compare with differences for a slab in parallel light, of which the coordinates `only` move along a few
+    directions.
+    """
 
     def moves(scene: Any) -> list[Move]:
         return [Displacement("top.vertex_positions", smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array(only))]
@@ -311,7 +327,9 @@ def test_a_moving_receiver():
 
 @pytest.mark.usefixtures("_quiet")
 def test_slopes_of_the_shading_correction_without_its_jumps(monkeypatch: pytest.MonkeyPatch):
-    """Faces that slide through the light: within each the correction has a slope, at their edges it jumps back."""
+    """Faces slide through the light. Within each face the shading correction has a slope, and at the face's edges the
+    correction jumps back.
+    """
     right = bsdf.shading_correction
 
     def tracked(plan: Any, *rest: Any) -> Any:

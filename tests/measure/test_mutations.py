@@ -1,4 +1,4 @@
-"""The code broken on purpose: gradcheck or the extreme suite finds each of these faults, and says where it is."""
+"""The code with planted faults. Gradcheck or the extreme suite finds each fault and reports its place."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ def test_enough():
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_the_faults_apply_to_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
-    """Also those that the default suite does not run: a change of the code that one gets lost by shows at once."""
+    """All faults are planted, also those that only the long suite checks. A change of the code that invalidates a fault
+    therefore fails at once.
+    """
     plant(fault, monkeypatch)
 
 
@@ -52,19 +54,20 @@ def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
 
 @cache
 def as_it_stands(check: str) -> set[tuple[str | None, str]]:
-    """What fails of a check without any fault: once for all faults that it is to find."""
+    """Return the failures of a check without any fault. The result is computed once for all faults of the check."""
     return failures(CHECKS[check]())
 
 
 def failures(records: Iterable[GradcheckRecord]) -> set[tuple[str | None, str]]:
-    """Estimator and reference of each record that fails."""
+    """Return the estimator and the reference of each failing record."""
     return {(r.estimator, r.reference.value) for r in records if r.verdict is Verdict.FAILS}
 
 
 def plant(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put a fault into a function, wherever it has been imported to.
+    """Plant a fault in a function. The fault takes effect in every module that imports the function.
 
-    Its source has to hold the line once: a fault that no longer fits the code is an error of this test.
+    The function's source must contain the fault's line exactly once. A fault that no longer fits the code fails the
+    test.
     """
     module, _, path = fault.where.partition(":")
     function = attrgetter(path)(importlib.import_module(f"reslrb_cli.{module}"))

@@ -1,4 +1,6 @@
-"""Integrators that users write: checked against all references, and told where to look."""
+"""Users' own integrators, which are checked against all references. The check's messages point to the cause of a
+fault.
+"""
 
 from __future__ import annotations
 
@@ -82,14 +84,14 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def call(words: list[str]) -> int:
-    """The exit code of a command."""
+    """Run a command, and return its exit code."""
     with pytest.raises(SystemExit) as ended:
         main(words)
     return int(ended.value.code or 0)
 
 
 def checked(capsys: pytest.CaptureFixture[str], options: str, *more: str) -> tuple[int, list[str]]:
-    """The exit code of a check of the integrator with these options, and what it says of it."""
+    """Check the integrator with these options, and return the exit code and the output lines about the integrator."""
     name = f"own_replay.py:Replay({options})" if options else "own_replay.py:Replay"
     words = ["gradcheck", "room.yaml", "--integrators", name, "--allow-code", "--seeds", "24", "--spp", "64", *more]
     code = call(words)
@@ -145,7 +147,7 @@ DIFFUSE = ["--set", "scene.options.size=16", "--set", "integrator.max_depth=5", 
 @pytest.mark.long
 @pytest.mark.parametrize("options", ["primal_fault=clamp", "fault=clamp", "primal_fault=bright", "fault=bright"])
 def test_clamped_values_are_detected_in_darker_scenes(capsys: pytest.CaptureFixture[str], options: str) -> None:
-    """A throughput, and light, in both passes and in that which differentiates."""
+    """Clamped throughput and clamped light are detected, in both passes or only in the differentiating pass."""
     words = DIFFUSE if options.endswith("clamp") else ["room.yaml"]
     name = f"own_replay.py:Replay({options})"
     words = ["gradcheck", *words, "--integrators", name, "--allow-code", "--seeds", "24", "--spp", "64"]
@@ -220,8 +222,10 @@ run: {iterations: 2, spp: 64}
 def test_silhouettes_are_compared_with_differences(
     capsys: pytest.CaptureFixture[str], triangles: list[str], projective_holds: bool
 ) -> None:
-    """Those of a sheet `direct_projective` has, and `prb_basic` has not, which the sentence says. At the edges of a box
-    Mitsuba 3.9's are wrong (docs/your_integrator.md)."""
+    """`direct_projective` has the silhouette derivatives of a sheet. `prb_basic` lacks silhouette derivatives, and the
+    output line names them. At the edges of a box, the derivatives of Mitsuba 3.9 are wrong
+    (docs/your_integrator.md).
+    """
     corners = [f"v {x} {y} {z}" for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     Path("thing.obj").write_text("\n".join([*corners, *(f"f {each}" for each in triangles)]))
     Path("moving.xml").write_text(MOVING_SCENE)
@@ -239,7 +243,7 @@ def test_silhouettes_are_compared_with_differences(
 
 
 def test_two_black_images_agree() -> None:
-    """As of paths of one segment, where the sensor sees no lamp."""
+    """Images of paths of one segment are black where the sensor sees no lamp."""
     nothing, something = np.zeros(4), np.array([1.0, 1.1, 0.9, 1.0])
     assert not _over(nothing, nothing).wrong
     assert _over(something, nothing).wrong
@@ -283,7 +287,9 @@ def test_a_nan_image_fails(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_run_by_an_own_integrator_equals_prb(capsys: pytest.CaptureFixture[str]) -> None:
-    """`integrator.type: custom` recovers parameters, needs leave again to go on, and `render` asks for it too."""
+    """A run with `integrator.type: custom` needs `--allow-code` to start and to resume. After a change of the
+    integrator's file, the run does not resume.
+    """
     own = "integrator={type: custom, file: own_replay.py:Replay, max_depth: 3}"
     words = ["optimize", "room.yaml", "--set", own, "--set", "run.name=own", "--set", "run.certainty=false"]
     words += ["--set", "target.render.integrator={type: prb, max_depth: 3}"]

@@ -1,4 +1,4 @@
-"""Comparisons of two methods, and what errors are taken from."""
+"""Comparisons of two methods, and the choice of the reference for errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ def samples(sd, count, seed, entries=200):
 
 @pytest.mark.parametrize("entries", [3, 200])
 def test_the_interval_has_its_coverage(entries):
-    """Four times the variance at half the time; without what single times may be off, the level is the nominal one."""
+    """The first method has four times the variance at half the time. Without the allowance for timing errors, the
+    interval has its nominal level.
+    """
     inside = 0
     for seed in range(200):
         own, other = samples(2.0, 8, 2 * seed, entries), samples(1.0, 8, 2 * seed + 1, entries)
@@ -79,7 +81,7 @@ def test_camera_paths_are_checked_wherever_they_are_used(
      ("both", "reslrb:stack(paths=both,light_share=0.5)", 0.5)],
 )  # fmt: skip
 def test_errors_refer_to_all_light_of_the_scene(tmp_path: Path, paths: str, label: str, share: float | None) -> None:
-    """Of the default list, what there are no paths for is left out, and said."""
+    """Methods of the default list that need paths the scene lacks are left out, and a message names them."""
     stage = pretended_steps.Stage(facts={"paths": paths})
     usual = pretended_steps.plan(
         "reslrb:stack,reslrb:stack(paths=both)", rounds=3, reference=parse_cases(REFERENCE)[0], default=True

@@ -1,4 +1,6 @@
-"""Checks whose samples and cases workers take: to the bit those of one process, whoever takes them."""
+"""Checks whose samples and cases workers take. The results equal those of one process to the bit, whichever worker
+takes a part.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def checked(config: Config, estimators: str | None, own: str | None = None) -> C
 
 
 def sampled(settings: CheckSettings, place: Place | None, earlier: Kept | None = None) -> tuple[Kept, list[str]]:
-    """What is kept of a check, and its records, in one thread each; it goes on from an `earlier` one."""
+    """Run a check with one thread for each process, and return its kept content and its records. The check continues an
+    `earlier` one.
+    """
     before = None if earlier is None else Earlier(KIND, Path("a.jsonl"), *earlier)
     made = Gradcheck(settings, earlier=before)
     with one_thread():
@@ -60,7 +64,7 @@ def sampled(settings: CheckSettings, place: Place | None, earlier: Kept | None =
 
 
 def check(settings: CheckSettings, workers: int) -> None:
-    """Samples, steps and records are the same, also where workers go on from what one process did."""
+    """Check that the samples, steps and records of workers equal those of one process."""
     alone, table = sampled(settings, None)
     together, same_table = sampled(settings, Place(workers))
     assert json.dumps(alone[0]) == json.dumps(together[0])
@@ -72,7 +76,9 @@ def check(settings: CheckSettings, workers: int) -> None:
 
 
 def test_samples_of_workers_equal_those_of_one_process(experiment: Path) -> None:
-    """With the steps of differences, which workers do not choose, and a start that is sent by itself."""
+    """The test covers the steps of differences, which workers do not choose, and initial values that are sent
+    separately.
+    """
     check(checked(load(experiment / "tiny.yaml", [MOTION]), "stack"), 1)
 
 
@@ -112,7 +118,7 @@ def call(*words: str) -> int:
 
 @pytest.mark.long
 def test_cases_of_the_suite_are_calls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """In the order of one process; threads add in an order of their own, so that the last digits differ."""
+    """The cases keep the order of one process. Threads add in any order, so that the last digits differ."""
     cases = ["--suite", "extreme", "--case", "furnace", "--case", "film_crop", "--estimators", "stack", "--seeds", "4"]
     assert call(*cases, "--json", str(tmp_path / "alone.jsonl")) == 0
     alone = capsys.readouterr().out.splitlines()

@@ -1,4 +1,4 @@
-"""Whether two gradients agree: the statistics, what they see, and how a budget is spent on them."""
+"""Statistics that decide whether two gradients agree, the differences they detect, and the use of a budget for them."""
 
 from __future__ import annotations
 
@@ -102,7 +102,9 @@ def test_effective_entries():
 
 
 def test_correlated_entries_do_not_count_separately():
-    """Sixty entries that are five: their z rms scatters as that of five, and a bias of one of them still shows."""
+    """The sixty entries are copies of five. Their z rms scatters like the z rms of five entries, and a bias in one of
+    the five is still detected.
+    """
     rng, failed = np.random.default_rng(3), 0
     for _ in range(200):
         a, b = (np.repeat(rng.normal(size=(64, 5)), 12, axis=1) for _ in range(2))
@@ -236,7 +238,9 @@ def test_entry_count(shape: tuple[int, ...], count: int, finest: int):
 
 
 def test_a_rarely_hit_texture_is_compared_in_larger_tiles():
-    """Rare, skewed samples in every texel: equal in expectation, and far from normal in single tiles."""
+    """Every texel has rare, skewed samples. The expectations are equal, but the distribution in single tiles is far
+    from normal.
+    """
     shape, tiled, coarser = (16, 16, 3), [], []
     for k in range(30):
         rng = np.random.default_rng(k)
@@ -290,7 +294,7 @@ NAMES: list[Name] = [
 
 
 class Pretended:
-    """Participants whose samples cost `sample_s` each, and `compile_s` more when they are taken for the first time."""
+    """Participants whose samples cost `sample_s` each. The first sample of each name costs `compile_s` more."""
 
     compile_s, sample_s, load_s = 5.0, 0.1, 2.0
 
@@ -318,7 +322,7 @@ def _pretend(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def spent(budget_s: float, seeds: int | None = None) -> tuple[dict[Name, int], float, list[str]]:
-    """Samples by name of those that were enough, the time that it took, and what was said."""
+    """Return the sample counts of all names with enough samples, the elapsed time, and the messages."""
     clock, said = [0.0], []
     listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
     settings: Any = SimpleNamespace(budget_s=budget_s, seeds=seeds, integrators=listed, clock=clock, spent_s=0.0)

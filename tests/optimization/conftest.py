@@ -1,4 +1,4 @@
-"""The variant of these tests, and a step that needs no scene."""
+"""The variant of these tests, and a gradient step that needs no scene."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from reslrb_cli.optimization import loop
 
 @pytest.fixture(autouse=True)
 def _variant(llvm):
-    """LLVM: these tests are about arithmetic, not about a device."""
+    """LLVM variant, because these tests check arithmetic and not a device."""
 
 
 @pytest.fixture
 def steps(monkeypatch, request):
-    """Replaces the gradient step by one whose image is the mean of the parameters; returns its calls.
+    """Replace the gradient step by a step whose image is the mean of the parameters. Return the state of the replaced
+    step, which lists its calls.
 
-    `steps.spoil(call, key)` says what to multiply into a gradient, `steps.derivative(call)` which dL/dI is refused
-    where it is not finite, and `steps.loss(call)` what to add to the loss.
+    `steps.spoil(call, key)` returns the factor of a gradient. `steps.derivative(call)` returns the dL/dI whose
+    non-finite entries are refused. `steps.loss(call)` returns a number that is added to the loss.
     """
     calls = []
     state = types.SimpleNamespace(calls=calls, problem=None, has_image=False, spoil=lambda call, key: 1.0)

@@ -1,4 +1,4 @@
-"""What tests share of decisions by steps taken both ways: worlds that are made up, and runs whose times are given."""
+"""Common code for tests of decisions by steps taken in two ways, with simulated worlds and runs of given times."""
 
 from __future__ import annotations
 
@@ -35,9 +35,11 @@ SIZES = Sizes(step=64, call=16, part=16, alone=False, rounds=ROUNDS, lessons=1 /
 
 @dataclass
 class World:
-    """Steps whose times and variances are given, for each sample: those of the other kind have `variance` and `time`
-    times those of the one, and their images `image` times; a walk that is learned from takes `walk` ms a sample and
-    `python` beside. `sparse`: a gradient is made of so few paths that say anything (a thirtieth of them)."""
+    """Simulated steps with given times and variances for each sample. The second kind of step has `variance` and `time`
+    times the values of the first kind. The variance of its images is `image` times as large. A walk for learning
+    takes `walk` ms for each sample, and `python` ms in addition. With `sparse`, only a thirtieth of the paths
+    contribute to a gradient.
+    """
 
     variance: float = 1.0
     time: float = 1.0
@@ -78,14 +80,14 @@ class World:
         return 1 + np.sqrt(variance) * noise
 
     def run(self, sizes: Sizes = SIZES, share: float = 2 * GUIDING_SHARE) -> Any:
-        """The record of what is decided."""
+        """Return the record of the decision."""
         rounds = ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS
         sizes, learn = replace(sizes, rounds=rounds, alone=self.alone), self.learn if self.learns else None
         return self.pilot(self.take, sizes, 1.0, share, learn=learn).run()
 
 
 def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The tiny experiment in the working directory, with a cache of its own."""
+    """Write the tiny experiment to `folder`, make it the working directory, and set a cache of its own."""
     tiny.write_experiment(folder)
     monkeypatch.chdir(folder)
     monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
@@ -94,7 +96,9 @@ def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) -> None:
-    """Have a step take 1 ms, one of the other kind what is given for what is decided, and a walk to learn from 1 ms."""
+    """Fix the times of steps. A step and a walk for learning take 1 ms each. A step of the other kind takes the time
+    that `other_ms` gives for the decided option.
+    """
     monkeypatch.setattr(race, "timed", lambda times, wall_ms=None: Step(kernel_ms=1.0, wall_ms=1.0))
     take = StepTrial.take
 
@@ -108,12 +112,12 @@ def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) ->
 
 
 def is_even(problem: Problem) -> bool:
-    """Whether paths have low-discrepancy numbers."""
+    """Return whether paths use low-discrepancy numbers."""
     return problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence is not None
 
 
 def operations(problem: Problem) -> list[int]:
-    """Those of the kernels of a step of the run, after a first one."""
+    """Return the operation counts of the kernels of the run's second step."""
     clock = StepClock()
     for iteration in range(2):
         with clock.step():

@@ -1,7 +1,7 @@
-"""Whether memory or step time grows while a run goes on, by statistics that a busy machine does not mislead.
+"""Checks whether memory or step time grows during a run, by statistics that a busy machine does not mislead.
 
-Time is that of the process's own processors, and of each window the least of its blocks: what else runs on the machine
-can only add to it. Memory is what the process has resident, medians of windows.
+Time is CPU time of the process. Each window keeps the shortest of its blocks, because other programs can only add time.
+Memory is resident memory, compared by medians of windows.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ LEVEL = 1e-3
 
 @dataclass
 class Watched:
-    """A run that is watched: processor seconds of an iteration in each window, MiB resident, and the allocator's peak
-    in MiB, after each window; `block` iterations are timed together."""
+    """Measurements of a run. Each window has the CPU seconds of an iteration, the resident memory in MiB and the
+    allocator's peak in MiB. `block` iterations are timed together.
+    """
 
     block: int
     seconds: list[float] = field(default_factory=list)
@@ -35,26 +36,31 @@ class Watched:
 
     @property
     def growth(self) -> float:
-        """MiB by which the last tenth has more resident than the second tenth: the first one warms up."""
+        """Growth of the resident memory in MiB from the second tenth to the last tenth. The first tenth is a
+        warm-up.
+        """
         tenth = len(self.resident) // 10
         return statistics.median(self.resident[-tenth:]) - statistics.median(self.resident[tenth : 2 * tenth])
 
     @property
     def peak_growth(self) -> float:
-        """The same of the allocator's peak, which never falls."""
+        """Growth of the allocator's peak in MiB after the first tenth. It never falls."""
         return self.peaks[-1] - self.peaks[len(self.peaks) // 10]
 
     @property
     def trend(self) -> tuple[float, float]:
-        """The share by which the time of a step grows over the run but for its first tenth, by Theil's and Sen's slope,
-        and how probable as much is by chance (Kendall's tau, two-sided)."""
+        """Relative growth of the step time over the run, without the first tenth, and the growth's p-value. The growth
+        is the Theil-Sen slope, and the p-value comes from Kendall's tau, two-sided.
+        """
         times = np.array(self.seconds[len(self.seconds) // 10 :])
         at = np.linspace(0, 1, len(times))
         slope = stats.theilslopes(times, at)[0]
         return float(slope / np.median(times)), float(stats.kendalltau(at, times).pvalue)
 
     def faults(self) -> list[str]:
-        """What grows: memory by more than 1 % and 2 MiB, step time significantly and by more than 5 %."""
+        """Return the faults. Memory grows by more than 1 % and 2 MiB, or the peak by more than 1 % and 0.05 MiB. Step
+        time grows significantly, by more than 5 %.
+        """
         found = []
         allowed = max(2.0, 0.01 * statistics.median(self.resident))
         if self.growth > allowed:
@@ -76,7 +82,7 @@ class Watched:
 
 
 def watch(records: Iterable[Any], block: int = 10) -> Watched:
-    """Go through all records of a run, and watch it meanwhile."""
+    """Go through all records of a run, and return the measurements of memory and time."""
     watched, blocks = Watched(block), []
     begin = time.process_time()
     for record in records:
@@ -94,6 +100,6 @@ def watch(records: Iterable[Any], block: int = 10) -> Watched:
 
 
 def resident() -> float:
-    """MiB of this process's memory now."""
+    """Return this process's resident memory in MiB."""
     status = Path("/proc/self/status").read_text()
     return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1]) / 1024

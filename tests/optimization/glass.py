@@ -1,4 +1,6 @@
-"""A spot light, a glass slab whose lower face is a flat mesh, and a floor below it: an experiment of 24x24 pixels."""
+"""An experiment of 24x24 pixels with a spot light, a glass slab and a floor below the slab. The slab's lower face is a
+flat mesh.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,7 @@ run: {iterations: 3, spp: 16, final_spp: 16}
 
 
 def write_experiment(folder: Path) -> Path:
-    """Scene, mesh and `glass.yaml` in `folder`; a variant must be set."""
+    """Write the scene, the mesh and `glass.yaml` to `folder`. A variant must be set."""
     import mitsuba as mi
 
     axis = np.linspace(-1, 1, CELLS + 1)
@@ -61,7 +63,7 @@ def write_experiment(folder: Path) -> Path:
 
 
 def assemble(folder: Path, *sets: str) -> Any:
-    """The problem of the experiment, without targets."""
+    """Write the experiment, and return its problem without targets."""
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization.assemble import assemble_scene
 

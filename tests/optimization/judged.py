@@ -1,6 +1,8 @@
-"""Small scenes whose truth is known, recovered with success or made to fail, and what is said of the results.
+"""Small scenes with known true values, for runs that succeed or are made to fail, and for the verdicts on their
+results.
 
-A wall under lamps of their own colours, a rough mirror, a lamp that lights nothing, and two that light the wall alike.
+The wall has lamps of different colours, and two more that light the wall alike. There are also a rough mirror and a
+lamp that lights nothing.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ run: {iterations: 100, spp: 16}
 
 @dataclass(frozen=True)
 class Toy:
-    """One run: its parameters with their options, its settings, and the verdict that each parameter ought to have."""
+    """One run, with its parameters and their options, its settings, and the correct verdict for each parameter."""
 
     name: str
     parameters: dict[str, str]
@@ -62,7 +64,7 @@ class Toy:
 
 @dataclass
 class Outcome:
-    """What a run came to."""
+    """Result of a run."""
 
     certainty: CertaintyRecord
     final: dict[str, np.ndarray]
@@ -74,7 +76,7 @@ class Outcome:
 
 
 def write_scene(folder: Path) -> None:
-    """Scene and texture; a variant must be set."""
+    """Write scene, texture and `toy.yaml`. A variant must be set."""
     import mitsuba as mi
 
     texture = np.random.default_rng(2).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32)
@@ -84,7 +86,7 @@ def write_scene(folder: Path) -> None:
 
 
 def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
-    """Recover, and measure how certain that is; the scene is in `folder`."""
+    """Run the recovery in `folder`, which holds the scene, and return the measured certainty."""
     parameters = ", ".join(f"{{key: {key}, {options}}}" for key, options in toy.parameters.items())
     settings = [f"parameters=[{parameters}]", f"run.seed={seed}", *toy.settings]
     problem = assemble(load(folder / "toy.yaml", settings))

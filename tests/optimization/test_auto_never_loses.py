@@ -1,8 +1,9 @@
-"""No scene loses by `guiding: auto` and `sequence: auto`: all shipped configurations, and scenes of the extreme suite.
+"""`guiding: auto` and `sequence: auto` reduce the efficiency of no scene. The tests cover all shipped configurations,
+and scenes of the extreme suite.
 
-What is on has a gain whose interval lies above 1; what is off traces what `off` does, operation by operation; and all
-that is measured takes what it may. Shipped films are as they are, or smaller where an iteration takes seconds; those of
-the extreme suite have so many samples that there is time to measure.
+An enabled option has a gain whose interval lies above 1. A disabled option traces the same operations as `off`. All
+measurements together stay within their allowed share of time. Shipped films keep their size, or are smaller where an
+iteration takes seconds. Scenes of the extreme suite have so many samples that there is time to measure.
 """
 
 from __future__ import annotations
@@ -60,19 +61,21 @@ SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], Problem]] = {"settl
 
 @pytest.fixture(autouse=True)
 def alone() -> None:
-    """Scenes that are alive at the same time show in each other's kernels."""
+    """Collect garbage, because scenes that exist at the same time change each other's kernels."""
     gc.collect()
 
 
 def decided(config: Config, case: ExtremeCase | None) -> Problem:
-    """The problem, in the scene of a case if one is given, with all that is left to measurement decided now."""
+    """Return the problem, in the scene of a case if one is given, after all decisions by measurement."""
     problem = assemble_scene(config, None if case is None else load_scene(case.scene()))
     problem = make_targets(fit_memory(problem), lambda line: None)
     return SETTLE["settle"](problem, lambda line: None)
 
 
 def extreme(case: ExtremeCase, folder: Path) -> str:
-    """A configuration of a case: reflectances that are to be recovered from an image of it, which is written here."""
+    """Return a configuration for a case. The configuration recovers reflectances from an image of the case, which this
+    function writes.
+    """
     keys = [key for key in case.keys if "reflectance" in key]
     image = render_image(integrator("reslrb", **case.options), load_scene(case.scene()), 0, 1, 256)
     write_file(folder / "target.exr", np.array(image), linear=True)
@@ -88,7 +91,7 @@ run: {{spp: {spp}, iterations: 200}}
 
 
 def config_of(name: str, case: ExtremeCase | None, folder: Path, *settings: str) -> Config:
-    """A shipped configuration by its name, or that of a case of the extreme suite."""
+    """Return a shipped configuration by its name, or the configuration of a case of the extreme suite."""
     if case is not None:
         return loads(extreme(case, folder), Path(f"{case.name}.yaml"), [*settings])
     target = ["target.render.spp=64"] if name not in PICTURED else []
@@ -96,7 +99,7 @@ def config_of(name: str, case: ExtremeCase | None, folder: Path, *settings: str)
 
 
 def judged(record: PaidRecord | None, on: bool, alone: bool) -> list[str]:
-    """What a decision has that it may not."""
+    """Return the faults of a decision."""
     if record is None:
         return ["nothing was decided"]
     if not on:
@@ -141,7 +144,7 @@ def test_no_scene_loses(name: str, tmp_path: Path) -> None:
 
 
 def forced(record: Callable[..., PaidRecord], on: bool) -> Callable[..., PaidRecord]:
-    """A pilot's way to its record, with another decision."""
+    """Return a replacement for a pilot's `_record` that decides `on` instead."""
 
     def decided(pilot: Any, note: str, gain: Gain = NOTHING, picture: Gain = NOTHING, *decision: bool) -> PaidRecord:
         return record(pilot, note, gain, picture, on, on)
@@ -151,8 +154,9 @@ def forced(record: Callable[..., PaidRecord], on: bool) -> Callable[..., PaidRec
 
 @pytest.mark.parametrize("fault", ["on whatever is found", "off with a grid"])
 def test_losses_are_found(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a scene that guided light paths have a third of the efficiency in: it is on; and it is off, and paths start in
-    cells."""
+    """The scene has a third of the efficiency with guided light paths. The test enables guiding there, or leaves the
+    decision off while paths start in cells. Both faults are found.
+    """
     monkeypatch.setattr(sys.modules[__name__], "AUTO", [*AUTO, "integrator.paths=light"])
     if fault == "on whatever is found":
         monkeypatch.setattr(GuidingPilot, "_record", forced(GuidingPilot._record, True))

@@ -1,4 +1,6 @@
-"""How certain a run's values are: verdicts on runs whose truth is known, views, and when nothing is measured."""
+"""Certainty of a run's values. The tests cover verdicts on runs with known true values, views, and runs without a
+measurement.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +109,7 @@ def test_failures_are_reported_with_their_cause(folder, toy):
 
 
 def test_a_value_at_its_bound_without_a_gradient_is_at_its_bound(folder, monkeypatch):
-    """A roughness that ran to its bound, where the lobe is so narrow that no sample differs from 0."""
+    """A roughness reaches its bound, where the lobe is so narrow that no sample differs from 0."""
     monkeypatch.setattr(measuring, "sample_gradient", lambda *given: None)
     options = "initial: 0.6, bounds: [0.4, 1], learning_rate: 0.05"
     toy = Toy("without a gradient", {ALPHA: options, HIDDEN: COLOR}, {ALPHA: BOUND, HIDDEN: NONE},
@@ -145,7 +147,9 @@ HELD = Toy("a texture that is held even", {POSTER: f"{COLOR}, regularizers: [{{t
 
 
 def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
-    """The images alone would have it move; and it is surer than they would have it be."""
+    """The images alone would move the texture. The regularizer makes the texture's spread smaller than the images alone
+    do.
+    """
     sampled, images, gradients = measuring.sample_gradient, [], []
 
     def of_images(problem, *rest):
@@ -172,7 +176,7 @@ def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
 
 
 def test_noisy_curvature_is_measured_again_with_all_samples(folder, monkeypatch):
-    """Where a first look finds no curvature of a colour, a second one does."""
+    """If the first measurement finds no curvature of a colour, a second one with all samples does."""
     asked, along = [], measuring.LossCurvature.along
 
     def hidden(self, changes, go_on):
@@ -206,7 +210,7 @@ def noisy(name: str, loss: str) -> Toy:
 
 
 def test_noise_of_a_rendered_target_is_part_of_the_spread(folder):
-    """By its samples: a quarter of the variance with four times as many. Without it nothing but the run's is left."""
+    """With 16 times as many target samples, the target's part of the spread falls to about a quarter."""
     found = {}
     for spp in (16, 256):
         toy = noisy("a colour", "l2")
@@ -224,7 +228,9 @@ def test_noise_of_a_rendered_target_is_part_of_the_spread(folder):
 @pytest.mark.parametrize("loss", ["l2", "relative_l2"])
 @pytest.mark.parametrize("name", NOISY)
 def test_the_truth_is_within_spreads_with_the_noise_of_the_target(folder, name, loss, monkeypatch):
-    """Over many noisy targets: errors are as large as they are said to be, and most of that is the target's."""
+    """Over many noisy targets, errors are about as large as the spreads. Most of the error comes from the target's
+    noise.
+    """
     z, without, settled = [], [], 0
     for seed in range(12):
         monkeypatch.setattr(targets, "TARGET_SEED", seed)
@@ -312,7 +318,7 @@ SUBPIXELS = 4
 
 
 def write_mask(folder: Path) -> None:
-    """Leave out every pixel that sees anything but the wall."""
+    """Write a mask without the pixels that see anything but the wall."""
     scene = mi.load_file(str(folder / "scene.xml"), optimize=False)
     sensor, (width, height) = scene.sensors()[0], scene.sensors()[0].film().size()
     x, y = np.meshgrid(*(np.arange(SUBPIXELS * size) + 0.5 for size in (width, height)))

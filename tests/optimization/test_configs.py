@@ -1,4 +1,4 @@
-"""Shipped configurations: the stiff ones are stiff, and what moves light is recovered."""
+"""Shipped configurations. The stiff ones are stiff, and parameters that move light are recovered."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MORE = [("plate", "change"), ("wall", "gradient")]
     [("lamp", "change"), *(pytest.param(*each, marks=pytest.mark.long) for each in MORE)],
 )
 def test_sensitivities_differ_by_a_million(name, quantity):
-    """By the parameters' units, or, of single entries, by how many they are."""
+    """The parameters' units cause the difference, or the number of entries for single entries."""
     spp = "run.spp=1024" if name == "wall" else "run.spp=64"
     measured = measure_conditioning(assemble(load(CONFIGS / f"{name}.yaml", [*SMALL, spp])), samples=4)
     assert measured.spread(quantity) > 1e6
@@ -40,7 +40,7 @@ def test_sensitivities_differ_by_a_million(name, quantity):
 
 @pytest.mark.long
 def test_the_mixed_room_is_recovered_if_only_the_mirror_shows_it():
-    """Light paths alone keep the initial values there."""
+    """Light paths alone keep the initial values of the mirrored part."""
     problem = assemble(load(CONFIGS.parent / "mixed_room.yaml"))
     for _ in optimize(problem):
         pass

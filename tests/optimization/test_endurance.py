@@ -1,4 +1,4 @@
-"""Long runs: neither memory nor time grows; clock and allocator against costs that are planted."""
+"""Long runs, in which neither memory nor time grows. Planted costs test the clock and the allocator's peak."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_ten_thousand_iterations(tmp_path: Path, estimator: str) -> None:
 
 @pytest.fixture
 def toy(tmp_path: Path, steps: Any) -> Iterator[Any]:
-    """The toy's step, whose parts can be spoilt, and its problem."""
+    """Toy step, whose parts a test can change, with its problem."""
     steps.problem = make_problem(tmp_path, sets=[f"run.iterations={FEW}"])
     yield steps
     steps.calls.clear()
@@ -56,7 +56,9 @@ def toy(tmp_path: Path, steps: Any) -> Iterator[Any]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_the_loop_does_not_grow(toy: Any) -> None:
-    """Its memory: so few iterations say little of time on a machine whose load changes."""
+    """The test checks only memory, because the time of so few iterations is unreliable on a machine with varying
+    load.
+    """
     watched = watch(loop.optimize(toy.problem), BLOCK)
     print(watched)
     assert [fault for fault in watched.faults() if not fault.startswith("steps")] == []
@@ -110,7 +112,7 @@ SLEEP_S = 0.2
 
 
 def chain(turns: int) -> None:
-    """Launch a kernel whose only cost is a chain of so many dependent operations a lane."""
+    """Launch a kernel whose only cost is a chain of `turns` dependent operations in each lane."""
 
     def turn(number: mi.UInt, value: mi.Float) -> tuple[mi.UInt, mi.Float]:
         return number + 1, dr.fma(value, mi.Float(0.999), mi.Float(0.5))
@@ -122,10 +124,11 @@ def chain(turns: int) -> None:
 
 
 def test_a_kernel_of_known_cost() -> None:
-    """As many times the operations are as many times the time, by the history as by the wall; and twice is twice.
+    """Time grows in proportion to the number of operations, in the kernel history and in wall time. Two launches take
+    twice the time of one.
 
-    Of the least of several repetitions, taken in turns, so that what else the machine does is not in them: more of them
-    where it does much. The same kernel is launched.
+    The test keeps the shortest of several interleaved repetitions, which excludes the machine's other work. A busy
+    machine needs more repetitions. All launches use the same kernel.
     """
     clock = StepClock()
     kernel_ms: dict[int, float] = {}
@@ -174,7 +177,7 @@ def test_time_of_python_does_not_count_as_kernels() -> None:
 
 @pytest.mark.parametrize("what", ["MetricsWriter.write", "save_checkpoint"])
 def test_writing_files_is_not_timed(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A disk that takes 0.2 s for every line, or every checkpoint, which are written after each iteration here."""
+    """Each written line or checkpoint takes 0.2 s. Both are written after each iteration here."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
     holder: Any = recording.MetricsWriter if what == "MetricsWriter.write" else prepare
@@ -210,7 +213,7 @@ def test_temporary_arrays_of_a_step_count_in_the_peak() -> None:
 
 
 def test_a_leak_shows_in_the_peak_of_a_run(tmp_path: Path, steps: Any) -> None:
-    """Two MiB that each iteration leaves behind; without them the peak is flat."""
+    """Each iteration leaves 2 MiB allocated. Without the leak, the peak is flat."""
     peaks: dict[bool, list[float]] = {}
     for leaks in (False, True):
         reset_peak()

@@ -1,4 +1,4 @@
-"""Losses of which brightness is no part: values, gradients, noise, and runs with them."""
+"""Losses that ignore brightness, with tests of values, gradients, noise and runs."""
 
 from __future__ import annotations
 
@@ -84,14 +84,16 @@ def test_a_fitted_loss_ignores_brightness(name):
 
 
 def slopes_along(view, images, directions):
-    """dL/dI of noisy images (N, 2, H, W, C), along directions (K, H, W, C): (N, K)."""
+    """Return dL/dI of noisy images (N, 2, H, W, C) along directions (K, H, W, C), with the shape (N, K)."""
     found = [slope(view.objective, pair).reshape(-1, *directions.shape[1:]).sum(axis=0) for pair in images]
     return np.einsum("nhwc,khwc->nk", np.array(found, dtype=np.float64), directions)
 
 
 @pytest.mark.parametrize("name", ["l2", "relative_l2"])
 def test_noise_leaves_a_fitted_gradient_unbiased(name):
-    """The mean of dL/dI of noisy halves is that of the mean image; one image in place of halves shows the noise."""
+    """The mean of dL/dI over noisy halves equals dL/dI of the noise-free image. With one image in place of halves,
+    noise biases dL/dI.
+    """
     rng = np.random.default_rng(4)
     image, target = (each + 0.3 for each in images((24, 24, 1)))
     view = view_of(name, target, None)
@@ -108,8 +110,9 @@ def test_noise_leaves_a_fitted_gradient_unbiased(name):
 
 @pytest.mark.parametrize("size", [8, 32])
 def test_the_bias_of_the_scale_matches_the_docs(size):
-    """s is too large by 2 to 3 v / n, v the relative variance of a half's pixels, n their number; of one image it would
-    be too small by v / (2 + v)."""
+    """Let v be the relative variance of a half's n pixels. Then s is too large by 2 v / n to 3 v / n. From one image, s
+    would be too small by v / (2 + v).
+    """
     rng, noise = np.random.default_rng(5), 0.25
     image = rng.uniform(0.3, 2, (size, size, 1))
     view = view_of("l2", image, None)
@@ -189,7 +192,9 @@ def test_a_step_is_unbiased_through_halves(folder, adjoint):
     ("reslrb", "correlated"), ("walk_ad", "correlated"), ("ptracer", "correlated"),
 ])  # fmt: skip
 def test_halves_are_the_samples_of_a_step(folder, type, adjoint):
-    """Of a loss that sees the image alone, a step of halves is as good as any other."""
+    """For a loss that depends only on the image, gradients of a step with halves agree with gradients of any other
+    step.
+    """
     problem = make(folder, f"integrator={{type: {type}, max_depth: 3}}", "loss.scale=none")
     [view], rows, images = problem.views, {True: [], False: []}, []
     problem.apply()
@@ -242,7 +247,7 @@ def test_a_whole_image_is_the_mean_of_its_halves():
 
 
 def test_each_view_including_held_out_ones_has_its_own_factor(folder):
-    """Light is scattered once, so that half the reflectance makes half the image, which no loss sees."""
+    """Light is scattered once, so that half the reflectance gives half the image. No loss detects this change."""
     write_experiment(folder, scene_seen("0, 0, 4", "1, 0, 4"))
     problem = make(folder, "views=[{sensor: 0}, {sensor: 1}]", "run.held_out=[1]", "run.spp=16")
     values, found = problem.values(), []

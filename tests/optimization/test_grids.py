@@ -1,4 +1,4 @@
-"""Grids that are made of rectangles, so that heightmaps can displace them."""
+"""Rectangles turned into grids, so that heightmaps can displace them."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_a_mesh_of_four_vertices_becomes_a_grid(tmp_path, with_quad):
 
 
 def test_a_flat_grid_can_be_refined(tmp_path):
-    """Over the same square, its outside where it was."""
+    """The grid covers the same square, and its normals are unchanged."""
     from reslrb_cli.optimization.assemble import assemble_scene
 
     plain = assemble_scene(configured(tmp_path, "mesh: face, resolution: [4, 4]"))

@@ -1,4 +1,6 @@
-"""`guiding: auto`: decided on fabricated steps and in whole runs of a small scene; and what `sequence: auto` shares."""
+"""`guiding: auto`, tested with simulated steps and in whole runs of a small scene. Some tests also cover `sequence:
+auto`.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +91,7 @@ def decided(monkeypatch: pytest.MonkeyPatch, guided_ms: float, *settings: str, *
 def test_on_enables_guiding_and_off_removes_it(
     option: str, adjoint: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Off, a step's kernels are, operation by operation, those of who says so."""
+    """With the option off, a step's kernels equal those of a run without `auto`, operation by operation."""
     counts, name = [], FIELD[option]
     for other_ms, asked in ((0.1, True), (1000.0, True), (0.1, False)):
         fix_times(monkeypatch, {option: other_ms})
@@ -151,7 +153,9 @@ def test_images_are_not_guided_if_it_does_not_pay(experiment: Path, monkeypatch:
 
 
 def seeds_of_parts(monkeypatch: pytest.MonkeyPatch, experiment: Path) -> tuple[set[int], set[int]]:
-    """The seeds of walks that a table learned from, and those of steps; whatever learned in between has failed."""
+    """Return the seeds of walks from which a table learned, and the seeds of steps. The function fails if the table
+    learns during the steps.
+    """
     drawn: dict[str, set[int]] = {"learn": set(), "take": set()}
     problem = assemble(load("tiny.yaml", AUTO[1:]))
     plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
@@ -189,7 +193,7 @@ def test_learning_paths_are_not_used_for_the_decision(experiment: Path, monkeypa
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("fault", ["seeds", "held"])
 def test_faults_of_the_decision_are_found(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps with the seeds of what was learned from; a table that goes on learning from what it is judged by."""
+    """Two faults are planted. Steps reuse the seeds of learning, or a table learns from the steps that judge it."""
     if fault == "seeds":
         monkeypatch.setattr(StepTrial, "_seed", lambda self, round, view, what: round)
         learned, judged = seeds_of_parts(monkeypatch, experiment)
@@ -243,7 +247,7 @@ def test_a_run_reports_remembers_and_records_the_decision(
 
 @pytest.mark.usefixtures("llvm")
 def test_a_resumed_run_keeps_the_decision_bit_by_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Guided or not, and from which sequence: decided once, and restored."""
+    """Guiding and the sequence are decided once, and a resumed run restores both decisions."""
     begin_alone(tmp_path, monkeypatch)
     fix_times(monkeypatch, {"guiding": 0.2, "sequence": 0.1, "sequence alone": 1000.0})
     settings = [
@@ -299,7 +303,9 @@ def test_a_damaged_record_is_measured_again(experiment: Path, monkeypatch: pytes
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("option", ["guiding", "sequence"])
 def test_comparisons_and_scripts_need_an_explicit_choice(option: str) -> None:
-    """In measurements `auto` of the experiment is off, and is refused where somebody writes it."""
+    """In measurements, the experiment's `auto` counts as off. An `auto` in a list of methods or in a script is
+    refused.
+    """
     named = ("on", "off") if option == "guiding" else WORDS[option]
     config = load(Path(__file__).parents[2] / "configs" / "furnace.yaml")
     [plain, asked] = parse_cases(f"reslrb:stack,reslrb:gather({option}=auto)")
@@ -325,7 +331,7 @@ def test_an_explicit_choice_is_not_measured(option: str, experiment: Path, monke
 
 
 def gain(world: World, sizes: Sizes = SIZES) -> float:
-    """The true gain of a world: by hand."""
+    """Return the true gain of a world, computed by hand."""
     learning = (world.walk * sizes.part + world.python) / sizes.call
     return 1 / (world.variance * (world.time + learning * sizes.lessons))
 
@@ -357,7 +363,9 @@ def test_it_is_on_if_it_pays(world: World, on: bool) -> None:
 @pytest.mark.parametrize("entries", [3, 200])
 @pytest.mark.parametrize("sparse", [False, True])
 def test_the_interval_of_the_gain_has_its_coverage(entries: int, sparse: bool) -> None:
-    """Without what single times may be off, the level is the nominal one; learning is a part of the gain."""
+    """Without the allowance for timing errors, the interval has its nominal level. The gain includes the cost of
+    learning.
+    """
     inside = 0
     for seed in range(100):
         world = World(0.25, 2.0, walk=3.0, python=40.0, sparse=sparse, entries=entries, seed=seed)
@@ -371,7 +379,7 @@ def test_the_interval_of_the_gain_has_its_coverage(entries: int, sparse: bool) -
 
 
 def on_by_accident(**world: Any) -> int:
-    """Of 100 worlds, in how many it is on."""
+    """Count the worlds, out of 100, with guiding on."""
     return sum(World(**world, seed=seed).run().guided for seed in range(100))
 
 
@@ -385,14 +393,15 @@ def test_it_is_rarely_on_if_it_does_not_pay() -> None:
 
 
 def test_a_decision_without_the_cost_of_learning_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As it is seen by the tests above: the same worlds are called better then."""
+    """Without the cost of learning, guiding is enabled in most worlds where it gains nothing."""
     monkeypatch.setattr(GuidingPilot, "_more_ms", lambda self: 0.0)
     assert on_by_accident(variance=0.8, walk=0.7, python=16.8) > 50
 
 
 def test_a_run_pays_for_its_amount_of_learning() -> None:
-    """What is worth nothing where a table learns from each seventh set of samples is worse where it learns from most of
-    them, as in a short run, and better where it rarely does."""
+    """A world has no gain where a table learns from each seventh set of samples. The gain falls where the table learns
+    from most sets, as in a short run, and rises where the table rarely learns.
+    """
     world, gains = {"variance": 0.8, "walk": 0.7, "python": 16.8}, []
     for learned in (3 / 4, SIZES.lessons, 1 / 16):
         sizes = replace(SIZES, lessons=learned)
@@ -425,7 +434,7 @@ def test_its_share_of_the_time_is_kept(spp: int, overhead: float, python: float,
 
 
 def test_costs_outside_kernels_count_as_often_as_in_a_run() -> None:
-    """Half the variance for three times the kernels pays where these are a small part of what is waited for."""
+    """Half the variance at three times the kernel time pays off where kernels are a small part of the elapsed time."""
     world = World(0.5, 3.0, overhead=160.0)
     record, trial = world.run(), SIZES.trial
     python = world.overhead * trial / SIZES.call
@@ -471,7 +480,7 @@ def test_images_with_their_own_samples_are_guided_if_it_pays() -> None:
 
 
 def test_unclear_results_are_measured_longer() -> None:
-    """What is, is not; and nothing is beyond its share."""
+    """Only close results are measured longer, and all stay within their share."""
     assert World(0.1, 2.2).run().rounds == SIZES.rounds
     assert World(3.0, 1.0).run().rounds == SIZES.rounds
     close = World(0.8, 1.0, walk=0.1)
@@ -537,7 +546,7 @@ def test_a_run_learns_as_often_as_planned(
 
 @pytest.mark.parametrize("lesson", [0.0, 0.5, 3.0])
 def test_the_cost_of_learning_counts_as_often_as_in_a_run(lesson: float) -> None:
-    """Learning is among the steps that are timed twice in ten times, and in two of three."""
+    """Learning occurs in two of ten timed steps, or in two of three."""
     for learned in ([0, 0, 1, 0, 0, 0, 0, 0, 1, 0], [2, 0, 1]):
         times = [1.0 + lesson * count for count in learned]
         for mean in (0.0, 0.08, 2.0):

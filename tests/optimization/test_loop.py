@@ -1,4 +1,4 @@
-"""The loop: what it records, what it does with values that are not finite, and with outliers."""
+"""The optimization loop, with tests of its records and its treatment of non-finite values and outliers."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ def test_records_follow_gradient_descent(tmp_path, steps):
 
 
 def test_the_time_limit_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch):
-    """A clock that every look at it moves by a second: iterations after the first take equally long."""
+    """Each reading of the clock advances time by one second, so that all iterations after the first take equally
+    long.
+    """
     seconds = itertools.count()
     monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
 
@@ -99,7 +101,9 @@ def test_each_view_and_iteration_has_its_own_seed(tmp_path, steps):
 
 
 def test_equal_states_have_equal_successors(tmp_path, steps):
-    """A step is a function of its state: one that was left behind is come back to, and what it was given stays."""
+    """A step depends only on its state. An earlier state can be restored, and a step leaves its input state
+    unchanged.
+    """
     sets = ["optimizer.clamp_gradient=1.1", "optimizer.type=adam"]
     problem = steps.problem = make_problem(tmp_path, sets=sets, keys=("albedo", "other"))
     begun = standing(problem)
@@ -183,7 +187,9 @@ def test_it_gives_up_if_everything_is_non_finite(tmp_path, steps):
 
 
 def run(problem, found=None):
-    """All records, and the mean of each parameter after each of them; a run that ends early ends both."""
+    """Return all records, the mean of each parameter after each record, and the error. A run that ends early ends both
+    lists.
+    """
     records, values, error = [], {key: [] for key in problem.selection.keys}, None
     try:
         for record in loop.optimize(problem, (found if found is not None else []).append):
@@ -197,14 +203,14 @@ def run(problem, found=None):
 
 
 def one_entry(value):
-    """A factor of a gradient that leaves all but one entry as they are."""
+    """Return a gradient factor that is `value` in one entry and 1 elsewhere."""
     factor = np.ones((2, 2, 3), np.float32)
     factor[1, 0, 2] = value
     return mi.TensorXf(factor)
 
 
 def nan_pixel(call, calls):
-    """A derivative of the loss that is NaN in one entry in some calls."""
+    """Return a dL/dI of zeros that has NaN in one entry in the given calls."""
     derivative = np.zeros((2, 2, 3), np.float32)
     derivative[1, 0, 1] = np.nan if call in calls else 0
     return mi.TensorXf(derivative)
@@ -263,7 +269,7 @@ def test_zero_continues_while_something_moves(tmp_path, steps):
 
 @pytest.mark.parametrize("kind", ["stop", "skip", "zero"])
 def test_a_derivative_of_the_loss_is_refused_by_each_policy(tmp_path, steps, kind):
-    """The step takes it for 0: what becomes of the rest is the policy's."""
+    """The step replaces the non-finite entry by 0. The policy decides about the rest of the iteration."""
     problem = make_problem(tmp_path, views=2, sets=[f"run.on_nonfinite={kind}", "run.iterations=4"])
     steps.derivative = lambda call: nan_pixel(call, (3,))  # the second view of iteration 1
     records, values, error = run(problem)
@@ -329,7 +335,7 @@ def leaf(kind, shape):
 
 
 def clamp_all(factor, gradients, kind=None):
-    """Clamp gradients (T, ...) in turn; the clamped ones, and what was said of each."""
+    """Clamp gradients (T, ...) in turn. Return the clamped gradients and the report on each."""
     parameter = leaf(mi.TensorXf, gradients[0].shape) if kind is None else leaf(kind, 1)
     clamped, said, known = [], [], ({}, {})
     for gradient in gradients:
@@ -342,7 +348,7 @@ def clamp_all(factor, gradients, kind=None):
 
 
 def reference(gradients, k):
-    """The same in NumPy."""
+    """Clamp the gradients in NumPy."""
     m, result = np.zeros(gradients[0].shape), []
     for number, g in enumerate(gradients):
         usual = m / (1 - DECAY**number) if number else np.inf
@@ -354,7 +360,7 @@ def reference(gradients, k):
 
 @pytest.fixture
 def heavy_tailed():
-    """Gradients (50, 4, 5, 3) of a Pareto law, of either sign, one entry of which is always 0 but once."""
+    """Gradients (50, 4, 5, 3) of a Pareto distribution with random signs. One entry is 0 in all gradients but one."""
     random = np.random.default_rng(3)
     gradients = random.pareto(1.5, (50, 4, 5, 3)) * random.choice([-1, 1], (50, 4, 5, 3))
     gradients[:, 0, 0, 0] = 0
@@ -377,7 +383,9 @@ def test_the_clamp_matches_its_docstring(heavy_tailed):
 
 
 def test_symmetric_outliers_are_no_bias():
-    """Outliers of both signs in turn: each takes a share of its gradient, and together they take nothing."""
+    """Outliers alternate in sign. Clamping each outlier removes a share of its gradient, and together these changes
+    nearly cancel.
+    """
     gradients = np.ones((41, 1, 1, 3), np.float32)
     gradients[1::2, 0, 0, 1] = np.where(np.arange(20) % 2, 1000, -1000)
     _, said = clamp_all(3.0, gradients)
@@ -423,7 +431,7 @@ def test_later_iterations_compile_nothing():
 
 
 def outlier(call, key):
-    """A factor of 1000 in one entry of the third gradient."""
+    """Return a factor of 1000 in one entry of the third gradient, and 1 elsewhere."""
     factor = np.ones((2, 2, 3), np.float32)
     factor[0, 1, 2] = 1000 if call == 2 else 1
     return mi.TensorXf(factor)

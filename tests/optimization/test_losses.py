@@ -1,4 +1,4 @@
-"""Losses, exposures and masks: values, gradients, and what counts."""
+"""Losses, exposures and masks, with tests of values, gradients and the weights of pixels."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_a_nan_is_not_hidden(name):
 
 
 def textured(shape=(17, 14, 3), seed=5):
-    """An image with structure, and one that is like it, float32."""
+    """Return an image with structure and a similar image, both float32."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     base = 0.6 + 0.3 * np.sin(rows / 2)[:, :, None] * np.cos(columns[:, :, None] / 3 + np.arange(shape[2]))
@@ -115,7 +115,7 @@ def test_ssim_of_bright_images_keeps_its_digits(level):
 
 
 def test_ssim_of_faint_structure_on_a_bright_ground_keeps_its_digits():
-    """Squares of single precision have none left of it."""
+    """In single precision, squares have no digits left of the structure."""
     image, target = (200 + each for each in textured())
     expected = structural_similarity(
         image.astype(np.float64), target.astype(np.float64), channel_axis=2, gaussian_weights=True, sigma=1.5,
@@ -126,7 +126,7 @@ def test_ssim_of_faint_structure_on_a_bright_ground_keeps_its_digits():
 
 
 def differences(loss, image, rng, step):
-    """A derivative along a random direction by Dr.Jit, and by central differences."""
+    """Return a derivative along a random direction, once by Dr.Jit and once by central differences."""
     direction = rng.uniform(-1, 1, image.shape).astype(np.float32)
     attached = mi.TensorXf(image)
     dr.enable_grad(attached)
@@ -164,7 +164,9 @@ def test_gradients_of_new_losses_against_finite_differences(name, masked):
 
 @pytest.mark.parametrize(("name", "biased"), [("l2", False), ("ssim", True)])
 def test_gradients_that_image_noise_biases(name, biased):
-    """As with `independent` and `batched`, where dL/dI comes from samples of its own: its mean over noisy images."""
+    """Over noisy images, the mean dL/dI of `l2` is unbiased, and that of `ssim` is biased. `independent` and `batched`
+    also take dL/dI from separate samples.
+    """
     rng = np.random.default_rng(11)
     image, target = textured((16, 16, 1))
     view = View(0, make_loss(name))
@@ -283,9 +285,9 @@ def set_exposure(problem, values):
 @pytest.mark.parametrize("kind", AT)
 @pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
 def test_the_gradient_equals_that_of_the_mean_image(folder, kind, adjoint):
-    """dL/dE of `l2` is the sum of 2 (E I - T) I over all entries, over their number; I is the mean image.
+    """dL/dE of `l2` is the sum of 2 (E I - T) I over all entries, divided by their number. I is the mean image.
 
-    With the samples of dL/dI the noise of I would add its variance, which `correlated` shows.
+    If I and dL/dI share samples, the noise of I adds its variance. `correlated` shows this bias.
     """
     problem = make(folder, f"target.exposure={kind}", f"run.adjoint={adjoint}", "run.spp=8")
     set_exposure(problem, AT[kind])
@@ -303,7 +305,7 @@ def test_the_gradient_equals_that_of_the_mean_image(folder, kind, adjoint):
 
 @pytest.mark.parametrize("exposure", ["target.exposure=auto", "views=[{sensor: 0, exposure: auto}]"])
 def test_indistinguishable_parameters_are_refused(folder, exposure):
-    """All light, or all that it falls on directly, scales the image as the exposure does."""
+    """Parameters of all light, or of everything that light reaches directly, scale the image as the exposure does."""
     wall = make(folder, exposure, "integrator.max_depth=2")
     with pytest.raises(ConfigError, match=f"cannot distinguish `exposure.*` from `{KEY}`") as error:
         check_exposures(wall)
@@ -350,7 +352,7 @@ GLASS = """
 
 @pytest.fixture
 def masked_folder(tmp_path):
-    """The tiny experiment, with a PNG of 8 bits and an EXR as photographs."""
+    """Folder with the tiny experiment, and with an 8-bit PNG and an EXR as photographs."""
     write_experiment(tmp_path)
     rng = np.random.default_rng(1)
     pixels = rng.integers(40, 200, (8, 8, 4), dtype=np.uint8)
@@ -371,7 +373,7 @@ def make_masked(folder, *sets):
 
 
 def left_out(problem):
-    """The pixels (y, x) that have no weight."""
+    """Return the pixels (y, x) without weight."""
     [view] = problem.views
     return [] if view.weights is None else [tuple(at) for at in np.argwhere(np.array(view.weights)[:, :, 0] == 0)]
 
@@ -425,7 +427,9 @@ def test_pixels_mixed_with_clipped_ones_are_excluded(masked_folder):
 
 
 def test_a_file_can_show_the_values_of_the_scene(masked_folder):
-    """As pictures of other renderers do; the parameters' errors are then those from the scene's own values."""
+    """A file can show the scene's own values, as pictures of other renderers do. The parameters' errors are then
+    measured from the scene's own values.
+    """
     assert not make_masked(masked_folder, "target.file=photo.png")[0].truth
     problem, _ = make_masked(masked_folder, "target.file=photo.png", "target.truth=true")
     rendered = assemble(load(masked_folder / "tiny.yaml", []))
@@ -436,7 +440,7 @@ def test_a_file_can_show_the_values_of_the_scene(masked_folder):
 
 
 def test_photograph_and_weights_are_rotated_by_their_own_exif(masked_folder):
-    """The same picture upright, and upside down with an EXIF that says so, make the same target and mask."""
+    """The same picture upright, and upside down with a matching EXIF orientation, gives the same target and mask."""
     from PIL import Image  # comes with matplotlib
 
     pixels = np.random.default_rng(2).integers(40, 200, (8, 8, 3), dtype=np.uint8)
@@ -519,7 +523,7 @@ def test_an_empty_mask_is_refused(masked_folder):
 
 
 def test_excluded_pixels_do_not_count(masked_folder):
-    """Neither gradients, as the pilot takes them, nor sensitivities see what an alpha of 0 hides."""
+    """Pixels with an alpha of 0 affect neither the gradients, as the pilot takes them, nor the sensitivities."""
     found = []
     for value in (60, 200):
         pixels = np.array(mi.Bitmap(str(masked_folder / "photo.png")))

@@ -1,4 +1,4 @@
-"""Parameters that move light: their gradients, what is recorded of a step, and what is refused, located."""
+"""Parameters that move light: gradients, recorded steps, and located errors for unsupported parameters."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STEPS = {"translation": 1e-2, "rotation": 0.3, "scale": 1e-2, "heightmap": 2e-3}
 
 
 def weights() -> mi.TensorXf:
-    """A smooth dL/dI that vanishes at the film's border."""
+    """Return a smooth dL/dI that vanishes at the film's border."""
     y, x = (np.mgrid[0:24, 0:24] + 0.5) / 24
     inside = np.clip((np.minimum.reduce([x, 1 - x, y, 1 - y]) - 0.05) / 0.2, 0, 1)
     image = np.stack([np.sin(5 * x) * np.cos(4 * y) + 1.5, np.cos(3 * x + 2 * y) + 1.2, x + y], -1)
@@ -80,7 +80,7 @@ def test_gradients_match_finite_differences(tmp_path):
 
 
 def glass_at(problem: Any, values: dict[str, np.ndarray]) -> Any:
-    """The problem with other values, from which the optimiser goes on."""
+    """Give the problem other values, from which the optimiser continues, and return the problem."""
     for key, value in values.items():
         kind = type(problem.optimizer[key])
         new = kind(np.ascontiguousarray(value)) if value.ndim else kind(float(value))
@@ -108,7 +108,7 @@ def test_a_recorded_step_follows_moving_parameters(tmp_path):
 
 @pytest.fixture(scope="module")
 def norm_of_all_samples(llvm, tmp_path_factory) -> float:
-    """The gradient's norm in a step of more samples, in one pass."""
+    """Norm of the gradient of a step with more samples, in one pass."""
     path = glass.write_experiment(tmp_path_factory.mktemp("all"))
     one = assemble(load(path, ["run.adjoint=independent", "run.iterations=1", "run.spp=64"]))
     one = find_reached(one)
@@ -124,7 +124,7 @@ def norm_of_all_samples(llvm, tmp_path_factory) -> float:
     ),
 )
 def test_steps_of_several_backward_passes_add_up(tmp_path, options, norm_of_all_samples):
-    """Batches and passes propagate more than once through what moves, from one set of values."""
+    """Batches and passes propagate gradients several times through the moving parameters, from one set of values."""
     path = glass.write_experiment(tmp_path)
     problem = assemble(load(path, [options, "run.iterations=1"]))
     problem = find_reached(problem)

@@ -1,4 +1,4 @@
-"""Glass that moves, seen in a picture by camera paths: its mask moves with it."""
+"""Moving glass, seen in a picture by camera paths. The mask moves with the glass."""
 
 from __future__ import annotations
 
@@ -63,7 +63,9 @@ def seen_by(problem: Problem) -> np.ndarray:
 
 
 def test_the_mask_follows_the_glass(llvm: str, tmp_path: Path) -> None:
-    """In the whole film, in that of a stage, and on a worker; and the loss of the true place has noise alone."""
+    """The mask follows the glass in the whole film, in a stage's film, and on a worker. At the true place, the new mask
+    leaves less than a tenth of the loss.
+    """
     problem = make(tmp_path)
     coarse, [view] = at_stage(problem, 0), problem.views
     start, before, began = left_out(problem), view.weights, seen_by(coarse)
@@ -88,7 +90,7 @@ def test_the_mask_follows_the_glass(llvm: str, tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_glass_ball_is_found_in_a_picture(llvm: str, tmp_path: Path) -> None:
-    """Within 2 % of its size, which is 1; with the mask of the start it ends 0.9 away."""
+    """The ball ends within 2 % of its size, which is 1. With the mask of the start, the ball ends 0.9 away."""
     sets = ["run.iterations=300", "run.spp=32", "run.stages=[]", "optimizer.schedule=cosine", "scene.options.size=64"]
     sets += ["parameters[0].initial=[0.25, 0.3, 0]", "parameters[0].learning_rate=0.02"]
     problem = make(tmp_path, *sets)

@@ -1,4 +1,4 @@
-"""Optimisers against their published formulas, and reparameterisations."""
+"""Optimisers, compared with their published formulas, and reparameterisations."""
 
 from __future__ import annotations
 
@@ -48,7 +48,9 @@ def make(type="sgd", value=START, options=None, rate=None, bounds=None):
 
 
 def descend(optimizer, gradient=lambda p: 2 * (p - TARGET)):
-    """Put the gradient of |p - TARGET|² (or `gradient`, from NumPy) into the optimiser."""
+    """Backpropagate the gradient of |p - TARGET|² (or `gradient`, from NumPy) into the optimiser. Return the
+    optimiser's gradient.
+    """
     value = optimizer["p"]
     wanted = mi.TensorXf(np.array(gradient(np.array(value)), dtype=np.float32))
     dr.backward(dr.sum(value * wanted, axis=None))
@@ -70,8 +72,9 @@ def test_updates_follow_the_formula(type, options, reference):
 
 
 def test_adam_as_configured_soon_forgets_a_large_first_gradient():
-    """A value 0.6 away from the minimum, whose first gradient is 100 times larger than the loss says: it arrives within
-    200 steps of 0.02. With a `beta_2` of 0.999 it takes 600."""
+    """A value starts 0.6 away from the minimum. Its first gradient is 100 times larger than the loss implies. The value
+    arrives within 200 steps at a rate of 0.02. With a `beta_2` of 0.999, it takes 600 steps.
+    """
     rate, value = 0.02, mi.TensorXf(np.array([0.8], dtype=np.float32))
     options = AdamSettings().own_options()
     optimizer = Optimizer("adam", rate, options, {"p": value}, {"p": None}, {"p": None})
@@ -168,7 +171,9 @@ def test_schedules_at_half_time():
 
 
 def test_step_lengths_at_given_values():
-    """In the scene's unit, by way of what is moved; with plain gradient descent that depends on the gradient."""
+    """Step lengths are in the scene's unit, also under a transform. With plain gradient descent, the length depends on
+    the gradient and is None.
+    """
     start = mi.Float(2.0)
     for kind, transform, bounds, step in (
         ("adam", "none", None, RATE), ("sgd", "none", None, None),
@@ -213,7 +218,7 @@ def test_a_transform_is_inverted(name, bounds, values, length):
 
 @pytest.mark.parametrize(("name", "bounds", "values"), TRANSFORMS)
 def test_the_chain_rule_matches_finite_differences(name, bounds, values):
-    """L = sum of x², so that dL/dx = 2 x; the difference is taken in double precision."""
+    """L is the sum of x², so that dL/dx = 2 x. The finite difference is computed in double precision."""
     variable = Variable(make_transform(name, bounds), bounds, length=0.5, gain=3.0)
     v = variable.from_scene(numbers(values))
     found = np.array(variable.chain(v, 2 * variable.to_scene(v)))
@@ -259,7 +264,7 @@ def test_values_reach_the_bounds_and_return(name, bounds, low, high):
 
 
 def adam_in_u(name, bounds, target, steps, rate):
-    """Adam on (x - target)², by its formula, in double precision."""
+    """Return the result of Adam on (x - target)², by its formula, in double precision."""
     transform = {
         "sigmoid": lambda u: (1 / (1 + np.exp(-u)), np.exp(-u) / (1 + np.exp(-u)) ** 2),
         "log": lambda u: (np.exp(u), np.exp(u)),
@@ -343,7 +348,7 @@ def test_the_state_holds_the_variable():
 
 
 def sphere_mesh():
-    """Vertices (3 n) and triangles (3 m) of a coarse sphere whose seam has two indices for each place."""
+    """Return vertices (3 n) and triangles (3 m) of a coarse sphere. Each place on its seam has two indices."""
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 13), np.linspace(0.2, np.pi - 0.2, 8))
     points = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
     points[:, -1] = points[:, 0]
@@ -377,7 +382,7 @@ def test_smoothing_its_inverse_and_the_gradient_between(kind):
 
 
 def test_a_length_is_independent_of_the_resolution():
-    """A cosine of wavelength w is damped by 1 / (1 + (2 pi l / w)^2), however fine the map."""
+    """A cosine of wavelength w is damped by 1 / (1 + (2 pi l / w)^2) at any resolution of the map. The length is l."""
     damped = []
     for size in (32, 128):
         wave = np.cos(2 * np.pi * 2 * (np.arange(size) + 0.5) / size)[:, None, None] * np.ones((1, size, 1))

@@ -1,4 +1,4 @@
-"""Losses that users have written: what is run and when, what comes of it, and what is refused."""
+"""Losses written by users: when their code runs, the results, and refused losses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`paths: auto`: which paths a run traces, decided on steps of a small scene, and what it makes of its target."""
+"""`paths: auto`: the paths of a run, decided on steps of a small scene, and the run's target."""
 
 from __future__ import annotations
 
@@ -54,14 +54,17 @@ def decided(
     monkeypatch: pytest.MonkeyPatch, other_ms: float, *settings: str, cache: PilotCache | None = None,
     apart: dict[float, float] | None = None,
 ) -> Problem:  # fmt: skip
-    """The problem, where steps of another share take so many times as long as those of the best so far; those of some
-    shares `apart`."""
+    """Return the problem with given step times. Steps of another share take `other_ms` times as long as steps of the
+    best share so far. `apart` gives separate times for some shares.
+    """
     fix_times(monkeypatch, {f"paths {share:g}": (apart or {}).get(share, other_ms) for share in OTHERS})
     return assemble(load("tiny.yaml", [*AUTO, *settings]), cache=cache)
 
 
 def _put_glass() -> None:
-    """A ball of glass, and a point in place of the lamp: of its light no camera path finds what the ball gathers."""
+    """Put a glass ball into the scene, and a point emitter in place of the lamp. No camera path finds the light that
+    the ball gathers.
+    """
     scene = Path("scene.xml")
     scene.write_text(scene.read_text().split('<shape type="rectangle" id="lamp">')[0] + GLASS)
 
@@ -71,7 +74,7 @@ def share_of(problem: Problem) -> tuple[str, float]:
 
 
 def test_camera_paths_are_tried_first_if_they_find_all_light(monkeypatch: pytest.MonkeyPatch):
-    """All surfaces are diffuse."""
+    """All surfaces of the scene are diffuse."""
     problem = decided(monkeypatch, 100.0, apart={0.0: 0.01})
     assert problem.sides is not None
     assert (problem.sides.paths, problem.sides.light_share) == ("camera", 0.0)
@@ -80,7 +83,9 @@ def test_camera_paths_are_tried_first_if_they_find_all_light(monkeypatch: pytest
 
 
 def test_a_faster_share_is_pursued_to_the_end(monkeypatch: pytest.MonkeyPatch):
-    """A few light paths after all, and then more; and from a half on fewer, where there have to be some."""
+    """The trials add a few light paths to camera paths alone, and then more. Where light paths are better or necessary,
+    trials start from a half and take fewer.
+    """
     assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[0])
     assert share_of(decided(monkeypatch, 0.01, apart={FEWER[0]: 100.0})) == ("both", FEWER[1])
     assert share_of(decided(monkeypatch, 0.01, apart={0.0: 100.0})) == ("both", FEWER[1])
@@ -118,7 +123,9 @@ def test_the_decision_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 def test_only_light_paths_that_find_everything_are_guided(monkeypatch: pytest.MonkeyPatch):
-    """With the border of both, which the target has; and that is what goes on from a checkpoint."""
+    """Guided light paths keep the film's border as `paths: both` does, and the target has this border. A resumed run
+    keeps the border too.
+    """
     fix_times(monkeypatch, {f"paths {share:g}": 100.0 for share in OTHERS} | {"guiding": 1e-6})
     problem = assemble(load("tiny.yaml", [*AUTO, "integrator.guiding=auto"]))
     assert problem.guided.guided
@@ -145,7 +152,7 @@ def test_light_paths_find_all_except_mirrors_and_light_hidden_by_lamps():
 
 
 def test_camera_paths_find_all_except_light_from_gloss_and_glass():
-    """Unless all light comes straight from the lamps."""
+    """At depth 2, all light comes straight from the lamps. Camera paths then find all light."""
     room: dict[str, Any] = {
         "type": "scene", "wall": {"type": "rectangle", "bsdf": {"type": "roughconductor"}},
         "lamp": {"type": "sphere", "center": [0, 0, 1], "radius": 0.2, "emitter": {"type": "area"}},
@@ -159,7 +166,7 @@ def test_camera_paths_find_all_except_light_from_gloss_and_glass():
 
 
 def test_a_short_run_uses_camera_paths_if_they_find_all_light():
-    """In the furnace they have a thousand times the efficiency, and more."""
+    """In the furnace, camera paths have at least a thousand times the efficiency."""
     problem = assemble(load(ROOT / "configs" / "furnace.yaml", ["target.render.spp=64"]))
     assert problem.config.run.measuring == 0.1
     assert (problem.sides.paths, problem.integrator.paths) == ("camera", "camera")
@@ -168,7 +175,7 @@ def test_a_short_run_uses_camera_paths_if_they_find_all_light():
 
 @pytest.mark.parametrize("paths", ["auto", "camera"])
 def test_camera_paths_of_a_guided_run_are_unchanged(paths: str, monkeypatch: pytest.MonkeyPatch):
-    """Whether they were found to pay or asked for: no table says where they begin."""
+    """No table determines where camera paths begin, whether camera paths were found to pay or were requested."""
     fix_times(monkeypatch, {f"paths {share:g}": 0.01 if share == 0 else 100.0 for share in OTHERS})
     words = [*SMALL, "integrator.guiding=on", "integrator.estimator=stack", f"integrator.paths={paths}"]
     assert optimize("tiny.yaml", *tiny.settings(*words)) == 0
@@ -179,7 +186,7 @@ def test_camera_paths_of_a_guided_run_are_unchanged(paths: str, monkeypatch: pyt
 
 
 def test_a_short_run_keeps_its_caustic():
-    """Which no camera path finds, so that they seem to have hardly any noise."""
+    """No camera path finds the caustic. Camera paths therefore seem to have hardly any noise."""
     _put_glass()
     problem = assemble(load("tiny.yaml", [*SHORT, "integrator.max_depth=6"]))
     assert problem.sides.paths == "both"
@@ -188,7 +195,9 @@ def test_a_short_run_keeps_its_caustic():
 
 @pytest.mark.parametrize(("spp", "rounds"), [(1, race.LEAST_ROUNDS), (8, 8), (16, 16), (1024, 16)])
 def test_the_decision_for_camera_paths_uses_all_rounds_without_python_time(spp: int, rounds: int):
-    """In three iterations' worth of samples, or as near to that as the least that says anything comes."""
+    """The rounds use the samples of three iterations. If these samples allow too few rounds for a result, the minimum
+    number of rounds applies.
+    """
     taken: list[race.Step] = []
 
     def take(other: bool, round: int, samples: int) -> race.Step:
@@ -251,7 +260,7 @@ def test_a_resumed_run_keeps_its_paths(settings: list[str], monkeypatch: pytest.
     "integrator", ["{paths: camera}", "{paths: both}", "{type: walk_ad, paths: both}", "{type: walk_ad, paths: camera}"]
 )
 def test_targets_and_images_have_the_same_light(integrator: str):
-    """At the film's border, too, where light paths alone lack what falls off it."""
+    """This also holds at the film's border, where light paths alone lack the light that falls off the film."""
     problem = assemble(load("tiny.yaml", [f"integrator={integrator}", "target.render.spp=256", *SMALL]))
     problem.selection.set_arrays(problem.truth)
     [view] = problem.views
@@ -263,7 +272,9 @@ def test_targets_and_images_have_the_same_light(integrator: str):
 
 
 def test_auto_distributes_paths_only_for_l2(monkeypatch: pytest.MonkeyPatch):
-    """Also with a mask; the pixels that are left out have no extra paths, nor by a loss for which the user asks."""
+    """`pixels: auto` distributes paths for `l2` only, also with a mask. Masked pixels get no extra paths, even if the
+    user requests `measured` for another loss.
+    """
     monkeypatch.setattr(sampling, "noted_part", lambda paths, spp: 0.01)
     weights = np.ones((32, 32, 3), np.float32)
     weights[:4] = 0
@@ -285,7 +296,9 @@ def test_auto_distributes_paths_only_for_l2(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("epsilon", [0.01, 0.3])
 def test_the_curvature_of_relative_l2_is_the_inverse_squared_target(epsilon: float):
-    """In a grey target; in coloured ones the bright channels count, which have most of the noise."""
+    """The equality holds for a grey target. In coloured targets, bright channels count, because they have most of the
+    noise.
+    """
     view = View(0, make_loss("relative_l2", epsilon=epsilon))
     target, weights = np.geomspace(0.01, 1e8, 24).reshape(4, 6, 1).repeat(3, 2), np.ones((4, 6))
     weights[1, :3] = 0
@@ -296,7 +309,7 @@ def test_the_curvature_of_relative_l2_is_the_inverse_squared_target(epsilon: flo
 
 
 def test_a_memory_budget_includes_the_distribution_of_paths():
-    """Of a film on which what else is allocated counts little."""
+    """The film is so large that other allocations count little."""
 
     def expected(pixels: str) -> int:
         integrator = f"integrator={{estimator: stack, paths: both, pixels: {pixels}}}"

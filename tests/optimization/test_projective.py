@@ -1,4 +1,4 @@
-"""Mitsuba's projective integrators as types: outlines and shadow edges of a box that moves."""
+"""Mitsuba's projective integrators as integrator types, with outlines and shadow edges of a moving box."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ def write_experiment(folder: Path, spot: bool = False) -> Path:
 
 
 def unguided(problem: Problem) -> Problem:
-    """The problem whose integrator builds no octree: that takes 20 s a step here, and 2.7 GB."""
+    """Return the problem with an integrator that builds no octree. Here the octree takes 20 s per step, and 2.7 GB."""
     plugin: Any = problem.integrator
     plugin.plugin.guiding = "none"
     return problem
 
 
 def gradient(problem: Problem, spp: int = 4) -> np.ndarray:
-    """The gradient of the box's place, (3,), with a fixed dL/dI and seed."""
+    """Return the gradient of the box's place, of shape (3,), for a fixed dL/dI and seed."""
     weights = mi.TensorXf(np.random.default_rng(1).normal(size=(16, 16, 3)).astype(np.float32))
     known_step(problem.integrator, problem.scene, 0, weights, seed=3, spp=spp, params=problem.selection.params)
     found = np.array(problem.gradients()[MOVED]).ravel()
@@ -75,7 +75,7 @@ def gradient(problem: Problem, spp: int = 4) -> np.ndarray:
 
 
 def test_a_box_moves_to_its_place(tmp_path: Path) -> None:
-    """The picture is by camera paths; light paths alone move the box the other way."""
+    """Camera paths render the picture. Light paths alone move the box the other way."""
     problem = find_reached(unguided(assemble(load(write_experiment(tmp_path), []))))
     records = list(optimize(problem))
     errors = [records[0].parameter_rmse, problem.selection.array(MOVED) - [0.22, -0.12, 0]]
@@ -140,7 +140,7 @@ def test_measurements_accept_it_like_prb(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_commands_accept_it_like_prb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a colour, which has no silhouettes. The few samples may fail a check."""
+    """The parameter is a colour, which has no silhouettes. With so few samples, a check may fail."""
     kind = "prb_projective"
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Regularizers: derivatives, how little values depend on the resolution, and what a run makes of them."""
+"""Regularizers: derivatives, small dependence on the resolution, and effect on a run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WHOLE = Span(WIDE), Span(HIGH)
 
 
 def waves(n, depth=0.3):
-    """Heights at the centres of n x n texels."""
+    """Return heights at the centres of n x n texels."""
     x, y = np.meshgrid(*[(np.arange(n) + 0.5) / n] * 2)
     return (depth * np.sin(5 * x + 0.4) * np.cos(4 * y + 1.3))[:, :, None]
 
@@ -58,7 +58,7 @@ def test_refining_a_map_keeps_its_cost(name):
 
 
 def test_lengths_are_in_scene_units():
-    """A ball of radius 5 seen from below is a hollow of curvature 1/5; a ramp is as steep as it is."""
+    """A ball of radius 5, seen from below, is a hollow of curvature 1/5. A ramp of slope 2 has a slope of 2."""
     n = 64
     x, y = np.meshgrid(*[((np.arange(n) + 0.5) / n - 0.5) * 2] * 2)
     bowl = (5 - np.sqrt(25 - x**2 - y**2))[:, :, None]
@@ -77,7 +77,9 @@ def test_lengths_are_in_scene_units():
 
 
 def sheet(n, depth=0.3):
-    """Positions and faces of a grid of n x n vertices from edge to edge, and texture coordinates at texels' centres."""
+    """Return positions and faces of a grid of n x n vertices from edge to edge, and texture coordinates at the texels'
+    centres.
+    """
     x, y = np.meshgrid(np.linspace(0, WIDE, n), np.linspace(0, HIGH, n))
     z = depth * np.sin(6 * x / WIDE + 0.4) * np.cos(5 * y / HIGH + 1.3)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
@@ -160,7 +162,7 @@ def test_heights_never_cross_the_back_and_are_counted(tmp_path):
 
 
 def test_vertices_of_a_scene_have_a_laplacian(tmp_path):
-    """Of a flat face it is zero, and one vertex that stands out is pulled back."""
+    """The Laplacian of a flat face is zero. The gradient pulls a vertex that stands out back."""
     problem = regularized(tmp_path, "[{type: laplacian}]", "key: face.vertex_positions")
     key = "face.vertex_positions"
     flat = np.array(problem.selection.array(key), np.float64)
@@ -250,7 +252,9 @@ def test_meaningless_settings_are_refused_in_one_line(case, tmp_path):
 
 
 def facing(high=9, wide=11, there=(6, 7), **settings):
-    """The plate between a map over a face, and one over a back whose columns run the other way."""
+    """Return the plate between a heightmap of a face and a heightmap of a back. The back's columns run the other
+    way.
+    """
     own = sheet(24)[0], sheet(24)[2], (high, wide, 1)
     below = sheet(24)[0] * [1, 1, 0] - [0, 0, 0.5]
     other = below, sheet(24)[2] * [-1, 1] + [1, 0], (*there, 1)

@@ -1,4 +1,4 @@
-"""Results: parameters in a few numbers, their errors, the best of them, and images that are saved."""
+"""Results: parameters in a few numbers, their errors, the best parameters, and saved images."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_results_of_a_run(tmp_path, steps):
 
 @pytest.mark.parametrize(("iterations", "worse"), [(3, ["albedo"]), (4, [])])
 def test_a_short_run_is_called_worse_only_at_its_end(tmp_path, iterations, worse):
-    """Pages of a run that goes on ask from its first iterations on."""
+    """Pages of an unfinished run request these results from the first iterations on."""
     problem = make_problem(tmp_path, sets=[f"run.iterations={iterations}"])
     results = Results(problem)
     for iteration in range(3):
@@ -74,7 +74,7 @@ def test_a_short_run_is_called_worse_only_at_its_end(tmp_path, iterations, worse
 
 
 def test_a_non_finite_truth_is_null(tmp_path):
-    """The manifest is JSON, which has no such numbers."""
+    """The manifest is JSON, which has no non-finite numbers."""
     problem = make_problem(tmp_path)
     problem.truth["albedo"][0, 0, 0] = np.nan
     results = Results(problem)
@@ -144,7 +144,7 @@ def test_different_units_are_not_added():
 
 
 def test_units_of_parameters_without_errors_do_not_matter():
-    """A lamp that nothing reaches has no error that could be added."""
+    """A lamp without any entry in its mask has no error that could be added."""
     masks = {"wall": np.ones(3, bool), "lamp": np.zeros(3, bool)}
     meter = ErrorMeter({"wall": np.ones(3), "lamp": np.ones(3)}, masks, {"wall": "", "lamp": "intensity"})
     assert meter.one_unit
@@ -225,7 +225,7 @@ def seen(losses, held_out=None):
 
 
 def test_noise_does_not_make_values_the_best():
-    """One lucky loss at the start, and less of it on the average later."""
+    """One lucky loss at the start does not count as the best. A lower mean loss later does."""
     losses = [0.01] + [1.0] * 20 + [0.5] * 15 + [0.9] * 20
     best = seen(losses)
     means = [np.mean(losses[end - WINDOW : end]) for end in range(WINDOW, len(losses) + 1)]
@@ -273,7 +273,9 @@ TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2"]
 
 @pytest.mark.parametrize(("most", "recorded"), [(12 * 12 * 8, True), (12 * 12 * 8 - 1, False)])
 def test_only_small_images_are_recorded(monkeypatch, most, recorded):
-    """The trials of a recording render an image three times more: no gain where that takes long, and it comes once."""
+    """The trials of a recording render an image three more times. That does not pay for a large image, because it takes
+    long and is rendered once.
+    """
     monkeypatch.setattr(loading, "MOST_PATHS_APART", most)
     problem = assemble_scene(load(CONFIG, TINY))
     image = problem.render(0, 8, 0, "saved image")
@@ -283,7 +285,7 @@ def test_only_small_images_are_recorded(monkeypatch, most, recorded):
 
 
 def test_passes_of_a_large_image_are_not_recorded(monkeypatch):
-    """However small the last of them is."""
+    """This holds however small the last pass is."""
     monkeypatch.setattr(loading, "PATHS_PER_PASS", 12 * 12 * 4)
     monkeypatch.setattr(loading, "MOST_PATHS_APART", 12 * 12 * 3)
     problem = assemble_scene(load(CONFIG, TINY))

@@ -1,4 +1,4 @@
-"""Measured sensitivities, the units made of them, and what they do for a stiff problem."""
+"""Measured sensitivities, the units derived from them, and their effect on a stiff problem."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ def relative_errors(problem):
 
 
 def test_a_planted_ratio_is_found():
-    """A lamp in units of a millionth, over the same picture: its sensitivity falls by a million, the floor's stays."""
+    """A lamp has values and light a million times as large. Relative to the image, its sensitivity per unit falls by a
+    million, and the floor's sensitivity stays.
+    """
     before = measured()
     after = measured("parameters[1].initial=3e12", f"target.render.parameters.{LAMP}=[1.2e13, 1.0e13, 0.6e13]")
     assert before[LAMP].change / after[LAMP].change == pytest.approx(1e6, rel=1e-3)
@@ -91,7 +93,7 @@ def test_measuring_changes_nothing():
 
 
 def test_parameters_without_effect_are_not_scaled():
-    """At depth 1 nothing but emitters is seen, and a point has no size."""
+    """At depth 1, only emitters are visible, and a point emitter has no size."""
     problem = assemble(load(CONFIG, [*TINY, "integrator={estimator: gather, max_depth: 1}", "run.iterations=1"]))
     problem = replace(problem, truth={})
     state, _ = loop.step(problem, standing(problem))
@@ -114,7 +116,9 @@ def test_own_lengths():
 
 @pytest.mark.parametrize("type", ["adam", "sgd"])
 def test_in_its_own_units_no_scale_remains(type):
-    """The same problem in units of 1e6 and 1, and its loss times 1e-12: equal steps, epsilon too."""
+    """The same problem in units of 1e6 and 1, and with its loss times 1e-12, takes equal steps in spite of
+    `epsilon`.
+    """
 
     def descend(unit, loss):
         optimizer = Optimizer(type, 0.02, {}, {"p": mi.TensorXf(np.array([0.3, 0.7], np.float32) * unit)},
@@ -132,7 +136,9 @@ def test_in_its_own_units_no_scale_remains(type):
 
 
 def test_a_stiff_problem_is_solved_with_one_learning_rate():
-    """An albedo with an intensity of 1e7: a tenth of the error of plain Adam at its best learning rate."""
+    """An albedo is recovered together with an intensity of 1e7. The error is below a tenth of that of plain Adam at its
+    best learning rate.
+    """
 
     def error(*sets):
         problem = assemble(load(CONFIG, [*TINY, "run.iterations=100", "run.spp=16", "run.adjoint=independent", *sets]))
@@ -164,7 +170,7 @@ def test_the_optimiser_gets_gradients_of_order_one(transforms):
 
 @pytest.mark.parametrize("transform", a_few(["none", "sigmoid", "log", "softplus"], ["none", "log"]))
 def test_the_first_step_matches_the_printed_line(transform):
-    """Adam's first step is one learning rate in what it moves."""
+    """Adam's first step is one learning rate in the variable that Adam moves."""
     sets = [f"parameters[1].transform={transform}", "parameters[1].bounds=[0, 1e8]", "run.iterations=1"]
     problem = assemble(load(CONFIG, [*TINY, *sets]))
     problem = replace(problem, truth={})
@@ -206,7 +212,9 @@ LAMP_ALONE = ["parameters=[{key: lamp.intensity.value, initial: [2e6, 4e6, 1e6]}
 
 
 def test_the_curvature_of_a_lamp_matches_its_image():
-    """The image I_c = x_c a, so that the mean of (I - T)^2 has the curvature 2 mean(a_c^2) / 3 along channel c."""
+    """The image is I_c = x_c a_c. The mean of (I - T)^2 therefore has the curvature 2 mean(a_c^2) / 3 along
+    channel c.
+    """
     problem = assemble(load(CONFIG, [*TINY, *LAMP_ALONE]))
     x = problem.selection.array(LAMP).astype(np.float64)
     before = np.array(problem.optimizer[LAMP])

@@ -1,4 +1,4 @@
-"""`sequence: auto`: decided on fabricated steps and in whole runs of a small scene."""
+"""`sequence: auto`, decided on fabricated steps and in whole runs of a small scene."""
 
 from __future__ import annotations
 
@@ -60,7 +60,9 @@ def made(settings: list[str], **options: Any) -> Problem:
 
 
 def spied(monkeypatch: pytest.MonkeyPatch, settings: list[str], guided_ms: float) -> list[tuple[str, Any, Any, bool]]:
-    """Of every step that is taken: what is decided by it, which way, what its table had learned, whether it is even."""
+    """Return for each measured step: the decision, the option, the learned content of its table, and whether its
+    numbers are low-discrepancy.
+    """
     seen: list[tuple[str, Any, Any, bool]] = []
     take_times(monkeypatch, 0.1, guided_ms)
     take, learn = StepTrial.take, StepTrial.learn
@@ -94,7 +96,9 @@ def spied(monkeypatch: pytest.MonkeyPatch, settings: list[str], guided_ms: float
 def test_it_is_measured_with_the_decision_on_guiding(
     guiding: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both kinds of steps draw from the table that guiding was decided with, held; without that, from one of theirs."""
+    """Both kinds of steps draw from the fixed table of the decision on guiding. Without that decision, both kinds draw
+    from one table of their own.
+    """
     asked, _, found = guiding.partition(", ")
     is_on = (found or asked) == "on"
     seen = spied(monkeypatch, [f"integrator.guiding={asked}", *AUTO], 0.1 if is_on else 1000.0)
@@ -119,7 +123,7 @@ def test_it_is_measured_with_the_decision_on_guiding(
 
 @pytest.mark.usefixtures("llvm")
 def test_without_guiding_it_replaces_guiding_if_it_is_better(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Then nothing of guiding is left, neither in kernels nor in what memory is planned for."""
+    """After the replacement, neither the kernels nor the memory plan contains any part of guiding."""
     take_times(monkeypatch, 0.1, 0.1, alone_ms=0.001)
     budget = "run.memory_budget=64"
     counts, plans = [], []
@@ -184,7 +188,7 @@ def test_compared_options_are_named() -> None:
 
 
 def world(variance: float, time: float, **options: Any) -> World:
-    """Nothing is learned in it, but where `options` say so."""
+    """Return a world in which nothing is learned, unless `options` enable learning."""
     return World(variance, time, **{"learns": False, "pilot": SequencePilot, **options})
 
 
@@ -219,7 +223,7 @@ def test_it_is_on_if_it_pays(options: dict[str, Any], on: bool) -> None:
 
 
 def on_by_accident(**options: Any) -> int:
-    """Of 100 worlds, in how many it is on."""
+    """Return in how many of 100 worlds low-discrepancy numbers are on."""
     return sum(world(**options, seed=seed).run(sizes(0.05), 0.05).low_discrepancy for seed in range(100))
 
 
@@ -275,7 +279,7 @@ def test_more_remaining_time_gives_longer_steps() -> None:
 
 
 class Spent:
-    """The problem of a run of which measuring has taken these shares so far."""
+    """Problem of a run in which measurements took the given shares so far."""
 
     def __init__(self, paths: float | None, guided: float | None) -> None:
         self.sides = None if paths is None else SimpleNamespace(share=paths)
@@ -284,7 +288,7 @@ class Spent:
 
 @pytest.mark.parametrize("paths", [None, 0.02, SHARE - GUIDING_SHARE])
 def test_all_measurements_share_one_limit(paths: float | None) -> None:
-    """Guiding leaves the sequence its part, and both keep within the share of all decisions."""
+    """The decision on guiding leaves the sequence its part. Both decisions stay within the share of all decisions."""
     ample = Allowance(1.0, 1e9, 0.0, 1.0)
     for_guiding = share_left(Spent(paths, None), ample, SEQUENCE_SHARE)  # type: ignore[arg-type]
     assert for_guiding == pytest.approx(SHARE - SEQUENCE_SHARE - (paths or 0))

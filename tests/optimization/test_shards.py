@@ -1,4 +1,4 @@
-"""Shards: unbiased whatever they are, of one sum in whatever order, and refused where they are none."""
+"""Shards: unbiased in every form, equal sums in any order, and refused where they are invalid."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TWO_VIEWS = "views=[{sensor: 0, weight: 3, exposure: 1}, {sensor: 1, exposure: a
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The tiny experiment with three sensors."""
+    """Folder with the tiny experiment with three sensors."""
     write_experiment(tmp_path, scene_seen(*EYES))
     return tmp_path
 
@@ -42,7 +42,9 @@ def make(folder: Path, *sets: str) -> Problem:
 
 
 def rows(problem: Problem, iterations: int) -> np.ndarray:
-    """The gradients of so many iterations at the same values, all parameters in a row: (iterations, entries)."""
+    """Return the gradients of several iterations at the same values, of shape (iterations, entries). Each row holds all
+    parameters.
+    """
     found = []
     for iteration in range(iterations):
         shards.add_gradient(problem, iteration, lambda: None, lambda: None)
@@ -51,7 +53,7 @@ def rows(problem: Problem, iterations: int) -> np.ndarray:
 
 
 def independent(problem: Problem, rounds: int, spp: int) -> np.ndarray:
-    """The same of steps with `run.adjoint: independent`, none of them in shards."""
+    """Return the gradients of steps with `run.adjoint: independent` and without shards, of shape (rounds, entries)."""
     found = []
     for round in range(rounds):
         sample_gradient(problem, problem.integrator, round, "reference", spp)
@@ -74,7 +76,9 @@ WAYS = {
 
 @pytest.mark.parametrize("way", a_few(WAYS, [way for way in WAYS if way not in ("4 in rounds", "16 in rounds")]))
 def test_gradients_are_unbiased(folder, way):
-    """Beside steps of a thousand samples with a second set for dL/dI; each shard has one or two samples a pixel."""
+    """The reference consists of steps of a thousand samples with a second set for dL/dI. Each shard has one or two
+    samples per pixel.
+    """
     sets, iterations = WAYS[way]
     loss = [each for each in sets if each.startswith("loss")]
     problem, plain = make(folder, *sets), make(folder, "run.adjoint=independent", *loss)
@@ -84,21 +88,23 @@ def test_gradients_are_unbiased(folder, way):
 
 
 def test_a_single_set_of_samples_would_be_found(folder):
-    """That test has the power to tell: the bias of one set shows in it."""
+    """The comparison of `test_gradients_are_unbiased` has enough power to detect the bias of a single set."""
     reference = independent(make(folder, "run.adjoint=independent"), 16, 1024)
     found = compare(rows(make(folder, "run.spp=2", "run.shards=2", "run.adjoint=correlated"), 400), reference, None)
     assert not found, found
 
 
 def test_views_and_exposures_are_unbiased(folder):
-    """Two views that count unlike, each in two shards; the second one's exposure is recovered."""
+    """Two views with different weights have two shards each. The second view's exposure is recovered."""
     reference = independent(make(folder, TWO_VIEWS, "run.adjoint=independent"), 16, 1024)
     found = compare(rows(make(folder, TWO_VIEWS, "run.spp=2", "run.shards=4", OTHERS), 300), reference, block=None)
     assert found, found
 
 
 def test_halves_are_unbiased_except_for_the_quotient(folder):
-    """`loss.scale: fitted` in shards of two halves each, of many samples: what bias there is, is that of a quotient."""
+    """With `loss.scale: fitted`, shards of two halves with many samples each are unbiased. Any remaining bias is that
+    of a quotient.
+    """
     sets = ["loss.scale=fitted", "run.spp=64"]
     reference = independent(make(folder, *sets, "run.adjoint=independent"), 16, 1024)
     found = compare(rows(make(folder, *sets, "run.shards=4", OTHERS), 60), reference, block=None)
@@ -109,7 +115,9 @@ def test_halves_are_unbiased_except_for_the_quotient(folder):
 
 
 def shuffled(problem: Problem, function: Callable[..., Any], work: Any) -> Iterator[tuple[int, Any]]:
-    """Computes shards from the last to the first, each twice and from a pickled task."""
+    """Compute even shards from the last to the first, then odd ones. Compute each twice, the second time from a pickled
+    task.
+    """
     for place in sorted(range(len(work)), key=lambda place: (place % 2, -place)):
         task, *more = work[place]
         function(problem, task, *more)
@@ -126,7 +134,7 @@ def shuffled(problem: Problem, function: Callable[..., Any], work: Any) -> Itera
     ],
 )
 def test_the_order_of_evaluation_does_not_matter(folder, sets):
-    """Bit by bit, over iterations in which tables learn."""
+    """Results are equal bit by bit, over iterations in which tables learn."""
     sets, results = [*sets, "run.iterations=3"], []
     for engine in (None, shuffled):
         problem = make(folder, *sets)
@@ -144,13 +152,13 @@ def test_the_order_of_evaluation_does_not_matter(folder, sets):
 
 
 def unmeasured(problem: Problem) -> Problem:
-    """Without true values, of which nobody asks here."""
+    """Return the problem without true values, which these tests do not use."""
     problem.truth.clear()
     return problem
 
 
 def test_shards_of_whole_views_sum_up(folder):
-    """The same samples as steps of each view by itself, in one sum."""
+    """The sum equals the sum of separate steps of each view with the same samples."""
     problem = make(folder, "views=[{sensor: 0, weight: 2}, {sensor: 1}, {sensor: 2}]", "run.spp=8", "run.shards=2")
     tasks = shards.make_tasks(problem, 3)
     assert [[part.sensor for part in task.parts] for task in tasks] == [[0], [1, 2]]
@@ -170,7 +178,7 @@ def test_shards_of_whole_views_sum_up(folder):
 
 
 def test_shares_sum_up_to_a_gradient_at_their_mean(folder):
-    """In one round: the mean of the shards' gradients, and the loss of their mean image."""
+    """In one round, the gradient is the mean of the shards' gradients. The loss is that of their mean image."""
     problem = make(folder, "run.spp=8", "run.shards=4", "run.adjoint=independent")
     found = [shards.shard_gradient(problem, task) for task in shards.make_tasks(problem, 0)]
     mean = np.mean([one.images[0] for one in found], axis=0, dtype=np.float64)
@@ -191,7 +199,7 @@ def test_no_two_shards_share_a_seed(folder):
 
 
 def test_a_subset_of_the_views_is_sharded(folder):
-    """Each shard has dL/dI at the mean image of the others, of a view that counts for all three."""
+    """Each shard has dL/dI at the mean image of the other shards. The drawn view counts for all three views."""
     views = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
     problem = make(folder, views, "run.views_per_iteration=1", "run.spp=8", "run.shards=4", OTHERS)
     for iteration in range(4):
@@ -219,7 +227,7 @@ def test_sums_are_in_double_precision():
 
 
 def test_without_shards_nothing_changes(folder, monkeypatch):
-    """The loop that was there, whose seeds and options are those of always."""
+    """Without shards, the loop, its seeds and its options stay as before."""
     monkeypatch.setattr(loop, "add_gradient", lambda *args: pytest.fail("shards"))
     given, step = [], loop.gradient_step
     monkeypatch.setattr(loop, "gradient_step", lambda *args, **kept: given.append(kept) or step(*args, **kept))
@@ -232,7 +240,7 @@ def test_without_shards_nothing_changes(folder, monkeypatch):
 
 
 def test_memory_does_not_grow_with_the_shards(folder):
-    """Of the backend's allocator: shards of the same samples, 2 of them and 16."""
+    """The peak memory of the backend's allocator does not grow from 2 to 16 shards of equal size."""
     peaks = []
     for count in (2, 16):
         problem = make(folder, f"run.spp={64 * count}", f"run.shards={count}", OTHERS, "scene.size=[64, 64]")

@@ -1,4 +1,4 @@
-"""Stages of a run: which problem each iteration works on, what goes from one to the next, and what is refused."""
+"""Stages of a run: the problem of each iteration, the values passed to the next stage, and refused settings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def experiment(llvm: str, tmp_path: Path) -> Path:
 
 
 def worked_on(problem: Problem) -> Iterator[tuple[Problem, State, Record]]:
-    """What each iteration worked on, and what it left."""
+    """Yield the problem, the state and the record of each iteration."""
     stages = Stages(problem)
     for state, record in iterate(stages, standing(problem)):
         yield stages.now, state, record
@@ -55,7 +55,7 @@ def test_each_iteration_has_the_resolution_of_its_stage(experiment: Path) -> Non
 
 
 def test_parameters_too_fine_for_a_stage_stay_unchanged(experiment: Path) -> None:
-    """The texture begins rough, and a stage of 2x2 texels moves nothing: no roughness is lost by it."""
+    """The texture begins rough, and a stage of 2x2 texels moves nothing. The texture loses no roughness."""
     stages = "run.stages=[{until: 0.5, resolution: 0.5, film: 0.5}]"
     still = ["parameters[0].initial=scene", "optimizer.learning_rate=1e-12"]
     problem = assemble(load(experiment, [*PLAIN, stages, *still]), to_run=True)
@@ -72,7 +72,7 @@ def test_parameters_too_fine_for_a_stage_stay_unchanged(experiment: Path) -> Non
 
 
 def test_values_are_carried_over_within_their_bounds(experiment: Path) -> None:
-    """Steps of a coarse stage arrive in the fine texture, and none leaves its bounds."""
+    """Steps of a coarse stage reach the fine texture. No value leaves its bounds."""
     sets = [*PLAIN, "run.stages=[{until: 0.9, resolution: 0.5}]", "optimizer.learning_rate=5"]
     problem = assemble(
         load(experiment, [*sets, "parameters[0].bounds=[0.2, 0.7]", "parameters[0].initial=0.2"]), to_run=True
@@ -88,7 +88,7 @@ def test_values_are_carried_over_within_their_bounds(experiment: Path) -> None:
 
 
 def test_a_smaller_film_sees_the_weighted_mean_of_the_target(experiment: Path) -> None:
-    """And an image whose expectation is the mean of the whole one's, with a box filter."""
+    """With a box filter, the expectation of the smaller film's image is the mean of the whole film's image."""
     problem = assemble(load(experiment, [*PLAIN, "run.stages=[{until: 0.5, film: 0.5}]"]), to_run=True)
     rng = np.random.default_rng(3)
     target, weights = rng.uniform(size=(8, 8, 3)), rng.integers(0, 3, (8, 8)).astype(np.float32)
@@ -156,7 +156,9 @@ def test_a_stage_without_coarsening_is_refused(experiment: Path) -> None:
 
 @pytest.mark.parametrize("face", a_few(["face", "back"], ["back"]))
 def test_a_lens_and_its_mesh_are_coarsened_together(llvm: str, tmp_path: Path, face: str) -> None:
-    """From edge to edge, its outside where it was, a plane as flat and a slope as steep as before."""
+    """The coarse lens reaches from edge to edge, and its outside stays in place. Planes stay as flat and slopes as
+    steep as before.
+    """
     tones = np.kron(0.3 + 0.7 * np.random.default_rng(1).uniform(size=(4, 4)), np.ones((4, 4)))
     write_file(tmp_path / "p.exr", np.repeat(tones[:, :, None], 3, 2).astype(np.float32), linear=True)
     tiny.done("lens", tmp_path / "p.exr", "--pixels", 16, "--both", "-o", tmp_path / "l")

@@ -1,4 +1,4 @@
-"""When a loss stands: runs that end early, and plateaus."""
+"""Losses that stand still: runs that end early, and plateaus."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def config(tmp_path: Path, *sets: str) -> Config:
 
 
 def follow(given: Config, losses: np.ndarray, held_out: dict[int, float] | None = None) -> list[State]:
-    """The states after each iteration, until the run stops."""
+    """Return the states after each iteration, until the run stops."""
     watch, state, states = Watch(given), State(0, 0.0, 0.0, 0, {}, {}), []
     for number, loss in enumerate(losses):
         seen = None if held_out is None else held_out.get(number)
@@ -52,7 +52,9 @@ def test_a_loss_that_falls_by_more_than_its_noise_does_not_stop(tmp_path: Path) 
 
 
 def test_a_loss_that_halves_every_100_iterations_is_not_stopped(tmp_path: Path) -> None:
-    """Also under noise of 30 %, where no two windows of 20 tell it from one that stands."""
+    """Under noise of 30 %, no two windows of 20 distinguish this loss from a constant one. A constant loss is
+    stopped.
+    """
     rng, given = np.random.default_rng(2), config(tmp_path, STOP)
     noise = 1 + 0.3 * rng.normal(size=(20, 400))
     assert all(len(follow(given, 0.5 ** (np.arange(400) / 100) * each)) == 400 for each in noise)
@@ -140,7 +142,7 @@ def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 @pytest.mark.parametrize("at", [18, 19, 20])
 def test_a_run_stops_after_a_kill_as_well(experiment: Path, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
-    """Killed before, and after, the last iteration, when its state is kept already."""
+    """The kill comes before the last iteration, or after it, when its state is already saved."""
     stop = ["--set", "run.stop={patience: 5, relative: 0.9}", "--set", "run.iterations=40"]
     every = ["--set", f"run.checkpoint_every={{iterations: {5 if at == 20 else 3}}}"]
     whole, left = run_and_kill(monkeypatch, at, *SETS, *every, *stop)

@@ -1,4 +1,4 @@
-"""Trend and standstill of losses with heavy tails: how often each test is wrong, over many simulated runs."""
+"""Trend and standstill of losses with heavy tails: frequency of errors of each test, over many simulated runs."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ REAL = np.array([
 
 
 def bright(random: np.random.Generator, shape: tuple[int, int]) -> Array:
-    """Noise of a tenth, and one iteration in twenty that is up to ten times as bright."""
+    """Return losses with noise of a tenth. One iteration in twenty is up to ten times as bright."""
     firefly = np.where(random.random(shape) < 0.05, random.uniform(1, 10, shape), 1)
     return (1 + 0.1 * random.normal(size=shape)) * firefly
 
 
 def real(random: np.random.Generator, shape: tuple[int, int]) -> Array:
-    """Pieces of ten consecutive losses of the real run."""
+    """Return pieces of ten consecutive losses of the real run."""
     first = random.integers(0, REAL.size - 10, (shape[0], shape[1] // 10))
     return REAL[first[..., None] + np.arange(10)].reshape(shape)
 
 
 def wandering(random: np.random.Generator, shape: tuple[int, int]) -> Array:
-    """Each loss shares half of its deviation with the one before."""
+    """Return losses that each share half of their deviation with the previous loss."""
     drawn = 0.1 * random.normal(size=shape)
     for i in range(1, shape[1]):
         drawn[:, i] = 0.5 * drawn[:, i - 1] + np.sqrt(0.75) * drawn[:, i]
@@ -53,7 +53,9 @@ PATIENCE, RELATIVE = 20, 0.01
 
 
 def ends(losses: Array, patience: int = PATIENCE, relative: float = RELATIVE) -> Array:
-    """After how many iterations each run (R, N) stops; beyond the last where it does not."""
+    """Return after how many iterations each run (R, N) stops. A run that does not stop gets a number beyond the
+    last.
+    """
     runs, windows = len(losses), losses.shape[1] // patience
     levels = levels_of(losses[:, : windows * patience].reshape(runs, windows, patience))
     end = np.full(runs, losses.shape[1] + 1)
@@ -64,7 +66,9 @@ def ends(losses: Array, patience: int = PATIENCE, relative: float = RELATIVE) ->
 
 
 def check_stops(kind: str, runs: int, iterations: int) -> None:
-    """Losses that fall by just `RELATIVE` a window, and faster ones, which have less than that to the end."""
+    """Check that at most 5 % of runs stop while losses fall by `RELATIVE` per window or faster. A fall of just
+    `RELATIVE` gets a tolerance.
+    """
     random, at = np.random.default_rng(4), np.arange(iterations)
     tolerance = 3 * np.sqrt(0.05 * 0.95 / runs)
     for window in (1 - RELATIVE, 1 - 2 * RELATIVE, 0.5 ** (PATIENCE / 100)):
@@ -92,7 +96,7 @@ def test_long_runs_with_a_falling_loss_are_not_stopped(kind: str) -> None:
     ("normal, 10 %", 300), ("normal, 30 %", 600), ("t of 3 degrees", 360), ("fireflies", 360), ("grey_room", 700),
 ])  # fmt: skip
 def test_the_cost_of_a_stop(kind: str, longest: int) -> None:
-    """Medians over runs that stand from their first iteration on; docs/steps.md has the figures."""
+    """The medians are over runs whose losses stand still from the first iteration on. docs/steps.md has the figures."""
     random = np.random.default_rng(5)
     assert np.median(ends(NOISE[kind](random, (300, 1000)))) <= longest
     assert np.median(ends(NOISE[kind](random, (300, 1000)), relative=0.05)) <= 240

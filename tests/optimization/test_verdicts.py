@@ -1,4 +1,4 @@
-"""The rules of verdicts, the posterior they rest on, and whether a loss fell."""
+"""Rules of verdicts, the posterior on which verdicts are based, and the test whether a loss fell."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ from reslrb_cli.optimization.uncertainty.verdicts import (
 
 
 def judged(*entries: dict[str, float | bool]) -> list[ParameterVerdict]:
-    """The verdicts of entries that are settled, but for these changes, of two gradients whose noise has either sign."""
+    """Return the verdicts of entries that are settled except for the given changes. Each entry has two gradients with
+    noise of opposite sign.
+    """
     usual = {"value": 0.5, "low": 0.0, "high": 1.0, "touched": True, "gradient": 0.0, "error": 1.0, "step": 0.01}
     usual |= {"start": 0.5, "spread": 0.01, "alone": 0.01, "to_go": 0.0, "to_go_error": 0.01}
     every = [usual | changes for changes in entries]
@@ -107,9 +109,9 @@ def test_a_parameter_combines_its_entries(entries, verdict):
 
 
 def simulate(H, response, scale, noise, samples, rates, runs, random, fixed=None):
-    """Offsets (runs, M) at the end of the model itself, and the gradients (runs, M) that are measured there.
+    """Return offsets (runs, M) at the end of runs of the model itself, and the gradients (runs, M) measured there.
 
-    `fixed` is the covariance of what each run's gradients have in common.
+    `fixed` is the covariance of the part that all gradients of a run share.
     """
     root = np.linalg.cholesky(noise)
     offset = random.normal(size=(runs, len(scale))) * scale
@@ -123,9 +125,11 @@ def simulate(H, response, scale, noise, samples, rates, runs, random, fixed=None
 @pytest.mark.parametrize("target", [0.0, 0.7, 5.0])
 @pytest.mark.parametrize("iterations", [5, 60, 600])
 def test_offsets_of_the_model_are_as_wide_as_stated(iterations, target):
-    """Coverage: over many runs the way to go is right on the average, and its error is what is stated.
+    """Coverage over many runs is correct. The estimated way to go is right on average, and the actual error equals the
+    stated error.
 
-    With noise of a target, which all gradients of a run share, too: it is in what is left.
+    This also holds with noise of the target, which all gradients of a run share. The remaining offset contains this
+    noise.
     """
     H = np.array([[2.0, 1.2, 0.0], [1.2, 1.0, 0.3], [0.0, 0.3, 4.0]])
     response, scale = np.array([0.02, 0.1, 0.01]), np.array([1.0, 3.0, 0.5])
@@ -150,7 +154,7 @@ def test_offsets_of_the_model_are_as_wide_as_stated(iterations, target):
 
 @pytest.mark.parametrize("last", [1, 30])
 def test_the_last_steps_locate_the_values(last):
-    """Coverage, where the last steps of a run are what is known of its end beside a few gradients there."""
+    """Coverage is correct if a run's end is known only from its last steps and a few gradients there."""
     random, runs = np.random.default_rng(8), 500
     H, sd = np.array([[2.0, 1.2], [1.2, 1.0]]), np.array([0.5, 0.8])
     response, scale, noise, rates, few = np.array([0.02, 0.1]), np.array([1.0, 3.0]), np.diag(sd**2), [1.0] * 60, 3
@@ -173,7 +177,7 @@ def test_the_last_steps_locate_the_values(last):
 
 
 def test_unforeseen_gradients_are_believed():
-    """By the model nothing of the start is left; a pull of ten standard errors says otherwise."""
+    """According to the model, nothing of the start is left. A pull of ten standard errors contradicts the model."""
     H, few = np.diag([2.0, 3.0]), 4
     given = np.full(2, 0.2), np.ones(2), np.diag([0.01, 0.01])
     foreseen = joint(H, *given, np.array([0.02, 0.0]), few, [1.0] * 100)
@@ -198,7 +202,7 @@ def test_marginal_equals_joint_without_shared_parts():
 
 
 def test_noise_of_the_target_remains_after_convergence():
-    """H^-1 b: whatever gradients at the end say, all of them have it."""
+    """The spread H^-1 b remains, because all gradients at the end contain the target's noise b."""
     found = joint(np.array([[4.0]]), np.array([0.1]), np.ones(1), np.array([[1e-8]]), np.zeros(1), 9, [1.0] * 300,
                   np.array([[0.04]]))  # fmt: skip
     assert found.spread == pytest.approx([0.2 / 4], rel=1e-3)
@@ -206,7 +210,7 @@ def test_noise_of_the_target_remains_after_convergence():
 
 
 def test_a_value_unknown_to_the_view_stays():
-    """Two lamps that light the view alike: their sum is known, their difference is as open as at the start."""
+    """Two lamps light the view alike. Their sum is known, and their difference is as uncertain as at the start."""
     H = np.full((2, 2), 5.0)
     found = joint(H, np.full(2, 0.1), np.ones(2), np.eye(2) * 1e-4, np.zeros(2), 5, [1.0] * 200)
     assert found.error == pytest.approx(np.full(2, np.sqrt(0.5)), rel=0.02)
@@ -232,7 +236,9 @@ CLOSE = 0.06
 
 
 def recover(random, iterations, start=START, tails=3.0):
-    """A run of Adam on it, as measured at its end: noise of heavy tails, and the more of it while the wall is off."""
+    """Run Adam on `ROOM`, and return the end values and the measurements there. The noise has heavy tails, and is
+    larger while the wall is off.
+    """
 
     def gradient(x):
         size = 0.006 + 0.6 * np.abs(x[0])
@@ -266,14 +272,14 @@ def recover(random, iterations, start=START, tails=3.0):
 
 
 def told_of(measured):
-    """The verdicts on wall and ceiling, whose curvature is known."""
+    """Return the verdicts on wall and ceiling, whose curvature is known."""
     directions = [ParameterDirection(name, np.ones(1), None, 0) for name in measured]
     return {name: each.verdict for name, each in
             weigh(measured, directions, ROOM, {}, {}, np.zeros((2, 2)), {}).items()}  # fmt: skip
 
 
 def test_a_value_that_depends_on_a_moving_one_is_not_settled():
-    """An exposure and a colour make up for each other: the exposure is not known before the colour is."""
+    """An exposure and a colour compensate each other. The exposure is not known before the colour is known."""
     H, random = np.array([[1.0, 0.3], [0.3, 0.1]]), np.random.default_rng(1)
 
     def told(scale, shared):
@@ -293,8 +299,9 @@ def test_a_value_that_depends_on_a_moving_one_is_not_settled():
 
 
 def test_a_creeping_value_under_heavy_tailed_noise_is_not_settled(monkeypatch):
-    """The wall, off at first, drives the ceiling the wrong way, and large gradients then make steps short; by the steps
-    of the end nothing would be left of it."""
+    """The wall, off at first, drives the ceiling the wrong way. Large gradients then make steps short. Judged by the
+    steps of the end alone, nothing of the ceiling's error would be left.
+    """
     random, off, told, before = np.random.default_rng(11), 0, [], 0
     for _ in range(200):
         x, measured = recover(random, 100)
@@ -347,7 +354,9 @@ def test_curvature_is_averaged_over_entries_of_similar_noise():
 
 
 def test_entries_of_a_motion_have_their_own_noise():
-    """Across the light and along it a lens differs by orders of magnitude: a run's mean squares say so."""
+    """Across the light and along it, the gradients of a lens differ by orders of magnitude. A run's mean squares show
+    this difference.
+    """
     sizes = np.array([1.0, 0.01, 0.3])
     gradients = np.random.default_rng(0).normal(size=(3, 3)) * sizes
     given = {"value": sizes, "bounds": (-np.inf, np.inf), "scale": 1.0, "gradients": gradients, "is_small": True}
@@ -362,7 +371,7 @@ ROUNDS = 400
 
 
 def shares_of_verdicts(make, iterations, seed=3):
-    """How often each verdict is given of noisy series."""
+    """Return the frequency of each verdict for noisy series."""
     random = np.random.default_rng(seed)
     found = collections.Counter(find_trend(make(random, np.arange(iterations))).change for _ in range(ROUNDS))
     return {change: found[change] / ROUNDS for change in Change}
@@ -373,7 +382,7 @@ def noisy(curve, noise=0.1):
 
 
 def fireflies(curve):
-    """One iteration in fifty has a value of up to fifty times the usual one."""
+    """Return a function that makes noisy series. About one iteration in fifty has up to 50 added to its value."""
 
     def make(random, i):
         bright = (random.random(len(i)) < 0.02) * 50 * random.random(len(i))
@@ -392,7 +401,7 @@ def test_pure_noise_is_flat(iterations):
 @pytest.mark.parametrize("iterations", [20, 100, 1000])
 @pytest.mark.parametrize("decay", [1, 3, 8])
 def test_a_fall_within_a_few_iterations_is_found(iterations, decay):
-    """Nine tenths of the first tenth may be as low as the end."""
+    """Up to nine tenths of the run's first tenth may be as low as its end."""
     found = shares_of_verdicts(noisy(lambda i: 1 + 5 * np.exp(-i / decay)), iterations)
     assert found[Change.FELL] > 0.95
     assert found[Change.FLAT] + found[Change.ROSE] < 0.01
@@ -423,7 +432,7 @@ def test_a_slow_rise_is_found():
 
 
 def test_a_slow_fall_is_rarely_missed():
-    """A fifth over the run, where a single iteration has a tenth of noise."""
+    """The loss falls by a fifth over the run. A single iteration has noise of a tenth."""
     for iterations in (50, 100, 200):
         found = shares_of_verdicts(noisy(lambda i: 1 - 0.2 * i / len(i)), iterations)
         assert found[Change.FLAT] < 0.12
@@ -431,7 +440,7 @@ def test_a_slow_fall_is_rarely_missed():
 
 
 def test_a_jump_that_declines_counts_as_a_rise():
-    """Adam with a rate far too large: up at once, and slowly back to a level above the start."""
+    """With a rate far too large, Adam's loss jumps at once. The loss then falls slowly to a level above the start."""
     found = shares_of_verdicts(noisy(lambda i: np.where(i == 0, 0.3, 1 + 20 * np.exp(-i / 10))), 100)
     assert found[Change.ROSE] > 0.95
 

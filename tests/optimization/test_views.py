@@ -1,4 +1,4 @@
-"""Views: what their section says, subsets of them, and those that are held out."""
+"""Views: settings of their section, subsets of views, and held-out views."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALL = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
 
 @pytest.fixture
 def folder(tmp_path):
-    """The tiny experiment with three sensors."""
+    """Folder with the tiny experiment with three sensors."""
     write_experiment(tmp_path, scene_seen(*EYES))
     return tmp_path
 
@@ -89,7 +89,9 @@ def test_separate_views_need_no_target_section(folder):
 
 
 def test_a_subset_of_the_views_is_unbiased(tmp_path):
-    """Every view is drawn as often, and counts as much in the mean, as if all were taken; seeds draw others."""
+    """Every view is drawn equally often, and on average counts as much as if all views were taken. Another seed draws
+    other views.
+    """
     problem = make_problem(tmp_path, views=5, sets=["run.views_per_iteration=2"])
     counts, total = np.zeros(5), 4000
     for iteration in range(total):

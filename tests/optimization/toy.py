@@ -23,7 +23,7 @@ run: {iterations: 20, spp: 3, seed: 5}
 
 
 class Params(dict):
-    """Stands in for `mi.SceneParameters` without a scene."""
+    """Substitute for `mi.SceneParameters` without a scene."""
 
 
 def make_problem(tmp_path, views=1, sets=(), keys=("albedo",)):

@@ -1,4 +1,4 @@
-"""What tests of records share: a disk, or the next thing to it, that takes no more."""
+"""Shared fixture of tests of records: a limit of file sizes, which replaces a full disk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pytest
 
 @pytest.fixture
 def file_size_limit() -> Callable[[int], AbstractContextManager[None]]:
-    """A function that, as a context manager, lets no file become larger than so many bytes."""
+    """Function that returns a context manager. Inside this context, no file becomes larger than the given number of
+    bytes.
+    """
     resource = pytest.importorskip("resource")
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""Files that are whole or absent: any file, checkpoints, file names."""
+"""Files that are complete or absent: any file, checkpoints, and file names."""
 
 from __future__ import annotations
 
@@ -109,7 +109,9 @@ def iteration_of(path: Path) -> int:
 
 
 def test_a_kill_at_any_moment_leaves_a_complete_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Copied before and after every call by which the writing of the fourth state changes the disk."""
+    """The test copies the folder before and after every call that changes the disk while the fourth state is
+    written.
+    """
     folder, left = tmp_path / "checkpoint", []
     folder.mkdir()
     for iteration in (1, 2, 3):

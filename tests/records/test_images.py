@@ -1,4 +1,4 @@
-"""Images and EXR files of named layers: whole or absent, and showing what they were given."""
+"""Images and EXR files of named layers: complete or absent, with the given contents."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_layers_survive_a_round_trip(tmp_path):
 
 
 def test_other_programs_find_the_channels(tmp_path):
-    """Mitsuba's reader, by the names that every reader knows."""
+    """Mitsuba's reader finds the channels by the names that every reader knows."""
     import mitsuba as mi
 
     written = layers()

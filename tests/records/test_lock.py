@@ -1,4 +1,4 @@
-"""Locks on run folders: one holder, gone with its process, and what is believed where there are none."""
+"""Locks on run folders: one holder, release at the end of its process, and assumptions where there are no locks."""
 
 from __future__ import annotations
 
@@ -110,7 +110,9 @@ def test_dead_holders_with_locks(tmp_path: Path) -> None:
 
 
 def test_a_process_does_not_wait_for_its_own_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run draws its own page; by another process's lock it is told apart from an instant's."""
+    """A run draws its own page without waiting. Waiting only distinguishes another process's lasting lock from a
+    momentary one.
+    """
     here = Holder.here(locked=True)
     with monkeypatch.context() as patch, FolderLock(tmp_path):
         patch.setattr(locks.time, "sleep", lambda seconds: pytest.fail("it waits"))

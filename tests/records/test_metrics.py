@@ -1,4 +1,4 @@
-"""metrics.jsonl and files of measurements: keys, lines cut short, what a run goes on from."""
+"""metrics.jsonl and files of measurements: keys, incomplete lines, and the data from which a run continues."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run folders, their manifests, and the cache of what earlier runs measured."""
+"""Run folders, their manifests, and the cache of measurements of earlier runs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def make_manifest(**changes):
 
 
 def create(output, name="run", force=False, **changes):
-    """A run folder in which nobody works any more."""
+    """Return a new run folder that no process uses any more."""
     with RunFolder.create("c.yaml", output, name, force, "scene: {}\n", make_manifest(**changes)) as folder:
         return folder
 
@@ -212,7 +212,7 @@ def test_an_unfinished_folder_of_a_killed_process_is_removed_later(tmp_path):
 
 
 def test_a_slowly_written_folder_is_not_removed(tmp_path):
-    """An export into a folder of runs takes minutes; a run that begins there meanwhile leaves it alone."""
+    """An export into a folder of runs takes minutes. A run that starts there meanwhile leaves the export alone."""
     with unfinished_folder(tmp_path) as part:
         (part / "scene.xml").write_text("half")
         os.utime(part, (1e9, 1e9))
@@ -297,7 +297,7 @@ def test_the_end_is_written(tmp_path):
 
 
 def abandoned(folder: Path) -> Manifest:
-    """The manifest of a run whose process, with a lock, has gone."""
+    """Write and return the manifest of a run whose process, with a lock, has ended."""
     manifest = make_manifest(process=Holder.here(locked=True))
     manifest.write(folder)
     return manifest
@@ -341,7 +341,7 @@ def test_a_reader_without_write_permission_sees_the_same(tmp_path, monkeypatch):
 
 
 def damaged(content):
-    """Yield the keys to each field of a manifest, and the manifest with a value of another type there."""
+    """Yield the keys to each field of a manifest, and the manifest with a value of another type in that field."""
     for key, value in content.items():
         for wrong in (None, "text", 5, False, [1], {"a": 1}):
             if type(wrong) is not type(value):
@@ -351,7 +351,7 @@ def damaged(content):
 
 
 def refusal(folder):
-    """The error of reading the manifest in `folder`; empty where it is read."""
+    """Return the error of reading the manifest in `folder`, or an empty string if reading succeeds."""
     try:
         read_manifest(folder)
     except ConfigError as error:

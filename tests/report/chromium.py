@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to in the DevTools protocol over a pipe: pages as a browser lays them out."""
+"""Headless Chromium, controlled by the DevTools protocol over a pipe, for pages in a browser's layout."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ PATIENCE = 60.0
 
 
 def find_chromium() -> str | None:
-    """The path of a Chromium; None where there is none."""
+    """Return the path of a Chromium, or None if there is none."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
 class Chromium:
-    """One browser with one page; ends with `close`."""
+    """Browser with one page, which `close` ends."""
 
     def __init__(self, executable: str, profile: Path) -> None:
         to_browser, self._write = os.pipe()
@@ -60,7 +60,7 @@ class Chromium:
             self._call(f"{domain}.enable")
 
     def open(self, path: Path, width: int, scripts: bool = True, dark: bool = False) -> None:
-        """Lay the page at `path` out at a width in pixels, and wait until all of it is there."""
+        """Open the page at `path` with a width in pixels, and wait until the page is fully loaded."""
         self._call("Emulation.setScriptExecutionDisabled", value=not scripts)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._call("Emulation.setEmulatedMedia", features=[scheme])
@@ -70,13 +70,13 @@ class Chromium:
         self._wait(lambda: any(event["method"] == "Page.loadEventFired" for event in self.events))
 
     def evaluate(self, expression: str) -> Any:
-        """The value of a JavaScript expression in the page, which may itself run no script."""
+        """Return the value of a JavaScript expression in the page. Scripts of the page itself may be disabled."""
         result = self._call("Runtime.evaluate", expression=expression, returnByValue=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
     def wait_for(self, expression: str, seconds: float) -> bool:
-        """Wait until a JavaScript expression is true; whether it was before so many seconds were over."""
+        """Wait until a JavaScript expression is true. Return whether it became true within `seconds`."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             if self.evaluate(expression):
@@ -85,14 +85,14 @@ class Chromium:
         return False
 
     def screenshot(self, path: Path) -> None:
-        """Write all of the page as a PNG."""
+        """Write the whole page as a PNG."""
         size = self._call("Page.getLayoutMetrics")["cssContentSize"]
         clip = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
         data = self._call("Page.captureScreenshot", captureBeyondViewport=True, clip=clip)["data"]
         path.write_bytes(base64.b64decode(data))
 
     def requests(self) -> list[str]:
-        """The addresses that the page asked for since it was opened."""
+        """Return the addresses that the page requested since it was opened."""
         return [
             event["params"]["request"]["url"] for event in self.events if event["method"] == "Network.requestWillBeSent"
         ]

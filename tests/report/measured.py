@@ -1,4 +1,4 @@
-"""A run folder and files of measurements as the commands leave them, made without measuring anything."""
+"""Run folder and files of measurements as the commands write them, made without any measurement."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ORIGIN = Origin("a machine, 3 threads", "llvm_ad_rgb", ["reslrb", "bench", "my <
 
 
 def write_bench(path, depths=(2, 4, 8), spps=(4,)):
-    """Two integrators; `ptracer` runs out of memory at the last depth."""
+    """Write a bench of two integrators. `ptracer` runs out of memory at the last depth."""
     records = []
     for spp in spps:
         for depth in depths:
@@ -47,7 +47,7 @@ def write_bench(path, depths=(2, 4, 8), spps=(4,)):
 
 
 def write_gradcheck(path, parameter="floor.reflectance.data"):
-    """One comparison that holds, one that fails, and what is missing of a derivative."""
+    """Write a comparison that holds, one that fails, and the missing part of a derivative."""
     common = {"kind": Kind.EXPECTATION, "seeds": 8, "relative_l2": 0.02, "z_rms": 1.1, "z_rms_limit": 1.4}
     records = [
         GradcheckRecord("box.yaml", parameter, "reslrb", estimator, Reference.PTRACER, verdict=verdict, z_max=z,
@@ -62,7 +62,9 @@ def write_records(path, records):
 
 
 def convergence_lines(parameter="all"):
-    """Two methods that fall as the square root, and their reference; one time is extrapolated, one is never reached."""
+    """Return lines of two methods and their reference. The errors fall as the square root of time. One time is
+    extrapolated, and one error is never reached.
+    """
     lines = []
     for integrator, estimator, factor in (("ptracer", None, 0.5), ("reslrb", "stack", 0.2)):
         label = integrator if estimator is None else f"{integrator}:{estimator}"
@@ -84,7 +86,7 @@ def write_convergence(path, parameter="all"):
 
 
 def write_maps(folder, name="floor-stack"):
-    """A map of a gradient as `gradcheck --images` writes it."""
+    """Write a map of a gradient as `gradcheck --images` does."""
     folder.mkdir()
     gradient = np.random.default_rng(1).normal(size=(8, 12, 3)).astype(np.float32)
     layers = {"gradient": gradient, "reference": 1.1 * gradient, "difference": -0.1 * gradient, "z": gradient[:, :, 0]}
@@ -107,7 +109,9 @@ def texture(height, width, seed=0):
 
 
 def make_run(folder, keys=(FLOOR, LAMP), sensors=1, truth=True, iterations=30, size=(24, 32), **manifest):
-    """Write the folder of a run of a texture (the first of `keys`) and of colours; `manifest` is passed on."""
+    """Write the run folder of a texture (the first of `keys`) and of colours. `manifest` holds further fields of the
+    manifest.
+    """
     for name in ("images", "parameters", "checkpoint"):
         (folder / name).mkdir(parents=True)
     moments = {"initial": 0.5, "final": 0.9, "true": 1.0}

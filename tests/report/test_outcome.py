@@ -1,4 +1,4 @@
-"""The sentence about a run: how it went, what to do next, and when it counts as good."""
+"""Sentence about a run: its course, the next step, and the conditions for a good run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands on a run's page, as text and as a browser lays it out."""
+"""Content of a run's page, as text and in a browser's layout."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposu
 
 
 class Page(html.parser.HTMLParser):
-    """The text of a page by section, its tables by section, its elements, and the pictures."""
+    """Parsed page with its text by section, tables by section, elements, and pictures."""
 
     VOID = ("meta", "img", "br", "wbr")
 
@@ -133,7 +133,7 @@ def test_textures_are_shown_side_by_side(tmp_path):
 
 
 def test_heights_are_shown_from_lowest_to_highest(tmp_path):
-    """They may be negative, and far below what a picture shows."""
+    """Heights may be negative, and far below the values that a picture shows."""
     heights = np.array([[-1e-3, 0, 3e-3]], np.float32)[:, :, None]
     (tmp_path / "parameters" / "true").mkdir(parents=True)
     np.savez(tmp_path / "parameters" / "parameters.npz", **{"slab.heightmap": np.zeros_like(heights)})
@@ -198,7 +198,7 @@ def test_dark_scenes_are_shown_brighter_and_say_so(tmp_path):
 
 
 def test_swatches_have_the_colours_of_the_values(tmp_path):
-    """One exposure for all moments of a lamp, in sRGB; none for what is no colour."""
+    """All moments of a lamp share one exposure, in sRGB. Values that are not colours have no swatch."""
     markup = render_run(make_run(tmp_path / "lamp", keys=(FLOOR, LAMP, "plate.eta.value")))
     swatches = [
         tuple(map(int, found.split(","))) for found in re.findall(r'"swatch" style="background:rgb\((.*?)\)"', markup)
@@ -240,7 +240,7 @@ def test_times_of_workers_are_reported_by_part_and_worker(tmp_path):
 
 
 def test_paths_and_their_sampling_are_reported(tmp_path):
-    """In the order in which they are decided, each where it was left to measurement."""
+    """Decisions that were left to measurement appear in the order in which they are made."""
     paths = PathsRecord(paths="both", light_share=0.125, gain=1.5, low=1.2, high=1.9, measure_s=2.0, compile_s=3.0)
     guided, sequence = GuidedRecord(guided=False, note="<b>"), SequenceRecord(low_discrepancy=False, note="alike")
     decided = {"paths": paths, "guided": guided, "sequence": sequence}
@@ -257,7 +257,7 @@ def test_paths_and_their_sampling_are_reported(tmp_path):
 
 
 def test_paths_alone_are_reported(tmp_path):
-    """Where the estimator is given."""
+    """The run has a given estimator."""
     camera = PathsRecord(paths="camera", light_share=0.0, note="all is diffuse").to_json()
     title = "Choice of the samples"
     page = page_of(make_run(tmp_path / "camera", iterations=0, paths=camera))
@@ -446,7 +446,7 @@ def test_nothing_scrolls_sideways(chromium, pages, name, width):
 
 @pytest.mark.parametrize("width", [400, 750, 1400])
 def test_no_number_is_wrapped(chromium, pages, width):
-    """Each is on one line of its own table cell."""
+    """Each number is on one line of its own table cell."""
     broken = """[...document.querySelectorAll('.rows td, thead th')].filter(cell => {
         const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT), range = document.createRange();
         for (let node = walker.nextNode(); node; node = walker.nextNode())
@@ -544,7 +544,7 @@ def test_markup_in_names_has_no_effect(chromium, pages):
 
 @pytest.mark.parametrize("dark", [False, True])
 def test_text_has_contrast_with_its_background(chromium, pages, dark):
-    """WCAG's contrast of 4.5, of every element that has text of its own, in light and in dark."""
+    """Every element with text of its own has at least WCAG's contrast of 4.5, in light and in dark mode."""
     contrast = """(() => {
         const level = c => c / 255 <= 0.04045 ? c / 255 / 12.92 : ((c / 255 + 0.055) / 1.055) ** 2.4;
         const light = c => { const [r, g, b] = c.match(/[\\d.]+/g).map(Number);

@@ -1,4 +1,4 @@
-"""Errors as people see them, against values that can be computed by hand or stand in publications."""
+"""Errors as people see them, compared with values computed by hand or published."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from reslrb_cli.report.perceptual import (
 
 
 def test_colours_are_linear_srgb():
-    """White and the red of sRGB in L*a*b*; black and white are 100 apart; what is beyond white is white."""
+    """White and the red of sRGB have known L*a*b* values. Black and white are 100 apart. Colours beyond white count as
+    white.
+    """
     np.testing.assert_allclose(to_lab(np.ones(3)), [100, 0, 0], atol=0.02)
     np.testing.assert_allclose(to_lab(np.array([1.0, 0, 0])), [53.24, 80.09, 67.20], atol=0.03)
     red, green, blue = np.eye(3)
@@ -40,19 +42,23 @@ def test_identical_images():
 
 
 def test_the_signal_to_noise_ratio():
-    """An offset of 0.1 everywhere is 20 dB."""
+    """An offset of 0.1 everywhere gives 20 dB."""
     assert psnr(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.6)) == pytest.approx(20)
 
 
 def test_images_are_compared_as_displayed():
-    """In sRGB, where a linear 0.5 is 0.735357 and 0.214041 is 0.5, and where nothing is brighter than 1."""
+    """Errors are computed in sRGB, where a linear 0.5 is 0.735357 and a linear 0.214041 is 0.5. No value is brighter
+    than 1.
+    """
     half, dark = np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.214041)
     assert image_errors(half, dark, 1.0)["psnr_db"] == pytest.approx(-20 * np.log10(0.735357 - 0.5), rel=1e-4)
     assert image_errors(dark, 2 * dark, 20.0)["psnr_db"] is None
 
 
 def test_structural_similarity():
-    """Of two even images it is (2 a b + C) / (a² + b² + C), with C = 0.01²; small images have none."""
+    """The similarity of two even images is (2 a b + C) / (a² + b² + C), with C = 0.01². Small images have no
+    similarity.
+    """
     first, second = np.full((16, 16, 1), 0.5), np.full((16, 16, 1), 0.7)
     assert ssim(first, second) == pytest.approx((2 * 0.35 + 1e-4) / (0.25 + 0.49 + 1e-4), rel=1e-6)
     assert ssim(first[:10], second[:10]) is None
@@ -76,7 +82,7 @@ def test_non_finite_pixels_are_counted_and_black():
 
 
 def test_grey_images_and_alpha():
-    """One channel counts as a grey colour; alpha is no colour."""
+    """One channel counts as a grey colour. Alpha does not count as a colour."""
     grey, other = texture(16, 16)[:, :, :1], texture(16, 16, seed=2)[:, :, :1]
     found = image_errors(grey, other, 1.0)
     tripled = image_errors(np.repeat(grey, 3, axis=2), np.repeat(other, 3, axis=2), 1.0)
@@ -87,7 +93,7 @@ def test_grey_images_and_alpha():
 
 
 def test_recovered_colours():
-    """Only the texels in the mask count. Arrays of one number, refractive indices and positions are no colours."""
+    """Only the texels in the mask count. Arrays of one number, refractive indices and positions are not colours."""
     true, final = np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.5)
     final[0] = 0.9
     mask = np.ones((4, 4), bool)

@@ -1,4 +1,4 @@
-"""One page about several runs and measurements, whole optimisations, versions and commands."""
+"""Pages about several runs and measurements, whole optimisations, versions and commands."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def page_of(*paths):
 
 
 def lines_drawn(markup):
-    """The colours of the curves in each diagram, in order."""
+    """Return the colours of the curves in each diagram, in order."""
     diagrams = re.findall(r"<svg .*?</svg>", markup, re.S)
     return [[c for c in COLORS if f"stroke: {c}" in diagram] for diagram in diagrams]
 
@@ -185,7 +185,9 @@ def test_a_convergence(tmp_path):
 
 
 def test_a_convergence_over_samples_and_of_a_single_parameter(tmp_path):
-    """Each number of samples is a method of its own; what all parameters come to is left out where there is one."""
+    """Each sample count is a separate method. For a single parameter, the page leaves out the results of all parameters
+    together.
+    """
     lines = [line for what in ("all", LAMP) for line in convergence_lines(what)]
     lines += [line | {"spp": 16} for line in lines if line["kind"] == "point"]
     (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -256,7 +258,7 @@ def test_other_folders(tmp_path):
 
 
 def damage(folder, change):
-    """Change the manifest in a run folder."""
+    """Apply `change` to the manifest in a run folder."""
     manifest = json.loads((folder / "manifest.json").read_text())
     change(manifest)
     (folder / "manifest.json").write_text(json.dumps(manifest))

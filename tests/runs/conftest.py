@@ -1,4 +1,4 @@
-"""What the tests of runs that go on share."""
+"""Fixtures shared by the tests of resumed runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from reslrb_cli.runs import recorder as recording
 
 @pytest.fixture
 def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory, with `tiny.yaml` of two parameters; nothing is cached before."""
+    """The working directory, which contains `tiny.yaml` with two parameters. The cache is empty at first."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
@@ -23,7 +23,7 @@ def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 @pytest.fixture(scope="module")
 def interrupted(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The folder of a run that has done 4 of 6 iterations, its states those after 4 and 3."""
+    """Folder of a run that has done 4 of 6 iterations. Its states are those after iterations 4 and 3."""
     folder = tmp_path_factory.mktemp("interrupted")
     tiny.write_experiment(folder)
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Runs, what a kill would have left of them in their midst, and whether both come to the same."""
+"""Helpers that make a run, make a copy as a kill would leave it, and compare two runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOTION = "{motion: {of: wall, free: [translation, scale]}, learning_rate: 0.01}"
 
 
 def write_experiment(folder: Path) -> None:
-    """As `tiny` has it, with three sensors, a smooth filter, and parameters of two shapes."""
+    """Write the experiment of `tiny` with three sensors, a smooth filter, and parameters of two shapes."""
     eyes = [f"{x}, 0, 4" for x in (0, 1, -1)]
     tiny.write_experiment(folder, tiny.scene_seen(*eyes, rfilter="gaussian"))
     config = tiny.CONFIG.replace(f"\n  - {{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}", f" {PARAMETERS}")
@@ -43,7 +43,7 @@ def write_experiment(folder: Path) -> None:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Sums of a kernel have one order then."""
+    """Use one thread, which fixes the order of a kernel's sums."""
     dr.sync_thread()
     before = dr.thread_count()
     dr.set_thread_count(1)
@@ -55,10 +55,10 @@ def one_thread() -> Iterator[None]:
 
 
 def work_alone(patch: pytest.MonkeyPatch) -> None:
-    """Have one thread compute what is measured before the first iteration, every step, and what follows from it.
+    """Make one thread compute the measurements before the first iteration, every step, and the results of the steps.
 
-    Sums have one order then. Not all of the program: with one thread Mitsuba never comes to the end of reading, or
-    writing, an EXR file.
+    The sums then have a fixed order. The rest of the program keeps its threads. With one thread, Mitsuba never finishes
+    reading or writing an EXR file.
     """
 
     def alone(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -84,8 +84,9 @@ def work_alone(patch: pytest.MonkeyPatch) -> None:
 
 
 def begin_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The experiment in the working directory, for runs that are to be equal bit by bit; their pages, which take longer
-    than they do, are not drawn."""
+    """Prepare the experiment in the working directory for runs that must be equal bit by bit. Reports are not drawn,
+    because drawing takes longer than the runs.
+    """
     write_experiment(folder)
     work_alone(monkeypatch)
     monkeypatch.chdir(folder)
@@ -95,7 +96,7 @@ def begin_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def optimize(*args: str) -> int:
-    """`reslrb optimize` in this process; its exit code."""
+    """Run `reslrb optimize` in this process, and return its exit code."""
     with pytest.raises(SystemExit) as end:
         main.main(["optimize", *args])
     logging.getLogger("reslrb_cli").handlers.clear()
@@ -105,7 +106,9 @@ def optimize(*args: str) -> int:
 def run_and_kill(
     monkeypatch: pytest.MonkeyPatch, at: int, *args: str, act: Callable[[Path], object] = lambda run: None
 ) -> tuple[Path, Path]:
-    """A whole run, and a copy of what a process that was killed after iteration `at` would have left."""
+    """Return the folder of a complete run, and a copy of the folder that a process killed after iteration `at` would
+    leave.
+    """
     show = progress.Progress.show
     run, left = Path("runs/tiny"), Path("runs/killed")
 
@@ -124,30 +127,32 @@ def run_and_kill(
 
 
 def state_of(run: Path) -> dict[str, np.ndarray[Any, Any]]:
-    """The arrays of the newest state."""
+    """Return the arrays of the newest state."""
     with np.load(run / "checkpoint/state.npz") as arrays:
         return {name: arrays[name] for name in arrays.files if name != "state"}
 
 
 def records_of(run: Path) -> list[dict[str, Any]]:
-    """The metrics, without times."""
+    """Return the metrics without times and peak memory."""
     lines = (run / "metrics.jsonl").read_text().splitlines()
     return [{key: value for key, value in json.loads(line).items() if key not in TIMES} for line in lines]
 
 
 def found_of(run: Path) -> dict[str, Any]:
-    """What the manifest says was found, without times, and what several threads measure after the last iteration."""
+    """Return the results in the manifest. Times are left out, and so are the measurements that several threads make
+    after the last iteration.
+    """
     results = json.loads((run / "manifest.json").read_text())["results"]
     return {key: value for key, value in results.items() if key not in ("elapsed_s", "certainty", "error_maps")}
 
 
 def noted_by(run: Path) -> Any:
-    """What the newest state says of what certainty has taken note of, but for arrays."""
+    """Return the values, without arrays, that the newest state holds for the certainty measurement."""
     return read_state(run / "checkpoint/state.npz")[1]["certainty"]
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """Where two runs are not the same, bit by bit."""
+    """Return the names of all entries in which two runs differ in any bit."""
     one, other = state_of(first), state_of(second)
     found = [f"entry {name}" for name in sorted(set(one) ^ set(other))]
     found += [
@@ -167,6 +172,6 @@ def differences(first: Path, second: Path) -> list[str]:
 
 
 def left_over(run: Path) -> list[str]:
-    """Files of no bytes, and those that were never finished."""
+    """Return all empty files and all files that were never finished."""
     names = [path for path in run.rglob("*") if path.is_file()]
     return [os.fspath(path) for path in names if path.stat().st_size == 0 or path.name.startswith(".")]

@@ -1,4 +1,6 @@
-"""Hosts on this machine, each in a network namespace of its own: a scheduler, and others that reach nobody but it."""
+"""Hosts on this machine, each in a network namespace of its own. One host runs the scheduler. Every other host reaches
+only the scheduler.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ PREFIX = "reslrb-test"
 
 
 def missing() -> str:
-    """Why there can be none here; empty where there can."""
+    """Return the reason why hosts cannot be made here, or an empty text if they can."""
     if shutil.which("ip") is None or shutil.which("openssl") is None:
         return "needs iproute2 and openssl"
     done = subprocess.run(["ip", "netns", "add", f"{PREFIX}-try"], capture_output=True, text=True)
@@ -27,7 +29,9 @@ def missing() -> str:
 
 
 def make_certificates(folder: Path) -> dict[str, str]:
-    """An authority, and a key with a certificate that it has signed, as docs/cluster.md says; dask's variables."""
+    """Write a key and a self-signed certificate, which is also the authority, as in docs/cluster.md. Return dask's
+    variables for them.
+    """
     request = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=reslrb",
                "-keyout", folder / "key.pem", "-out", folder / "cert.pem"]  # fmt: skip
     subprocess.run(request, check=True, capture_output=True)
@@ -39,7 +43,7 @@ def make_certificates(folder: Path) -> dict[str, str]:
 
 
 class Hosts:
-    """Namespaces `s` of the scheduler, and `0`, `1`, ... each with a line to it alone."""
+    """Namespace `s` of the scheduler, and namespaces `0`, `1`, ... Each of these is connected only to `s`."""
 
     def __init__(self, count: int, folder: Path) -> None:
         self.folder, self.count = folder, count
@@ -48,11 +52,11 @@ class Hosts:
         self.running: list[subprocess.Popen[bytes]] = []
 
     def address(self, host: int) -> str:
-        """The scheduler's, as a host sees it."""
+        """Return the address of the scheduler as seen from a host."""
         return f"tls://10.77.{host}.1:{PORT}"
 
     def make(self) -> None:
-        """Make the namespaces and the lines between them."""
+        """Make the namespaces and the links between them."""
         _ip("netns", "add", f"{PREFIX}-s")
         _ip("-n", f"{PREFIX}-s", "link", "set", "lo", "up")
         for host in range(self.count):
@@ -65,13 +69,13 @@ class Hosts:
                 _ip("-n", space, "link", "set", end, "up")
 
     def cut(self, host: int, whether: bool = True) -> None:
-        """Cut a host off, or not."""
+        """Disconnect a host, or connect a host again."""
         _ip("-n", f"{PREFIX}-s", "link", "set", f"rs{host}", "down" if whether else "up")
 
     def start(
         self, host: int | str, command: Sequence[object], core: int | None = None, **variables: str
     ) -> subprocess.Popen[bytes]:
-        """Start a command on a host, on one core of this machine, or all; what it says is kept in a file."""
+        """Start a command on a host, on one core of this machine or on all cores. Its output goes to a log file."""
         pinned = [] if core is None else ["taskset", "-c", str(core)]
         words = ["ip", "netns", "exec", f"{PREFIX}-{host}", *pinned, *map(str, command)]
         log = (self.folder / f"log-{len(self.running)}-{host}.txt").open("wb")
@@ -94,7 +98,7 @@ class Hosts:
                                  "--name", f"host {host}", *options], core, **variables)  # fmt: skip
 
     def remove(self) -> None:
-        """End what runs there, and remove the namespaces."""
+        """End all processes in the namespaces, and remove the namespaces."""
         for process in self.running:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, 9)
@@ -113,7 +117,7 @@ def _ip(*words: object) -> None:
 
 @contextmanager
 def hosts(count: int, folder: Path) -> Iterator[Hosts]:
-    """So many hosts beside that of the scheduler."""
+    """Yield `count` hosts in addition to the scheduler's host."""
     made = Hosts(count, folder)
     try:
         made.make()

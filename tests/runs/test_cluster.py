@@ -1,4 +1,6 @@
-"""Steps on several processes: the numbers of one, whoever computes them and whatever becomes of them."""
+"""Steps on several processes give the same numbers as one process. Neither the number of workers nor their failures
+matter.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +57,9 @@ def make(folder: Path, *sets: str) -> RunProgress:
 
 
 def both(folder: Path, *sets: str) -> tuple[dict[str, np.ndarray], RunProgress]:
-    """What a course comes to in this process, and another with the same targets: these are rendered on all threads, so
-    that now and then two renderings differ in their last bits."""
+    """Return the result of a course in this process, and a second course with the same targets. Targets are rendered on
+    all threads, so two renderings sometimes differ in their last bits.
+    """
     first = make(folder, *sets)
     targets = target_arrays(first.problem.views)
     alone = end(first)
@@ -67,7 +70,7 @@ def both(folder: Path, *sets: str) -> tuple[dict[str, np.ndarray], RunProgress]:
 
 
 def end(course: RunProgress, after: Callable[[int], object] = lambda iteration: None) -> dict[str, np.ndarray]:
-    """The values after the iterations, and what tables have learned."""
+    """Return the parameter values after the iterations, and the learned tables."""
     with one_thread():
         for state, _ in iterate(course.stages, course.state):
             after(state.iteration)
@@ -113,7 +116,7 @@ def check(folder: Path, case: str, workers: int) -> None:
 
 
 def compare(folder: Path, sets: list[str], workers: int) -> None:
-    """Bit by bit, with one thread each."""
+    """Compare the results bit by bit, with one thread each."""
     alone, course = both(folder, *sets)
     with engine.engine_at(course, Place(workers), threads=1) as local:
         course.compute_with(local)
@@ -149,8 +152,9 @@ QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n
 def test_a_bundle_contains_all_files_of_an_experiment(
     llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Includes, folders of <path>, variables, meshes, textures, initial values and cameras, wherever they are; in the
-    end nothing of the experiment's own folder is read."""
+    """The bundle contains includes, files from <path> folders, variables, meshes, textures, initial values and cameras,
+    wherever they are. After unpacking, nothing is read from the experiment's own folder.
+    """
     rng, where = np.random.default_rng(1), made(tmp_path / "here")
     for name in ("parts", "textures", "shots"):
         made(where / name)
@@ -189,7 +193,7 @@ def test_a_bundle_contains_all_files_of_an_experiment(
 
 @pytest.fixture
 def as_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """This process as a worker."""
+    """This process in the role of a worker."""
     me = SimpleNamespace(address="tls://here:1", local_directory=str(tmp_path), name=1)
     monkeypatch.setattr(worker, "get_worker", lambda: me)
     monkeypatch.setattr(worker, "_state", None)
@@ -200,7 +204,9 @@ def reads(folder: Path, threads: int) -> tuple[str, dict[str, float]]:
 
 
 def test_a_worker_reports_missing_requirements(as_worker: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another version and code that is not asked for stand against it for good; files are sent once."""
+    """A different version, or users' own code without permission, excludes a worker permanently. Files are sent only
+    once.
+    """
     opening = worker.Opening("1", reads)
     other = worker.Opening("1", reads, versions={"mitsuba": "0.1"})
     said = worker.open_state(other, None, 1)
@@ -233,7 +239,7 @@ def test_each_worker_sees_one_gpu(as_worker: None, monkeypatch: pytest.MonkeyPat
 
 @contextmanager
 def beside(folder: Path, workers: int, iterations: int, *sets: str):
-    """A course with so many workers, and what it should come to."""
+    """Yield a course with `workers` workers and its crew, and compare its result with one process."""
     sets = ("run.shards=4", f"run.iterations={iterations}", "views=[{sensor: 0}]", *sets)
     alone, course = both(folder, *sets)
     with engine.engine_at(course, Place(workers), threads=1) as local:
@@ -246,12 +252,12 @@ def beside(folder: Path, workers: int, iterations: int, *sets: str):
 
 
 def hang() -> None:
-    """Have the worker that this is called on say nothing any more."""
+    """Make the worker that runs this function stop answering."""
     spoil(lambda: threading.Event().wait())
 
 
 def run_full() -> None:
-    """Have its disk be full."""
+    """Make the worker's next call fail as on a full disk."""
 
     def fail() -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -260,7 +266,7 @@ def run_full() -> None:
 
 
 def take_memory() -> None:
-    """Have its next call take twice the memory that it is allowed."""
+    """Make the worker's next call take 3 GiB, 1.5 times the memory that the worker may use."""
 
     def fill() -> None:
         taken = [np.ones(2**27) for _ in range(3)]
@@ -286,7 +292,9 @@ def spoil(act: Callable[[], object]) -> None:
 def test_failing_workers_are_restarted(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, fault: Callable[[], None], workers: int
 ) -> None:
-    """One of them, in the midst of a run, which ends the same, and is never held up for longer than a minute."""
+    """One worker fails in the middle of a run. The run ends with the same result, and no iteration takes longer than a
+    minute.
+    """
     monkeypatch.setattr("reslrb_cli.backend.memory.free_bytes", lambda variant: workers * 2 * 2**30)
     longest, before = 0.0, time.monotonic()
 
@@ -303,7 +311,7 @@ def test_failing_workers_are_restarted(
 
 @pytest.mark.long
 def test_a_very_slow_worker_is_not_waited_for(experiment: Path) -> None:
-    """A worker that has a twentieth of its time, from the second iteration on."""
+    """From iteration 6 on, one worker gets a twentieth of its time."""
     stopped = threading.Event()
 
     def slow(pid: int) -> None:
@@ -333,7 +341,7 @@ def test_a_very_slow_worker_is_not_waited_for(experiment: Path) -> None:
 
 @pytest.mark.long
 def test_thirty_kills_lose_nothing(experiment: Path) -> None:
-    """Of a random worker at random moments of 200 iterations."""
+    """Random workers are killed at random moments of 200 iterations."""
     rng = random.Random(1)
     moments = sorted(rng.sample(range(2, 199), 30))
     killed: list[int] = []
@@ -364,7 +372,7 @@ def _is_worker(pid: int) -> bool:
 
 @pytest.mark.long
 def test_memory_does_not_grow(experiment: Path) -> None:
-    """Of the run and its workers, from iteration 200 to 2,000."""
+    """The memory of the run and its workers is compared at iterations 200 and 2,000."""
     import psutil
 
     sizes: dict[int, list[int]] = {}
@@ -404,7 +412,7 @@ def values(folder: Path) -> dict[str, bytes]:
 
 
 def said(net, process) -> str:
-    """What a command that has ended said."""
+    """Return the output of a command that has ended."""
     number = net.running.index(process)
     (log,) = net.folder.glob(f"log-{number}-*.txt")
     return log.read_text()
@@ -412,7 +420,7 @@ def said(net, process) -> str:
 
 @pytest.mark.long
 def test_isolated_hosts_give_the_same(net, tmp_path: Path) -> None:
-    """One is cut off for 20 seconds in the midst; who has no certificate is refused."""
+    """One host is disconnected for 20 seconds in the middle of a run. A host with a foreign certificate is refused."""
     more = tiny.settings("run.iterations=40", "run.spp=64")
     local = reslrb(net, 2, *RUN, *more, "--cluster", "local:2", "--set", "run.name=local")
     assert local.wait(300) == 0, said(net, local)
@@ -437,7 +445,7 @@ def test_isolated_hosts_give_the_same(net, tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("whom", ["scheduler", "coordinator"])
 def test_a_single_worker_survives_five_kills(net, tmp_path: Path, whom: str) -> None:
-    """One line within a minute, and the same parameters by --resume."""
+    """If the scheduler is killed, one line appears within a minute. `--resume` gives the same parameters."""
     more = tiny.settings("run.iterations=60", "run.spp=64", "run.checkpoint_every={iterations: 5}")
     local = reslrb(net, 2, *RUN, *more, "--cluster", "local:2", "--set", "run.name=local")
     assert local.wait(300) == 0, said(net, local)

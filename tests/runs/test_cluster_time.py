@@ -1,4 +1,4 @@
-"""The time of workers that a run records."""
+"""The working time of workers, as recorded by a run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ QUICK = [word for text in SETS for word in ("--set", text)]
 
 
 def shared(run: str = "runs/tiny") -> SharedTime | None:
-    """What the manifest of a run says."""
+    """Return the workers' time in the manifest of a run."""
     told = json.loads(Path(run, "manifest.json").read_text())["shared"]
     if told is None:
         return None
@@ -29,7 +29,7 @@ def shared(run: str = "runs/tiny") -> SharedTime | None:
 
 
 class Counting:
-    """Computes shards here, for a second each."""
+    """Engine that computes shards here and counts one second for each."""
 
     def __init__(self, where: str) -> None:
         self.where, self.calls = where, 0
@@ -45,7 +45,9 @@ class Counting:
 
 
 def test_times_of_a_resumed_run_add_up(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two rounds of four shards an iteration; also where only the state knows, as after a kill."""
+    """Each iteration has two rounds of four shards. The times also add up if only the state holds them, as after a
+    kill.
+    """
 
     @contextmanager
     def at(course: object, place: object) -> Iterator[Counting]:
@@ -73,7 +75,7 @@ def test_a_local_run_has_no_cluster_time(experiment: Path) -> None:
 
 @pytest.mark.long
 def test_all_work_of_workers_is_counted(experiment: Path) -> None:
-    """Of each worker its calls, and of the iterations no more than they took."""
+    """The calls of all workers are counted. The recorded time of the iterations is not longer than the run."""
     run = ["tiny.yaml", *QUICK, "--cluster", "local:2"]
     assert optimize(*run, "--set", "run.iterations=4") == 0
     first = shared()

@@ -1,4 +1,4 @@
-"""A run that goes on ends where it would have ended, bit by bit; so does one that is killed."""
+"""A resumed run ends with the same bits as a run without interruption. This also holds for a killed run."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 @pytest.mark.parametrize("case", a_few(CASES, FEW))
 def test_a_killed_run_resumes_to_the_same_end(case: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It was killed three iterations after its newest state, which are done again."""
+    """The run is killed three iterations after its newest state. These iterations are computed again."""
     sets = [word for setting in CASES[case] for word in ("--set", setting)]
     at, newest = KILLED.get(case, (15, 12))
     whole, left = run_and_kill(monkeypatch, at, *ITERATIONS, *sets)
@@ -150,7 +150,9 @@ def test_a_killed_run_resumes_to_the_same_end(case: str, experiment: Path, monke
 
 
 def test_a_run_killed_in_five_stages_resumes_to_the_same_end(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the midst of a stage, and at the moment at which the next one begins; from each state a life goes on."""
+    """The run is killed in the middle of a stage, and at the moment at which the next stage begins. A run is resumed
+    from each state.
+    """
     settings = ["run.checkpoint_every={iterations: 1}", "run.certainty=false", FIVE_STAGES]
     sets = [word for setting in settings for word in ("--set", setting)]
     whole, left = run_and_kill(monkeypatch, 2, *ITERATIONS[:2], *sets)
@@ -172,8 +174,9 @@ def test_a_run_killed_in_five_stages_resumes_to_the_same_end(experiment: Path, m
 
 
 def test_fewer_iterations_end_a_coarse_stage_at_once(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run was killed in its coarse stage, after the end of this stage in the shorter run. Losses and values of the
-    coarse stage are not among the best."""
+    """The run is killed in its coarse stage, at an iteration after the end of this stage in the shorter run. Losses and
+    values of the coarse stage do not count as best.
+    """
     sets = ["--set", "run.stages=[{until: 0.4, resolution: 0.5}]", "--set", "run.checkpoint_every={iterations: 1}"]
     _, left = run_and_kill(monkeypatch, 20, "--set", "run.iterations=60", *sets, *ITERATIONS[4:])
     assert optimize("--resume", str(left), "--quiet", "--set", "run.iterations=22") == 0
@@ -183,7 +186,7 @@ def test_fewer_iterations_end_a_coarse_stage_at_once(experiment: Path, monkeypat
 
 
 def test_a_run_with_wrong_tables_resumes(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its newest state is that of a moment at which gradients are counted anew."""
+    """The newest state is from a moment at which the count of gradients restarts at 0."""
     right = Learned.with_more
 
     def wrong(*given: Any) -> Learned:
@@ -199,7 +202,7 @@ def test_a_run_with_wrong_tables_resumes(experiment: Path, monkeypatch: pytest.M
 
 
 def test_a_resumed_run_can_be_resumed_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And a finished one has more iterations, as many as it would have had at once."""
+    """A finished run is resumed twice with more iterations. Its result equals that of one run with all iterations."""
     assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE, "--set", "run.name=whole") == 0
     assert optimize("tiny.yaml", "--quiet", *ITERATIONS, "--set", "run.iterations=7", *SIMPLE) == 0
     for iterations in (13, 18):
@@ -230,7 +233,7 @@ def _another_seed(run_seed, iteration, view, purpose):
     ),
 )
 def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Planted: each part of the state is left out in turn."""
+    """Each planted fault drops a part of the state, changes seeds, or keeps surplus metrics."""
     from reslrb_cli.runs import prepare, resume
 
     load, restore = prepare.load, prepare.RunProgress.restore
@@ -262,7 +265,9 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
 
 
 def test_a_state_survives_a_round_trip(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A failure in the midst of an update leaves the state of the last whole iteration to be kept."""
+    """After a failure in the middle of an update, the folder keeps the state of the last complete iteration. The run
+    resumes from this state.
+    """
     step, calls = optimizers.Optimizer.step, []
 
     def failing(self, factor, skip=()):
@@ -318,13 +323,13 @@ def end(process: subprocess.Popen[str]) -> tuple[int, str]:
 
 
 def count(run: Path) -> int:
-    """Lines of the metrics."""
+    """Return the number of metrics lines."""
     path = run / "metrics.jsonl"
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
 def kill_at_random(process: subprocess.Popen[str], run: Path, chance: random.Random) -> None:
-    """In the midst of its iterations, for the most part; else whenever it may be."""
+    """Kill the process at a random moment, mostly in the middle of its iterations."""
     if chance.random() < 0.2:
         time.sleep(chance.uniform(0, 4))
     else:
@@ -441,7 +446,9 @@ def test_a_run_with_a_full_disk_resumes_when_there_is_room(tmp_path: Path, disk:
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
 @pytest.mark.long
 def test_with_several_threads_it_differs_no_more_than_repeated_runs(tmp_path: Path) -> None:
-    """Twice the largest distance among five whole runs, as large as sums in another order make it."""
+    """The allowed distance is twice the largest distance among five complete runs. These runs differ because their sums
+    have different orders.
+    """
     tiny.write_experiment(tmp_path)
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     sets = [*SETS, "--set", "run.iterations=80", "--set", "run.spp=1024", "--set", "run.adjoint=batched"]

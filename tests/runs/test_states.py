@@ -1,4 +1,4 @@
-"""States that are damaged or do not fit: the run goes on, or one line says why not."""
+"""With states that are damaged or do not fit, the run continues or one line gives the reason."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ STATE, PREVIOUS = "checkpoint/state.npz", "checkpoint/previous.npz"
 
 @pytest.fixture
 def run(interrupted: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
+    """Copy of the interrupted run."""
     return Path(shutil.copytree(interrupted, tmp_path / "run"))
 
 
 def told(capsys: pytest.CaptureFixture[str], run: Path, *args: str) -> str:
-    """The one line with which `--resume` is refused, without the folder; the run is as it was."""
+    """Return the one line with which `--resume` refuses the run, without the folder. The run must stay unchanged."""
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     capsys.readouterr()
     with pytest.raises(SystemExit) as end:
@@ -48,7 +48,7 @@ def told(capsys: pytest.CaptureFixture[str], run: Path, *args: str) -> str:
 
 
 def rewritten(run: Path, arrays: dict[str, Any] | None = None, values: dict[str, Any] | None = None) -> None:
-    """Write the states of a run anew, with other arrays and values; None leaves out."""
+    """Write the states of a run again with other arrays and values. A value of None removes its entry."""
     for name in (STATE, PREVIOUS):
         with np.load(run / name) as state:
             kept = {key: state[key] for key in state.files}
@@ -124,7 +124,9 @@ def test_differences_are_shown(run: Path, capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_the_source_of_a_change_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Not an override that may change what it does, beside a file in which something else was changed."""
+    """The line names the changed configuration file, not the override beside it. This override only changes a setting
+    that may change.
+    """
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(text.replace("max_depth: 3", "max_depth: 4"))
     line = told(capsys, run, "--set", "run.iterations=9")
@@ -144,7 +146,9 @@ def test_a_changed_scene_is_another_experiment(
 
 
 def test_changeable_settings_are_in_the_manifest(run: Path, tmp_path: Path) -> None:
-    """Iterations, learning rates, and the folder, in which case the first one stays as it was."""
+    """Iterations, learning rates and the output folder can change. With another folder, the first folder stays
+    unchanged.
+    """
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     sets = ["run.iterations=7", "optimizer.learning_rate=0.1", f"run.output={tmp_path}/other"]
     assert optimize("--resume", str(run), "--quiet", *(word for each in sets for word in ("--set", each))) == 0
@@ -192,7 +196,7 @@ def test_lost_lines_are_reported(run: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_an_unwritable_folder_is_reported(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """And the run can go on in another."""
+    """The run can continue in another folder."""
     place = tmp_path / "disk"
     place.mkdir()
     mount(place, 4096)

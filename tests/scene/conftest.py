@@ -10,7 +10,9 @@ import pytest
 
 @pytest.fixture
 def make_scene(llvm: str) -> Callable[..., Any]:
-    """A function that makes a scene: a lit textured floor seen by a camera, with `changes` to its dictionary."""
+    """Function that makes a scene of a lit textured floor seen by a camera. Its arguments `changes` replace entries of
+    the scene's dictionary.
+    """
     import mitsuba as mi
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""Cameras of other programs' files: where they stand, what they see of a point, and what is refused."""
+"""Cameras from files of other programs: their poses, the pixel in which they see a point, and refused files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def write_nerf(folder, **changes):
 
 
 def quaternion(rotation):
-    """Of a rotation, w first."""
+    """Return the quaternion of a rotation, w first."""
     values, vectors = np.linalg.eigh(
         np.array(
             [
@@ -71,7 +71,7 @@ def write_colmap(folder, model=f"PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {CENTE
 
 
 def directions(scene, number):
-    """Where the sensor looks in PIXELS."""
+    """Return the sensor's viewing directions at PIXELS."""
     position = mi.Point2f(*(PIXELS / (WIDTH, HEIGHT)).T)
     ray, _ = scene.sensors()[number].sample_ray(0, 0.5, position, mi.Point2f(0.5))
     np.testing.assert_allclose(np.array(ray.o)[:, 0] + 0 * EYE, EYE, atol=0.02)  # on the near plane
@@ -109,7 +109,7 @@ def test_images_of_the_cameras_are_the_targets(folder):
 
 
 def test_images_of_the_cameras_are_not_rotated(folder):
-    """COLMAP looks for cameras that see pixels as they lie in the file."""
+    """COLMAP finds cameras for the pixels as stored in the file, so the EXIF orientation is not applied."""
     from PIL import Image  # comes with matplotlib
 
     image = Image.fromarray(np.random.default_rng(3).integers(9, 200, (HEIGHT, WIDTH, 3), dtype=np.uint8))

@@ -1,4 +1,4 @@
-"""Motions, heightmaps and tied keys: what they do to a scene, how gradients come back, and what is refused."""
+"""Motions, heightmaps and tied keys: their effect on a scene, their gradients, and refused settings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ def heightmap(mesh: Any, resolution: Any = (4, 3), **settings: Any) -> dict[str,
 
 @pytest.fixture
 def scene(make_scene):
-    """The lit floor, with a box, a ball, a spot light and a mesh without texture coordinates."""
+    """The lit floor with more objects. Among these are a box, a ball, a spot light and a mesh without texture
+    coordinates.
+    """
     import mitsuba as mi
 
     T = mi.ScalarTransform4f
@@ -64,7 +66,7 @@ def matrix(selection: Any, key: str) -> np.ndarray:
 
 
 def turn(degrees: Any) -> np.ndarray:
-    """Rz Ry Rx."""
+    """Return the rotation Rz Ry Rx."""
     result = np.eye(3)
     for axis, angle in enumerate(np.radians(degrees)):
         i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -89,7 +91,7 @@ def test_a_mesh_is_scaled_rotated_and_translated_in_this_order(scene):
 
 
 def test_axes_move_alone(scene):
-    """Only the free axes move, each by its own number; the derivative of a held axis has nowhere to go."""
+    """Only the free axes move, each by its own number. The derivative of a fixed axis reaches no parameter."""
     import drjit as dr
     import mitsuba as mi
 
@@ -116,7 +118,9 @@ def test_all_parts_rotate_about_the_centre_of_their_box(scene):
 
 
 def test_shapes_and_emitters_move_with_a_mesh(scene):
-    """One motion: places of all move alike, directions turn, and frames of emitters have no scale."""
+    """One motion moves the positions of all objects alike and rotates directions. The transforms of emitters get no
+    scale.
+    """
     plain = select(scene, motion("box"))
     old = {key: matrix(plain, key) for key in ("ball.to_world", "spot.to_world", "sun.to_world")}
     point = np.array(plain.params["lamp.position"]).reshape(3)
@@ -185,7 +189,7 @@ def test_interpolated_normals_follow(scene):
 
 
 def test_gradients_reach_the_moving_parameters(scene):
-    """Central differences of where the vertices are, weighted as a step would."""
+    """The gradients equal central differences of weighted vertex positions and of the ball's weighted transform."""
     import drjit as dr
     import mitsuba as mi
 
@@ -222,7 +226,7 @@ def test_gradients_reach_the_moving_parameters(scene):
 
 
 def test_a_non_finite_gradient_is_not_lost(llvm):
-    """Where no other vertex shares its texels, atomic sums would drop it."""
+    """Atomic sums would drop the non-finite gradient of a vertex that shares its texels with no other vertex."""
     import drjit as dr
     import mitsuba as mi
 

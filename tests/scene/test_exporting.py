@@ -1,4 +1,4 @@
-"""Exported scenes: Mitsuba alone reads recovered values back, and renders the same image, whatever was recovered."""
+"""Exported scenes: Mitsuba alone reads the recovered values and renders the same image, for every kind of parameter."""
 
 from __future__ import annotations
 
@@ -110,13 +110,15 @@ TOGETHER = [name for name in KINDS if name not in ("finer texture", "colour", "h
 
 @pytest.fixture(autouse=True)
 def _without_checks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leaves out what loading measures of a scene: with so many kinds of things in one it takes long to compile."""
+    """Skip the measurements that loading makes of a scene. A scene with so many kinds of objects takes long to
+    compile.
+    """
     monkeypatch.setattr(load, "doubts", lambda scene: [])
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
-    """The scene, with what it names."""
+    """The scene file, with the files that it names."""
     folder = tmp_path_factory.mktemp("exporting")
     (folder / "room/images").mkdir(parents=True)
     random = np.random.default_rng(0)
@@ -151,13 +153,13 @@ def file(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
 
 
 def described(file: Path, keys: Sequence[str] = ()) -> tuple[mi.Scene, Description]:
-    """The scene, and what it was built from."""
+    """Return the scene and the description that it was built from."""
     found: list[Description] = []
     return load_scene(file, {"elsewhere": str(file.parent.parent)}, look=found.append, keys=keys), found[0]
 
 
 def changed(file: Path, names: list[str]) -> tuple[mi.Scene, Description, Selection]:
-    """The scene with other values of what `names` of `KINDS` recover."""
+    """Return the scene with other values of the parameters that `names` recover, its description and the selection."""
     scene, description = described(file, ["floor.*"])
     selection = select_parameters(scene, [ParameterSpec(**KINDS[name][0]) for name in names], "c.yaml")
     random = np.random.default_rng(1)
@@ -176,7 +178,7 @@ def export(description: Description, selection: Selection, folder: Path) -> None
 
 
 def images(scene: mi.Scene, seeds: range, spp: int) -> np.ndarray:
-    """Images (N, H, W, 3) by Mitsuba's own `path`."""
+    """Return images (N, H, W, 3) that Mitsuba's own `path` renders."""
     integrator = mi.load_dict({"type": "path", "max_depth": 5})
     return np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed)) for seed in seeds])
 

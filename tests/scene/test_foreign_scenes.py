@@ -1,4 +1,4 @@
-"""Scenes of other versions and exporters, and their spectra: what is mended, read as colours, or refused."""
+"""Scenes of other versions and exporters, and their spectra: repairs, conversions to colours, and refusals."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def write(folder: Path, **changes: str) -> Path:
 
 
 def values(scene: Any) -> dict[str, Any]:
-    """Every number of a scene by its key."""
+    """Return every number of a scene by its key."""
     import mitsuba as mi
 
     return {
@@ -56,7 +56,9 @@ def values(scene: Any) -> dict[str, Any]:
 
 
 def assert_same(found: dict[str, Any], expected: dict[str, Any]) -> None:
-    """The same numbers in the same order, under the same keys but for what Mitsuba names by its address."""
+    """Assert that both scenes have the same numbers in the same order. Keys must be equal except where Mitsuba makes a
+    name from an address.
+    """
     assert len(found) == len(expected)
     for (key, value), (other, reference) in zip(found.items(), expected.items(), strict=True):
         parts = slice(1 if other.startswith("object_") else 0, None)
@@ -345,7 +347,7 @@ def value(scene: mi.Scene, key: str) -> np.ndarray:
 
 
 def colour(wavelengths: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The colour of light of that spectrum: what Mitsuba's spectral variants make of it."""
+    """Return the colour of light with the given spectrum, as Mitsuba's spectral variants compute the colour."""
     fine = np.linspace(wavelengths[0], wavelengths[-1], 20001)
     matching = np.array(mi.cie1931_xyz(mi.Float(fine.astype(np.float32))), dtype=np.float64)
     heights = matching * np.interp(fine, wavelengths, values)
@@ -354,7 +356,7 @@ def colour(wavelengths: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def black_body(temperature: float, low: float = 360, high: float = 830) -> tuple[np.ndarray, np.ndarray]:
-    """Wavelengths in nm, and radiance in W/(m^2 sr nm)."""
+    """Return wavelengths in nm and the radiance in W/(m^2 sr nm)."""
     nm = np.linspace(low, high, 5001)
     metres = 1e-9 * nm
     exponent = PLANCK * LIGHT / (metres * BOLTZMANN * temperature)

@@ -1,4 +1,6 @@
-"""Scene files that Mitsuba would crash on, never finish reading, or not locate: each is one located line."""
+"""Scene files that Mitsuba would crash on, never finish reading, or not locate. Each gives one line with the
+location.
+"""
 
 from __future__ import annotations
 

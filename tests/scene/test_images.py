@@ -1,4 +1,4 @@
-"""Images: formats, colour spaces, photographs, and files that are no whole images."""
+"""Images: formats, colour spaces, photographs, and incomplete or damaged files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def picture():
-    """(H, W, 3) float32 with detail everywhere."""
+    """Return a (H, W, 3) float32 image with detail everywhere."""
     y, x = np.mgrid[0:96, 0:128].astype(np.float32)
     noise = np.random.default_rng(3).uniform(0, 0.3, (96, 128, 3)).astype(np.float32)
     return noise + np.stack([x / 200, y / 200, (x + y) / 400], axis=-1)
@@ -37,7 +37,7 @@ NAMES = ["a.jpg", "progressive.jpg", "restarts.jpg", "a.png", "a.exr", "a.hdr", 
 
 @pytest.fixture(params=NAMES)
 def image(request, tmp_path):
-    """A whole image file of each format that can be read."""
+    """A complete image file in each readable format."""
     import mitsuba as mi
     from PIL import Image  # comes with matplotlib
 
@@ -52,7 +52,7 @@ def image(request, tmp_path):
 
 
 def refused(path, **options):
-    """The message for a file that is refused, which is located in it."""
+    """Return the message for a refused file, without the file's path at its beginning."""
     with pytest.raises(ConfigError) as caught:
         read_image(path, **options)
     line = str(caught.value)
@@ -117,7 +117,7 @@ def test_messages_of_libjpeg_are_read_without_standard_error(tmp_path, monkeypat
 
 
 def png(width, height, data=b""):
-    """A PNG file that says that it is of that size."""
+    """Return a PNG file whose header gives the size `width` x `height`."""
 
     def chunk(kind, content):
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
@@ -127,7 +127,7 @@ def png(width, height, data=b""):
 
 
 def exr(right, bottom):
-    """The head of an EXR file that says that it is of that size."""
+    """Return the head of an EXR file whose data window ends at pixel (`right`, `bottom`)."""
 
     def attribute(name, kind, content):
         return name + b"\0" + kind + b"\0" + struct.pack("<i", len(content)) + content
@@ -214,7 +214,7 @@ def test_a_failed_allocation_is_no_damage(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("width", [7, 8, 40, 300])
 def test_lines_of_a_radiance_image_are_checked_before_decoding(width, tmp_path):
-    """Mitsuba writes past its memory where one of them is no runs, which the first ones are."""
+    """If the first lines are run-length encoded and a later line is not, Mitsuba writes past its memory."""
     import mitsuba as mi
 
     path = tmp_path / "a.hdr"
@@ -239,7 +239,7 @@ def test_lines_of_a_radiance_image_are_checked_before_decoding(width, tmp_path):
 
 
 def with_orientation(path, orientation, channels=3):
-    """A picture of 7x5 pixels in a file whose EXIF has this orientation, as Pillow writes it."""
+    """Write a picture of 7x5 pixels whose EXIF has this orientation, in the form that Pillow writes."""
     from PIL import Image  # comes with matplotlib
 
     pixels = np.random.default_rng(1).integers(0, 255, (5, 7, channels), dtype=np.uint8)
@@ -270,14 +270,14 @@ def test_orientation_matches_pillow(name, channels, orientation, tmp_path):
 
 
 def exif(entries, order=">", place=8, count=None):
-    """What EXIF says, from its entries (tag, type, count, value)."""
+    """Return EXIF data with the given entries (tag, type, count, value)."""
     head = (b"MM\0*" if order == ">" else b"II*\0") + struct.pack(f"{order}I", place)
     body = struct.pack(f"{order}H", len(entries) if count is None else count)
     return head + body + b"".join(struct.pack(f"{order}HHIHH", *entry, 0) for entry in entries)
 
 
 def jpeg_with(path, *contents, kind=0xE1):
-    """A JPEG of 7x5 pixels with these application segments behind its head."""
+    """Write a JPEG of 7x5 pixels with these application segments after its head."""
     import mitsuba as mi
 
     mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
@@ -329,7 +329,7 @@ def test_exif_without_orientation_rotates_nothing(data, tmp_path):
 
 
 def png_with(path, data):
-    """A PNG of 7x5 pixels with this EXIF data behind its head."""
+    """Write a PNG of 7x5 pixels with this EXIF data after its head."""
     import mitsuba as mi
 
     mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
@@ -365,7 +365,7 @@ def write(path, array):
 
 
 def srgb(value: float) -> float:
-    """Linear value of an sRGB-encoded one (IEC 61966-2-1)."""
+    """Return the linear value of an sRGB-encoded value (IEC 61966-2-1)."""
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
@@ -444,7 +444,7 @@ def test_missing_and_unreadable(tmp_path):
 
 
 def smaller(path: Path, values: np.ndarray, size: tuple[int, int]) -> Path:
-    """The file `values` as an image, and then with fewer pixels."""
+    """Write `values` as an image, and return a version of this image with fewer pixels."""
     bitmap = mi.Bitmap(np.ascontiguousarray(values))
     bitmap.set_srgb_gamma(values.dtype.kind == "u")
     source = path / ("photo.png" if values.dtype.kind == "u" else "photo.exr")

@@ -1,4 +1,4 @@
-"""Scene files: what loads, what names its objects get, and one located line for what does not."""
+"""Scene files that load, the names of their objects, and one line with the location for a file that does not load."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ TEXTURES = {
 
 @pytest.fixture
 def walls(tmp_path, request):
-    """A scene with this texture at its wall, and another of 8 bits at its ball."""
+    """Scene file whose wall has the texture under test. Its ball has another texture of 8 bits."""
     random = np.random.default_rng(0)
     for name, channels, kind in (("a.png", 3, np.uint8), ("rgba.png", 4, np.uint8), ("y.png", 1, np.uint8),
                                  ("a.jpg", 3, np.uint8), ("a16.png", 3, np.uint16)):  # fmt: skip
@@ -353,19 +353,19 @@ def write(folder: Path, text: str, name: str = "scene.xml") -> Path:
 
 
 def keys(file: Path, **options: object) -> list[str]:
-    """The keys of a scene, in their order."""
+    """Return the keys of a scene in their order."""
     import mitsuba as mi
 
     return list(mi.traverse(load_scene(file, options)).properties)
 
 
 def names(found: list[str]) -> list[str]:
-    """The objects that they begin with, in their order."""
+    """Return the objects with which the keys begin, in their order."""
     return list(dict.fromkeys(key.partition(".")[0] for key in found if "." in key))
 
 
 def lit(objects: str) -> str:
-    """A scene of `objects` that a lamp lights and a camera sees."""
+    """Return a scene of `objects` that a lamp lights and a camera sees."""
     return f'<scene version="3.0.0">\n{SENSOR}\n<emitter type="constant" id="sky"/>\n{objects}\n</scene>'
 
 
@@ -386,7 +386,9 @@ def test_names_have_kind_and_number(tmp_path):
 
 
 def test_a_script_sees_the_names_of_the_command_line(tmp_path):
-    """Of an older version's file, too, which `mi.load_file` refuses, with textures of 8 bits that are asked for."""
+    """A script gets the same keys as the command line. The file is of an older version that `mi.load_file` refuses.
+    Requested textures of 8 bits are floats.
+    """
     import mitsuba as mi
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""What a scene needs, how deep its paths are, what a sensor sees, and glass that rays jump over."""
+"""The requirements of a scene, the depth of its paths, the pixels of a sensor, and glass that rays jump over."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ GLASS = {"type": "dielectric"}
 
 @pytest.fixture
 def _without_scenes_of_before() -> Iterator[None]:
-    """Mitsuba asks all emitters that there are, also a `timed_sunsky` of a scene that an error still holds."""
+    """Collect garbage after the test. Mitsuba asks all existing emitters, also a `timed_sunsky` of a scene that an
+    error still holds.
+    """
     yield
     gc.collect()
 
@@ -301,7 +303,9 @@ def test_asymmetric_materials_are_refused_for_light_paths(make_scene, bsdf, same
 
 
 def inside(albedo: float) -> mi.Scene:
-    """A camera in a sphere of that albedo that emits 1: paths of at most d segments show the sum of albedo^k, k < d."""
+    """Return a scene with a camera in a sphere of this albedo that emits 1. Paths of at most d segments show the sum of
+    albedo^k over k < d.
+    """
     return mi.load_dict(
         {
             "type": "scene",
@@ -376,7 +380,7 @@ def test_crop_window_and_orientation(make_scene):
 
 
 def mirrored(make_scene, bsdf):
-    """The floor, which a sensor sees through a pane alone."""
+    """Return the scene of the floor, which the sensor sees only through a pane."""
     film = {"type": "hdrfilm", "width": 16, "height": 16}
     to_world = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0])
     pane = mi.ScalarTransform4f().translate([0, 0, 2]).scale(3)
@@ -394,7 +398,7 @@ def test_camera_paths_see_through_glass(make_scene):
 
 
 def test_excluded_pixels_show_nothing(make_scene):
-    """As a mask has them: those of the film's left half, (H, W)."""
+    """A mask (H, W) excludes pixels, here the left half of the film."""
     scene = make_scene()
     height, width = (int(n) for n in reversed(scene.sensors()[0].film().crop_size()))
     kept = np.ones((height, width), dtype=bool)
@@ -446,7 +450,9 @@ BLEND = {"type": "blendbsdf", "weight": 0.5, "one": {"type": "twosided", "bsdf":
 
 
 def seen(bsdf: dict, filter: str = "box", in_front: dict | None = None) -> SeenSpecular:
-    """What a sensor sees of a pane, two rows high, before a diffuse wall, with another pane before all of it."""
+    """Return the specular surfaces that a sensor sees of a pane, two rows high, before a diffuse wall. If `in_front` is
+    given, another pane stands before both.
+    """
     T = mi.ScalarTransform4f
     scene = {
         "type": "scene",
@@ -471,7 +477,7 @@ def seen(bsdf: dict, filter: str = "box", in_front: dict | None = None) -> SeenS
 
 
 def pixels(margin: int = 0) -> np.ndarray:
-    """The pixels of the pane, and so many around it."""
+    """Return a mask of the pane's pixels and of `margin` pixels around them."""
     mask = np.zeros((8, 16), dtype=bool)
     mask[3 - margin : 5 + margin, COVERED.start - margin : COVERED.stop + margin] = True
     return mask

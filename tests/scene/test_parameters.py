@@ -1,4 +1,4 @@
-"""Selecting parameters: what they start from, and what is refused, located in the configuration."""
+"""Selection of parameters: their initial values, and refusals located in the configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""No scene brings code along: plugins come from Mitsuba's own folder, Python modules from where the program's do."""
+"""No scene brings its own code. Plugins come from Mitsuba's own folder, and Python modules from where the program's
+modules come from.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ SMALL = '<film type="hdrfilm"><integer name="width" value="8"/><integer name="he
 
 
 class Trap:
-    """A folder of a scene, and a working folder, in which libraries lie that write a file when they are loaded."""
+    """The folder of a scene and a working folder. Both contain libraries and Python modules that write a file when
+    loaded.
+    """
 
     def __init__(self, folder: Path) -> None:
         compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
@@ -61,7 +65,7 @@ class Trap:
 
     @property
     def is_sprung(self) -> bool:
-        """Whether any of it ran since the last time that this was asked."""
+        """True if any of this code ran since the last query."""
         ran = self._ran.exists()
         self._ran.unlink(missing_ok=True)
         return ran
@@ -127,7 +131,7 @@ def test_the_plugin_of_mitsuba_wins_over_one_of_the_scene(trap):
 
 
 def run(trap: Trap, script: str, *args: str) -> subprocess.CompletedProcess[str]:
-    """Run `script` in a Python of its own, in the working folder, without that folder among its modules'."""
+    """Run `script` in a separate Python in the working folder. Python does not search this folder for modules."""
     command = [*python_command(script), *args]
     return subprocess.run(command, cwd=trap.folder / "work", capture_output=True, text=True, check=False)
 

@@ -1,4 +1,4 @@
-"""The scenes in `scenes/`: their assets are what the script makes, and they look as their comments say."""
+"""The scenes in `scenes/`: their assets match the script, and their images match their comments."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_meshes_match_the_script():
 
 @pytest.mark.parametrize("name", a_few(["lens_pose", "caustic_heightmap"], ["caustic_heightmap"]))
 def test_moving_light_stays_off_the_border(name):
-    """Where it crosses that, derivatives of what moves it are cut off."""
+    """At the border, derivatives of the parameters that move the light would be cut off."""
     import mitsuba as mi
 
     config = load(ROOT / "configs" / f"{name}.yaml", [])
@@ -132,7 +132,9 @@ def test_caustic_is_not_seen_through_the_glass():
 
 
 def test_mixed_room_has_light_that_each_side_misses():
-    """Light paths do not see the mirror; of what both see, connections to the lamp find less than half on the wall."""
+    """Light paths do not see the mirror. In the caustic on the wall, connections to the lamp find less than a tenth of
+    the light that light paths find.
+    """
     import mitsuba as mi
 
     scene = small("mixed_room")
@@ -147,7 +149,9 @@ def test_mixed_room_has_light_that_each_side_misses():
 
 
 def test_the_target_of_the_mixed_room_is_its_image():
-    """By blocks of 16 pixels, against light from both sides, which shares no code with what made it."""
+    """Blocks of 16 pixels are compared with an image of light and camera paths. That integrator shares no code with the
+    one that made the target.
+    """
     import mitsuba as mi
 
     scene = load_scene(ROOT / "scenes" / "mixed_room" / "scene.xml", {"resx": 128, "resy": 128})

@@ -1,4 +1,6 @@
-"""Python reads this as it starts, where PYTHONPATH has this folder: that process compiles kernels quickly too."""
+"""Python reads this file at its start if PYTHONPATH contains this folder. Processes started by tests then also compile
+kernels quickly.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,12 @@ from types import ModuleType
 
 
 class BeforeDrJit:
-    """Finds no module: it waits until Dr.Jit is imported, for which `reslrb_cli` has then chosen the libLLVM."""
+    """Finder that never finds a module. It waits for the import of Dr.Jit, before which `reslrb_cli` chooses the
+    libLLVM.
+    """
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> None:
-        """Have optimisations left out before the first of Dr.Jit is looked for."""
+        """Turn optimisations off before the first module of Dr.Jit is searched for."""
         if name == "drjit":
             sys.meta_path.remove(self)
             file = Path(__file__).resolve().parents[1] / "compilation.py"

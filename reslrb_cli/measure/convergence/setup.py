@@ -203,10 +203,11 @@ def survey(
 
     The facts have these keys.
 
-    - `keys` and `shapes` of the estimated quantities: parameters, or `image`.
-    - `independent`: the valid stock integrator for each key, or None. `why`: the reason against others for each key.
+    - `keys` and `shapes`: the keys and shapes of the estimated quantities. A quantity is a parameter or `image`.
+    - `independent`: the valid stock integrator for each key, or None. `why`: the reasons against other stock
+        integrators for each key.
     - `without`: stock integrators that are valid for no key, with the reason.
-    - `paths`: the paths of the reference, which determine the reference's light.
+    - `paths`: the kinds of paths in the reference, which determine the reference's light.
     - `masked`: true if pixels along the film's border are left out, because some of the compared images are dark there
         and others are not. `pixels`: the number of pixels.
     - `pictures`: a description of the rendered images.

@@ -181,19 +181,21 @@ class ExtremeCase:
     """One case. `scene` is a function, because building the scene needs Mitsuba. The case uses the scene's first
     sensor.
 
-    - `source` is the reference of gradients besides naive AD at equal seeds. `naive` tells whether naive AD fits into
-        memory.
+    - `source` is the reference for gradients, in addition to naive AD at equal seeds. `naive` is true if naive AD fits
+        into memory.
     - `image` is the stock integrator for the reference image, or "" if none can render the scene.
-    - `options` are options of all integrators, and `ours` options of `reslrb` and `walk_ad` only.
+    - `options` are options of all integrators. `ours` are options of only `reslrb` and `walk_ad`.
     - `weights` changes the usual dL/dI of mean 1.
-    - `signed` tells whether derivatives can have either sign. Otherwise none may be negative.
-    - `equal` is the limit of the relative L2 distance at equal seeds. It also applies to exact values if there is only
-        one seed.
-    - `residual` tells whether the residual of the replay of `gather` is checked.
-    - `open_ended` lists parameters that no z-test can decide, with the reason. They are compared only at equal seeds.
-    - `elsewhere` lists parameters that another case decides, with its name. They are compared only at equal seeds.
-    - `moves` has motions of light. Their amplitudes are then the only parameters, `keys` is empty, and dL/dI is smooth.
-        Only estimators with attached derivatives take part.
+    - `signed` is true if derivatives can have either sign. Otherwise, no derivative may be negative.
+    - `equal` is the limit of the relative L2 distance at equal seeds. If there is only one seed, the limit also applies
+        to the distance from exact values.
+    - `residual` is true if the residual of `gather`'s replay is checked.
+    - `open_ended` lists parameters that no z-test can decide, with the reason. These parameters are compared only at
+        equal seeds.
+    - `elsewhere` maps each parameter that another case decides to the case's name. These parameters are compared only
+        at equal seeds.
+    - `moves` has the motions of light. With `moves`, the motions' amplitudes are the only parameters, `keys` is empty,
+        and dL/dI is smooth. Only estimators with attached derivatives then take part.
     """
 
     name: str

@@ -1,8 +1,10 @@
 """Comparisons of options before the first iteration: their cost, their evaluation, and their storage.
 
-- `Tuner.decide` makes one decision. It uses the result of an earlier run, or measures now if the run is long enough.
-- `compare` returns the gain in efficiency of one way of sampling a gradient over another, with its interval.
-- `Turns` decides whether another way of taking steps pays. It alternates steps whose gradients have the same mean.
+- `Tuner.decide` makes one decision. The method uses the result of an earlier run, or measures now if the run is long
+    enough.
+- `compare` compares two ways of sampling a gradient. The function returns the gain in efficiency, with its interval.
+- `Turns` decides whether another way of taking steps pays. Steps of both ways alternate, and their gradients have the
+    same mean.
 
 The gain compares variance times time.
 

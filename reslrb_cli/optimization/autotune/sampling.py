@@ -4,18 +4,20 @@ Open settings are decided in the order paths, pixels, guiding, sequence. The set
 paths over the pixels, and needs no steps (`guiding/pixels.py`). Alternating steps (`race.Turns`) compare two ways of
 sampling, with dL/dI fixed at one image (`StepTrial`).
 
-- `PathsPilot` tries another share of light paths, or one kind of paths alone if it finds all light, unguided. The first
-    share is one half. Other shares compete with the best so far, towards the better side, as long as they win. Camera
-    paths alone come first if they find all light, because they may be a thousand times as efficient. Even a run of a
-    second then gains, and a few small steps decide (`CameraPilot`). If they win, the run needs their kernels anyway.
-- `GuidingPilot` tries guided emission, from a table that learns first and is then kept. The time of a guided step
-    includes its share of the run's learning: one more walk per lesson, and the Python code for a new table. Short steps
-    underestimate the table of a run, which has learned from more paths. If light paths alone find all light, they
-    compete when guided, because weights ignore guiding and take away most of its benefit.
-- `SequencePilot` tries low-discrepancy numbers, guided if the run is guided. Both ways then sample from one table.
-    Later learning costs both the same, and is left out. The noise of low-discrepancy numbers falls at least as fast as
-    the inverse of the sample count, so short steps underestimate the gain. If guiding pays, low-discrepancy numbers
-    compete with it first.
+- `PathsPilot` tries other shares of light paths, without guiding. If one kind of paths finds all light, `PathsPilot`
+    also tries this kind alone. The first share is one half. Further shares compete with the best share so far, towards
+    the better side, as long as they win. If camera paths find all light, camera paths alone are tried first, because
+    they may be a thousand times as efficient. Even a run of one second then gains, and a few small steps decide
+    (`CameraPilot`). If camera paths win, the run needs their kernels anyway.
+- `GuidingPilot` tries guided emission. The table learns first and then stays fixed. The time of a guided step includes
+    the step's share of the run's learning: one more walk per lesson, and the Python code for a new table. Short steps
+    underestimate the table of a run, because the run's table has learned from more paths. If light paths find all
+    light, the guided steps use light paths only. With both kinds of paths, the weights ignore guiding and take away
+    most of its benefit.
+- `SequencePilot` tries low-discrepancy numbers. If the run is guided, both ways are guided and sample from one table.
+    Later learning costs the same for both ways, and is left out. The noise of low-discrepancy numbers falls at least as
+    fast as the inverse of the sample count, so short steps underestimate the gain. If guiding pays, low-discrepancy
+    numbers without guiding first compete with guiding.
 """
 
 from __future__ import annotations

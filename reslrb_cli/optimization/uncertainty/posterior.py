@@ -86,12 +86,13 @@ class LastSteps:
 class Measured:
     """Parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
-    - `response` is the movement of an entry by a step per unit of gradient, at the factor 1. `rates` are the schedule's
-        factors of all iterations.
-    - `pace` is the step length of each iteration divided by that at the end, or None if all are equal.
-    - `last` has the last iterations, if known. `recent` (N,) is the mean square of their gradients, if the optimiser
-        stores it.
-    - `seen` (N,) are the entries of a texture that some view shows, or None for other parameters.
+    - `response` is an entry's movement by one step per unit of gradient, at the schedule's factor 1. `rates` has the
+        schedule's factor for each iteration.
+    - `pace` is the step length of each iteration divided by the step length at the end. `pace` is None if all step
+        lengths are equal.
+    - `last` has the last iterations, if known. `recent` (N,) is the mean square of the gradients in the last
+        iterations, if the optimiser stores this mean.
+    - `seen` (N,) marks the entries of a texture that some view shows. `seen` is None for other parameters.
     - `start` (N,) are the values before the first iteration.
     - `mean` and `noise`, both (N,), are the gradients' mean and variance.
     """

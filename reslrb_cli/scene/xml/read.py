@@ -207,9 +207,10 @@ MAX_INCLUDE_DEPTH = 15
 class Description:
     """A scene as described by its files, with all includes and variables resolved.
 
-    - `folders`: the search path for the files that it names.
-    - `variables`: the values of its `$name` variables, including the scene's own defaults.
-    - `hides_emitters`: whether its integrator hides emitters. Nothing else of the integrator is used.
+    - `folders`: the search path for the files that the scene names.
+    - `variables`: the values of the scene's `$name` variables, including the scene's own defaults.
+    - `hides_emitters`: whether the scene's integrator hides emitters. All other settings of this integrator are
+        ignored.
     - `files`: the XML files that were read.
     """
 
