@@ -1,8 +1,8 @@
 """Figure 1: a caustic, its target, and the gradient of their distance with respect to the heights of the glass.
 
-Gradients by naive AD (Mitsuba's `ptracer`) and by ours, with few samples and with many, each kind under the same limit
-of memory. The means have to agree, the noise of ours has to fall with the root of the samples, and naive AD with many
-samples has to run out of memory.
+The gradients are by naive AD (Mitsuba's `ptracer`) and by our estimator, with few samples and with many. All kinds of
+gradient have the same memory limit. The means must agree. The noise of our gradients must fall with the square root of
+the sample count. Naive AD with many samples must run out of memory.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ GREY = 0.93
 
 @dataclass(frozen=True)
 class Plan:
-    """Samples per pixel, seeds, and the limit of each process in bytes."""
+    """Samples per pixel, seeds, and the memory limit of each process in bytes."""
 
     few_spp: int = 32
     many_spp: int = 1024
@@ -47,9 +47,9 @@ def plan(sets: list[str], seeds: int, _room: Path | None) -> tuple[Config, Plan]
 
 
 def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dict[str, Any], Any]:
-    """Sample and check everything; returns the record, and the rows of panels of the picture.
+    """Sample and check all gradients. Return the record, and the rows of panels of the picture.
 
-    Raises ConfigError, `processes.Refused`, and Ended where a gradient that has to be there is missing.
+    Raises ConfigError, `processes.Refused`, and Ended if a required gradient is missing.
     """
     label = own_label(config)
     if config.parameters[0].heightmap is None:
@@ -73,7 +73,9 @@ def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dic
 
 
 def judge(plan: Plan, kinds: list[Kind], asked_mib: float) -> dict[str, Any]:
-    """Return the record: the comparisons of the means, the fall of the noise, and whether all `holds`."""
+    """Return the record: the comparisons of the means, the decrease of the noise, and whether the whole figure
+    `holds`.
+    """
     naive, ours, many, failing = kinds
     comparisons = compare([(ours, naive), (many, naive), (many, ours)])
     noise = fall(ours.rows, many.rows, float(np.sqrt(many.spp / ours.spp)))
@@ -90,7 +92,7 @@ def judge(plan: Plan, kinds: list[Kind], asked_mib: float) -> dict[str, Any]:
 
 
 def panels(pictures: dict[str, np.ndarray], kinds: list[Kind], limit: int) -> list[list[tuple[str, np.ndarray]]]:
-    """Return the panels of the picture: target and caustic, and a gradient of each kind, of one seed."""
+    """Return the panels of the picture: target, caustic, and one gradient of each kind from one seed."""
     naive, ours, many, failing = kinds
     shape, white = np.shape(many.samples)[1:], float(np.quantile(pictures["target"], 0.999)) or 1.0
     end = signed_end(many.rows[0].reshape(shape).sum(-1))

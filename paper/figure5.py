@@ -1,10 +1,12 @@
 """Figure 5: the gradient of an image's loss with respect to the floor of the Grey & White Room, paths of length 32.
 
-Gradients by naive AD and by ours at 32 spp, and the z map of their means. dL/dI is 0 where light paths find less light
-than camera paths: where the sensor sees glass, mirrors or coats, and at the film's border. Naive AD is that of our own
-walk, as stock `ptracer` emits wrongly from the room's environment map, which is turned. The experiment's own estimator
-is compared at other seeds with naive AD and with `prb`, which shares no code with ours; the exact estimators with naive
-AD at equal seeds.
+The figure shows gradients by naive AD and by our estimator at 32 spp, and the z map of their means. dL/dI is 0 where
+light paths find less light than camera paths. These are the pixels where the sensor sees glass, mirrors or coats, and
+the film's border.
+
+Naive AD differentiates our own walk. Stock `ptracer` emits wrongly from the room's environment map, because the map is
+rotated. The experiment's own estimator is compared at other seeds with naive AD and with `prb`, which shares no code
+with ours. The exact estimators are compared with naive AD at equal seeds.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ TILES, FAR = 32, 5.0
 
 @dataclass(frozen=True)
 class Plan:
-    """Samples per pixel of a gradient and of the image of dL/dI, and seeds."""
+    """Seeds, and samples per pixel of a gradient and of the image for dL/dI."""
 
     spp: int = 32
     reference_spp: int = 1024
@@ -42,7 +44,7 @@ class Plan:
 
 
 def room_settings(room: Path) -> list[str]:
-    """Return the settings of `room.yaml` for the room in this folder."""
+    """Return the settings that make `room.yaml` use the room in this folder."""
     file = room if room.suffix == ".xml" else room / "scene.xml"
     return [f"scene.file={json.dumps(str(file.resolve()))}"]
 
@@ -54,9 +56,9 @@ def plan(sets: list[str], seeds: int, room: Path) -> tuple[Config, Plan]:
 
 
 def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dict[str, Any], Any]:
-    """Sample and check everything; returns the record, and the rows of panels of the picture.
+    """Sample and check all gradients. Return the record, and the rows of panels of the picture.
 
-    Raises ConfigError, `processes.Refused`, and Ended where a gradient is missing.
+    Raises ConfigError, `processes.Refused`, and Ended if a gradient is missing.
     """
     label = own_label(config)
     say(f"image and dL/dI, {plan.reference_spp} spp")
@@ -84,7 +86,7 @@ def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dic
 
 
 def judge(kinds: list[Kind], exact: list[Kind]) -> dict[str, Any]:
-    """Return the gradients and comparisons of the record, and whether all `holds`."""
+    """Return the gradients and comparisons of the record, and whether all comparisons hold (`holds`)."""
     naive, ours, prb = kinds
     comparisons = compare([(ours, naive), (ours, prb)])
     comparisons += [compared(kind, naive, compare_equal_seeds(kind.rows, naive.rows[:1], CLOSE)) for kind in exact]
@@ -97,7 +99,9 @@ def judge(kinds: list[Kind], exact: list[Kind]) -> dict[str, Any]:
 
 
 def z_map(naive: Kind, ours: Kind) -> np.ndarray:
-    """Return the z scores of the means of tiles, channels added up, with the size of the gradient: (H, W)."""
+    """Return the z scores of the means of tiles, as an array (H, W) of the gradient's size. Channels are summed
+    first.
+    """
     height, width, channels = shape = np.shape(ours.samples)[1:]
     down, across = min(TILES, height), min(TILES, width)
     sums = [parts(kind.rows, shape, TILES).reshape(-1, down, across, channels).sum(-1) for kind in (ours, naive)]
@@ -106,7 +110,9 @@ def z_map(naive: Kind, ours: Kind) -> np.ndarray:
 
 
 def panels(image: np.ndarray, kinds: list[Kind]) -> list[list[tuple[str, np.ndarray]]]:
-    """Return the panels of the picture: the room, the z map, and a gradient by naive AD and by ours, of one seed."""
+    """Return the panels of the picture: the room, the z map, and gradients by naive AD and by our estimator from one
+    seed.
+    """
     naive, ours, _ = kinds
     shape, white = np.shape(naive.samples)[1:], float(np.quantile(image, 0.9)) or 1.0
     first = {kind.label: kind.rows[0].reshape(shape).sum(-1) for kind in (naive, ours)}

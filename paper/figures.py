@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Make the figures of the paper, each from an experiment, and check what they show.
+"""Make the figures of the paper, each from an experiment, and check them.
 
-A figure writes NAME.json and NAME.png (figure6: NAME.jsonl) and prints its tables; its exit code is 1 where something
-does not hold. `write` makes docs/paper.md from the records in docs/paper/. ROOM is the folder of Wig42's Grey & White
-Room, from Mitsuba's gallery of scenes.
+Each figure command writes NAME.json (figure6: NAME.jsonl) and NAME.png. Figures 1 and 5 print their tables, and exit
+with code 1 if a check fails. `write` makes docs/paper.md from the records in docs/paper/. ROOM is the folder of Wig42's
+Grey & White Room, from Mitsuba's gallery of scenes.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _figure(options: argparse.Namespace) -> int:
-    """Measure, check and draw a figure of gradients; return the exit code."""
+    """Measure, check and draw a figure of gradients. Return the exit code."""
     from make_figures import write_panels
 
     def say(line: str) -> None:

@@ -1,9 +1,10 @@
-"""Gradients of an experiment with the same dL/dI for all, and comparisons of their means and of their noise.
+"""Gradients of an experiment with one common dL/dI, and comparisons of their means and their noise.
 
-From their own images, gradients of different noise have different expectations, since the noise of an image biases the
-gradient. So dL/dI is that of one reference image. Each kind of gradient is sampled in a process of its own, which may
-have a limit of memory; gradients are those at the parameters' initial values, of the first parameter, through the first
-sensor.
+The noise of an image biases the gradient. If each method used its own image, gradients with different noise would have
+different expectations. Therefore dL/dI is that of one reference image.
+
+Each kind of gradient is sampled in its own process, which may have a memory limit. The gradients belong to the first
+parameter, at the parameters' initial values, through the first sensor.
 """
 
 from __future__ import annotations
@@ -50,9 +51,10 @@ CONFIDENCE, WIDEST = 0.95, 0.2
 
 @dataclass
 class Kind:
-    """One kind of gradient: `samples` (N, H, W, C) by the integrator `by` (see `comparable`), and the peak of arrays.
+    """One kind of gradient: `samples` (N, H, W, C) by the integrator `by` (see `comparable`), and the peak memory of
+    arrays.
 
-    `end` says how its process ended if it did not take all samples.
+    `end` is the reason why the process ended before it took all samples. `end` is None otherwise.
     """
 
     name: str
@@ -64,17 +66,17 @@ class Kind:
 
     @property
     def label(self) -> str:
-        """The name and the samples per pixel."""
+        """Name and samples per pixel."""
         return f"{self.name}, {self.spp} spp"
 
     @property
     def rows(self) -> np.ndarray:
-        """The samples in rows, (N, P), in double precision."""
+        """Samples as rows (N, P) in double precision."""
         assert self.samples is not None, "has been sampled"
         return self.samples.reshape(len(self.samples), -1).astype(np.float64)
 
     def record(self, mean: np.ndarray) -> dict[str, Any]:
-        """Return the figures of this kind; its noise is relative to the gradient `mean` (P,)."""
+        """Return the figures of this kind. The noise is relative to the gradient `mean` (P,)."""
         count = 0 if self.samples is None else len(self.samples)
         return {
             "gradient": self.name,
@@ -88,7 +90,9 @@ class Kind:
 
 
 def own_label(config: Config) -> str:
-    """Return the label of the experiment's own estimator. Raises ConfigError where gradients cannot be compared."""
+    """Return the label of the experiment's own estimator. Raises ConfigError if gradients of this experiment cannot be
+    compared.
+    """
     integrator = config.integrator
     if config.variant not in ("auto", VARIANT):
         raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}: the limit bounds address space alone")
@@ -100,10 +104,17 @@ def own_label(config: Config) -> str:
 
 
 def comparable(config: Config, by: str) -> Config:
-    """Return the experiment with another integrator; the gradients of all of them have the same expectation.
+    """Return the experiment with another integrator. The gradients of all these integrators have the same expectation.
 
-    `by` is `own` for the experiment's `reslrb`, `ptracer` or `walk_ad` for naive AD of the stock walk or of ours,
-    `prb`, or the name of an estimator. None has roulette, whose decision naive AD does not differentiate.
+    The values of `by` are:
+
+    - `own`: the experiment's `reslrb`
+    - `ptracer`: naive AD of the stock walk
+    - `walk_ad`: naive AD of our walk
+    - `prb`
+    - the name of an estimator
+
+    No integrator uses Russian roulette, because naive AD does not differentiate its decision.
     """
     assert isinstance(config.integrator, ReslrbConfig), "checked by `own_label`"
     own = config.integrator.undecided_off()
@@ -121,10 +132,11 @@ def comparable(config: Config, by: str) -> Config:
 
 
 def take_pictures(config: Config, spp: int, masked: bool = False) -> dict[str, np.ndarray]:
-    """Return the target and the initial image (H, W, C), the latter with `spp` samples, and dL/dI at it (`adjoint`).
+    """Return the target and the initial image (H, W, C), and dL/dI at the initial image (`adjoint`). The initial image
+    has `spp` samples per pixel.
 
-    If `masked`, dL/dI is 0 where light paths find less light than camera paths: in pixels that see smooth specular
-    lobes, and at the film's border.
+    If `masked`, dL/dI is 0 where light paths find less light than camera paths. These pixels see smooth specular lobes
+    or lie at the film's border.
     """
     set_variant(VARIANT)
     problem = assemble(config.with_exposures_fixed())
@@ -142,7 +154,9 @@ def take_pictures(config: Config, spp: int, masked: bool = False) -> dict[str, n
 
 
 def begin(first: dict[str, Any]) -> Begun:
-    """Begin a process of `sample`; each question names `seed`, `spp`, and the file `out` for the gradient."""
+    """Begin the work of a process that `sample` starts. Each question contains `seed`, `spp`, and the file `out` for
+    the gradient.
+    """
     problem = assemble_scene(comparable(loads(first["config"], first["source"]), first["by"]).with_exposures_fixed())
     selection = problem.selection
     case = Case(problem.scene, selection.keys, problem.sensors[0], selection)
@@ -160,9 +174,10 @@ def begin(first: dict[str, Any]) -> Begun:
 
 
 def sample(kind: Kind, count: int, config: Config, adjoint: np.ndarray, series: str, limit: int | None = None) -> None:
-    """Take `count` gradients with this dL/dI (H, W, C), in a process whose address space has a limit in bytes.
+    """Take `count` gradients with this dL/dI (H, W, C) in a separate process. `limit` bounds the address space of the
+    process in bytes.
 
-    Kinds of the same `series` have the same seeds.
+    Kinds with the same `series` have the same seeds.
     """
     with tempfile.TemporaryDirectory(prefix="reslrb-paper-") as name:
         held, out, taken = Path(name) / "adjoint.npy", Path(name) / "gradient.npy", []
@@ -189,7 +204,9 @@ def sample(kind: Kind, count: int, config: Config, adjoint: np.ndarray, series: 
 
 
 def compare(pairs: Sequence[tuple[Kind, Kind]]) -> list[dict[str, Any]]:
-    """Return a record for each pair of kinds, whose means are compared in standard errors, all pairs as one family."""
+    """Return a record for each pair of kinds. The means of each pair are compared in standard errors. All pairs form
+    one family of comparisons.
+    """
     shape = np.shape(pairs[0][0].samples)[1:]
     family = Family(len(pairs), len(pairs) * entry_count(shape))
     found = [compare_expectations(one.rows, other.rows, family, shape=shape, paired=False) for one, other in pairs]
@@ -202,16 +219,17 @@ def compared(one: Kind, other: Kind, figures: Comparison) -> dict[str, Any]:
 
 
 def relative_noise(samples: np.ndarray, mean: np.ndarray) -> float:
-    """Return the standard deviation of (N, P) samples over the norm of the mean (P,), in L2."""
+    """Return the L2 norm of the standard deviation of (N, P) samples, divided by the L2 norm of the mean (P,)."""
     return float(np.sqrt(samples.var(0, ddof=1).sum()) / np.linalg.norm(mean))
 
 
 def fall(coarse: np.ndarray, fine: np.ndarray, expected: float) -> dict[str, Any]:
-    """Return the ratio of the noise of (N, P) samples to that of (M, P) others, its interval, and a verdict.
+    """Return the ratio of the noise of (N, P) samples to the noise of (M, P) others, its interval, and a verdict.
 
-    The logarithm of the ratio has the jackknife's standard error and the degrees of freedom of Welch and Satterthwaite.
-    The verdict is `holds` if the expected ratio lies in the interval that a right ratio leaves with probability
-    `ALPHA`, and `unresolved` if that interval is wider than `WIDEST`.
+    The logarithm of the ratio has the jackknife's standard error, and the degrees of freedom of Welch and
+    Satterthwaite. A correct ratio lies outside of the test's interval with probability `ALPHA`. The verdict is `holds`
+    if the expected ratio lies in this interval. Instead of `holds`, the verdict is `unresolved` if the relative half
+    width of the interval exceeds `WIDEST`.
     """
     (a, var_a), (b, var_b) = (_log_deviation(samples) for samples in (coarse, fine))
     error = np.sqrt(var_a + var_b)
@@ -225,7 +243,9 @@ def fall(coarse: np.ndarray, fine: np.ndarray, expected: float) -> dict[str, Any
 
 
 def _log_deviation(samples: np.ndarray) -> tuple[float, float]:
-    """Return the logarithm of the standard deviation of (N, P) samples, and its variance by the jackknife."""
+    """Return the logarithm of the standard deviation of (N, P) samples, and the jackknife variance of this
+    logarithm.
+    """
     count = len(samples)
     deviations = np.square(samples - samples.mean(0)).sum(1)
     total = deviations.sum()
@@ -235,5 +255,7 @@ def _log_deviation(samples: np.ndarray) -> tuple[float, float]:
 
 
 def colored(values: np.ndarray, end: float) -> np.ndarray:
-    """Return values (H, W) as colours (H, W, 3): blue at -`end` and below, grey at 0, red at `end` and above."""
+    """Return values (H, W) as colours (H, W, 3). Values up to -`end` are blue, 0 is grey, and values from `end` on are
+    red.
+    """
     return np.asarray(color_map(signed=True)(np.clip(values / end / 2 + 0.5, 0, 1))[:, :, :3])

@@ -1,6 +1,7 @@
-"""docs/paper.md: the paper's figures beside ours, prose from docs/paper/page.md, figures from the records there.
+"""Write docs/paper.md, which shows the paper's figures beside ours.
 
-No figure of ours is typed.
+The text comes from docs/paper/page.md, and our figures come from the records in docs/paper/. None of our figures is
+typed by hand.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ MEANS = "The next table compares the means of the gradients in standard errors."
 
 
 def write(folder: Path | None = None) -> int:
-    """Copy records and pictures from `folder`, if any, and write the page; return the exit code. Raises ConfigError."""
+    """Copy records and pictures from `folder`, if given, and write the page. Return the exit code. Raises
+    ConfigError.
+    """
     names = [f"figure{number}.{ending}" for number in (1, 5, 6) for ending in ("json", "jsonl", "png")]
     found = [] if folder is None else [folder / name for name in names if (folder / name).exists()]
     if folder is not None and not found:
@@ -40,7 +43,7 @@ def write(folder: Path | None = None) -> int:
 
 
 def page() -> str:
-    """Return the page."""
+    """Return the text of docs/paper.md."""
 
     def made(match: re.Match[str]) -> str:
         [file] = PAPER.glob(f"{match[1]}.json*")
@@ -120,7 +123,7 @@ def _origin(origin: Row) -> str:
 
 
 def _gradients(record: Row, about: str) -> str:
-    """Return where a record comes from, and its table of gradients."""
+    """Return the origin of a record, and its table of gradients."""
     rows = []
     for row in record["gradients"]:
         spp = row.get("spp", record["plan"].get("spp"))

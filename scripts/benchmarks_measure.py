@@ -1,7 +1,8 @@
-"""Takes the measurements of docs/benchmarks/, and lists the records that are older than the code that they measure.
+"""Take the measurements of docs/benchmarks/, and list the records that are older than the code that they measure.
 
-A record is what `reslrb` wrote, or the figures of a run. Its first line says where it comes from: the commit, whether
-all changes were committed (`clean`; null where that is not known), the device, versions and the command.
+A record contains the lines that `reslrb` wrote, or the figures of a run. The first line of a record contains its
+origin: the commit, whether all changes were committed (`clean`), the device, versions and the command. `clean` is null
+if this is not known.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ _GLASS = (
 
 
 def experiment_record(experiment: str) -> str:
-    """Return the name of the measurement of a whole run of configs/EXPERIMENT.yaml."""
+    """Return the name of the measurement of a complete run of configs/EXPERIMENT.yaml."""
     return f"optimize_{experiment.replace('/', '_')}"
 
 
@@ -94,7 +95,9 @@ COLD = 5
 
 
 def code_state() -> dict[str, Any]:
-    """Return the commit of the code, and whether nothing was changed since; None for what git does not know."""
+    """Return the commit of the code (`commit`), and whether nothing has changed since that commit (`clean`). A value is
+    None if git does not know it.
+    """
     commit = _git("rev-parse", "--short=12", "HEAD")
     if commit is None:
         return {"commit": None, "clean": None}
@@ -110,7 +113,7 @@ def _git(*words: str) -> str | None:
 
 
 def origins() -> dict[str, Mapping[str, Any]]:
-    """Return where each record in docs/benchmarks/ and docs/paper/ comes from."""
+    """Return the origin of each record in docs/benchmarks/ and docs/paper/."""
     found = {}
     for file in sorted([*RECORDS.glob("*.jsonl"), *PAPER.glob("figure*.json*")]):
         text = file.read_text(encoding="utf-8")
@@ -130,7 +133,7 @@ def measures(command: list[str]) -> list[str]:
 
 
 def stale() -> list[str]:
-    """Return a line for each record that is older than the code that it measures."""
+    """Return a line for each record whose code has changed since, was not committed, or has no known commit."""
     lines = []
     for name, origin in origins().items():
         commit = origin.get("commit")
@@ -147,7 +150,9 @@ def stale() -> list[str]:
 
 
 def _changed(commit: str, place: str) -> int:
-    """Return how many files of a folder have changed since a commit. Comments and docstrings do not count."""
+    """Return how many files of a folder have changed since a commit. Changes of comments, docstrings and messages do
+    not count.
+    """
     files = (_git("diff", "--name-only", "--no-renames", commit, "HEAD", "--", place, *UNMEASURED) or "").splitlines()
     read = {".py": _syntax, ".yaml": _settings}
     made = {file: read.get(Path(file).suffix) for file in files}
@@ -155,15 +160,16 @@ def _changed(commit: str, place: str) -> int:
 
 
 def _settings(commit: str, file: str) -> Any:
-    """Return the content of a YAML file at a commit, or None without the file."""
+    """Return the content of a YAML file at a commit, or None if the file does not exist there."""
     text = _git("show", f"{commit}:{file}")
     return None if text is None else yaml.safe_load(text)
 
 
 def _syntax(commit: str, file: str) -> str | None:
-    """Return the syntax tree of a Python file at a commit without docstrings and messages; None without the file.
+    """Return the syntax tree of a Python file at a commit, without docstrings and messages. Return None if the file
+    does not exist there.
 
-    Messages are texts on one line of at least two words. No figure depends on them.
+    Messages are texts of at least two words on one line. No figure depends on messages.
     """
     text = _git("show", f"{commit}:{file}")
     if text is None:
@@ -180,7 +186,7 @@ _WORD = re.compile(r"[a-z]{2,}", re.IGNORECASE)
 
 
 class _WithoutMessages(ast.NodeTransformer):
-    """Replaces all messages of a syntax tree by one and the same text."""
+    """Transformer that replaces all messages of a syntax tree by the same text."""
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.expr:
         return self._without(
@@ -197,12 +203,12 @@ class _WithoutMessages(ast.NodeTransformer):
 
 
 def record_file(name: str) -> Path:
-    """Return the file of a measurement's record."""
+    """Return the file that contains the record of a measurement."""
     return RECORDS / f"{name}.jsonl"
 
 
 def measure(name: str, words: Sequence[str]) -> None:
-    """Run `reslrb` with these words and write the record. If the command fails, an earlier record stays.
+    """Run `reslrb` with these arguments and write the record. If the command fails, an earlier record stays unchanged.
 
     Raises SystemExit.
     """
@@ -236,7 +242,7 @@ def measure(name: str, words: Sequence[str]) -> None:
 
 
 def draw_bench(lines: Sequence[Mapping[str, Any]], picture: Path) -> None:
-    """Draw time and memory of a step against path depth, from the lines of a record."""
+    """Draw the time and memory of a step against path depth, from the lines of a record."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -257,14 +263,16 @@ def draw_bench(lines: Sequence[Mapping[str, Any]], picture: Path) -> None:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table with a heading for each column."""
+    """Return a Markdown table with a heading for each column."""
     lines = ["|".join(f" {cell} " if cell else " " for cell in cells) for cells in [head, *rows]]
     lines.insert(1, "|".join("---" for _ in head))
     return "\n".join(f"|{line}|" for line in lines)
 
 
 def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
-    """Return the page of the extreme suite, from the lines of its file: a row for each case, a column by estimator."""
+    """Return the page of the extreme suite, made from the lines of its file. The page has a row for each case and a
+    column for each estimator.
+    """
     from reslrb_cli.measure.extreme import CASES
 
     origin, records = lines[0], [line for line in lines if "verdict" in line]
@@ -294,7 +302,7 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _suite_cell(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the largest figures of an estimator in one case, and the verdicts that are not `holds`."""
+    """Return the largest figures of an estimator in one case, and all verdicts other than `holds`."""
     if not records:
         return "-"
     held = [record["z_max"] for record in records if record["z_max"] is not None and record["verdict"] == "holds"]
@@ -309,7 +317,7 @@ def _suite_cell(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def run_lines(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a run's record: where it comes from, then its figures."""
+    """Return the lines of a run's record. The first line has the origin, and the second line has the figures."""
     manifest, steps = json.loads((folder / "manifest.json").read_text("utf-8")), read_lines(folder / "metrics.jsonl")
     origin = {"kind": "origin"} | {name: manifest[name] for name in ("device", "variant", "versions", "platform")}
     figures = {
@@ -325,7 +333,9 @@ def run_lines(folder: Path) -> list[dict[str, Any]]:
 
 
 def traced(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the `paths` of a run by `reslrb`, the share of light paths, and whether these are guided."""
+    """Return the `paths` of a run by `reslrb`, the share of light paths, and whether light paths are guided. Other runs
+    have None.
+    """
     rows = {row["feature"]: row for row in (manifest.get("plan") or {}).get("rows") or ()}
     camera = rows.get("camera paths")
     if camera is None:
@@ -338,5 +348,5 @@ def traced(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_lines(file: Path) -> list[dict[str, Any]]:
-    """Return the objects of a file of JSON lines."""
+    """Return the objects of a JSON Lines file."""
     return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]

@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
-"""Measure what docs/benchmarks.md and the README's results say, and write them from the records in docs/benchmarks/.
+"""Measure the figures of docs/benchmarks.md and of the README's results, and write these tables from the records in
+docs/benchmarks/.
 
-Prose comes from docs/benchmarks/page.md, figures from the records: no figure in these tables is typed. Measure on a
-machine that does nothing else. The tables in Markdown of docs/paper.md are made here too.
+The text comes from docs/benchmarks/page.md, and the figures come from the records. No figure in these tables is typed
+by hand. Measure on a machine that does nothing else. This script also makes the Markdown tables of docs/paper.md.
 """
 
 from __future__ import annotations
@@ -48,25 +49,25 @@ SWEPT = {"depth": ("max_depth", "depth"), "spp": ("spp", "spp"), "moving": ("max
 
 @dataclass(frozen=True)
 class Record:
-    """A file of measurements: where it comes from, and its other lines."""
+    """File of measurements: its origin, and its other lines."""
 
     origin: Row
     rows: Sequence[Row]
 
     @property
     def command(self) -> str:
-        """The command, as it can be typed into a shell."""
+        """Command as a user types it into a shell."""
         return shlex.join(self.origin["command"])
 
 
 def read(file: Path) -> Record:
-    """Return a record, whose first line says where it comes from. Raises OSError."""
+    """Return the record in a file. The first line of the file contains the origin. Raises OSError."""
     origin, *rows = read_lines(file)
     return Record(origin, [row for row in rows if row.get("kind") != "origin"])
 
 
 def commit_of(origin: Row) -> str:
-    """Return the commit that a record was measured at, and what is not certain about it."""
+    """Return the commit at which a record was measured, with a note if the state of the code is uncertain."""
     if origin.get("commit") is None:
         return "a commit that is not known"
     changed = {True: "", False: " with changes that were not committed", None: " (not recorded; from the history)"}
@@ -74,7 +75,7 @@ def commit_of(origin: Row) -> str:
 
 
 def measured_at(origins: Mapping[str, Row]) -> str:
-    """Return a sentence that says at which commit the records of these names were measured."""
+    """Return a sentence that lists the commits at which the records with these names were measured."""
     names: dict[str, list[str]] = {}
     for name, origin in origins.items():
         names.setdefault(commit_of(origin), []).append(f"`{name}`")
@@ -87,13 +88,15 @@ def _filled(text: str) -> str:
 
 
 def name_of(row: Row) -> str:
-    """Return the name of an integrator, `reslrb`'s estimators without its name."""
+    """Return the name of an integrator. For an estimator of `reslrb`, this is the name of the estimator alone."""
     name = row["estimator"] or row["integrator"]
     return f"`{name}`" + (f" of {row['capacity']}" if row.get("capacity") not in (None, 1) else "")
 
 
 def figure(value: float | None, digits: int = 3) -> str:
-    """Return so many digits of a figure, without exponents where it is not far from 1; empty where there is none."""
+    """Return a figure with this number of significant digits. Figures below 1e6 have no positive exponent. Without a
+    figure, the text is empty.
+    """
     if value is None:
         return ""
     whole = f"{value:.{digits}g}"
@@ -101,7 +104,9 @@ def figure(value: float | None, digits: int = 3) -> str:
 
 
 def bench_ratios(record: Record, swept: str) -> str:
-    """Return kernel times over those of `ptracer`, a column for each value of the sweep, and the range of the peaks."""
+    """Return a table of kernel times divided by those of `ptracer`. The table has a column for each value of the sweep,
+    and a column with the range of the peaks.
+    """
     key, head = SWEPT[swept]
     values = sorted({row[key] for row in record.rows})
     found: dict[str, dict[int, Row]] = {}
@@ -117,7 +122,9 @@ def bench_ratios(record: Record, swept: str) -> str:
 
 
 def ratio(row: Row | None, base: Row | None, times: str) -> str:
-    """Return the ratio of two medians, how a row ended without one, or nothing where there is nothing to divide."""
+    """Return the ratio of two medians. If a row has no median, return how the row ended. If there is nothing to
+    compare, return an empty text.
+    """
     if row is None or row["status"] != "ok":
         return "" if row is None else row["status"].replace("_", " ")
     if base is None or base["status"] != "ok":
@@ -126,7 +133,7 @@ def ratio(row: Row | None, base: Row | None, times: str) -> str:
 
 
 def bench_details(record: Record, swept: str) -> str:
-    """Return every line of a bench: times with their least and greatest, and memory."""
+    """Return a table of all lines of a bench: memory, and times with their minimum and maximum."""
     key, first = SWEPT[swept]
     head = (first, "", "step, ms", "kernels, ms", "first step, s", "peak, MiB", "scratch of a path, B", "n")
 
@@ -145,7 +152,7 @@ def bench_details(record: Record, swept: str) -> str:
 
 
 def gradcheck_line(record: Record) -> list[str]:
-    """Return the verdicts of a gradcheck, and its figures that are closest to their limits."""
+    """Return the verdicts of a gradcheck, and the figures that are closest to their limits."""
     rows = [row for row in record.rows if "verdict" in row]
     of_means = [row for row in rows if row["kind"] == "expectation" and row["z_rms"] is not None]
     equal = [row["relative_l2"] for row in rows if row["kind"] == "equal_seeds" and row["relative_l2"] is not None]
@@ -158,7 +165,9 @@ def gradcheck_line(record: Record) -> list[str]:
 
 
 def run_errors(record: Record, moment: str) -> str:
-    """Return the parameters' errors at `initial` or `final`, each in its own unit, with names if there are several."""
+    """Return the parameters' errors at the moment `initial` or `final`, each in its own unit. If there are several
+    parameters, the text contains their names.
+    """
     errors = record.rows[0]["parameter_rmse"]
     if len(errors) == 1:
         return figure(next(iter(errors.values()))[moment])
@@ -169,7 +178,7 @@ def run_errors(record: Record, moment: str) -> str:
 
 
 def paths_of(record: Record) -> str:
-    """Return the paths of a run by `reslrb` in words; nothing of other runs."""
+    """Return a description of the paths of a run by `reslrb`. For other runs, return an empty text."""
     row = record.rows[0]
     name, share = row.get("paths"), row.get("light_share")
     if name is None:
@@ -179,7 +188,7 @@ def paths_of(record: Record) -> str:
 
 
 class Blocks:
-    """The pieces that are made of the records in a folder, by their names."""
+    """Parts of the pages that are made from the records in a folder. Each part has a name."""
 
     def __init__(self, folder: Path = RECORDS) -> None:
         self.folder = folder
@@ -195,7 +204,9 @@ class Blocks:
             self.makers |= {name: lambda of=name: self.bench(of), f"{name}_ratios": lambda of=name: self.ratios(of)}
 
     def make(self, name: str) -> str:
-        """Return a piece in Markdown, or a line that says that nothing of it is recorded. Raises KeyError, OSError."""
+        """Return a part in Markdown. If its record does not exist, return a line that reports this. Raises KeyError,
+        OSError.
+        """
         try:
             return self.makers[name]()
         except FileNotFoundError as error:
@@ -206,18 +217,20 @@ class Blocks:
         return read(self.folder / f"{name}.jsonl")
 
     def recorded(self, names: Mapping[str, str]) -> dict[str, tuple[str, Record]]:
-        """Return words and records, by the names of the records that there are: some may be measured later."""
+        """Return the description and the record for each name whose record exists. Other records may be measured
+        later.
+        """
         return {name: (words, self.record(name)) for name, words in names.items()
                 if (self.folder / f"{name}.jsonl").exists()}  # fmt: skip
 
     def gpu(self) -> str:
-        """Return the summary that `scripts/gpu_check` wrote on a GPU."""
+        """Return the summary that `scripts/gpu_check` wrote on a GPU, or a sentence about its absence."""
         file = self.folder / "gpu.md"
         found = file.read_text(encoding="utf-8").rstrip() if file.exists() else ""
         return found or "No figure on this page is from a GPU so far."
 
     def machine(self) -> str:
-        """Return the machines of all records."""
+        """Return a list of the machines of all records."""
         found = []
         for file in sorted(self.folder.glob("*.jsonl")):
             origin = read(file).origin
@@ -226,7 +239,7 @@ class Blocks:
         return "\n".join(dict.fromkeys(found))
 
     def bench(self, name: str) -> str:
-        """Return every line of a bench below its command, how long that took, and the conditions of all lines."""
+        """Return the command of a bench, its duration, the conditions that all its lines share, and all its lines."""
         record = self.record(name)
         row = next((row for row in record.rows if row["status"] == "ok"), record.rows[0])
         parts = {"spp": f"{row['spp']} spp", "max_depth": f"depth {row['max_depth']}"}
@@ -239,19 +252,19 @@ class Blocks:
         return f"    {record.command}\n\n{took}\n\n{bench_details(record, name)}"
 
     def ratios(self, name: str) -> str:
-        """Return the ratios of a bench."""
+        """Return the table of a bench's ratios."""
         record = self.record(name)
         return _with_commits(bench_ratios(record, name), {name: record})
 
     def gradcheck(self) -> str:
-        """Return a line for each scene whose gradients were compared."""
+        """Return a table with a line for each scene whose gradients were compared."""
         head = ("command", "seeds", "hold", "fail", "z rms (limit)", "max abs z (limit)", "equal seeds, relative L2")
         found = dict(self.recorded({f"gradcheck_{name}": name for name in CHECKED}).values())
         rows = [[f"`{record.command}`", *gradcheck_line(record)] for record in found.values()]
         return _with_commits(table(head, rows), found)
 
     def extreme(self) -> str:
-        """Return the result of the extreme suite, from its page and, if there is one, from its record."""
+        """Return the result of the extreme suite, from its page and, if it exists, from its record."""
         scenes = EXTREME.read_text(encoding="utf-8").count("\n| `")
         found, origin = "none fails", {}
         if (self.folder / "extreme.jsonl").exists():
@@ -265,12 +278,14 @@ class Blocks:
         )
 
     def experiments(self) -> str:
-        """Return the README's table of whole runs: the experiments in `configs/`, and one by other integrators."""
+        """Return the README's table of complete runs: the experiments in `configs/`, and runs by other integrators."""
         shipped = {experiment_record(name): f"`{name}`: {words}" for name, words in EXPERIMENTS.items()}
         return self._ends(shipped | {name: words for name, (words, _) in OTHERS.items()})
 
     def _ends(self, names: Mapping[str, str]) -> str:
-        """Return errors at the start and at the end of runs, by the names of their records and their words."""
+        """Return a table of errors at the start and at the end of runs. `names` maps the names of records to their
+        descriptions.
+        """
         head = ("experiment", "parameter RMSE, start", "end", "time", "command that prints it")
         rows, found = [], self.recorded(names)
         for words, record in found.values():
@@ -280,7 +295,7 @@ class Blocks:
         return _with_commits(table(head, rows), {name.removeprefix("optimize_"): of for name, (_, of) in found.items()})
 
     def runs(self) -> str:
-        """Return time, memory and paths of whole runs."""
+        """Return a table of the time, memory and paths of complete runs."""
         head = ("run", "iterations", "spp", "a step, ms", "iterations in all, s", "with everything, s", "peak, MiB",
                 "estimator", "paths")  # fmt: skip
         found = dict(self.recorded({experiment_record(name): name for name in EXPERIMENTS}).values())
@@ -300,12 +315,14 @@ def _with_commits(text: str, records: Mapping[str, Record]) -> str:
 
 
 def page(blocks: Blocks) -> str:
-    """Return docs/benchmarks.md."""
+    """Return the text of docs/benchmarks.md."""
     return PLACE.sub(lambda match: blocks.make(match[1]), (RECORDS / TEMPLATE).read_text(encoding="utf-8"))
 
 
 def gallery(blocks: Blocks) -> str:
-    """Return docs/gallery.md: the picture, errors, costs and command of each experiment that has a picture."""
+    """Return the text of docs/gallery.md: the picture, errors, costs and command of each experiment that has a
+    picture.
+    """
     parts = [
         "# Gallery\n\n"
         "This page shows every shipped experiment in `configs/`. Each picture has three images: the target,\n"
@@ -327,7 +344,7 @@ def gallery(blocks: Blocks) -> str:
 
 
 def readme(blocks: Blocks, text: str) -> str:
-    """Return the README with its tables made anew."""
+    """Return the text of the README with new tables."""
 
     def made(match: re.Match[str]) -> str:
         return f"<!-- benchmarks: {match[1]} -->\n{blocks.make(match[1])}\n<!-- end -->"
@@ -336,7 +353,7 @@ def readme(blocks: Blocks, text: str) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Do what the command line says; the exit code."""
+    """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(prog="scripts/benchmarks", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="the measurements, and the command of each")

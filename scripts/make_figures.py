@@ -3,9 +3,9 @@
 
     scripts/make_figures.py run RUN_FOLDER OUT.png    from a finished run: target, start, recovered and true texture
     scripts/make_figures.py scenes OUT.png            render the scenes in `scenes/`
-    scripts/make_figures.py lens PICTURE RUN OUT.png  a picture, the face that a run found for it, and what it throws
+    scripts/make_figures.py lens PICTURE RUN OUT.png  a picture, the glass face that a run found, and the face's light
 
-All need the environment that `scripts/setup` makes: run them with `.venv/bin/python`.
+All commands need the environment that `scripts/setup` makes. Run them with `.venv/bin/python`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ Panel = tuple[str, Image]
 
 
 def run_panels(folder: Path) -> list[Panel]:
-    """Target, initial image, and the first texture of the run: recovered, and true where it is known."""
+    """Return the target, the initial image, and the first texture of the run. The texture is shown as recovered and, if
+    known, as it truly is.
+    """
     summary = json.loads((folder / "parameters" / "parameters.json").read_text())
     texture = next((entry["file"] for entry in summary.values() if "file" in entry), None)
     if texture is None:
@@ -64,7 +66,9 @@ def image_panels(folder: Path) -> list[Panel]:
 
 
 def lens_panels(picture: Path, folder: Path) -> list[Panel]:
-    """The picture, the face lit from its upper left (without its mean curvature), and the light it throws."""
+    """Return the picture, the glass face lit from its upper left, and the light that passes through the face. The face
+    is shown without its mean curvature.
+    """
     from reslrb_cli.backend.variant import set_variant
 
     set_variant("auto")
@@ -88,7 +92,7 @@ def lens_panels(picture: Path, folder: Path) -> list[Panel]:
 
 
 def scene_panels() -> list[Panel]:
-    """The targets of the experiments in `SCENES`."""
+    """Return the targets of the experiments in `SCENES`."""
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization.assemble import assemble
@@ -104,14 +108,16 @@ def scene_panels() -> list[Panel]:
 
 
 def encode(image: Image) -> Image:
-    """Return linear values (H, W, C) as sRGB in [0, 1], without alpha."""
+    """Return linear values (H, W, C) as sRGB in [0, 1]. Alpha is dropped."""
     from reslrb_cli.report import tonemap
 
     return tonemap.encode(np.clip(image[:, :, :3], 0, 1))
 
 
 def write_panels(rows: Sequence[Sequence[Panel]], out: Path) -> None:
-    """Write rows of panels, all rows of one width, the first of the height `PANEL`; a title above each panel."""
+    """Write rows of panels with a title above each panel. All rows have the same width. The first row has the height
+    `PANEL`.
+    """
     aspects = [[image.shape[1] / image.shape[0] for _, image in panels] for panels in rows]
     gaps = [MARGIN * (len(panels) - 1) for panels in rows]
     whole = PANEL * sum(aspects[0]) + gaps[0]

@@ -1,7 +1,7 @@
-"""Writes the references: docs/config.schema.json and docs/config.md, of the schema, and the end of docs/python.md.
+"""Write the references: docs/config.schema.json and docs/config.md from the schema, and the end of docs/python.md.
 
-`python scripts/make_reference.py [FOLDER]`, after every change of the schema or of what is public; a test holds them
-together.
+Run `python scripts/make_reference.py [FOLDER]` after every change of the schema or of public names. A test checks that
+the references match the code.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ The names in `scene.options` and `target.render.parameters` may contain dots. If
 
 
 def json_schema() -> dict[str, Any]:
-    """The JSON Schema of a configuration file."""
+    """Return the JSON Schema of a configuration file."""
     schema = _tidied(Config.model_json_schema())
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "reslrb configuration", **schema}
 
 
 def _tidied(node: Any) -> Any:
-    """Without titles, and with descriptions of keys, which are docstrings, on one line."""
+    """Return a schema without titles. Descriptions of keys come from docstrings and are put on one line."""
     if isinstance(node, list):
         return [_tidied(item) for item in node]
     if not isinstance(node, dict):
@@ -69,7 +69,7 @@ def _tidied(node: Any) -> Any:
 
 
 def markdown() -> str:
-    """The reference page."""
+    """Return the text of docs/config.md."""
     schema = json_schema()
     lines = [_HEAD, "```yaml", EXAMPLE.rstrip(), "```", "", "## Top level", "", *_table([schema])]
     for key, value in schema["properties"].items():
@@ -81,7 +81,9 @@ def markdown() -> str:
 
 
 def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int = 2) -> Iterator[str]:
-    """The lines for the section that `value` describes, if it is one, and for the sections below it."""
+    """Yield the lines of the section that `value` describes and of the sections below it. Yield nothing if `value`
+    describes no section.
+    """
     members = _members(value, defs)
     if not members:
         return
@@ -105,12 +107,16 @@ def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int 
 
 
 def _has_own_section(key: str) -> bool:
-    """Others are told apart in the text of their key's type; `target.render.integrator` is as `integrator`."""
+    """Return whether a key's section has its own heading. The type of other keys describes their sections.
+    `target.render.integrator` equals `integrator`.
+    """
     return key in ("render", "heightmap", "motion", "mask", "precondition", "regularizers", "stages", "stop")
 
 
 def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]]:
-    """The definitions that `value` refers to, directly, as a union, as the items of a list or beside null."""
+    """Return the definitions that `value` refers to. The reference may be direct, in a union, in the items of a list,
+    or beside null.
+    """
     if "$ref" in value:
         return [defs[value["$ref"].rsplit("/", 1)[1]]]
     if value.get("type") == "array":
@@ -120,7 +126,7 @@ def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]
 
 
 def _table(members: list[dict[str, Any]]) -> Iterator[str]:
-    """A table of the members' keys; one that not all of them have says who has it."""
+    """Yield the lines of a table of the members' keys. If only some members have a key, its row names these members."""
     yield "| key | type | default | meaning |"
     yield "|---|---|---|---|"
     rows: dict[tuple[str, str], tuple[dict[str, Any], bool, list[str]]] = {}  # by key and meaning
@@ -160,7 +166,7 @@ _IN_A_LINE = {
 
 
 def _type(value: dict[str, Any]) -> str:
-    """A key's type in words, from its JSON Schema."""
+    """Return a key's type in words, from its JSON Schema."""
     for union in ("oneOf", "anyOf"):
         if union in value:
             names = list(dict.fromkeys(_type(option) for option in value[union]))
@@ -232,14 +238,14 @@ that line.
 
 
 def python_reference() -> str:
-    """The end of docs/python.md: all public names, their signatures and docstrings."""
+    """Return the end of docs/python.md: all public names with their signatures and docstrings."""
     public = [name for name in reslrb_cli.__all__ if not name.startswith("_")]
     names = [*_FIRST, *(name for name in public if name not in _FIRST)]
     return "\n".join([_PYTHON, *("\n".join(_described(name, getattr(reslrb_cli, name))) for name in names)])
 
 
 def _described(name: str, thing: Any) -> Iterator[str]:
-    """The lines of one public name."""
+    """Yield the lines about one public name."""
     yield from (f"### `{name}`", "")
     if inspect.isclass(thing):
         yield from (_text(thing), "")
@@ -264,13 +270,13 @@ def _described(name: str, thing: Any) -> Iterator[str]:
 
 
 def _fields(thing: Any) -> dict[str, str]:
-    """The fields of a dataclass, by name, and their types in words."""
+    """Return the names of a dataclass's fields and their types in words."""
     found = getattr(thing, "__dataclass_fields__", {})
     return {name: str(each.type).replace("Figure", "float") for name, each in found.items() if not name.isupper()}
 
 
 def _signature(name: str, function: Any, method: bool = False) -> str:
-    """The signature, in one line or, where it is long, an argument a line."""
+    """Return the signature on one line. A long signature of a function has one line for each argument."""
     signature = inspect.signature(function)
     parameters = []
     for each in list(signature.parameters.values())[method:]:
@@ -287,12 +293,14 @@ def _text(thing: Any) -> str:
 
 
 def python_page(before: str) -> str:
-    """docs/python.md, of which `before` is as it stands: what is written by hand, and the reference anew."""
+    """Return the new text of docs/python.md: the handwritten part of the current text `before`, and the new
+    reference.
+    """
     return before.partition(_MARK)[0].rstrip() + "\n\n" + python_reference().rstrip() + "\n"
 
 
 def write(folder: Path = DOCS) -> None:
-    """Writes the files into `folder`."""
+    """Write the reference files into `folder`."""
     schema = json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
     (folder / "config.schema.json").write_text(schema, encoding="utf-8")
     (folder / "config.md").write_text(markdown(), encoding="utf-8")

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""Make the assets of the scenes in `scenes/`: textures, an environment map and a mesh.
+"""Make the assets of the scenes in `scenes/`: textures, an environment map and meshes.
 
     scripts/make_scenes.py [FOLDER]
 
-writes them below FOLDER (default: `scenes/` of this repository). The result does not depend on the machine, apart
-from the last bits of sines and cosines, which are rounded away; a test compares the files in the repository with it.
+The script writes the assets below FOLDER (default: `scenes/` of this repository). The result does not depend on the
+machine. Only the last bits of sines and cosines differ, and these are rounded away. A test compares the files in the
+repository with the result.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ Image = np.ndarray  # (H, W, 3) float32, linear Rec. 709
 
 
 def main(arguments: list[str]) -> None:
-    """Write all assets below the folder named on the command line."""
+    """Write all assets below the folder that the command line names."""
     folder = Path(arguments[0]) if arguments else SCENES
     for name, image in images().items():
         write_exr(folder / name, image)
@@ -35,7 +36,7 @@ def main(arguments: list[str]) -> None:
 
 
 def images() -> dict[str, Image]:
-    """Every image asset by its path below the scenes folder."""
+    """Return all EXR images. The keys are their paths below the scenes folder."""
     return {
         "cornell_floor/floor.exr": carpet(64),
         "grey_room/planks.exr": planks(96),
@@ -49,7 +50,9 @@ def images() -> dict[str, Image]:
 
 
 def meshes() -> dict[str, tuple[np.ndarray, ...]]:
-    """Meshes by their paths below the scenes folder, as `height_field` returns them; the slab has no coordinates."""
+    """Return all meshes in the format of `height_field`. The keys are their paths below the scenes folder. The slab has
+    no texture coordinates.
+    """
     return {
         "caustic_slab/slab.ply": height_field(96, 1.0, slab, texcoords=False),
         "caustic_heightmap/face.ply": height_field(128, 0.805, lambda x, z: 0 * x),
@@ -62,7 +65,7 @@ def meshes() -> dict[str, tuple[np.ndarray, ...]]:
 
 
 def carpet(size: int) -> Image:
-    """A woven carpet: borders, corners and a medallion, each stitch (texel) of a shade of its own."""
+    """Return a woven carpet with borders, corners and a medallion. Each stitch is a texel with its own shade."""
     x, y = grid(size)
     square = np.maximum(abs(x), abs(y))
     diamond = abs(x) + abs(y)
@@ -96,7 +99,7 @@ def carpet(size: int) -> Image:
 
 
 def planks(size: int) -> Image:
-    """A floor of oak planks, eight across, with grain along their length and dark joints."""
+    """Return a floor of oak planks, eight across, with grain along the planks and dark joints."""
     rows, columns = np.mgrid[0:size, 0:size]
     width, length = size // 8, size // 2
     plank = columns // width
@@ -111,7 +114,7 @@ def planks(size: int) -> Image:
 
 
 def painting(size: int) -> Image:
-    """A landscape in flat colours: sky, sun, hills."""
+    """Return a landscape of sky, sun and hills in flat colours."""
     x, y = grid(size)
     x, y = x / size, -y / size
     color = np.empty((size, size, 3))
@@ -125,7 +128,7 @@ def painting(size: int) -> Image:
 
 
 def paper(size: int) -> Image:
-    """Warm paper with a printed grid and a frame."""
+    """Return warm paper with a printed grid and a frame."""
     x, y = grid(size)
     color = np.empty((size, size, 3))
     color[:] = (0.78, 0.74, 0.66)
@@ -137,7 +140,7 @@ def paper(size: int) -> Image:
 
 
 def wallpaper(size: int) -> Image:
-    """A printed wall: rows of flowers in two colours on a light ground, each texel of a shade of its own."""
+    """Return a printed wall with rows of flowers in two colours on a light ground. Each texel has its own shade."""
     x, y = grid(size)
     color = np.empty((size, size, 3))
     color[:] = (0.62, 0.58, 0.44)
@@ -156,7 +159,9 @@ def wallpaper(size: int) -> Image:
 
 
 def heights(size: int) -> Image:
-    """Smooth waves of glass, in scene units: two to four ripples across, so shallow that light does not fold."""
+    """Return the heights of smooth waves of glass, in scene units. Two to four ripples across are so shallow that light
+    does not fold.
+    """
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size
     ripples = [((2, 2), 0.4, 1.4e-3), ((-3, 1), 1.9, 1.1e-3), ((1, -3), 4.1, 1.1e-3), ((3, 2), 2.7, 0.8e-3)]
     value = waves(2 * np.pi * x, 2 * np.pi * y, ripples)
@@ -164,23 +169,25 @@ def heights(size: int) -> Image:
 
 
 def beam(size: int) -> Image:
-    """The cross-section of a beam: soft dots, five across."""
+    """Return the cross-section of a beam with soft dots, five across."""
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size * 2 * np.pi * 5
     value = 0.1 + 0.9 * ((0.5 + 0.5 * np.cos(x)) * (0.5 + 0.5 * np.cos(y))) ** 1.5
     return quantise(np.repeat(value[:, :, None], 3, axis=2))
 
 
 def mottled_wall(width: int, height: int) -> np.ndarray:
-    """Soft waves of grey, (H, W) uint8, linear: no detail finer than a pixel of the picture shows."""
+    """Return soft waves of grey, linear, as (H, W) uint8. The waves have no detail finer than a pixel of the
+    picture.
+    """
     y, x = (np.mgrid[0:height, 0:width] + 0.5) / height
     value = 0.45 + 0.17 * np.sin(3 * np.pi * x + 1) + 0.17 * np.cos(4 * np.pi * y + 0.5)
     return np.round(255 * quantise(value)).astype(np.uint8)
 
 
 def sky(height: int) -> Image:
-    """A small latitude-longitude sky: haze, blue, ground, and a sun that is bright but wider than a texel.
+    """Return a small latitude-longitude sky with haze, blue and ground. The sun is bright but wider than a texel.
 
-    It is painted for a map that is turned, so that its horizon (across UP) does not lie on a row of texels.
+    The scene rotates this map. Therefore the horizon is perpendicular to UP and does not lie on a row of texels.
     """
     v, u = (np.mgrid[0:height, 0 : 2 * height] + 0.5) / height
     theta, phi = v * np.pi, u * np.pi
@@ -206,7 +213,7 @@ UP = (0.0, 0.9063, -0.4226)
 
 
 def slab(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """The rippled lower face of the glass slab: waves of 2 to 4 ripples across the slab."""
+    """Return the heights of the glass slab's rippled lower face. Its waves make 2 to 4 ripples across the slab."""
     return waves(x, z, [
         ((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.0120), ((7.9, -4.6), 4.1, 0.0062),
         ((2.2, -8.8), 2.7, 0.0055), ((-9.6, -7.1), 5.2, 0.0032), ((11.8, 3.9), 0.9, 0.0028),
@@ -214,12 +221,12 @@ def slab(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def waves(x: np.ndarray, z: np.ndarray, parts: list[tuple[tuple[float, float], float, float]]) -> np.ndarray:
-    """A sum of waves, each with its wave vector, phase and amplitude."""
+    """Return a sum of waves. Each wave has a wave vector, a phase and an amplitude."""
     return sum(amplitude * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, amplitude in parts)
 
 
 def grid_faces(cells: int) -> np.ndarray:
-    """The triangles of a grid of (cells + 1)^2 vertices, row by row: (F, 3) int32."""
+    """Return the triangles of a grid of (cells + 1)^2 vertices, row by row, as (F, 3) int32."""
     index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
@@ -228,9 +235,10 @@ def grid_faces(cells: int) -> np.ndarray:
 
 def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarray], np.ndarray], texcoords: bool = True
                  ) -> tuple[np.ndarray, ...]:  # fmt: skip
-    """A surface y = height(x, z) over [-half, half]^2, normals downwards, u along x, v along z.
+    """Return a surface y = height(x, z) over [-half, half]^2, with normals downwards, u along x and v along z.
 
-    Positions and normals (V, 3), texture coordinates (V, 2) if there are any, float32, and triangles (F, 3) int32.
+    The arrays are positions and normals (V, 3), texture coordinates (V, 2) if requested, and triangles (F, 3).
+    Triangles are int32, and the other arrays are float32.
     """
     axis = np.linspace(-half, half, cells + 1)
     x, z = np.meshgrid(axis, axis, indexing="ij")
@@ -246,12 +254,16 @@ def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarr
 
 
 def lens(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """The lower face of a lens that is stronger along x than along z, and has coma, so that every turn of it shows."""
+    """Return the heights of a lens's lower face. The lens is stronger along x than along z and has coma, so that every
+    rotation of the lens is visible.
+    """
     return x**2 / 1.6 + z**2 / 3.2 + 0.2 * x**3 + 0.2 * x * z**2 + 0.15 * z**3
 
 
 def pane(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """The lower face of a pane of cast glass: ripples in four directions, that gather light at arm's length."""
+    """Return the heights of the lower face of a pane of cast glass. Its ripples in four directions concentrate light at
+    arm's length.
+    """
     vectors = [((26, 9), 0.4, 5.0e-3), ((-13, 24), 1.9, 4.2e-3), ((37, -20), 4.1, 1.6e-3), ((15, 33), 2.7, 1.4e-3)]
     return waves(x, z, vectors)
 
@@ -260,13 +272,17 @@ def pane(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def grid(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Texel centres (x to the right, y down), the middle of the image being the origin, in texels."""
+    """Return the coordinates of texel centres in texels, with x to the right and y down. The origin is the middle of
+    the image.
+    """
     y, x = np.mgrid[0:size, 0:size] + 0.5 - size / 2
     return x, y
 
 
 def noise(rows: int, columns: int, stream: int, channels: int = 0) -> np.ndarray:
-    """White noise in [0, 1) from an integer hash (PCG's output function), the same on every machine and version."""
+    """Return white noise in [0, 1) from an integer hash (PCG's output function). The noise is the same on every machine
+    and with every version.
+    """
     count = rows * columns * max(channels, 1)
     with np.errstate(over="ignore"):
         state = (np.arange(count, dtype=np.uint32) + np.uint32(stream * 0x9E3779B1 % 2**32)) * np.uint32(747796405)
@@ -277,12 +293,12 @@ def noise(rows: int, columns: int, stream: int, channels: int = 0) -> np.ndarray
 
 
 def quantise(array: np.ndarray, step: float = 1 / 4096) -> np.ndarray:
-    """Round to multiples of `step`, so that the last bits of libm do not matter."""
+    """Return an array rounded to multiples of `step`, so that the last bits of libm do not matter."""
     return (np.round(array / step) * step).astype(np.float32)
 
 
 def write_exr(path: Path, image: Image) -> None:
-    """Write an RGB image (H, W, 3) as OpenEXR, 32 bits a channel."""
+    """Write an RGB image (H, W, 3) as OpenEXR with 32 bits per channel."""
     path.parent.mkdir(parents=True, exist_ok=True)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {"RGB": np.ascontiguousarray(image)}).write(str(path))
