@@ -8,18 +8,18 @@ from pathlib import Path
 
 from reslrb_cli.backend import llvm, shared_library
 
-# Kernels of the default suite are compiled without LLVM's optimisations: most of its time was spent on those.
-#
-# LLVM gets the same kernels; its optional passes are left out, by `-opt-bisect-limit=0`, its documented way of doing
-# so. No pass may reassociate or approximate, so values are the same; the kernels run slower, which small ones do not
-# feel. `-m long`, whose kernels run for minutes, has LLVM as users have it.
+# The default suite compiles kernels without LLVM's optimisations, because optimisation took most of its time.  LLVM
+# gets the same kernels. The documented option `-opt-bisect-limit=0` leaves out its optional passes. No pass may
+# reassociate or approximate, so the values are the same. The kernels run slower, which is negligible for small kernels.
+# `-m long` has kernels that run for minutes, so it uses LLVM as users do.
 
-#: Dr.Jit knows a kernel on the disk by what it computes, so those of users have to lie elsewhere.
+#: Dr.Jit identifies a cached kernel by its computation, so the kernels of the tests need a folder apart from those of
+#: users.
 CACHE = Path("~/.drjit-tests")
 OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0")
-#: What Python runs first in a process that a test starts.
+#: Folder with the code that Python runs first in each process that a test starts.
 STARTED = Path(__file__).parent / "started"
-#: Older ones name each pass that they leave out.
+#: First LLVM version that does not print the name of each pass that it leaves out.
 SILENT_SINCE = (20, 0, 0)
 
 
@@ -52,13 +52,12 @@ def leave_out_optimisations() -> bool:
     return True
 
 
-# Kernels of the default suite are computed by the thread that launches them.
-#
-# Dr.Jit's other threads look for work for 20 ms, after each kernel, before they sleep: longer than most kernels of
-# these tests take, and on cores that the tests beside them need. `-m long`, whose kernels are large, has as many
-# threads as users have, and so have processes that tests start.
+# In the default suite, the thread that launches a kernel also computes it.  After each kernel, Dr.Jit's other threads
+# look for work for 20 ms before they sleep. This is longer than most kernels of these tests take, and it occupies cores
+# that parallel tests need. `-m long` has large kernels and uses as many threads as users have. Processes that tests
+# start do the same.
 
-#: Of OpenEXR, as Mitsuba's packages bring it along.
+#: OpenEXR library that comes with Mitsuba's packages.
 LIBRARY = "libIlmThread-mitsuba.so"
 POOL = "_ZN13IlmThread_2_510ThreadPool"
 PROVIDER = "PNS_18ThreadPoolProviderE"
@@ -85,7 +84,7 @@ def compute_alone() -> bool:
     except (OSError, AttributeError):
         return False
     common.restype = ctypes.c_void_p
-    none = (ctypes.c_void_p * 2)()  # a ThreadPool: its methods, its data; of the data, users and provider
+    none = (ctypes.c_void_p * 2)()  # a ThreadPool points to its methods and its data (users, provider)
     make(none, 0)
     provider = ctypes.c_void_p.from_address(none[1] + ctypes.sizeof(ctypes.c_void_p))
     provide(ctypes.c_void_p(common()), provider)

@@ -21,7 +21,7 @@ import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.errors import BackendError
 
-#: What most tests come to import.
+#: Modules that most tests import sooner or later.
 HEAVY = ("colour", "matplotlib.pyplot", "reslrb_cli.cli.optimize", "reslrb_cli.report.page", "reslrb_cli.runs.recorder")
 
 
@@ -55,7 +55,7 @@ def pytest_collection_finish() -> None:
     """Exclude all existing objects from later garbage collections. Python collects garbage for each recording of a
     step, and the objects exist until the last test anyway.
     """
-    if "PYTEST_XDIST_WORKER" in os.environ:  # which has many tests before it
+    if "PYTEST_XDIST_WORKER" in os.environ:  # a worker has many tests before this one
         for name in HEAVY:
             importlib.import_module(name)
     gc.collect()
@@ -73,8 +73,8 @@ def is_quick(config: pytest.Config) -> bool:
 def pytest_configure(config: pytest.Config) -> None:
     """Leave out compiler optimisations in quick runs, and handle ignored signals by default."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        # Shells start what is in the background with SIGINT ignored, and nohup without SIGHUP: so would be all runs
-        # that tests start, some of which are to be interrupted.
+        # Shells start background jobs with SIGINT ignored, and nohup starts jobs with SIGHUP ignored. All runs that
+        # tests start would inherit this, but some of these runs must be interrupted.
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     if is_quick(config):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-#: The reflectance of a surface that shows `poster.exr`, texel by texel.
+#: The reflectance of a surface that shows `poster.exr` with nearest-texel lookup.
 TEXTURE = """<texture type="bitmap" name="reflectance">
             <string name="filename" value="{}"/> <boolean name="raw" value="true"/>
             <string name="format" value="variant"/> <string name="filter_type" value="nearest"/>

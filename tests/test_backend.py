@@ -27,7 +27,7 @@ from reslrb_cli.optimization.views import to_tensor
 from reslrb_cli.records.tree import like
 from reslrb_cli.transport.guide import make_grid
 
-# The choice of libLLVM: which of several, which ones are refused, and what the user is told.
+# The choice of libLLVM: which of several libraries is used, which are refused, and what the user is told.
 
 Machine = Callable[..., list[Path]]
 
@@ -231,7 +231,7 @@ def test_the_command_line_exits_with_3(tmp_path: Path, name: str) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-# The choice of the variant: CUDA where a ray can be traced on it, LLVM elsewhere, and a reason where neither.
+# The choice of the variant: CUDA if it can trace a ray, otherwise LLVM, and a reason if neither works.
 
 
 def test_auto_uses_cuda_if_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,9 +317,9 @@ def test_a_broken_mitsuba_is_one_line(llvm: str) -> None:
     assert "BackendError: Mitsuba cannot be loaded" in done.stderr.splitlines()[-1]
 
 
-# What comes from NumPy lies in Dr.Jit's own memory, so that kernels and recordings fit whatever comes next.
+# Values from NumPy lie in Dr.Jit's own memory, so that kernels and recordings fit all later values.
 
-ALIGNMENT = 64  # bytes; what Dr.Jit's own memory has
+ALIGNMENT = 64  # bytes, as in Dr.Jit's own memory
 
 
 def address(array):
@@ -352,7 +352,7 @@ def test_bits_are_kept_outside_the_memory_of_numpy(kind, values, offset):
     copy = own_memory(getattr(mi, kind), given)
     assert address(copy) % ALIGNMENT == 0
     assert address(copy) != given.ctypes.data
-    given[:] = 5  # whoever shared its memory would see that
+    given[:] = 5  # a copy with shared memory would change
     assert np.array(copy).tobytes() == values.tobytes()
 
 
@@ -362,6 +362,6 @@ def test_restored_arrays_are_copied():
     assert address(to_tensor(image).array) % ALIGNMENT == 0
     value = dr.ones(mi.TensorXf, (2, 2, 3))
     assert address(like(value, image).array) % ALIGNMENT == 0
-    for _ in range(8):  # NumPy's own memory lies otherwise every time
+    for _ in range(8):  # NumPy's memory has another address every time
         table = even_table(make_grid([True] * 4, [1.0, 2.0], 14))
         assert [address(part) % ALIGNMENT for part in (table.slots, table.weights, table.edges)] == [0, 0, 0]

@@ -7,7 +7,7 @@ import pytest
 from reslrb_cli.errors import LINE_LENGTH, MESSAGE_LENGTH, ConfigError, NonFinite, one_line, printable
 from reslrb_cli.seeds import seed
 
-# What a message may hold: one line of bounded length, in which nothing commands the terminal.
+# The content of a message: one line of bounded length that cannot control the terminal.
 
 
 @pytest.mark.parametrize(
@@ -78,5 +78,5 @@ def test_seeds_are_uniform_in_their_range():
     counts = [0] * 16
     for iteration in range(4096):
         counts[seed(0, iteration, 0, "image") >> 28] += 1
-    # 256 expected in each of 16 bins; chi-square with 15 degrees of freedom exceeds 45 in 1 of 10000 cases
+    # Each of 16 bins expects 256. Chi-square with 15 degrees of freedom exceeds 45 in 1 of 10000 cases
     assert sum((count - 256) ** 2 / 256 for count in counts) < 45

@@ -24,7 +24,7 @@ def gpu_check(*words: object, python: object = sys.executable) -> subprocess.Com
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
 
 
-@pytest.mark.long  # it takes as long as a score of other tests, and all it runs has tests of its own
+@pytest.mark.long  # takes as long as twenty other tests, and its commands have their own tests
 def test_its_commands_run_at_the_smallest_sizes(tmp_path: Path, llvm: str) -> None:
     done = gpu_check("--small", "-o", tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr

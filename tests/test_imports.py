@@ -39,7 +39,7 @@ ROWS = [
     "cli",
     "__main__",
 ]
-# What a row must not know at all.
+# Packages that a row must not import at all.
 FOREIGN = {
     "errors": {"mitsuba", "drjit"},
     "config": {"mitsuba", "drjit"},
@@ -58,7 +58,7 @@ def violations(root: Path) -> list[str]:
     for path in sorted(root.rglob("*.py")):
         parts = path.relative_to(root).with_suffix("").parts
         if parts == ("__init__",):
-            continue  # the package's own face, which loads what it shows on demand
+            continue  # the package's public names, which load on demand
         row = parts[0]
         if row not in ROWS:
             found.append(f"{path.relative_to(root)}: {row} is in no row")

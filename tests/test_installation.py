@@ -20,7 +20,7 @@ PIP = "install it with `pip install '{}'`"
 MITSUBA, DRJIT = PIP.format("mitsuba>=3.9,<3.10"), PIP.format("drjit>=1.5,<1.6")
 WORKING = "def set_variant(name): pass\ndef variants(): return ['llvm_ad_rgb']\n"
 
-#: The file of a package, its text, and what is said of it, where {place} is the file.
+#: The file of a package, its text, and the message about it. {place} is the file.
 PACKAGES = {
     "another mitsuba": (
         "mitsuba.py",
@@ -92,7 +92,7 @@ def test_found_packages_are_reported(case: str, tmp_path: Path, llvm: str) -> No
         assert "Traceback" not in done.stderr
         assert what.format(place=place) in done.stderr.splitlines()[-1]
         if case != "another mitsuba":
-            break  # every command asks in the same way
+            break  # all commands check this the same way
 
 
 def test_installed_packages_are_the_required_ones(llvm: str) -> None:

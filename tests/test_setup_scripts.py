@@ -36,7 +36,7 @@ def test_paper_refuses_an_unknown_figure() -> None:
     assert done.stderr.startswith("usage: scripts/paper")
 
 
-#: Stands in for Python: makes an environment of itself, and finds everything there.
+#: A substitute for Python that makes an environment of itself, and finds every package there.
 PYTHON = """#!/usr/bin/env bash
 case "$*" in
 *"-m venv"*) mkdir -p "${@: -1}/bin" && cp "$0" "${@: -1}/bin/python" ;;
@@ -90,7 +90,7 @@ def test_a_copied_folder_gets_its_own_environment(tmp_path: Path, python: Path) 
     assert set_up(second, python) == ""
     assert (first / ".venv/bin/reslrb").exists()
     assert set_up(first, python) == ""
-    # What is needed has changed: installed into the environment that is there.
+    # The requirements changed, so setup installs into the existing environment.
     (first / "pyproject.toml").write_text("")
     assert "removing" not in set_up(first, python)
     assert (first / ".venv/bin/reslrb").exists()
@@ -98,7 +98,7 @@ def test_a_copied_folder_gets_its_own_environment(tmp_path: Path, python: Path) 
 
 #: A Chromium that draws pages, and one that does not.
 CHROMIUM, BROKEN = "#!/bin/sh\necho '<html></html>'\n", "#!/bin/sh\nexit 1\n"
-#: Stands in for `apt-get`: installs Chromium, or puts its package into the working folder.
+#: A substitute for `apt-get` that installs Chromium, or puts its package into the working folder.
 APT = """#!/bin/sh
 echo "$@" >>'{log}'
 case "$*" in
@@ -108,7 +108,7 @@ case "$*" in
 *) exit 100 ;;
 esac
 """
-#: Stands in for `dpkg`: unpacks it.
+#: A substitute for `dpkg` that unpacks the package.
 DPKG = """#!/bin/sh
 mkdir -p "$3/usr/lib/chromium" && cp '{chromium}' "$3/usr/lib/chromium/chromium-headless-shell"
 """
@@ -163,7 +163,7 @@ def test_without_chromium_the_tests_say_so_in_one_line() -> None:
 
 
 @pytest.mark.skipif(
-    Path(sys.prefix) != ROOT / ".venv" or (ROOT / ".venv").is_symlink(),  # of another folder's, it would make anew
+    Path(sys.prefix) != ROOT / ".venv" or (ROOT / ".venv").is_symlink(),  # setup would replace a foreign environment
     reason="runs in the environment that scripts/setup made",
 )
 def test_a_second_setup_changes_nothing() -> None:

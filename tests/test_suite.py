@@ -14,10 +14,10 @@ from compilation import search_path
 from reslrb_cli.backend import llvm as library
 from reslrb_cli.backend import shared_library
 
-# What `compilation.py` leaves out changes code, not values, and shows nowhere but in the tests' own kernels.
+# The optimisations that `compilation.py` leaves out change code, not values. They affect only the tests' own kernels.
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Prints the bits of sums of what rounding would change, were a pass to reassociate, fuse or approximate.
+#: Prints the bits of sums that rounding would change if a pass reassociated, fused or approximated.
 SCRIPT = """
 import sys
 import reslrb_cli
@@ -59,10 +59,10 @@ def test_values_equal_those_of_optimised_kernels(tmp_path: Path, llvm: str) -> N
     values, optimised = compiled("optimised", tmp_path / "optimised")
     ours, quick = compiled("quick", tmp_path / "quick")
     assert ours == values
-    # The same kernels, of other code.
+    # The same kernels, but with different code.
     assert set(quick) == set(optimised) != set()
     assert any(quick[name] != optimised[name] for name in quick)
-    # A process that a test starts needs to be told nothing.
+    # A process that a test starts compiles the same way without being told.
     assert compiled("inherited", tmp_path / "inherited") == (values, quick)
 
 
@@ -80,7 +80,7 @@ def test_a_library_that_names_each_pass_is_left_unchanged(monkeypatch: pytest.Mo
     assert not {"DRJIT_CACHE_DIR", "PYTHONPATH"} & set(os.environ)
 
 
-# Tests compute with one thread, and files are read and written all the same.
+# Tests compute with one thread, and can still read and write files.
 
 READS_AND_WRITES = """
 import sys

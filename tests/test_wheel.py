@@ -24,7 +24,7 @@ from reslrb_cli.runs.prepare import flat
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "reslrb_cli"
 
-#: What a wheel is made of.
+#: The requirements and sources of a wheel.
 LEAST_SETUPTOOLS = 77  # as pyproject.toml says
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "reslrb_cli", "configs", "scenes")
 
@@ -57,7 +57,8 @@ def installed(wheel: Path, folder: Path) -> Path:
     install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--target", site, wheel]
     subprocess.run(install, check=True)
     needed = Path(sysconfig.get_path("purelib"))
-    # as this environment would, but for what leads to the repository: `.pth` files in such a folder are not read
+    # The packages of this environment are found, but not the repository, because Python does not read `.pth` files in
+    # such a folder
     (site / "needed.pth").write_text(f"{needed}\n")
     return folder / "bin/python"
 
@@ -72,7 +73,7 @@ def test_the_wheel_contains_all_data_files(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     wanted = {path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.j2")}
     wanted |= {path.relative_to(ROOT).as_posix() for kind in ("*.js", "*.py") for path in PACKAGE.rglob(kind)}
-    wanted.add("reslrb_cli/py.typed")  # without it a user's type checker takes every public name for Any
+    wanted.add("reslrb_cli/py.typed")  # without it, a user's type checker sees every public name as Any
     for name in ("configs", "scenes"):
         wanted |= {f"reslrb_cli/examples/{path.relative_to(ROOT).as_posix()}"
                    for path in (ROOT / name).rglob("*") if path.is_file()}  # fmt: skip
@@ -132,7 +133,7 @@ def test_an_example_runs_from_another_folder(python: Path, tmp_path: Path, llvm:
     """The run also writes its page, whose templates are in the package. A second command runs by `reslrb` itself."""
     program, elsewhere = python.with_name("reslrb"), tmp_path / "elsewhere"
     elsewhere.mkdir()
-    # the script that pip puts beside the packages, where `--target` has it
+    # With `--target`, pip puts the script beside the packages
     (script,) = python.parents[1].rglob("site-packages/bin/reslrb")
     if script != program:
         program.write_text(f"#!{python}\n" + script.read_text().partition("\n")[2])
@@ -160,8 +161,8 @@ def test_an_example_runs_from_another_folder(python: Path, tmp_path: Path, llvm:
 
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 
-#: Cells of a notebook whose stop button is pressed in the midst of the first loop, twice while the folder is completed,
-#: and whose loss then returns NaN.
+#: Cells of a notebook. The stop button is pressed in the first loop, and twice while the folder is completed. The loss
+#: then returns NaN.
 STOPPED = [
     'import reslrb_cli as rl\nconfig = rl.load("configs/cornell_floor.yaml", {"run.iterations": 100000, '
     '"scene.options": {"resx": 16, "resy": 16}, "run.final_spp": 16, "run.measuring": 0})\n'

@@ -36,7 +36,7 @@ def test_every_measurement_is_recorded_by_its_own_command() -> None:
     recorded = {file.stem for file in RECORDS.glob("*.jsonl")}
     assert recorded <= set(MEASUREMENTS)
     readme = pages.README.read_text(encoding="utf-8")
-    for name in pages.EXPERIMENTS:  # what a record shows is not typed beside it
+    for name in pages.EXPERIMENTS:  # recorded results are not also typed by hand
         assert readme.count(f"\n| `{name}`: ") == 1
     for words, _ in OTHERS.values():
         assert readme.count(f"\n| {words} | ") == 1
@@ -102,7 +102,7 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
     for name, command in commands.items():
         origin = {"kind": "origin", "command": command} | state
         (tmp_path / "docs" / "benchmarks" / f"{name}.jsonl").write_text(json.dumps(origin) + "\n")
-    (tmp_path / "reslrb_cli/cli/bench.py").write_text("1")  # changes no figure, nor do words
+    (tmp_path / "reslrb_cli/cli/bench.py").write_text("1")  # no figure depends on it, nor on words
     (tmp_path / "reslrb_cli/transport/walk.py").write_text('"""Walk."""  # along a path\na = "this is another message"')
     assert benchmarks_measure.code_state()["clean"] is False
     commit_all(tmp_path)
@@ -142,12 +142,12 @@ def test_all_names_on_the_pages_exist() -> None:
             assert (page.parent / name).exists(), f"{page.name} names {name}"
 
 
-#: Names of files of this repository, as text has them.
+#: Names of this repository's files, as they appear in text.
 NAMED = re.compile(
     r"(?<![\w/.{}-])((?:configs|docs|paper|scenes|scripts|tests|reslrb_cli)(?:/[\w-]+)*/[\w-]+\.\w+(?:\.\w+)*"
     r"|(?:[\w-]+/)*test_\w+\.py|(?:[a-z]\w*/)+\w+\.py|scripts/\w+)\b"
 )
-#: Files that are written, and names that stand for others.
+#: Names that need not exist: generated files and placeholders.
 NOT_HERE = {"docs/benchmarks/gpu.md"}
 
 

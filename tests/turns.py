@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-# Parameters of which the default suite runs a part: a few of many names; of pairs each name and each way.
+# Parameters of which the default suite runs only a part. Of many names, a few run. Of pairs, each name and each way
+# runs.
 
 
 def name_of(one: Any) -> str:
@@ -50,7 +51,7 @@ def taking_turns(
     return pytest.mark.parametrize((name, way), pairs)
 
 
-# A scene of somebody else, which is not part of the project: where it is, if it is there.
+# A scene by another author, which is not part of the project: its place, if it exists.
 
 _BESIDE = Path(__file__).parents[2] / "shared" / "scenes" / "grey-white-room"
 

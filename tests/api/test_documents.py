@@ -74,7 +74,7 @@ def test_scripts_of_the_docs_run(where: str, request: pytest.FixtureRequest) -> 
     assert {path.name for path in (folder / "runs").iterdir()} == {"carpet", "stopped"}
 
 
-@pytest.mark.long  # its target has many samples
+@pytest.mark.long  # the target has many samples
 def test_scripts_of_the_readme_run(checkout: Path) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
@@ -88,7 +88,8 @@ def blocks(name: str) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", (ROOT / name).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
-#: Pages with Python, and their blocks, each of which a test runs: here, or tests/conformance/test_plugin.py.
+#: Pages with Python blocks, and the number of blocks of each page. A test runs each block: this file or
+#: tests/conformance/test_plugin.py.
 PYTHON = {"README.md": 1, "docs/python.md": 7, "docs/integrator.md": 2, "docs/steps.md": 1, "docs/losses.md": 1,
           "docs/benchmarks.md": 1, "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1}  # fmt: skip
 

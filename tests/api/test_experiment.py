@@ -30,7 +30,7 @@ from reslrb_cli.measure.convergence import session
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.methods import Plan
 
-#: Cheap, and the same every time.
+#: Settings that make a run cheap and exactly repeatable.
 FAST = {"run.certainty": False, "run.iterations": 3}
 
 
@@ -258,7 +258,7 @@ def test_arguments_are_named_in_errors(folder: Path, call: Callable[[], Any], li
 
 # --- measuring --------------------------------------------------------------------------------------------------------
 
-#: Times apart, and what depends on them.
+#: Setting that makes the lamp's radiance the second parameter.
 SIMPLE = {"parameters[1]": {"key": LAMP, "initial": [3, 4, 5]}}
 
 
@@ -363,14 +363,14 @@ def test_an_export_equals_that_of_the_command(folder: Path) -> None:
     assert tiny.files(Path("mine")) == tiny.files(Path("command"))
     with pytest.raises(rl.ConfigError, match="folder: mine exists; give a new or empty folder"):
         rl.export(run.folder, "mine")
-    # and a run's folder is an experiment, which begins where that is
+    # A run folder is also an experiment, which starts at the recovered values
     assert np.array_equal(rl.render(run.folder, spp=8)[0], rl.render("tiny.yaml", 8, run.parameters)[0])
     assert rl.load(run.folder, {"run.spp": 2}).run.spp == 2
 
 
 # --- the package's face -----------------------------------------------------------------------------------------------
 
-#: A user's script, which mypy is to look at with what is installed.
+#: A user's script. mypy checks the script against the installed packages.
 TYPED = """
 import drjit as dr
 import mitsuba as mi
@@ -433,7 +433,7 @@ def test_users_type_checkers_see_the_types(tmp_path: Path) -> None:
     assert (tiny.ROOT / "reslrb_cli/py.typed").exists()
     seen = [line.partition("Revealed type is ")[2] for line in out.splitlines() if "Revealed type" in line]
     assert len(seen) == TYPED.count("reveal_type("), out + done.stderr
-    for each in seen:  # only the number of an array's dimensions is left open
+    for each in seen:  # only the number of an array's dimensions may be Any
         assert "Any" not in each.replace("numpy.ndarray[Any, ", ""), each
     assert "import-untyped" not in out
     errors = [line.partition(" error: ")[2] for line in out.splitlines() if ": error:" in line]

@@ -26,7 +26,7 @@ from reslrb_cli.errors import MachineError, NonFinite
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.runs import recorder as recording
 
-#: The case of tests/runs with two parameters; what certainty needs is compared there.
+#: Settings for the two-parameter case of tests/runs. The tests there compare the values that certainty needs.
 SET = {"run.certainty": False, "run.iterations": 6}
 STAYS = {"poster.reflectance.data": (4, 4, 3), "lamp.emitter.radiance.value": (3,)}
 

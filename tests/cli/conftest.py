@@ -14,7 +14,7 @@ from reslrb_cli.report.page.layout import diagram
 from reslrb_cli.report.plots import Curve
 from reslrb_cli.runs import recorder as recording
 
-#: What was drawn before, by labels.
+#: Diagrams that earlier tests drew, by caption and label.
 DRAWN: dict[tuple[str, str], str] = {}
 
 
@@ -35,7 +35,7 @@ def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: py
     closes.
     """
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path_factory.mktemp("cache")))
-    # tests/report looks at diagrams.
+    # The tests in tests/report check the diagrams.
     monkeypatch.setattr(values, "diagram", drawn_once)
     logger = logging.getLogger("reslrb_cli")
     logger.handlers.clear()
@@ -48,7 +48,7 @@ def optimize(llvm, tmp_path, monkeypatch, capsys, request):
     """Function that runs `reslrb optimize tiny.yaml` and returns the exit code, standard output and standard error."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
-    if getattr(request, "param", None) != "real page":  # which takes longer than the run
+    if getattr(request, "param", None) != "real page":  # the real page takes longer than the run
         monkeypatch.setattr(
             recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>")
         )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-# Scenes as they are found elsewhere: without ids, with what ours lack, spelt as today and as years ago.
+# Scenes as users have them: without ids, with features that our scenes lack, and in the current and in older spelling.
 
 #: A box lit by an area lamp and a sky, with instances, bumps, spectra, a blend, a mirror, and glass.
 STUDIO = """<scene version="3.5.0">
@@ -122,7 +122,7 @@ STUDIO = """<scene version="3.5.0">
     </emitter>
 </scene>
 """
-#: A terrace under a sun and a sky of one colour, with a lens that blurs, in the spelling of Mitsuba 0.6.
+#: A terrace under a sun and a sky of one colour, seen through a lens that blurs. The spelling is that of Mitsuba 0.6.
 TERRACE = """<?xml version="1.0" encoding="utf-8"?>
 <!-- exported by a modeller -->
 <scene version="0.6.0">
@@ -181,7 +181,7 @@ TERRACE = """<?xml version="1.0" encoding="utf-8"?>
     <emitter type="constant"><spectrum name="radiance" value="0.4"/></emitter>
 </scene>
 """
-#: The corners of a pyramid and its faces.
+#: Vertices and faces of a pyramid.
 CORNERS = ((-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1), (0, 1.6, 0))
 FACES = ((0, 4, 1), (1, 4, 2), (2, 4, 3), (3, 4, 0), (0, 1, 2), (0, 2, 3))
 
@@ -224,9 +224,10 @@ def _write_meshes(folder: Path) -> None:
     (folder / "meshes/pyramid.ply").write_text("\n".join([*head, *rows]) + "\n")
 
 
-# The Cornell box as a camera would see it: rendered by `path`, and written as an 8-bit file that clips.
+# The Cornell box as a camera would photograph it. `path` renders the image, and the image is written as an 8-bit file
+# that clips.
 
-#: Reflectances of the coloured walls, to be recovered.
+#: True reflectances of the coloured walls, which the runs recover.
 WALLS = {
     "red.reflectance.value": [0.570068, 0.0430135, 0.0443706],
     "green.reflectance.value": [0.105421, 0.37798, 0.076425],

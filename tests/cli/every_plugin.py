@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
-#: Kinds of plugins, and what the page calls them.
+#: Kinds of plugins, and the headings of the page for them.
 KINDS = {"bsdf": "BSDFs", "shape": "Shapes", "emitter": "Emitters", "texture": "Textures and spectra",
          "medium": "Media", "phase": "Phase functions", "volume": "Volumes", "sensor": "Sensors", "film": "Films",
          "rfilter": "Reconstruction filters", "sampler": "Samplers", "integrator": "Integrators"}  # fmt: skip
@@ -168,7 +168,7 @@ MATERIALS = {
     "retarder": '<bsdf type="retarder"/>',
     "circular": '<bsdf type="circular"/>',
 }
-#: What the page says of some of them: of what light paths leave out, and of both.
+#: Notes of the page on some BSDFs: `SMOOTH` states what light paths leave out, and `SAID_OF` applies to all paths.
 SMOOTH = dict.fromkeys(("conductor", "dielectric", "thindielectric", "plastic"),
                        "its smooth lobe is black where the sensor sees it directly")  # fmt: skip
 SAID_OF = {
@@ -319,7 +319,8 @@ ROWS: tuple[Row, ...] = (
     *(Row("integrator", name, scene=f'<integrator type="{name}"/>', note=OWN_INTEGRATOR)
       for name in INTEGRATORS),
 )  # fmt: skip
-#: By default these are taken through three iterations, too: of each kind one, and those whose ways differ.
+#: Rows that the default suite also takes through three iterations: one row of each kind, and rows with special
+#: behaviour.
 FEW = (
     "diffuse",
     "hair",
@@ -397,7 +398,7 @@ def write_files(folder: Path) -> None:
           wvls=np.uint16([450, 500, 550, 600, 650]))  # fmt: skip
 
 
-#: Reasons as the page gives them, by parts of the errors.
+#: Reasons as the page gives them, by a part of the error message.
 REASONS = {
     MEDIUM: "participating media are not supported",
     ONE_WAY: "not the same if light and view are exchanged",

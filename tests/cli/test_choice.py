@@ -74,7 +74,7 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
     assert f"guiding off: {because}it pays in long runs" in err.splitlines()
     code, err = optimize(capsys, *options, "run.measuring=1000")
     assert code == 0, err
-    assert "measuring which sampling is most efficient" in err  # what was decided so is not remembered as measured
+    assert "measuring which sampling is most efficient" in err  # the unmeasured decision is not stored as measured
     assert "chosen by measurement: paths" in err
     opening = err.splitlines()[: next(place for place, line in enumerate(err.splitlines()) if line.startswith("1/3: "))]
     assert 0 < len(opening) <= 6, opening
@@ -218,7 +218,7 @@ def test_paths_use_no_memory_if_the_adjoint_is_known(experiment, capsys, estimat
     peaks, memory = peaks_without_and_with(1.5, capsys, *settings)
     assert memory["passes"] == 1
     assert max(peaks) < 1, peaks
-    # expected from the start, and used: within a factor
+    # The memory expected at the start matches the used memory within a factor of 2
     assert peaks[1] / 2 < sum(memory["expected_bytes"].values()) / 2**20 < 2 * peaks[1]
 
 
@@ -247,7 +247,7 @@ def test_exceeding_a_budget_is_a_warning(experiment, capsys, monkeypatch):
 
     monkeypatch.setattr(budget, "allocated", lambda size: 0)
     settings = wide("integrator={max_depth: 4, estimator: event}", "run.spp=256", "run.memory_budget=3")
-    settings += ("run.adjoint=correlated",)  # else nothing is kept of paths
+    settings += ("run.adjoint=correlated",)  # other adjoints store nothing of paths
     code, err = optimize(capsys, *settings)
     assert code == 0, err
     assert len([line for line in err.splitlines() if line.startswith("run.memory_budget: ")]) == 1
@@ -278,7 +278,7 @@ def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
         problem.truth.clear()
         peaks[spp] = max(record.peak_mib for record in optimize(problem))
         assert problem.memory is not None
-        if adjoint == "correlated":  # else nothing of a path outlives the kernel
+        if adjoint == "correlated":  # otherwise, nothing of a path outlives its kernel
             assert problem.memory.passes > 1
     print(adjoint, peaks)
     assert max(peaks.values()) < 1.5

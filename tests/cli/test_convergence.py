@@ -73,9 +73,9 @@ def test_a_scene_end_to_end(folder: Path, monkeypatch: pytest.MonkeyPatch, capsy
     )  # fmt: skip
     printed = capsys.readouterr().out.splitlines()
     assert printed[-1].startswith("Best for this scene: ")
-    assert sum("16 rounds " in line for line in printed) == len(names)  # rows as they come
-    assert any(line.startswith("ptracer: first step") for line in printed)  # and what was compiled, apart
-    # What is on file is not taken again.
+    assert sum("16 rounds " in line for line in printed) == len(names)  # one row for each method
+    assert any(line.startswith("ptracer: first step") for line in printed)  # compilation has its own line
+    # Samples that are already in the file are not taken again.
     monkeypatch.setattr(Process, "__init__", None)
     assert call("tiny.yaml", *args) == 0
     assert read(folder / "out/c.jsonl") == lines
@@ -164,7 +164,7 @@ def test_continuing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("tiny.yaml", *args[:-1], "9", "--json", "c.jsonl", "--set", "run.spp=8") == 2
     reason = "run.spp is 4 there, 8 here; remove the file, or use another one"
     assert capsys.readouterr().err == f"--json: c.jsonl belongs to another measurement: {reason}\n"
-    assert len(read(folder / "c.jsonl")) > 2  # as it was
+    assert len(read(folder / "c.jsonl")) > 2  # file is unchanged
 
 
 @pytest.mark.long

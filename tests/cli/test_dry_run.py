@@ -48,7 +48,7 @@ def test_memory_matches_the_run(experiment: Path, capsys: pytest.CaptureFixture[
     printed = capsys.readouterr().out
     told = re.search(r"memory of the iterations: at most ([\d.]+) MiB", printed)
     assert told is not None, printed
-    sizes = re.findall(r"^ +([\d.]+) (MiB|KiB|B) ", printed, re.MULTILINE)[:-2]  # but for thread-local, and process
+    sizes = re.findall(r"^ +([\d.]+) (MiB|KiB|B) ", printed, re.MULTILINE)[:-2]  # no thread-local or process memory
     units = {"MiB": 1.0, "KiB": 2.0**-10, "B": 2.0**-20}
     assert sum(float(size) * units[unit] for size, unit in sizes) == pytest.approx(float(told[1]), abs=0.2)
     assert "time of the iterations: " in printed
@@ -84,7 +84,7 @@ def test_long_steps_are_extrapolated_from_shorter_ones(experiment: Path, monkeyp
     assert taken == [4, 40]
     taken.clear()
     assert make_forecast(load(experiment / "tiny.yaml", ["run.spp=400"]), lambda line: None).peak == 5000
-    assert taken == [4, 12, 24, 400]  # whole steps of 8.1 s are no long wait
+    assert taken == [4, 12, 24, 400]  # whole steps of 8.1 s are short enough to take
 
 
 def test_each_trial_starts_at_the_initial_values(experiment: Path) -> None:
@@ -154,7 +154,7 @@ def test_passes(spp: int, per_pass: int | None, pixels: int, said: str | None) -
     obstacle = passes_obstacle(spp, per_pass, pixels)
     assert (obstacle is None) if said is None else (obstacle is not None and said in obstacle)
     most = largest_pass(spp, pixels) if said else None
-    if most is not None and spp // most <= 2**16:  # what is advised is not refused
+    if most is not None and spp // most <= 2**16:  # the advice itself is accepted
         assert spp % most == 0
         assert passes_obstacle(spp, most, pixels) is None
 

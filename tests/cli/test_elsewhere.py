@@ -21,10 +21,11 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.load import load_scene
 
-# Scenes from elsewhere, through the commands that somebody would try on them: none of them stumbles.
+# Scenes from elsewhere, with the commands that a user would try on them. No command fails on these scenes.
 
 SCENES = {"studio": (write_studio, (32, 32)), "terrace": (write_terrace, (32, 24))}
-#: What `init` begins with: colours by their share, but of nothing that is a mirror alone.
+#: Parameters that `init` selects: colours, ordered by their share of the image. Colours of plain mirrors are not
+#: selected.
 FIRST = {
     "studio": [
         "plaster.brdf_0.reflectance.value",
@@ -32,13 +33,13 @@ FIRST = {
         "Cube_1.bsdf.diffuse_reflectance.value",
     ],
     "terrace": [
-        "ground.reflectance.data",  # 8 bits
+        "ground.reflectance.data",  # an 8-bit texture
         "Obj_1.bsdf.diffuse_reflectance.value",
-        *(f"Sphere_1.bsdf.alpha_{axis}.value" for axis in "uv"),  # of a rough metal
+        *(f"Sphere_1.bsdf.alpha_{axis}.value" for axis in "uv"),  # the roughness of a metal
         "Disk_1.bsdf.nested_bsdf.brdf_0.reflectance.value",
     ],
 }
-#: Commands on the configuration and the run, and what each of them says when it is done.
+#: Commands on the configuration and the run, and the text that each command prints at its end.
 COMMANDS = {
     "optimize": (("room.yaml", "--set", "run.iterations=20", "--set", "run.final_spp=8"), "finished after 20"),
     "inspect": (("runs/room",), "can be recovered"),
@@ -81,7 +82,7 @@ def test_every_command_works(name_scenes_from_elsewhere: str) -> None:
     for command, (arguments, words) in COMMANDS.items():
         done = reslrb(command, *arguments)
         print(command, done.exit_code, done.output[-1500:])
-        # `gradcheck` and `bench` end with 1 where a comparison, of few samples here, does not hold.
+        # `gradcheck` and `bench` exit with 1 if a comparison fails, and the comparisons have few samples here.
         assert done.exit_code in ((0, 1) if command in ("gradcheck", "bench") else (0,)), (command, done.output)
         assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
         assert words in done.output, command
@@ -90,7 +91,7 @@ def test_every_command_works(name_scenes_from_elsewhere: str) -> None:
     assert np.isfinite(np.array(mi.render(stock, spp=4))).all()
 
 
-# Scenes whose objects have no ids, from `inspect` to the page: the same keys everywhere, in each run.
+# Scenes whose objects have no ids, from `inspect` to the report page. The keys are the same everywhere and in each run.
 
 #: Three lamps of one kind and two of another over a floor.
 LAMPS = """<scene version="3.0.0">
@@ -108,7 +109,7 @@ LAMPS = """<scene version="3.0.0">
 <emitter type="point"><point name="position" x="1" y="3" z="2"/></emitter>
 </scene>
 """
-#: A corner as Mitsuba 0.6 wrote it, its light from a file of its own.
+#: A corner scene as Mitsuba 0.6 wrote it. Its light comes from a separate file.
 CORNER = """<scene version="0.6.0">
 <integrator type="bdpt"/>
 <sensor type="perspective"><float name="fov" value="50"/><sampler type="halton"/>
@@ -194,7 +195,7 @@ def test_keys_are_the_same_from_inspect_to_the_page(folder, name):
             assert found == chosen, record
         manifest = json.loads((run / "manifest.json").read_text())
         assert manifest["status"] == "finished"
-        if number <= 2:  # the true values are known by the same names
+        if number <= 2:  # the true values have the same names
             assert set(manifest["results"]["parameter_rmse"]) <= set(chosen)
             assert json.loads((run / "parameters" / "true" / "parameters.json").read_text()).keys() == set(chosen)
         pages.append((run / "report.html").read_text())
@@ -230,7 +231,7 @@ def test_the_other_commands_accept_the_names(folder):
     assert truth[key]["value"] == [2, 3, 4]
 
 
-# Photographs as targets: clipped, with unknown exposure, and with what light tracing cannot see in them.
+# Photographs as targets. They clip, their exposure is unknown, and they contain effects that light tracing cannot see.
 
 
 def optimize(*given: str) -> tuple[dict[str, np.ndarray], dict]:
@@ -316,19 +317,20 @@ def test_invisible_texels_are_told_from_settled_ones(tmp_path: Path, monkeypatch
     assert "does not include the noise of the target" in page
 
 
-# From somebody's scene, which has no ids, and a photograph to its colours: `init`, an edit, `optimize`.
+# From a user's scene without ids and a photograph to the colours of the scene, by `init`, an edit and `optimize`.
 
 EXPOSURE = 0.8
-#: What the scene file says of these, and what the photograph shows: two walls, and something to sit on.
+#: Reflectances in the scene file, and the true ones in the photograph, of two walls and a seat.
 GUESS = "0.5, 0.5, 0.5"
 TRUE = {
     "Rectangle_4.bsdf.reflectance.value": [0.55, 0.25, 0.15],
     "Rectangle_5.bsdf.reflectance.value": [0.2, 0.35, 0.5],
     "Cube_1.bsdf.reflectance.value": [0.6, 0.3, 0.2],
 }
-#: How wrong a channel may be that is above `BRIGHT`, and the exposure, as a share of the truth.
+#: Largest error of a colour channel above `BRIGHT`, that limit, and the largest error of the exposure. Errors are
+#: shares of the true value.
 COLOUR, BRIGHT, FACTOR = 0.1, 0.1, 0.05
-#: The same of colours after few iterations; the guesses are up to 230 % off.
+#: Largest error of colours after few iterations. The initial guesses are up to 230 % off.
 SHORT_COLOUR = 0.15
 LEFT, RIGHT, SEAT = TRUE.values()
 
@@ -458,11 +460,10 @@ def test_the_same_in_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert misses(run, SHORT_COLOUR) == []
 
 
-# The three commands on somebody else's room, from 8 bits of what a camera would see there.
-#
-# Most of its light comes through windows, which clip; a mirror and clear glass are in view; no exposure is given.
+# The three commands on another user's room, with an 8-bit photograph.  Most of the room's light comes through windows,
+# which clip. A mirror and clear glass are in view. The exposure is not given.
 
-#: What the photograph shows of what the scene file has as 0.1 and 1.
+#: True values in the photograph. The scene file has 0.1 and 1 for them.
 TRUE_OF_ROOM = {"Walls.brdf_0.reflectance.value": [0.45, 0.35, 0.25], "Sofa.brdf_0.reflectance.value": [0.6, 0.3, 0.2]}
 WIDTH, HEIGHT, SPP, PARTS = 320, 180, 128, 4
 

@@ -25,7 +25,8 @@ from reslrb_cli.cli.terminal import SIGNALS, Interrupts
 from reslrb_cli.records.manifest import read_content
 from reslrb_cli.runs import recorder as recording
 
-# How a run ends, in process: each part alone, the manifest first, nothing lost, and the truth in the folder.
+# The end of a run, in this process. Each part is written on its own, the manifest first. Nothing is lost, and the
+# folder states the truth.
 
 
 @pytest.mark.parametrize("optimize", ["real page"], indirect=True)
@@ -63,7 +64,7 @@ def test_a_signal_during_writing_loses_no_file(optimize, monkeypatch, name, call
 
     monkeypatch.setattr(recording, name, interrupted)
     code, _, err = optimize()
-    begun = call > 0  # all iterations are done by then, and nothing is left that could be cut short
+    begun = call > 0  # by then, all iterations are done, and nothing is left to interrupt
     assert (code, faults(RUN, code, err)) == (0 if begun else 130, [])
     assert files(RUN) >= (COMPLETE if begun else COMPLETE - {"metrics.jsonl"})
 
@@ -76,7 +77,7 @@ def test_a_run_that_ends_at_once_is_interrupted(optimize, during, monkeypatch):
 
     def abandon(record):
         if record.iteration == 2:
-            runs[0].abandon()  # as the thread does that ends the process
+            runs[0].abandon()  # like the thread that ends the process
             seen.append(read_content(RUN))
 
     during(abandon)
@@ -120,7 +121,8 @@ def test_a_running_run_is_not_replaced(optimize, during):
     assert sorted(os.listdir("runs")) == ["tiny"]
 
 
-#: By the part that fails: what writes it, how often that is called before the end, and what is not there.
+#: For each failing part: the function that writes it, the number of calls before the end of the run, and the files that
+#: are then absent.
 PARTS = {
     "checkpoint": ("save_checkpoint", 1, set()),
     "parameters": ("write_parameters", 2, {f"parameters/{name}" for name in
@@ -185,7 +187,7 @@ def test_running_out_of_memory_at_the_end_keeps_the_results(optimize, monkeypatc
     assert COMPLETE - files(RUN) == {"images/final.exr", "images/final.png"}
 
 
-# Signals: a wish to stop, the end at once, and no exception out of a handler.
+# Signals: a first signal asks the run to stop, a later signal ends it at once, and no handler raises an exception.
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -324,7 +326,7 @@ def test_a_last_act_that_fails_prevents_nothing():
 
 
 def test_initially_ignored_signals_stay_ignored():
-    process = start(FIRST, shell="trap '' HUP INT")  # as nohup does
+    process = start(FIRST, shell="trap '' HUP INT")  # like nohup
     for number in (signal.SIGHUP, signal.SIGINT):
         process.send_signal(number)
     time.sleep(0.2)
@@ -412,7 +414,7 @@ def test_mitsuba_writes_no_signal_messages_to_standard_output():
     assert (code, out) == (0, "interrupted\n"), err
 
 
-# Run folders that are removed, emptied, moved or replaced while a run is at work.
+# Run folders that are removed, emptied, moved or replaced during a run.
 
 
 def test_removing_the_folder_ends_the_run(optimize, during):
@@ -464,7 +466,7 @@ def test_another_run_with_the_same_name_is_left_alone(optimize, during):
     during(take)
     code, out, err = optimize("--set", "run.checkpoint_every={iterations: 1}")
     assert (code, out, os.listdir(RUN)) == (6, "", ["theirs"])
-    assert seen == []  # at once, not when all is done
+    assert seen == []  # it ends at once, not after all work
     [line] = lines(err)
     assert line.endswith("runs/tiny: has gone while the run went on")
 

@@ -33,7 +33,7 @@ from reslrb_cli.optimization import memory as room
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.scene import load as scene_load
 
-# Every error that a user can cause ends in one line and its exit code; `--help` works, and at once.
+# Every error that a user can cause ends in one line and its exit code. `--help` works without delay.
 
 COMMANDS = main.list_commands(click.Context(main))
 
@@ -181,12 +181,13 @@ def test_doctor_reports_as_json(llvm: str) -> None:
     assert {backend["variant"] for backend in report["backends"]} == {"llvm_ad_rgb", "cuda_ad_rgb"}
 
 
-# What no machine holds is refused at once, in one located line with the reason; what is merely large goes on.
+# Sizes that no machine can hold are refused at once, in one located line with the reason. Merely large sizes are
+# accepted.
 
-#: Seconds of the processor that a process may take until it has said so, Python and Mitsuba loaded.
+#: Processor seconds that a process may take until its refusal, including the loading of Python and Mitsuba.
 SECONDS = 5.0
 TRAJECTORY = "{type: trajectory, max_depth: 70000}"
-#: Overrides, the place in the line, and what it says: what is wrong, why, and what would be right.
+#: Overrides, and the start of the error line: the place, the error, the reason and a value that works.
 REFUSED = {
     "film": (["scene.size=[100000, 100000]"], "scene.size: must have at most 134217728 pixels, not 10000000000: each"),
     "smaller film": (["scene.size=[20000, 20000]"], "scene.size: must have at most 134217728 pixels, not 400000000: "),
@@ -302,8 +303,8 @@ def test_a_step_beyond_the_free_memory(experiment: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(room, "SMALL", 0)
     naive = "integrator={type: ptracer, max_depth: 3}"
-    # Bytes that are free, in MiB. What the scene's file does not say of the texture, its channels, makes the difference
-    # between the first two.
+    # Free memory in MiB. The first two cases differ because the scene file does not state the number of channels of the
+    # texture.
     for free, sets, said in (
         (40, ["parameters[0].resolution=[512, 512]"], "scene.size: a film of 512x512 pixels and 512x512 texels: "
                                                       "a step takes at least 48.8 MiB, and 40 MiB are free; "),
@@ -395,7 +396,7 @@ def test_a_long_run_is_announced(experiment: Path) -> None:
 @pytest.mark.usefixtures("llvm")
 def test_fitting_steps_are_not_refused(experiment: Path, little: int) -> None:
     config = load(experiment / "tiny.yaml", ["scene.size=[4000, 4000]", "parameters[0].resolution=[8000, 8000]"])
-    announced.check_announced(config)  # which allocates nothing
+    announced.check_announced(config)  # the check allocates nothing
 
 
 @pytest.mark.usefixtures("llvm")
@@ -428,7 +429,7 @@ def test_free_memory_is_no_more_than_a_limit(monkeypatch: pytest.MonkeyPatch) ->
         ["integrator.max_depth=65535"],
         ["scene.size=[256, 256]", "run.spp=1000000000", "integrator.samples_per_pass=62500"],
         ["scene.size=[8, 8]", "run.spp=1000000"],
-        ["scene.size=[256, 256]", "run.spp=1000000000", "run.memory_budget=64"],  # by which passes are chosen
+        ["scene.size=[256, 256]", "run.spp=1000000000", "run.memory_budget=64"],  # the budget determines the passes
         ["scene.size=[11000, 11000]"],
         ["run.iterations=2000000000", "run.final_spp=1000000"],
     ],

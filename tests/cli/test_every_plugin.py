@@ -19,12 +19,12 @@ from reslrb_cli.backend.installation import package_folder, shipped_plugins
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-#: Three iterations, as short as they may be.
+#: Settings for three iterations that are as short as possible.
 SHORT = settings("target={render: {spp: 64}}", "run.iterations=3", "run.spp=4",
                  "run.certainty=false", "integrator.max_depth=4")  # fmt: skip
-#: What a run would find out first.
+#: Decisions that a run would otherwise measure first.
 DECIDED = settings("integrator.estimator=stack", "integrator.guiding=off", "integrator.sequence=independent")
-#: All integrators of a configuration.
+#: All integrator types of a configuration.
 TYPES = ("reslrb", "ptracer", "walk_ad", "trajectory", "prb")
 BY_HAND = """
 variant: llvm_ad_rgb
@@ -60,7 +60,7 @@ def said(*arguments: object, code: int = 0) -> str:
     text = " ".join(result.output.split())
     ended, error = result.exit_code, repr(result.exception)
     del result
-    gc.collect()  # Mitsuba asks all emitters that there are, those of scenes that nobody has any more among them
+    gc.collect()  # Mitsuba also asks the emitters of unused scenes until the garbage collector removes the scenes
     assert ended == code, f"{' '.join(map(str, arguments))}: {text} {error}"
     assert "Traceback" not in text
     return text

@@ -28,10 +28,10 @@ from reslrb_cli.scene.values import resample
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# What goes on from a run: `initial: {run: RUN}` and `render --run RUN`.
+# Commands and settings that continue from a run: `initial: {run: RUN}` and `render --run RUN`.
 
 LAMP = "lamp.emitter.radiance.value"
-#: A texture, a colour and a motion, which is what a value can be shaped like.
+#: A texture, a colour and a motion: all shapes that a value can have.
 PARAMETERS = f"""[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAMP}, initial: [3, 4, 5]}},
   {{motion: {{of: wall, free: [translation, scale]}}, learning_rate: 0.01}}]"""
 
@@ -104,7 +104,7 @@ def test_rendering_a_run_renders_its_recovered_values(folder: Path) -> None:
     expected = reslrb("render", folder / "tiny.yaml", "--set", f"parameters={by_hand}", *common, folder / "a.exr")
     assert expected.exit_code == 0, expected.output
     assert reslrb("render", "--run", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
-    # Of equal samples, whose sum a CPU takes in any order.
+    # The samples are equal, but a CPU adds them in any order.
     assert np.allclose(load_image(folder / "a.exr"), load_image(folder / "b.exr"), rtol=1e-5)
     initial = reslrb("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
     assert initial.exit_code == 0
@@ -115,7 +115,7 @@ def test_rendering_a_run_renders_its_recovered_values(folder: Path) -> None:
 def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
     folder: Path, exposure: str, tmp_path: Path
 ) -> None:
-    spec = "[{motion: {of: wall, free: [translation]}, learning_rate: 0.01}]"  # a colour cannot be told from it
+    spec = "[{motion: {of: wall, free: [translation]}, learning_rate: 0.01}]"  # a colour cannot be told from exposure
     given = tiny.settings(f"target.exposure={exposure}", f"parameters={spec}", f"run.output={tmp_path}/runs")
     result = reslrb("optimize", folder / "tiny.yaml", *given, *tiny.settings("optimizer.learning_rate=0.2"))
     assert result.exit_code == 0, result.output
@@ -219,10 +219,10 @@ def test_an_exported_scene_names_path_if_ptracer_is_wrong(tmp_path: Path) -> Non
     assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")
 
 
-# What goes on from runs whose cameras come from a file, and that recovered a relief: `render --run` and `export`.
+# Continuing from runs whose cameras come from a file, and which recovered a relief: `render --run` and `export`.
 
 SIZE = 12
-#: A sheet of 5x5 corners over a lamp's light; the cameras of the file replace this one.
+#: A sheet of 5x5 vertices that is lit by a lamp. The cameras of the file replace this sensor.
 SCENE = """<scene version="3.0.0">
     <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>
         <string name="pixel_format" value="rgb"/><rfilter type="gaussian"/></film></sensor>
@@ -288,7 +288,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     return folder / "runs/box"
 
 
-#: The second camera's view is held out; the first one's is as any other.
+#: The view of the second camera is held out. The view of the first camera is an ordinary view.
 SENSORS = pytest.mark.parametrize("sensor", [pytest.param(0, marks=pytest.mark.long), 1])
 
 
@@ -304,7 +304,7 @@ def test_each_camera_is_rendered_with_the_relief(run: Path, tmp_path: Path, sens
     assert image.shape == (SIZE, SIZE, 3)
     recovered, begun = (assemble_scene(config) for config in (read_recovered(run, ()), load(run / "config.yaml")))
     own, first = (np.stack([one.render(sensor, 16, k, "test").mean() for k in range(16)]) for one in (recovered, begun))
-    error = own.std(ddof=1) * np.sqrt(2 / len(own))  # the image has as many samples as all of these
+    error = own.std(ddof=1) * np.sqrt(2 / len(own))  # the image has as many samples as all these renderings
     far = np.abs(np.array([own.mean(), first.mean()]) - image.mean()) / error
     assert far[0] < 3 < far[1], (image.mean(), own, first)
 

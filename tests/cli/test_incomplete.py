@@ -18,7 +18,8 @@ from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.measurements import MissingRecord
 from reslrb_cli.report.run_summary import find_remedy, warnings
 
-#: A box on a floor under an area lamp, seen from above; its place is read from a picture by `path`.
+#: A box on a floor under an area lamp, seen from above. Runs recover the box's place from an image that `path`
+#: rendered.
 SCENE = scene(
     sensor("0, 3.2, 4.2", "0, 0.2, 0", size=20, fov=45, rfilter="gaussian"),
     shape("rectangle", "floor", diffuse("0.5, 0.5, 0.5"), place='<rotate x="1" angle="-90"/><scale value="3"/>'),
@@ -137,7 +138,7 @@ def record(share: float | None, error: float | None, seeds: int = 8) -> MissingR
 @pytest.mark.parametrize(
     ("found", "incomplete", "refused"),
     [
-        (record(0.02, 0.001), False, False),  # of an interior derivative, by a step that is not 0
+        (record(0.02, 0.001), False, False),  # from the finite step, for an interior derivative
         (record(0.1, 0.04), False, False),
         (record(0.3, 0.04), True, False),
         (record(0.45, 0.2), True, False),

@@ -26,7 +26,7 @@ from reslrb_cli.scene.proposal import propose
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# `init`: a configuration that `optimize` takes, from a scene alone and from a scene and a photograph.
+# `init` writes a configuration that `optimize` accepts, from a scene alone and from a scene with a photograph.
 
 
 @pytest.fixture
@@ -54,7 +54,8 @@ def test_a_scene_alone_gets_a_configuration_without_a_photograph(folder: Path) -
     assert config.parameters[0].bounds == (0, 1)
     assert (config.loss.type, config.optimizer.schedule, config.integrator.max_depth) == ("relative_l2", "cosine", 8)
     assert (config.optimizer.scale, config.optimizer.learning_rate) == ("none", 0.03)
-    # Its own rate, of a tenth of what it is: once it is not commented out any more, it can get where it has to.
+    # The lamp's own learning rate is a tenth of its present value. The lamp can then reach its true value once a user
+    # activates the line.
     lamp = "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf], learning_rate: 0.8}"
     assert lamp in (folder / "room.yaml").read_text()
     missing = reslrb("optimize", "room.yaml")
@@ -109,7 +110,7 @@ def test_a_photograph_sets_the_size_of_the_film(folder: Path) -> None:
 
 
 def test_a_large_photograph_is_reduced_for_a_short_run(folder: Path) -> None:
-    config, result = of_photograph(folder, 600, 597)  # as near as a camera comes to the film's ratio
+    config, result = of_photograph(folder, 600, 597)  # a camera comes no closer to the film's aspect ratio
     width, height = config.scene.size or (0, 0)
     assert 0.9 * PIXELS < width * height <= 1.02 * PIXELS
     assert f"photo-{width}x{height}.png" in result.output
@@ -176,7 +177,8 @@ def test_errors_are_one_line(folder: Path, arguments: tuple[str, ...], message: 
     assert {path.name for path in folder.iterdir()} == {"room", "wide.png"}
 
 
-#: A floor that fills most of the picture, with a texture of its own; a ball; what is not seen; what has no effect.
+#: A floor with its own texture that fills most of the image, a ball, an object that is not seen, and parameters without
+#: effect.
 VIEW = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/>
 <integer name="height" value="16"/></film>
 <transform name="to_world"><lookat origin="0, 5, 5" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
@@ -197,7 +199,7 @@ def test_large_visible_parameters_come_first(tmp_path: Path) -> None:
     tiles = [f"Rectangle_1.bsdf.brdf_0.reflectance.color{k}.value" for k in range(2)]
     assert [item.info.key for item in found[:2]] == tiles
     first = [item.info.key for item in found if item.first]
-    assert first == [*tiles, "Sphere_2.bsdf.brdf_0.base_color.value"]  # no lamp's black, roughness, or mirror
+    assert first == [*tiles, "Sphere_2.bsdf.brdf_0.base_color.value"]  # not the lamp's black, roughness or the mirror
     shares = {item.info.key: item.share for item in found}
     assert shares["Cube_1.bsdf.specular_reflectance.value"] > 0.02
     assert shares["hidden.reflectance.value"] == 0
@@ -205,7 +207,7 @@ def test_large_visible_parameters_come_first(tmp_path: Path) -> None:
     assert not any("clearcoat.value" in key for key in shares), "it is 0, by which Mitsuba leaves it out for good"
 
 
-#: A bulb over a plate: what is in view tells how bright it is. Present values are wrong.
+#: A bulb over a plate. The visible surfaces show how bright the bulb is. The present values are wrong.
 BULB = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="24"/>
 <integer name="height" value="24"/><string name="pixel_format" value="rgb"/><rfilter type="box"/></film>
 <float name="fov" value="45"/>
@@ -217,7 +219,7 @@ PAINT = '<bsdf type="diffuse"><rgb name="reflectance" value="{}"/></bsdf>'
 METAL = """<bsdf type="roughconductor"><string name="material" value="Al"/><float name="alpha" value="{}"/>
 <rgb name="specular_reflectance" value="1"/></bsdf>"""
 LAMP, WRONG, RIGHT = "bulb.emitter.radiance.value", "5, 5, 5", "12, 11, 10"
-#: By name the plate with wrong values and with right ones, and the parameters with these.
+#: For each name: the plate with wrong values, the plate with true values, and the true values of the parameters.
 RECOVERED = {
     "a lamp and a wall": (PAINT.format("0.5, 0.5, 0.5"), PAINT.format("0.7, 0.35, 0.2"),
                           {LAMP: [12, 11, 10], "plate.bsdf.reflectance.value": [0.7, 0.35, 0.2]}),
@@ -249,7 +251,7 @@ def test_the_generated_configuration_recovers_lamps(tmp_path: Path, monkeypatch:
     config = load(tmp_path / "bulb.yaml")
     assert {spec.keys[0] for spec in config.parameters} == set(RECOVERED[name][2])
     assert config.optimizer.scale == "auto"
-    # Which estimator, and what is measured of the result, is no matter of the configuration's.
+    # The configuration decides neither the estimator nor the measurements of the result, so the test sets both.
     done = reslrb("optimize", "bulb.yaml", *settings("integrator.estimator=stack", "run.final_spp=16"))
     assert done.exit_code == 0, done.output
     values = np.load(tmp_path / "runs/bulb/parameters/parameters.npz")
@@ -271,7 +273,7 @@ def test_a_lamp_is_recovered_on_request(tmp_path: Path, monkeypatch: pytest.Monk
         assert [spec.keys for spec in config.parameters] == [[LAMP]]
         assert config.optimizer.scale == "auto"
         assert "  # - {key: plate.bsdf.reflectance.value, bounds: [0, 1]}" in text
-    assert config.target.exposure == 1  # which no image tells from the lamp
+    assert config.target.exposure == 1  # no image separates exposure from the lamp
     assert "# exposure: auto  # one factor for the whole image; the lamps below compensate for it" in text
 
 
@@ -299,9 +301,9 @@ def test_only_the_front_of_a_lamp_is_in_view(tmp_path: Path) -> None:
     assert shares == [(True, True), (False, False)]
 
 
-# `init` where there is something to choose: among sensors, and values of what a scene file leaves open.
+# `init` with choices: the sensor, and values that a scene file leaves open.
 
-#: Two sensors, the second of which sees the ball alone, on a film that the file leaves open.
+#: Two sensors, of which the second sees only the ball. The scene file leaves the film size of the first sensor open.
 CHOICES = """<scene version="3.0.0"><default name="side" value="16"/><default name="note" value="a &quot;b&quot;"/>
 <sensor type="perspective" id="floor"><film type="hdrfilm"><integer name="width" value="$side"/>
 <integer name="height" value="$side"/></film>
@@ -333,9 +335,9 @@ def test_one_of_several_sensors_is_named(choices: Path) -> None:
     assert "sensor 1 (ball); --sensor selects another: 0 (floor)" in other.output
     config = load(choices / "hall.yaml")
     assert [view.sensor for view in config.views] == [1]
-    assert config.scene.size is None  # that one's film is as large as the photograph
+    assert config.scene.size is None  # this sensor's film is as large as the photograph
     assert [spec.keys for spec in config.parameters] == [["Sphere_1.bsdf.reflectance.value"]]
-    # A ball of one colour under a light of one colour: its exposure cannot be told from it.
+    # The ball and the light each have one colour, so the exposure cannot be told from the colour of the ball.
     few = settings("run.iterations=2", "integrator.estimator=stack", "target.exposure=1")
     done = reslrb("optimize", "hall.yaml", *few)
     assert done.exit_code == 0, done.output
@@ -372,7 +374,7 @@ def test_a_photograph_is_oriented_as_a_person_sees_it(choices: Path) -> None:
     target = np.array(mi.Bitmap(str(choices / "runs/hall/images/target.exr")))
     seen = np.array(ImageOps.exif_transpose(Image.open(choices / "photo.jpg"))).astype(np.float32) / 255
     assert np.allclose(target, decode_srgb(seen), atol=1e-5)
-    photograph(600, 900, 8)  # copied, upright and smaller
+    photograph(600, 900, 8)  # the copy is upright and smaller
     assert init().exit_code == 0
     copy = load(choices / "hall.yaml").views[0].target
     assert (orientation_of(copy), image_size(copy)[0] > image_size(copy)[1]) == (1, True)
@@ -414,7 +416,7 @@ def test_open_variables_of_a_scene_are_named_and_can_be_set(choices: Path) -> No
     assert reslrb("init", "hall.xml", "--force", "--set", "scene.options.side=8").exit_code == 0
 
 
-#: A lamp whose rays Mitsuba cannot sample, behind glass; paths from the camera find its light.
+#: A lamp behind glass. Mitsuba cannot sample rays of this lamp, but camera paths find its light.
 CHECKED = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
 <integer name="height" value="8"/></film>
 <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>

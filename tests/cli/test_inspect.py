@@ -263,11 +263,11 @@ def test_conditioning_as_a_table_and_as_json():
         assert cells[:2] == [row["key"], "3"]
         names = ("value", "gradient", "noise", "change", "curvature", "length")
         assert [float(cell) for cell in cells[2:]] == pytest.approx([row[name] for name in names], rel=6e-3)
-    # an albedo of 0.5 and an intensity of 3e6: by their values alone, some 6e6
+    # The albedo is 0.5 and the intensity 3e6, so the ratio of these values alone is about 6e6
     assert 1e6 < measured["spread"]["change"] < 1e8
     assert measured["spread"]["change"] == pytest.approx(floor["change"] / lamp["change"])
     assert float(lines[-1].split()[4]) == pytest.approx(measured["spread"]["change"], rel=6e-3)
-    # of l2 the curvature is that of the image: both go with the same mean square
+    # With l2, the curvature of the loss is that of the image: curvature and change depend on the same mean square
     assert measured["spread"]["curvature"] == pytest.approx(measured["spread"]["change"] ** 2, rel=0.01)
 
 

@@ -23,7 +23,7 @@ from reslrb_cli.measure.nonfinite_trace import Witness
 from reslrb_cli.optimization import losses, state
 from reslrb_cli.runs.resume import problem_before_nonfinite
 
-# Planted faults: what a run does about them, and whether the command that it prints finds them.
+# Planted faults. The tests check how a run reacts, and whether the command that the run prints finds the fault.
 
 SCENE = scene(
     '<default name="format" value="rgb"/> <default name="power" value="8"/> <default name="wall" value="wall.exr"/>',
@@ -115,7 +115,7 @@ def test_a_nan_texel(spoilt_experiment, capsys, film):
     at = offender["where"]
     assert at["surface"] == "wall_shape"
     assert offender["quantity"].startswith(("scattering weight", "connection factor"))
-    x, y, z = at["position"]  # on a wall of [-4, 4]^2 at z = -1, of whose 8x8 texels (1, 4) is spoilt
+    x, y, z = at["position"]  # the wall is [-4, 4]^2 at z = -1, and texel (1, 4) of 8x8 is spoilt
     assert (int(x + 4), int(y + 4)) == (1, 4)
     assert z == pytest.approx(-1)
     assert f"path {at['path']} of 1024" in text
@@ -222,7 +222,7 @@ def test_finished_work_is_kept(spoilt_experiment, capsys, monkeypatch):
 
     def sometimes(image, target, weights=None):
         calls.append(1)
-        # The first is that of the saved initial image.
+        # The first call is for the saved initial image.
         return root_of_pixel(image, target) if len(calls) == 3 else losses.l2(image, target)
 
     monkeypatch.setitem(losses.LOSSES, "l2", sometimes)
@@ -398,19 +398,19 @@ def test_passes_of_a_memory_budget_are_replayed(spoilt_experiment, capsys):
     assert offender["quantity"] == "connection factor c"
 
 
-# `inspect --nonfinite` of guided runs: the step's paths start where the tables of then had them start.
+# `inspect --nonfinite` of guided runs. Paths of the inspected step start as the tables of that time sent them.
 
-#: So few paths that the spoilt texel is met for the first time behind many iterations.
+#: Settings with so few paths that a path first meets the spoilt texel after many iterations.
 SETTINGS = ["integrator.guiding=on", "scene.options={wall: spoilt.exr}", "run.iterations=60", "run.on_nonfinite=stop"]
-#: Ways to take a step; `batches` has tables learn between the batches of a step.
+#: Kinds of steps. With `batches`, the tables learn between the batches of a step.
 WAYS = {
     "correlated": ["run.adjoint=correlated", "run.spp=2"],
     "independent": ["run.adjoint=independent", "run.spp=2"],
     "batched": ["run.adjoint=batched", "run.spp=4"],
     "batches": ["run.adjoint=batched", "run.batches=8", "run.spp=8"],
 }
-#: Seeds that are tried in turn until one meets the texel when tables have learned. What they meet changes with whatever
-#: changes tables.
+#: Seeds that are tried in turn, until a run meets the texel after its tables have learned. Any change of the tables
+#: also changes which texels a seed meets.
 SEEDS = range(1, 9)
 Drawn = list[tuple[int, dict[str, np.ndarray] | None]]
 
@@ -443,7 +443,7 @@ def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
             break
     run = taken[:]
     assert told is not None, err
-    assert int(told[1]) > 0  # tables have learned
+    assert int(told[1]) > 0  # the tables have learned
     iteration, offenders, _ = inspect(capsys, err)
     assert iteration == int(told[1])
     seeds = list(dict.fromkeys(seed for seed, _ in looked_at))
@@ -451,7 +451,7 @@ def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
     for seed in seeds:
         own, there = ([table for number, table in drawn if number == seed] for drawn in (run, looked_at))
         found += [] if len(there) == 2 * len(own) else [f"{len(there)} sets in place of {len(own)}"]
-        for one, other in zip(own, there, strict=False):  # it was inspected twice
+        for one, other in zip(own, there, strict=False):  # the step was inspected twice
             assert one is not None
             assert one
             if other is None or any(not np.array_equal(other[name], value) for name, value in one.items()):

@@ -58,7 +58,7 @@ def experiment(llvm, tmp_path, monkeypatch):
     (tmp_path / "box.yaml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
     yield texture
-    # The command line keeps its handler, which holds this test's standard error.
+    # The command line keeps its log handler, which holds the standard error of this test.
     logger = logging.getLogger("reslrb_cli")
     logger.handlers.clear()
     logger.setLevel(logging.NOTSET)
@@ -121,9 +121,9 @@ def test_a_texture_is_recovered_with_a_transform(experiment, capsys, transform):
     assert errors["final"] < 0.4 * errors["initial"]
     [scaling] = manifest["scaling"]
     assert (scaling["key"], scaling["value"]) == (KEY, 0.5)
-    # what was measured first counts
+    # The elapsed time includes the measurements before the first iteration
     assert records[0]["elapsed_s"] > 1e-3 * records[0]["step_ms"] * 2
-    # everything that is written is in the scene's units
+    # All written values are in the scene's units
     with np.load("runs/box/checkpoint/state.npz") as state, np.load("runs/box/parameters/parameters.npz") as values:
         np.testing.assert_array_equal(state[f"parameter/{KEY}"], values[KEY])
         assert np.sqrt(np.mean((values[KEY] - experiment) ** 2)) == pytest.approx(errors["final"], rel=1e-4)
@@ -139,11 +139,11 @@ def test_saved_files_of_a_run_agree(experiment, capsys):
     page = Path("runs/box/report.html").read_text()
     for text in ("<svg", "data:image/png;base64", "finished", "target", "llvm_ad_rgb"):
         assert text in page
-    # the configuration as resolved can be run again, from anywhere
+    # The resolved configuration can be run again from any folder
     again = reslrb(capsys, "optimize", "runs/box/config.yaml", "--set", "run.iterations=1", "--quiet")
     assert again[0] == 0
     first, repeated = (read_metrics(folder)[0]["loss"] for folder in ("runs/box", "runs/box-2"))
-    assert first == pytest.approx(repeated, rel=1e-5)  # threads add up in any order
+    assert first == pytest.approx(repeated, rel=1e-5)  # threads add values in any order
 
 
 def test_runs_can_be_repeated_and_get_numbers(experiment, capsys):
@@ -204,7 +204,8 @@ def test_later_iterations_compile_nothing(experiment):
             problem.optimizer.step(0.9**iteration)
             problem.apply()
         misses.append((step.new_kernels, update.new_kernels))
-    # Making the recordings left zeros in the gradients, to which the first step added: two kernels of a line each.
+    # The recordings left zeros in the gradients, and the first step added to these zeros. This addition needs two
+    # one-line kernels.
     assert misses.pop(1)[0] <= 2
     assert misses[1:] == [(0, 0)] * 2
 
@@ -246,7 +247,7 @@ LIGHT = '<emitter type="area" id="light"><rgb name="radiance" value="8, 8, 8"/><
 POSTER = '<shape type="rectangle" id="poster_shape">'
 PANE = '<shape type="cube"><transform name="to_world"><translate z="4"/></transform><bsdf type="dielectric"/></shape>'
 FOG = '<shape type="sphere"><bsdf type="null"/><medium name="interior" type="homogeneous"/></shape>'
-#: By name: what is replaced in the scene, by what, with which integrator, and what the error line holds.
+#: For each name: the replaced text of the scene, the new text, the integrator, and a part of the error line.
 BAD_SCENES = {
     "orthographic": (CAMERA, PARALLEL, "{type: reslrb, paths: light}", "OrthographicCamera"),
     "orthographic from both sides": (CAMERA, PARALLEL, "{type: reslrb, paths: both}", "use integrator.paths: camera"),
@@ -311,7 +312,7 @@ def test_inspect_lists_recoverable_parameters(experiment, capsys):
 
 # Whole runs with several views, from the command line to the manifest and the page.
 
-#: Where eight cameras stand before the Cornell box.
+#: Positions of the eight cameras in front of the Cornell box.
 EYES = tuple(f"{x:.2f}, {y:.2f}, 3.6" for x, y in ((-0.8, 0), (0.8, 0), (0, 0.6), (0, -0.6), (-0.6, 0.5), (0.6, 0.5),
              (-0.6, -0.5), (0.6, -0.5)))  # fmt: skip
 
@@ -397,7 +398,7 @@ def test_moving_parameters_are_recorded_by_name(tmp_path, llvm, capsys):
     folder = tmp_path / "runs" / "glass"
     stored = json.loads((folder / "parameters" / "parameters.json").read_text())
     assert list(stored) == ["lamp.translation", "slab.heightmap"]
-    assert np.abs(stored["lamp.translation"]["value"]).max() == pytest.approx(0.01)  # its bounds
+    assert np.abs(stored["lamp.translation"]["value"]).max() == pytest.approx(0.01)  # the motion's bounds
     assert stored["slab.heightmap"] == {"shape": [2, 3, 1], "file": "slab.heightmap.exr"}
     true = json.loads((folder / "parameters" / "true" / "parameters.json").read_text())
     assert np.allclose(true["lamp.translation"]["value"], [0.05, 0.1, -0.05])

@@ -52,7 +52,7 @@ def test_one_page_for_everything(report, tmp_path):
     page = (tmp_path / "page.html").read_text()
     assert page.endswith("</html>\n")
     assert 'http-equiv="refresh"' not in page
-    # of runs that never recorded them they are found in the folder
+    # These runs never recorded the errors, so the report computes them from the run folder
     assert "Errors as people see them" in page
     assert "CIEDE2000" in page
 
@@ -94,7 +94,7 @@ def test_errors_are_one_line(report, tmp_path, args, line):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-# The page of a run while it is at work: current, whole at every moment, and in no time that is counted.
+# The page of a run in progress. The page is current and always complete, and writing it is not counted as run time.
 
 RUN, PAGE = Path("runs/tiny"), Path("runs/tiny/report.html")
 REFRESH = 'http-equiv="refresh"'
@@ -235,7 +235,7 @@ def test_the_manifest_has_the_plan_and_perceptual_errors(optimize):
     assert (rows["derivatives of BSDFs"], rows["derivatives of emission"]) == (True, False)
     seen = manifest["results"]["seen"]
     assert set(seen["images"][""]) == {"exposure", "initial", "final"}
-    assert seen["images"][""]["final"]["ssim"] is None  # 8x8 pixels
+    assert seen["images"][""]["final"]["ssim"] is None  # 8x8 is too small
     assert seen["colors"][KEY]["final"]["mean"] > 0
     page = PAGE.read_text()
     for title in ("Plan", "Errors as people see them"):

@@ -176,7 +176,7 @@ def test_an_unfinished_run_is_marked_everywhere(capsys):
     assert '<th scope="col">verdict</th>' in page
     assert '<span class="worse">still moving (' in page
     assert results["certainty"]["gradients"] == 3
-    # A run that says nothing of it ends with the same values.
+    # A run without certainty ends with the same values.
     values = np.load("runs/box/parameters/parameters.npz")[KEY]
     optimize(capsys, *sets, "run.certainty=false")
     np.testing.assert_allclose(np.load("runs/box/parameters/parameters.npz")[KEY], values, rtol=1e-5)
@@ -255,8 +255,8 @@ def test_images_are_tone_mapped_without_lamps(capsys):
     lamp = target.max(axis=2) > 4000
     assert 0 < lamp.mean() < 0.5
     assert 0 < view["shown"] < 1
-    wall = target.max(axis=2) < 600  # others are in part of the bulb
-    assert 0.5 < np.quantile(target[wall], 0.99) * view["shown"] < 1.5  # where 1 is white; the bulb is far beyond
+    wall = target.max(axis=2) < 600  # brighter pixels show part of the bulb
+    assert 0.5 < np.quantile(target[wall], 0.99) * view["shown"] < 1.5  # 1 is white, and the bulb is far brighter
     assert target[lamp].min() * view["shown"] > 3
     for name in ("initial", "final", "target"):
         linear = np.clip(read(f"runs/box/images/{name}.exr") * view["shown"], 0, 1)

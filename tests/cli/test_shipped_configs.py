@@ -14,11 +14,11 @@ from reslrb_cli.records.manifest import read_manifest
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
-#: What may be left of a parameter's error at the start: over the texels that light and sensor reach.
+#: Largest final error of a parameter, as a share of the initial error, over the texels that light and sensor reach.
 MOST = 0.2
-#: So much slower a machine may be than the README's.
+#: How many times slower a machine may be than the machine of the README.
 SLOWER = 4
-#: What the README says of single ones.
+#: Larger limits that the README states for single parameters.
 MOST_OF = {"painting.reflectance.data": 0.5}
 
 

@@ -31,11 +31,10 @@ from reslrb_cli.records.measurement_files import LineFile
 from reslrb_cli.records.measurements import SummaryRecord
 from reslrb_cli.runs import recorder
 
-# Runs that are hit at random moments, and runs on disks that are too small: what is left is whole, and true.
-#
-# A few of each by default; `-m long` has as many as it takes to hit every part of a run.
+# Runs that are hit at random moments, and runs on disks that are too small. The remaining files are complete and true.
+# The default suite has a few runs of each kind. `-m long` has enough runs to hit every part of a run.
 
-#: Moments of a run: it has printed this, or its folder holds that file.
+#: Moments of a run, each with a text that the run has then printed, or with a file that the run folder then holds.
 MOMENTS = {"loading": "variant ", "the target": "rendering ", "the mask": "finding ", "iterations": "metrics.jsonl"}
 LONG = ["-v", "--set", "run.iterations=20000"]
 
@@ -118,14 +117,14 @@ def storm(experiment: Path, number: int, count: int, times: int = 1) -> Counter[
         wait_for(process, run, stages[index % len(stages)])
         time.sleep(chance.uniform(0, 1))
         code, err = hit(process, number, times)
-        # Python itself answers a signal in the first moments of its start.
+        # In the first moments after its start, Python itself handles a signal.
         begun = "KeyboardInterrupt" not in err or "reslrb_cli" in err
         assert faults(run, code if begun else 130, err if begun else "") == [], (index, code, err)
         if number != signal.SIGKILL and code == 130 and times == 1 and run.exists():
             assert COMPLETE - {"metrics.jsonl"} <= files(run), (index, code, err)
         seen[code, (read_manifest(run) or {}).get("status")] += 1
     left = list((experiment / "runs").glob(".*"))
-    assert not left or number == signal.SIGKILL  # which the next run removes, after a minute
+    assert not left or number == signal.SIGKILL  # the next run removes these files after a minute
     print(signal.Signals(number).name, times, dict(seen))
     return seen
 
@@ -160,7 +159,7 @@ def mount(place: Path, kib: int) -> None:
         pytest.skip(f"no disk can be mounted here: {done.stderr.strip()}")
 
 
-#: With the second there is room for the start of a run.
+#: Sizes in KiB. The second disk has room for the start of a run.
 SIZES = [8, 192]
 ALL_SIZES = [16, 48, 96, 128, 256, 512, 1024]
 
@@ -185,7 +184,7 @@ def test_a_small_disk(experiment: Path, disk: Path, kib: int) -> None:
         assert "no run folder was made" in line
         assert not list(disk.glob("runs/*"))
         return
-    assert read_manifest(run)["status"] in ("failed", "interrupted")  # the latter if there was no room to say so
+    assert read_manifest(run)["status"] in ("failed", "interrupted")  # interrupted if the error could not be written
     if (run / "checkpoint" / "state.npz").exists():
         with np.load(run / "checkpoint" / "state.npz") as state:
             assert f"saved: the state after {int(state['iteration'])} of " in line
@@ -223,18 +222,18 @@ def test_a_closed_terminal(experiment: Path) -> None:
     os.close(theirs)
     run = experiment / "runs" / "tiny"
     shown = b""
-    while b"loss" not in shown:  # which a bar of 80 columns has room for, however long its other words are
+    while b"loss" not in shown:  # a bar of 80 columns always has room for the loss, despite other long words
         shown += os.read(ours, 4096)
     os.close(ours)
     time.sleep(0.5)
     assert process.poll() is None
     process.send_signal(signal.SIGHUP)
     process.wait(timeout=60)
-    assert faults(run, 130, "") == []  # the last line cannot be printed, which the exit code says
+    assert faults(run, 130, "") == []  # exit code 130 replaces the last line, which cannot be printed
     assert COMPLETE <= files(run)
 
 
-# Files of measurements while these go on: whole, current, and enough to go on from.
+# Files of measurements in progress. The files are complete and current, and a later measurement can continue from them.
 
 
 def lines(*words: str) -> list[SummaryRecord]:
@@ -268,7 +267,7 @@ def test_both_files_are_current_and_old_ones_are_removed(tmp_path: Path, monkeyp
     measurement_files.write_samples(samples, {"rows": 9}, {})
     (tmp_path / ".c.samples.npz.999999999.part").write_bytes(b"what a killed process left")
     measured = Measurement(file)
-    # Until there is something.
+    # The old files stay until there is a new result.
     assert (file.read_text(), measurement_files.read_samples(samples)[0]) == ("old\n", {"rows": 9})
     measured.now = lines("a")
     measured.keeper.refresh()
@@ -348,7 +347,8 @@ def test_the_target_of_a_link_is_written(tmp_path: Path) -> None:
     assert read(tmp_path / "c.jsonl") == ["a"]
 
 
-# Measurements whose process is killed: what was measured until then stands in their files, and is gone on from.
+# Measurements whose process is killed. Their files hold all results so far, and a later measurement continues from
+# them.
 
 BENCH = ["bench", "tiny.yaml", "--integrators", "reslrb:stack", "--max-depth", "2"]
 CONVERGENCE = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack"]
@@ -394,7 +394,7 @@ def test_a_killed_measurement_continues(
     text = file.read_text()
     assert text.endswith("}\n")
     assert all(json.loads(line) for line in text.splitlines())
-    # The next writing is seconds away, so that it is one round that stands there.
+    # The next write would come seconds later, so the files hold one round.
     monkeypatch.chdir(tmp_path)
     tiny.done(*command, "--rounds", "4", "--json", file.name)
     assert repeats(file) == {4 * steps}

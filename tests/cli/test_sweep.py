@@ -35,7 +35,7 @@ from reslrb_cli.runs import recorder as recording
 from reslrb_cli.runs import sweep as plans
 from reslrb_cli.runs.sweep import make_plan
 
-#: Settings by which a run takes a moment, and what two that are equal differ in all the same.
+#: Settings for very short runs, and the record entries that differ even between two equal runs.
 QUICK = ("run.measuring=0", "run.certainty=false", "run.final_spp=4", "run.checkpoint_every={iterations: 2}")
 TIMES = ("elapsed_s", "peak_mib")
 RATES = "optimizer.learning_rate=[0.02, 0.2]"
@@ -93,7 +93,7 @@ def test_integrators_are_varied_as_methods_with_the_depth_of_the_experiment(fold
         assert (config.integrator.max_depth, config.integrator.rr_depth) == (3, 2)
     assert (prb.integrator.type, stack.integrator.type, plain.integrator.type) == ("prb", "reslrb", "ptracer")
     assert (stack.integrator.estimator, stack.integrator.guiding, stack.adjoint) == ("stack", "on", "independent")
-    assert plain.integrator.max_depth == 8  # a section stands for itself
+    assert plain.integrator.max_depth == 8  # a given section keeps its defaults
     names = ["integrator=prb", "integrator=reslrb-stack-guiding=on-adjoint=independent", "integrator=ptracer"]
     assert list(plan.configs) == names
     depths = make_plan(Path("tiny.yaml"), ["integrator=[prb]", "integrator.max_depth=[2, 3]"], 1, [])
@@ -137,7 +137,7 @@ def test_names_are_short_safe_and_different(folder):
         (["--vary", "run.spp=[4, 8]", "--seeds", "501"], "2 x 501 seeds are 1002 runs; a sweep has at most 1000"),
         (["--set", f"run.seed={2**32 - 1}", "--seeds", "2"], "--seeds: exceeds the last seed, 4294967295"),
         (["--set", "run.spq=3"], "--set run.spq=3: run.spq: unknown key"),
-        # two values of which each is right with the others
+        # Each value is valid with some of the others, but not every combination is valid
         (["--vary", "run.spp=[4, 6]", "--vary", "run.adjoint=[independent, batched]"], "run.adjoint"),
         (["--set", "scene.file=gone.xml", "--vary", "run.spp=[4]"], "gone.xml: no such file"),
         (["--vary", "scene.file=[scene.xml, gone.xml]"], "gone.xml: no such file"),
@@ -241,8 +241,8 @@ def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
     assert [run["status"] for run in whole[0]] == ["finished"] * 4
     assert len(moments) == 4
     for place, left in enumerate(moments):
-        calls[:] = [None] * 10  # nothing is copied any more
-        # the same command again, or --resume
+        calls[:] = [None] * 10  # nothing is copied from now on
+        # Either the same command again or --resume
         tiny.done(*words, "-o", left) if place % 2 else tiny.done("sweep", "--resume", left)
         assert table(left) == whole, left
         assert [words[1] == "--resume" for words in calls[10:]].count(True) == (
@@ -279,7 +279,7 @@ def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
     for line in ("1 of 2, 1 failed", "learning_rate=0.02-seed=1 failed: the loss is not finite",
                  "finished, 2 of 4 runs done, 2 failed; look at s/sweep.html; --retry repeats"):  # fmt: skip
         assert line in result.output
-    assert "lowest median" not in result.output  # what is left of those that failed are the lucky ones
+    assert "lowest median" not in result.output  # remaining runs of failed combinations are the lucky ones
     kinds = [json.loads(line)["kind"] for line in Path("s.jsonl").read_text().splitlines()]
     assert kinds == ["origin", *["sweep_run"] * 4, *["sweep_row"] * 2]
     called.clear()
@@ -344,7 +344,7 @@ def count_lines(run):
     path = run / "metrics.jsonl"
     try:
         return len(path.read_text().splitlines())
-    except OSError:  # there are none yet, or they are about to be cut back
+    except OSError:  # there is no file yet, or its lines are about to be cut back
         return 0
 
 
@@ -366,12 +366,12 @@ def test_a_crashed_process_is_reported_by_its_last_message(monkeypatch):
     ):  # fmt: skip
         monkeypatch.setattr(sweep, "_PROGRAM", f"import os, sys, time; {end}")
         interrupts = Interrupts()
-        interrupts.requested = code == 130  # a run that does not heed signals yet
+        interrupts.requested = code == 130  # a run that does not handle signals yet
         assert sweep.call(["optimize"], interrupts) == (code, said)
 
 
 def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
-    monkeypatch.undo()  # `call` itself
+    monkeypatch.undo()  # use the real `call`
     monkeypatch.setattr(
         sweep, "_PROGRAM", "import os; print(*map(os.environ.get, ('DRJIT_CACHE_DIR', 'RESLRB_CACHE')))"
     )
@@ -430,7 +430,7 @@ def test_a_run_ends_with_its_killed_sweep(llvm, tmp_path):
             return True
 
     wait_for(is_gone, 5.0)
-    # another goes on from there, and is told to end by a signal to it alone
+    # Another sweep continues from there, and a signal to that sweep alone tells it to end
     before = count_lines(run)
 
     def stop():
@@ -552,7 +552,7 @@ def test_the_best_is_judged_by_seeds_that_all_share():
     assert "spp=1; surely lower than all others (in pairs of 10 seeds" in best.line
     assert "; lower than the next, spp=0, with 10 of 10 seeds, 0.909 [0.909, 0.909] times that" in best.line
     assert (equal.of, equal.tied) == ("error", ["spp=1"])
-    # of a seed that only one has nothing is compared, nor of what failed, nor of what is something else
+    # Comparisons leave out seeds that only one combination has, failed runs, and values of another kind
     runs[-1] = replace(runs[-1], status="waiting")
     assert best_records(sweep, runs)[0].seeds == 9
     runs[-1] = replace(runs[-1], status="failed", message="no room")
@@ -625,7 +625,7 @@ def coverage(count, seeds, spread, true, levels):
     random = np.random.default_rng(3)
     hit = 0
     for _ in range(count):
-        luck = random.normal(size=seeds) * spread / 2  # of the seed, which all have in common
+        luck = random.normal(size=seeds) * spread / 2  # factor of the seed, common to all rows
         own, base = (
             [list(median * level * np.exp(luck + spread * random.normal(size=seeds))) for level in levels]
             for median in (true, 1.0)
@@ -662,7 +662,7 @@ def test_equal_settings_are_rarely_distinguished():
     for _ in range(400):
         values = rng.normal(size=(4, 12))
         wrong += bool(find_best({str(k): list(each) for k, each in enumerate(values)}).beats)
-    # the best of four is chosen by the same values: more than 5 % would be 20 of 400, its standard deviation 4.4
+    # The best of four is chosen by the same values. A rate of 5 % would be 20 of 400, with a standard deviation of 4.4
     assert wrong <= 20 + 3 * 4.4
 
 
@@ -694,7 +694,7 @@ def test_the_page_has_a_table_curves_and_pictures(folder):
         text = Path(page).read_text()
         assert "2 combinations with 2 seeds: 4 of 4 runs finished." in text
         assert text.count("<svg") == 4  # loss and error, by iteration and by time
-        assert text.count("data:image/png") == 3 + 3  # the target, and the truth, beside what was recovered
+        assert text.count("data:image/png") == 3 + 3  # target and true values beside recovered values
         assert "losses of different `target.render.spp` are not of the same, and not compared" in text
         assert "lowest median parameter RMSE" in text
         assert "cannot be shown" not in text

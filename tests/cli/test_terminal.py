@@ -46,7 +46,7 @@ def experiment(llvm, tmp_path, monkeypatch):
     mi.Bitmap(np.full((8, 8, 3), 0.5, np.float32)).write(str(folder / "wall.exr"))
     mi.Bitmap(np.full((8, 8, 3), 0.2, np.float32)).write(str(folder / "target.exr"))
     scene = SCENE.replace("REFLECTANCE", '<rgb name="reflectance" value="0.6, 0.5, 0.4"/>')
-    # XML holds no control characters; a mark that turns the direction of writing does as much harm in a key.
+    # XML cannot hold control characters. In a key, a mark that reverses the writing direction does as much harm.
     (folder / "scene.xml").write_text(scene.replace('"poster"', f'"pos{TURNED}ter"'))
     (folder / "c.yaml").write_text(CONFIG.replace("poster.", "Diffuse_1."))
     monkeypatch.chdir(tmp_path)
@@ -176,7 +176,7 @@ def test_losing_the_terminal_does_not_end_a_run(monkeypatch: pytest.MonkeyPatch)
             progress.show(record(9, 1))
 
 
-# Progress on terminals of any width: a bar, the percentage and the loss, and no number that is cut.
+# Progress on terminals of any width: a bar, the percentage, the loss, and no truncated number.
 
 LAMP = "a_lamp_with_a_name_of_some_length.emitter.radiance.value"
 
@@ -299,7 +299,7 @@ def test_reading_a_long_file_has_a_bar(monkeypatch, tmp_path):
         with Reading() as tell:
             assert len(read_lines(write_metrics(tmp_path), tell).objects) == 20_000
         text = ""
-        while not text.endswith("\n") and select.select([master], [], [], 5)[0]:  # what was written arrives in pieces
+        while not text.endswith("\n") and select.select([master], [], [], 5)[0]:  # the written text arrives in pieces
             text += os.read(master, 1 << 16).decode()
     os.close(master)
     assert re.search(r"reading .*metrics.jsonl: +\d+%\|.*/605k ", text)
@@ -310,7 +310,7 @@ def test_without_a_terminal_lines_are_written_from_time_to_time(monkeypatch, tmp
     file = write_metrics(tmp_path)
     with Reading() as tell:
         read_lines(file, tell)
-    assert capsys.readouterr().err == ""  # it took no time
+    assert capsys.readouterr().err == ""  # reading took no time
     monkeypatch.setattr(module, "SECONDS_PER_LINE", 0.0)
     with Reading() as tell:
         read_lines(file, tell)

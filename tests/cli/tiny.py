@@ -20,7 +20,7 @@ from reslrb_cli.records.manifest import read_content, read_manifest
 from reslrb_cli.runs import prepare
 from reslrb_cli.runs import recorder as recording
 
-# The commands as they are called, within the tests' own process.
+# The commands of `reslrb`, called within the test process.
 
 
 def reslrb(*arguments: object) -> Result:
@@ -51,7 +51,7 @@ def manifest(folder: Path | str = "runs/tiny") -> dict[str, Any]:
     return content
 
 
-# What goes wrong while a tiny run is at work, and what it then says.
+# Failures during a tiny run, and the messages of the run about them.
 
 RUN = Path("runs/tiny")
 
@@ -81,11 +81,11 @@ def failing_last(monkeypatch, name, failure=full, calls=1):
     monkeypatch.setattr(holder, name, sometimes)
 
 
-# An experiment of 8x8 pixels that takes a second, and what the tests of its endings share.
+# An experiment of 8x8 pixels that takes a second, and helpers that the tests of run endings share.
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = "poster.reflectance.data"
-#: Three places of the camera.
+#: Three positions of the camera.
 EYES = ("0, 0, 4", "1, 0.5, 4", "-1, 1, 3")
 
 
@@ -110,7 +110,7 @@ parameters:
 integrator: {{type: reslrb, max_depth: 3, estimator: stack}}
 run: {{iterations: 5, spp: 4}}
 """
-#: What a run folder holds when all went well.
+#: Files of a run folder after a successful run.
 COMPLETE = {
     "checkpoint/state.npz", "config.yaml", "manifest.json", "metrics.jsonl", "report.html", "parameters/parameters.npz",
     "parameters/parameters.json", *(f"images/{name}.{kind}" for name in ("initial", "final", "target")
@@ -132,7 +132,7 @@ def write_experiment(folder: Path, text: str = SCENE) -> None:
 
 def start(folder: Path, *args: str, **options: Any) -> subprocess.Popen[str]:
     """Start `reslrb optimize tiny.yaml` in its own process, with `folder` as its working directory."""
-    # As the program is started, which is called `reslrb` from its first line on.
+    # Start the program like its entry point, so that its name is `reslrb` from the first line on.
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     command = [sys.executable, "-c", script, "optimize", "tiny.yaml", *args]
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
@@ -169,7 +169,7 @@ def faults(folder: Path, code: int, err: str) -> list[str]:
         iterations = [json.loads(line)["iteration"] for line in lines]
         found += [] if iterations == list(range(len(iterations))) and lines[-1].endswith("\n") else ["torn metrics"]
     absent = {name for name in COMPLETE if not (folder / name).exists()}
-    absent -= {"report.html"} if code == -signal.SIGKILL else set()  # the page is written from what the folder says
+    absent -= {"report.html"} if code == -signal.SIGKILL else set()  # the page can be written again later
     if status == "finished" and absent - {"report.html"}:
         found.append(f"absent: {sorted(absent)}")
     return found

@@ -17,7 +17,7 @@ from make_reference import DOCS
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
 
-#: Every section, every kind of value.
+#: Configuration with every section and every kind of value.
 FULL = """\
 variant: llvm_ad_rgb
 scene: {file: scene.xml, options: {resx: 64, fast: true, scale: 1e-3, text: "1e-3", no: no}}
@@ -38,7 +38,7 @@ target: {render: {parameters: {a.b: 1e-3, c: {file: x.exr}}, spp: 4, integrator:
 parameters: [{key: c}]
 integrator: {<<: *i, samples_per_pass: 8}
 """
-#: What no setting expects, as it stands in a file, parted by `¦`.
+#: Texts that no setting expects, as they stand in a file, separated by `¦`.
 TOKENS = (
     *r"""1e400¦-1e400¦.nan¦.inf¦-.inf¦1e-400¦-0¦18446744073709551615¦18446744073709551616¦2147483648¦0o777¦1_000¦1:30¦~
 null¦true¦yes¦''¦""¦"\ud800"¦"\udcff\e[31m"¦"\0"¦"\x9b2J"¦"\u202e"¦../x¦/abs¦~nobody-here/x¦con¦..¦.¦/¦\¦C:\x¦名前¦$x
@@ -50,14 +50,14 @@ null¦true¦yes¦''¦""¦"\ud800"¦"\udcff\e[31m"¦"\0"¦"\x9b2J"¦"\u202e"¦../
     *("{a: " * 30, "[" * 3000, "- " * 400, "[" + "1, " * 300 + "]"),
     *("\t", "\r", "\x01", "\x7f", "\x85", "\u202e", "\u2028", "\ufeff"),
 )
-#: The same as data, in JSON.
+#: Values that no setting expects, as JSON data.
 VALUES = (
     *r"""null¦true¦0¦-1¦10000000000000000000000000¦18446744073709551616¦1e308¦NaN¦Infinity¦""¦" "¦"\u001b[31m"¦"\ud800"
 "a\u0000b"¦"scene"¦"all"¦"../../x"¦[]¦{}¦[[]]¦{"file": "x"}¦{"type": "reslrb"}¦{"type": null}¦{"<x>": 1, "[key]": 2}
 {"1": 2}¦{"": ""}¦{"null": 1}¦{"\u001b[2J": 1}""".replace("\n", "¦").split("¦"),
     *("[" * 30 + "]" * 30, '{"a": [' * 7 + "]}" * 7),
 )
-#: Long ones, which take most of the time.
+#: Long values, which take most of the time.
 LONG_VALUES = (
     json.dumps("x" * 20_000),
     json.dumps(list(range(15_000))),
@@ -182,7 +182,7 @@ def _as_bomb(rng: random.Random, text: str) -> str:
     return bomb + text if rng.random() < 0.5 else text + "\n" + bomb + f"integrator: *b{depth}\n"
 
 
-#: Good overrides.
+#: Valid overrides.
 _OVERRIDES = (
     *("run.spp=16", "run.name=x", "scene.options.a.b=3", "parameters[0].bounds=[0, 1]", "parameters.0.key=a"),
     *("integrator={type: prb}", "parameters[1].key=b", "target={render: {}}", "optimizer.type=sgd", "loss=l1"),

@@ -51,7 +51,7 @@ def scene(file: str) -> str:
 
 PARAMETER = "{key: floor.reflectance.data}"
 
-#: The text of a file, how its error line begins behind the file's name, and what it holds.
+#: The text of a file, the start of its error line after the file name, and parts of that line.
 FILES: dict[str, tuple[str | bytes, ...]] = {
     "empty": ("", "is empty", "scene, target and parameters"),
     "comments only": ("# nothing\n", "is empty"),
@@ -307,7 +307,7 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     ),
 }
 
-#: An override of the good file, and what its error line holds.
+#: An override of the valid file, and parts of its error line.
 OVERRIDES: dict[str, tuple[str, ...]] = {
     "novalue": ("--set novalue: must be KEY=VALUE",),
     "=3": ("--set =3: must be KEY=VALUE",),
@@ -407,7 +407,7 @@ def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         raise PermissionError(13, "Permission denied")
 
     (tmp_path / "x.yaml").write_text(GOOD)
-    monkeypatch.setattr("pathlib.Path.open", refuse)  # root may read what chmod forbids
+    monkeypatch.setattr("pathlib.Path.open", refuse)  # chmod does not stop root from reading
     with pytest.raises(ConfigError, match=r"x\.yaml: cannot be read: Permission denied"):
         load(tmp_path / "x.yaml")
 

@@ -23,7 +23,7 @@ from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS, options_of
 
-# Values that a configuration may hold, its defaults, its paths, and the way back to YAML.
+# Valid values of a configuration, its defaults, its paths, and its conversion back to YAML.
 
 GOOD = """\
 scene: {file: scene.xml}
@@ -106,7 +106,7 @@ def test_values_and_paths(tmp_path: Path) -> None:
     assert config.loss.options() == {"epsilon": 1e-3}
     assert config.optimizer.final_fraction == 1e-2
     assert config.run.folder_name == "Floor-red-blue"
-    assert config.run.output == Path.cwd() / "out"  # the one path that is not the config file's
+    assert config.run.output == Path.cwd() / "out"  # the only path relative to the working directory
 
 
 def test_paths_do_not_depend_on_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,7 +225,7 @@ def test_configuration_loads_no_mitsuba() -> None:
         ([], "batched"),
         (["run.spp=6"], "independent"),
         (["run.spp=6", "run.batches=3"], "batched"),
-        (["run.spp=24", "integrator.samples_per_pass=4"], "independent"),  # batches of 6
+        (["run.spp=24", "integrator.samples_per_pass=4"], "independent"),  # batches of 6 samples
         (["run.spp=32", "integrator.samples_per_pass=4"], "batched"),
         (["run.adjoint=correlated"], "correlated"),
     ],
@@ -237,7 +237,7 @@ def test_adjoint_auto_uses_batches_that_divide_the_samples(tmp_path: Path, sets:
     assert load_text(tmp_path, dump(config)) == config
 
 
-# What is recovered, as a configuration says it: keys that are tied, heightmaps and motions.
+# Recovered parameters in a configuration: tied keys, heightmaps and motions.
 
 POSE = """\
 motion: {of: [lens, cap], free: [translation, rotation, scale]}
@@ -292,7 +292,7 @@ def test_a_heightmap_has_its_own_resolution() -> None:
 
 LENS = "motion: {of: lens}"
 MAP = "heightmap: {mesh: a, resolution: [4, 4]}"
-#: What stands in `parameters[0]`, and where the error is and what it holds.
+#: The text of `parameters[0]`, and the place and parts of the error line.
 WRONG = {
     "nothing": ("{initial: 1}", ("parameters[0]: must have one of `key`, `heightmap` and `motion`",)),
     "two kinds": (f"{{key: a, {LENS}}}", ("parameters[0].motion: cannot be combined with `key`",)),
@@ -379,7 +379,7 @@ def test_errors_are_located(case: str, tmp_path: Path) -> None:
         assert part in line
 
 
-# The options of `reslrb` in a configuration are those of its estimators.
+# The options of `reslrb` in a configuration are the options of its estimators.
 
 
 def test_the_table_names_every_estimator() -> None:
@@ -394,7 +394,7 @@ def test_options_and_defaults_match_the_estimators(name: str) -> None:
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator"}
     shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence", "paths", "light_share"}
     shared |= {"pixels"}
-    #: Those that are constants of every run.
+    #: Options that are constant in every run.
     constants = {"stack_size", "jacobian_damping"}
     known = {key: value for key, value in options_of(name).items() if key not in constants}
     assert {key: value for key, value in options.items() if key not in shared} == known
@@ -405,7 +405,7 @@ def test_paths_unsupported_by_the_named_estimator() -> None:
     assert Reslrb(estimator="stack").paths == "light"
     named = Reslrb(estimator="stack", paths="both")
     assert (named.paths, named.light_share) == ("both", 0.5)
-    again = Reslrb(**Reslrb(paths="camera").model_dump())  # as a run's folder has it
+    again = Reslrb(**Reslrb(paths="camera").model_dump())  # as the run folder stores it
     assert again.paths == "camera"
     written = Reslrb().model_dump(exclude_none=True)
     assert (Reslrb(**written).paths, Reslrb(**written).pixels) == ("auto", "auto")
@@ -460,14 +460,14 @@ def test_measured_options_if_the_estimator_is_measured(name: str, off: str, on: 
     assert given(estimator="stack") == off
     assert given(estimator="stack", **{name: "auto"}) == "auto"
     assert given(**{name: off}) == off
-    # What is made before anything is measured has nothing of it.
+    # Objects that are made before any measurement have an undecided option off.
     for own in (Reslrb(), Reslrb(**{name: "auto", "estimator": "reservoir"})):
         assert getattr(own.undecided_off(), name) == off
     asked = Reslrb(**{name: on})
     assert getattr(asked.undecided_off(), name) == on
 
 
-# The reference pages in docs/ say what the schema says.
+# The reference pages in docs/ agree with the schema.
 
 HINT = "run `python scripts/make_reference.py`"
 

@@ -18,7 +18,8 @@ from reslrb_cli.config.integrators import Prb
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import LINE_LENGTH, ConfigError
 
-# Thousands of configurations that are nearly right, in one process: each loads, or is one located line, at once.
+# Thousands of nearly valid configurations in one process. Each configuration loads or gives one located line, without
+# delay.
 
 SECONDS, MIB = 5.0, 200.0
 
@@ -34,12 +35,12 @@ def _memory(name: str) -> float:
 @pytest.mark.parametrize("count", [100, pytest.param(10_000, marks=pytest.mark.long)])
 def test_mutated_configurations(count: int, tmp_path: Path) -> None:
     texts, path = mutations.good_texts(), tmp_path / "x.yaml"
-    Path("/proc/self/clear_refs").write_text("5")  # the most so far begins anew
+    Path("/proc/self/clear_refs").write_text("5")  # resets the largest size so far
     before, loaded, slowest = _memory("VmRSS"), 0, 0.0
     for seed in range(count):
         data, overrides = mutations.mutate(random.Random(seed), texts)
         path.write_bytes(data)
-        begin = time.process_time()  # of this process, so that others on the machine do not count
+        begin = time.process_time()  # excludes other processes on the machine
         try:
             config = load(path, overrides)
         except ConfigError as error:
@@ -55,12 +56,13 @@ def test_mutated_configurations(count: int, tmp_path: Path) -> None:
         slowest = max(slowest, time.process_time() - begin)
         assert slowest < SECONDS, f"seed {seed}"
     assert _memory("VmHWM") - before < MIB
-    assert count / 100 < loaded < count / 2  # neither all wrong at the first look, nor hardly any
+    assert count / 100 < loaded < count / 2  # some configurations load, but fewer than half
 
 
-# Large input, and files that are no regular files, are refused at once.
+# Large input and special files are refused at once.
 
-#: Of processor time; a second or two on a quiet machine, and half a minute to hours where nothing bounds it.
+#: Processor seconds for one input. A quiet machine needs a second or two. Without limits, an input would take half a
+#: minute to hours.
 SECONDS_OF_ONE = 10
 
 

@@ -28,9 +28,10 @@ from conformance.moving import (
 
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb
 
-# The cases of test_attached.py: which scene, what of it moves, and what it is compared with.
+# The cases of test_attached.py: the scene, its moving parts, and the reference of the comparison.
 
-#: Relative L2 distance at equal seeds that rounding makes, through smooth glass and mirrors, and through rough ones.
+#: Relative L2 distance that rounding causes at equal seeds, through smooth glass and mirrors, and through rough
+#: surfaces.
 SMOOTH, ROUGH = 5e-5, 5e-4
 
 
@@ -168,7 +169,7 @@ CASES = [
 ]  # fmt: skip
 
 
-# Faults to break attached derivatives with, and the case of attached_cases.py that is to find each.
+# Faults that break attached derivatives, and the case of attached_cases.py that must find each fault.
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def _pane(bsdf: dict, **to_world: Any) -> dict:
     return {"type": "rectangle", "to_world": transform(**placed), "bsdf": bsdf}
 
 
-#: Between the camera and the corner.
+#: Place of a sheet between the camera and the corner.
 _IN_VIEW = {"translate": [0.2, -0.1, 1.2], "rotate": ([0, 1, 0], 15), "scale": 0.4}
 
 
@@ -230,9 +230,9 @@ CASES = [
                  ("sign.emitter.radiance.data", "lamp.emitter.radiance.value"), "prb"),
 ]  # fmt: skip
 
-#: The default suite compares the exact estimators with naive AD in these (test_gradients.py),
+#: Cases in which the default suite compares the exact estimators with naive AD (test_gradients.py).
 AT_EQUAL_SEEDS = ("texture", "roulette", "roughplastic", "bumpmap", "glass", "mesh_attribute", "mask_texture_in_view",
                   "visible_lamp")  # fmt: skip
-#: and the reservoir with stock integrators and with finite differences in these.
+#: Cases in which the default suite compares the reservoir with stock integrators and with finite differences.
 IN_EXPECTATION = ("texture", "roughconductor", "plastic", "blend", "mirror", "glass", "mask", "thin_glass",
                   "directional", "constant", "envmap")  # fmt: skip

@@ -132,7 +132,7 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Reslrb, "_replay", wrong)
 
 
-#: Those that bias.
+#: Faults that bias the result.
 FAULTS = (
     hole,
     without_weight,

@@ -20,10 +20,10 @@ from reslrb_cli.integrators.step import known_step, render_image
 from reslrb_cli.measure.scenes.small import diffuse, load, rgb, texture, transform
 
 SIZE = 32
-#: Slopes that bend light, and do not fold: amplitude, wave vector and phase of each wave.
+#: Amplitude, wave vector and phase of each wave. The slopes bend light but do not fold it.
 WAVES = ((0.0135, (5.1, 2.3), 0.4), (0.012, (-3.7, 5.9), 1.9), (0.0062, (7.9, -4.6), 4.1), (0.0055, (2.2, -8.8), 2.7))
 
-#: Numbers, or arrays of them, that a case is differentiated by.
+#: Numbers, or arrays of numbers, with respect to which a case is differentiated.
 Latents = dict[str, Any]
 Place = Callable[[mi.SceneParameters, Latents], None]
 
@@ -45,7 +45,7 @@ class Moving:
     loaded: mi.Scene = field(init=False)
     params: mi.SceneParameters = field(init=False)
     weights: mi.TensorXf = field(init=False)
-    image: np.ndarray = field(init=False)  # of the last step
+    image: np.ndarray = field(init=False)  # image of the last step
 
     def __post_init__(self) -> None:
         self.loaded = load(self.scene)
@@ -76,7 +76,7 @@ class Moving:
         """Return the derivative of sum(image * weights) with respect to each latent, from one step."""
         leaves = {name: _leaf(value) for name, value in self.start.items()}
         dr.enable_grad(list(leaves.values()))
-        # Copies: a parameter may be what a latent is, and `update` may put something else in its place.
+        # Pass copies, because a parameter may be the same object as a latent, and `update` may replace the parameter.
         self.set({name: type(leaf)(leaf) for name, leaf in leaves.items()})
         step = known_step(integrator, self.loaded, self.sensor, self.weights, seed=seed, spp=spp, params=self.params)
         self.image = np.array(step.image, np.float64)

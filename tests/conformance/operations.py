@@ -20,8 +20,8 @@ from reslrb_cli.transport.guide import Table, apportion
 from reslrb_cli.transport.plan import Grid, Plan
 from reslrb_cli.transport.samples import passes
 
-PATHS = 64  # traced to have kernels compiled
-LARGE = 100  # operations; smaller kernels develop images and prepare textures
+PATHS = 64  # paths that are traced to compile kernels
+LARGE = 100  # operations: smaller kernels only develop images or prepare textures
 
 
 def even_table(grid: Grid, film: Blocks | None = None) -> Table:

@@ -23,17 +23,18 @@ from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import Hooks
 
 DEPTH = 6
-#: How far rays start off a surface, over its largest coordinate and 1; and how many times that, at a right angle, the
-#: segments are long whose weights are compared. Shorter ones are left to rounding, and so are smaller cosines.
+#: `OFF` is the offset of rays from a surface, relative to its largest coordinate plus 1. Weights are compared for
+#: segments longer than `STEADY` offsets at a right angle, and for cosines above `GRAZING`. Rounding affects all others.
 OFF, STEADY, GRAZING = 1500 * 2**-24, 500, 0.01
 WAYS = ("H", "N", "L")
 
 
-# What walks note: at each vertex, (lanes * DEPTH,) a component, in buffers that hooks scatter into.
+# Notes of a walk. For each vertex, hooks scatter each component into a buffer of shape (lanes * DEPTH,).
 
-#: Where it is, its geometric normal, directions of the ray that comes and the one that goes on, and of the connection;
-#: densities of the latter two as camera paths (`f`) and light paths (`b`) have them, and whether light paths go there;
-#: the BSDF's flags, and how far the scattering is from that of a plane mirror; of light: which, where, and the weight.
+#: Position, geometric normal, and directions of the incoming ray, the outgoing ray and the connection. For the latter
+#: two: densities for camera paths (`f`) and light paths (`b`), and whether light paths take the direction. The flags of
+#: the BSDF, and how far the scattering is from that of a plane mirror. For light: the emitter, the place and the
+#: weight.
 FIELDS = {"p": 3, "n": 3, "come": 3, "go": 3, "f": 1, "b": 1, "ok": 1, "to": 3, "to_f": 1, "to_b": 1, "to_ok": 1,
           "flags": 1, "mirror": 1, "N": 1, "N_id": 1, "N_p": 3, "N_n": 3, "N_uv": 2,
           "H": 1, "H_id": 1, "H_n": 3, "H_uv": 2, "L": 1}  # fmt: skip
@@ -70,7 +71,7 @@ class Notes:
         (f_si, f_wo), (b_si, b_wo) = (here, there) if camera else (there, here)
         f = bsdf.pdf(mi.BSDFContext(mi.TransportMode.Radiance), f_si, f_wo)
         b = bsdf.pdf(mi.BSDFContext(mi.TransportMode.Importance), b_si, b_wo)
-        if self.samples.plan.needs.has_perturbed_normals:  # a fifth of light paths goes by the cosine
+        if self.samples.plan.needs.has_perturbed_normals:  # a fifth of light paths are cosine-distributed
             b = 0.8 * b + 0.2 * dr.select(si.wi.z * wo.z > 0, dr.abs(b_wo.z) / dr.pi, 0)
         side = dr.dot(si.n, si.sh_frame.n)
         ok = mi.Bool(True)
@@ -160,7 +161,7 @@ class Emission:
         """Return the emitted rays of these light paths."""
         e, scene = sample_emission(samples, samples.sampler()), samples.scene
         ray, emitter = e.ray, e.emitter
-        # They begin a little off the lamp, above the point that was drawn.
+        # The rays start slightly off the lamp, above the sampled point.
         above = scene.ray_intersect(mi.Ray3f(ray.o + 0.01 * ray.d, -ray.d))
         si = scene.ray_intersect(mi.Ray3f(ray.o + 0.01 * above.n, -above.n), above.is_valid())
         on_lamp = si.is_valid() & (si.t < 0.02) & (si.emitter(scene) == emitter)
@@ -177,7 +178,7 @@ class Emission:
         return Emission(*(np.array(value, np.float64).T for value in values))
 
 
-# Paths, from the sensor to the light, and their densities.
+# Paths, in order from the sensor to the light, and their densities.
 
 
 @dataclass
@@ -216,7 +217,7 @@ def paths_of(way: str, notes: dict[str, np.ndarray], emission: Emission | None =
     lane, last = np.nonzero(notes[way] >= 0)
     index = np.arange(DEPTH)
     length = last if way == "H" else last + 1
-    order = last[:, None] - index if way == "L" else np.broadcast_to(index, (len(lane), DEPTH))  # of the walk
+    order = last[:, None] - index if way == "L" else np.broadcast_to(index, (len(lane), DEPTH))  # order in the walk
     at = lane[:, None], order.clip(0)
     own = {name: notes[name][at] for name in ("p", "n", "f", "b", "ok", "come", "go", "flags", "mirror")}
     ends = (order == last[:, None]) if way != "H" else np.zeros(order.shape, bool)
@@ -272,13 +273,14 @@ class Densities:
         self.samples, self.scene = samples, samples.scene
         sensor = samples.sensor
         crop = int(np.prod(sensor.film().crop_size()))
-        # The latter in each pixel.
+        # Number of all light paths, and number of camera paths in each pixel.
         self.light, self.camera = samples.width if samples is not camera else 0, camera.width / crop
         params = mi.traverse(sensor)
         to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
         self.axis = to_world[:3, 2] / length(to_world[:3, 2])
         self.origin = to_world[:3, 3]
-        # A pixel's area at a distance of 1: what the film's position moves the rays of an aperture's middle by.
+        # Area of a pixel at a distance of 1: the film position moves the rays through the aperture's centre by this
+        # area.
         rays = sensor.sample_ray(0, 0.5, mi.Point2f([0.2, 0.7, 0.2], [0.3, 0.3, 0.9]), mi.Point2f(0.5), True)[0]
         d = np.array(rays.d, np.float64).T
         there = d / (d @ self.axis)[:, None]
@@ -288,7 +290,7 @@ class Densities:
         self.size, self.corner = size, there[0] - edges.T @ (np.array([0.2, 0.3]) * size)
         self.edges = edges
         self.counts = None
-        if camera.shares is not None:  # as they were drawn
+        if camera.shares is not None:  # counts of drawn samples
             with dr.suspend_grad():
                 drawn = np.floor(np.array(film_ray(camera, camera.sampler()).u)).astype(int)
             self.counts = np.bincount(drawn[1] * size[0] + drawn[0], minlength=crop)
@@ -303,7 +305,7 @@ class Densities:
         """
         rows, last = np.arange(len(paths.count)), paths.count - 1
         x_m, n_m = paths.x[rows, last], paths.n[rows, last]
-        # From the aperture: the plane through the sensor's origin.
+        # Paths start on the aperture, which is the plane through the sensor's origin.
         x_1, cos, cos_axis = paths.x[:, 0], cosine(paths.n[:, 0], paths.come[:, 0]), paths.come[:, 0] @ self.axis
         d = (x_1 - self.origin) @ self.axis / cos_axis
         begun = cos / d**2 / (self.pixel * cos_axis**3)
@@ -311,7 +313,7 @@ class Densities:
         fit = d * cos > least
         camera = self.camera
         if self.counts is not None:
-            # A direction's place on the film: the plane that `edges` span is met at a distance of 1.
+            # Place of a direction on the film: the direction meets the plane that `edges` span at a distance of 1.
             there = (x_1 - self.origin) / d[:, None] / cos_axis[:, None] - self.corner
             u = np.linalg.lstsq(self.edges.T, there.T, rcond=None)[0].T
             inside = np.all((u >= 0) & (u < self.size), axis=1)
@@ -381,9 +383,9 @@ class Densities:
         if kind != "AreaLight":
             return {"met": 0, "sampled": 1, "near": far, "sent": self.beam(emitter, kind, -d) / far**2}
         shape, cos = emitter.get_shape(), cosine(nz, d)
-        area = float(np.ravel(shape.surface_area())[0])  # for each unit of texture coordinates, where these count
+        area = float(np.ravel(shape.surface_area())[0])  # for textured lamps, area per unit of texture coordinates
         own = sampled = np.ones(len(x))
-        if "radiance.data" in params:  # over texels of equal area
+        if "radiance.data" in params:  # sampled over equal-area texels
             texture = next(t for t in self.samples.plan.needs.lamps if t.emitter == emitter).texture
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.uv = mi.Point2f(uv.T.astype(np.float32))
@@ -394,7 +396,7 @@ class Densities:
                 own = 0.9 * own + 0.1
             stretch = {"Sphere": np.pi / 2 * np.sin(np.pi * uv[:, 1]), "Disk": 2 * uv[:, 0]}
             area = np.maximum(area * stretch.get(shape.class_name(), np.ones(len(x))), 1e-9)
-        elif shape.class_name() == "Sphere":  # the cone that holds it
+        elif shape.class_name() == "Sphere":  # the cone around the sphere
             ball = shape.bbox()
             center, r = np.array(ball.center(), np.float64).ravel(), float(ball.extents().x) / 2
             outside = length(x - center)

@@ -15,9 +15,9 @@ from agreement import Agreement, compare
 import reslrb_cli
 from reslrb_cli.integrators.step import make_integrator, render_image
 
-#: Largest relative difference between images of the same random numbers.
+#: Largest allowed relative difference between images from the same random numbers.
 SAME = 3e-4
-#: How much of its samples `agreement` takes; less for the tests that use `samples` (conftest.py).
+#: Share of the samples that `agreement` takes. The share is smaller for tests that use `samples` (conftest.py).
 SHARE = 1.0
 WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.7, 0.6]}}
 RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.3, 0.2]}}

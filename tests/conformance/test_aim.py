@@ -29,7 +29,7 @@ from reslrb_cli.transport.film import BLOCKS, Blocks
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Scattering that is aimed at what the sensor sees: means stay, whatever it sees and however it is aimed.
+# Scattering that is aimed at what the sensor sees: means are unchanged for every view and every aim.
 
 NAMES = (
     *("roughconductor", "roughplastic", "plastic", "blend", "roughdielectric", "principled"),
@@ -164,7 +164,7 @@ def _with_share(found: Any) -> Any:
     return replace(aimed, share=0 * aimed.share + aim.SHARE), numbers
 
 
-#: With a case that shows them, and the steps that it takes.
+#: Each fault with a case that shows it, and the number of steps.
 FAULTS = {
     "without_factor": (without_factor, "roughplastic", 48),
     "of_even_density": (of_even_density, "roughplastic", 48),
@@ -189,7 +189,7 @@ def test_planted_biases_are_found(name: str, monkeypatch: pytest.MonkeyPatch) ->
 def test_a_replay_follows_the_traced_paths(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if fault:
         replayed_from(monkeypatch, lambda table: replace(table, aim=replace(table.aim, slots=0 * table.aim.slots)))
-    monkeypatch.setattr(guiding, "NOW", 0.0)  # what is known beforehand is compared with what is not
+    monkeypatch.setattr(guiding, "NOW", 0.0)  # a known dL/dI is compared with one that is not known
     assert replays_agree(lambda kind: aimed(name, estimator=kind)[:2]) is not fault
 
 
@@ -199,7 +199,7 @@ def test_a_recorded_step_equals_the_step() -> None:
     (scene, ours, _), (_, frozen, _) = (guided("roughplastic", 0, freeze=freeze) for freeze in (False, True))
     for factor in (0.0, 1.0, 2.0):
         for each in (ours, frozen):
-            sample(scene, each, 4)  # which settles the grid
+            sample(scene, each, 4)  # this fixes the grid
             askew(scene, each, factor)
         assert relative(*(sample(scene, each, 5) for each in (ours, frozen))) < 1e-4
     assert frozen.preparation.recordings.counts()["fused"] > 0
@@ -254,12 +254,12 @@ def test_paths_of_a_gradient_are_aimed_at_its_dl_di(purpose: Purpose) -> None:
     tables = ours.preparation.guiding
     film = tables.films[0]
     delta = np.random.default_rng(5).normal(0, 1e-6, (film.height, film.width, 3)).astype(np.float32)
-    delta[3, 2] = 1.0  # a single pixel of an image was far too bright
+    delta[3, 2] = 1.0  # one pixel of an image was far too bright
     known = np.array(tables.table(0, purpose, mi.TensorXf(delta)).aim.density, np.float64)
     before = np.array(tables.table(0, purpose).aim.density, np.float64)
     expected = (1 - purpose.value * NOW * (1 - AIM_UNIFORM)) * before
     expected[3 * film.width + 2] += purpose.value * NOW * (1 - AIM_UNIFORM) * film.count
-    # What is there evenly stays as it was, of the rest a share is the pixel's.
+    # The even share of the density is unchanged. A share of the rest goes to the bright pixel.
     assert np.isclose(known[3 * film.width + 2], expected[3 * film.width + 2], rtol=0.05)
     assert known.min() > 0.85 * AIM_UNIFORM
 
@@ -293,7 +293,7 @@ def test_only_scenes_with_glossy_surfaces_use_aiming(monkeypatch: pytest.MonkeyP
         assert (ours.preparation.guiding.table(0, Purpose.BOTH).aim is not None) is expected
 
 
-# Guided emission where light is followed: numbers of emission are held, so that its weight is a constant.
+# Guided emission with moving light: the random numbers of the emission are held, so that its weight is a constant.
 
 MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASES)}
 

@@ -27,17 +27,18 @@ from reslrb_cli.records.measurements import Verdict
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Derivatives of what moves light: `stack` against naive AD of the same paths, ours and Mitsuba's.
-#
-# At equal seeds rounding alone is between them, so that a distance is a fault, and not noise. `walk_ad` shares our
-# walk's faults; `ptracer` shares none, but its shadow rays start a little off the surface, which is what the two
-# references are apart by. So a fault of the walk shows where `stack` is farther from `ptracer` than that.
+# Derivatives of what moves light: `stack` against naive AD of the same paths, with our walk and with Mitsuba's.  At
+# equal seeds, only rounding separates the gradients, so that a larger distance is a fault and not noise. `walk_ad`
+# shares the faults of our walk. `ptracer` shares none, but its shadow rays start a little off the surface, so that the
+# two references differ. A fault of our walk shows where the distance of `stack` from `ptracer` is larger than that
+# difference.
 
-#: What Mitsuba's own light tracer differs by, relative to the entries, over many seeds (`measure.gradcheck`).
+#: Error of Mitsuba's own light tracer, relative to the entries, over many seeds (`measure.gradcheck`).
 STOCK_ROUNDING = 1e-3
-#: What twice the distance of the two references may be: more is a fault of the walk that both of ours share.
+#: Limit for twice the distance of the two references. A larger distance is a fault of the walk that `stack` and
+#: `walk_ad` share.
 FARTHEST = 1e-3
-#: An odd number of them, so that the median is one of theirs.
+#: The number of seeds is odd, so that the median is the distance at one of the seeds.
 SEEDS = (1, 2, 3)
 BY_NAME = {case.name: case for case in CASES}
 DEEP = {"slab.vertex_positions": None, "shell.bsdf.reflectance.value": None}
@@ -70,7 +71,8 @@ def distances(case: AttachedCase) -> Iterator[tuple[str, float, float]]:
 
     for name in found[0]["walk_ad"]:
         assert all(gradients["walk_ad"][name].any() for gradients in found), f"no pixel to compare: {name}"
-        # What the references differ by is theirs, and much where terms cancel. If NaN stood anywhere it would show.
+        # The references differ for reasons of their own, and by much where terms cancel. A NaN in any gradient would
+        # fail.
         apart = distance(name, "walk_ad", "ptracer") if case.stock else 0.0
         limit = max(case.limit, 2 * apart)
         for reference in list(tracers)[1:]:
@@ -105,8 +107,9 @@ def test_means_over_seeds_agree_with_ptracer(name: str):
     naive = moving.gradient(tracer(case, "walk_ad"), many[0], case.spp)
     for key in ours[0]:
         mine, theirs = (np.stack([gradient[key] for gradient in side]) for side in (ours, stock))
-        # An entry is a sum of terms as large as the largest one, which may cancel: what rounding and the references'
-        # own distance leave is by their size, not by its. `apart` is that of naive AD of our walk from stock.
+        # An entry is a sum of terms that may cancel, and these terms are as large as the largest entry. The error from
+        # rounding and from the references' distance follows the size of the terms, not of the entry. `apart` is the
+        # distance of naive AD of our walk from stock.
         apart = relative(naive[key], theirs[0])
         assert apart <= FARTHEST / 2
         floor = max(case.limit, apart) * float(np.abs(theirs.mean(0)).max())
@@ -135,7 +138,7 @@ def test_a_small_stack_equals_a_large_one(depth: int, sizes: tuple[int, ...], op
     expected = deep(depth, 128, **options)
     for size in sizes:
         for key, value in deep(depth, size, **options).items():
-            # Rounding makes 4e-7 with vectors of 16 lanes, 1.7e-5 with those of 8.
+            # Rounding causes 4e-7 with vectors of 16 lanes, and 1.7e-5 with vectors of 8 lanes.
             assert relative(value, expected[key]) < 1e-4, f"{key}, {size} places"
             assert value.any()
 
@@ -173,7 +176,7 @@ def test_fault(fault: AttachedFault, monkeypatch: pytest.MonkeyPatch):
         check(replace(BY_NAME[fault.case], stock=fault.stock))
 
 
-# Forward mode where light moves, against the gradient at equal seeds: <weights, J v> = <J^T weights, v>.
+# Forward mode with moving light, against the gradient at equal seeds: <weights, J v> = <J^T weights, v>.
 
 ROUNDING = 3e-5
 QUICK = ("slab", "bounce")
@@ -279,7 +282,7 @@ def test_as_a_plugin(normalization: str):
     assert abs(np.sum(tangent * weights) - dr.grad(amplitude)[0]) < ROUNDING * np.linalg.norm(tangent)
 
 
-@pytest.mark.long  # forward mode of naive AD is compiled for a minute
+@pytest.mark.long  # naive AD in forward mode compiles for a minute
 @pytest.mark.parametrize("normalization", ["attached", "detached"])
 def test_as_a_plugin_every_pixel_is_that_of_naive_ad(normalization: str):
     script = Script(normalization)
@@ -294,10 +297,10 @@ def test_a_moving_lamp_is_refused():
         case.tangent(integrator("reslrb", 2, estimator="stack"), np.array([1.0, 0, 0]), 1, 4)
 
 
-# Attached derivatives where something is at its edge: light that is reflected whole, that grazes, that meets nothing
-# or black, glass that is none, meshes that are flat and begin to bend.
+# Attached derivatives in edge cases: total reflection, grazing light, light that meets nothing or a black surface,
+# glass without refraction, flat meshes that begin to bend.
 
-#: What is left of derivatives that cancel; those of rippled glass are a million times as large.
+#: Largest remainder of derivatives that cancel. Derivatives of rippled glass are a million times as large.
 NOTHING = 1e-4
 SLAB = {"slab.vertex_positions": None}
 

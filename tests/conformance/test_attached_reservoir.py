@@ -25,15 +25,13 @@ from reslrb_cli.measure.scenes.small import diffuse
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# `reservoir` where light moves: against naive AD and `stack` at equal seeds, and in expectation.
-#
-# On specular chains with one connection a path nothing is selected, and nothing damped: rounding alone is between
-# them. With diffuse vertices in the chain, and still one connection, damping adds noise of its own and must add no
-# bias.
+# `reservoir` with moving light: against naive AD and `stack` at equal seeds, and in expectation.  On specular chains
+# with one connection per path, nothing is selected or damped, so that only rounding separates the gradients. With one
+# connection per path and diffuse vertices in the chain, damping adds noise of its own, and must not add bias.
 
 #: Relative L2 distance from naive AD on specular chains, at equal seeds.
 SPECULAR = 1e-4
-#: Cases of test_attached.py in which every path has one connection, behind specular vertices alone.
+#: Cases of test_attached.py in which every path has one connection, which lies behind specular vertices only.
 SINGLE = ("slab", "latents", "passes", "thin_lens", "second_sensor", "crop", "lanczos", "mirror")
 BY_NAME = {case.name: case for case in CASES}
 ONE = AttachedScene("one", "one diffuse vertex in the chain", lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved,
@@ -65,7 +63,7 @@ class Bias:
 
     value: float
     error: float
-    noise: float  # variance beyond that of `stack`, as a share of it
+    noise: float  # variance beyond that of `stack`, as a fraction of it
 
     def __str__(self) -> str:
         return f"bias {self.value:.2%} +- {self.error:.2%}, variance {1 + self.noise:.2f} of that of stack"
@@ -108,7 +106,7 @@ def test_no_bias_whatever_the_damping(scene: AttachedScene, damping: float, samp
     found = bias(scene, sampling, 64, jacobian_damping=damping)
     print(scene.name, sampling, damping, found)
     assert abs(found.value) < 4 * found.error
-    # What damping adds is proportional to it: its noise, and the bias that these seeds are to see.
+    # The noise that damping adds is proportional to the damping. So is the bias that these seeds must detect.
     assert found.error < max(0.15 * damping, 0.001)
 
 
@@ -235,7 +233,7 @@ FAULTS = {
 def distance(name: str) -> float:
     """Return the largest distance between `reservoir` and `stack` at equal seeds, which must be rounding alone."""
     case = BY_NAME[name]
-    depth = 4 if name == "receiver" else case.depth  # one connection a path
+    depth = 4 if name == "receiver" else case.depth  # one connection per path
     moving = case.moving()
     exact, ours = (
         moving.gradient(integrator("reslrb", depth, estimator=estimator, hide_emitters=True), 1, case.spp)
@@ -249,7 +247,7 @@ def test_the_faults_apply_to_the_code(fault: Fault, monkeypatch: pytest.MonkeyPa
     plant(fault, monkeypatch)
 
 
-#: Of the default suite.
+#: The faults that the default suite plants.
 QUICK = ("own_vertex_left_out",)
 
 
@@ -259,16 +257,15 @@ def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
     if name == "no_G":  # specular factors hardly change
         assert abs(bias(TWO, "stay", 6).value) > 0.1
         return
-    if name == "factors_passed_stay":  # what is left over is divided by the damping, of either sign
+    if name == "factors_passed_stay":  # the remainder is divided by the damping, of either sign
         assert bias(BOTH, "stay", 6).noise > 5
         return
     assert distance("receiver" if name == "own_vertex_left_out" else "slab") > 10 * SPECULAR
 
 
-# `attached_sampling`: light that follows a surface, and light that goes on to the same place.
-#
-# In scenes where nothing is hidden, and no edge is at rest where light is seen, both are right, and their means
-# agree. Where there is such an edge, finite differences say which is.
+# `attached_sampling`: light that follows a surface, and light that continues to the same place.  Both are right, and
+# their means agree, in scenes where nothing is hidden and no edge rests where light is seen. Where there is such an
+# edge, finite differences show which of the two is right.
 
 WHITE = diffuse(0.8, 0.7, 0.6)
 BRUSHED = {"type": "roughconductor", "material": "none", "alpha": 0.4, "sample_visible": False}
@@ -318,7 +315,8 @@ AGREEING = {
     "brushed_floor": AttachedScene("", "", lambda: lit_wall(BRUSHED), tilted, spp=256, options={"max_depth": 3}),
 }  # fmt: skip
 QUICK_SAMPLING = ("bounce", "moved_floor", "moved_wall")
-#: Of these, which take few seeds, by default: light that reflects off what moves, and is reflected again.
+#: The scenes that the default suite runs, because they need few seeds: light reflects off a moving object, and is
+#: reflected again.
 FEWEST = ("bounce",)
 
 
@@ -347,7 +345,7 @@ def test_a_corner_that_does_not_move():
     """
     scene = SCENES["bounce_corner"]
     right = compare_with_differences(scene, count=4)
-    # Differences are of the image alone, which is the same for both.
+    # The finite differences use only the image, which is the same for both kinds of sampling.
     wrong = replace(right, ours=gradients(scene, "follow", len(right.ours), first=0))
     print(f"auto: {right}; follow: {wrong}")
     assert right.error < 4 * right.standard_error < 0.6
@@ -374,7 +372,7 @@ def test_finite_differences_agree_if_auto_stays(name: str):
         (WHITE, "auto", 3, (True, False)),
         (WHITE, "auto", 2, (False, False)),
         (WHITE, "follow", 3, (False, False)),
-        (BRUSHED, "auto", 3, (False, False)),  # behind the wall, which is diffuse, nothing is seen
+        (BRUSHED, "auto", 3, (False, False)),  # behind the diffuse wall nothing is seen
         (BRUSHED, "stay", 3, (True, False)),
     ],
     ids=str,

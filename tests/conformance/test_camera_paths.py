@@ -68,7 +68,7 @@ def sheet() -> Any:
     return rectangle(bsdf, to_world)
 
 
-#: Lights, what stands there, the sensor, and options of both integrators.
+#: Emitters, objects, the sensor, and the options of both integrators.
 SCENES: dict[str, Callable[[], tuple[dict[str, Any] | None, Any, dict[str, Any], dict[str, Any]]]] = {
     "mirror": lambda: (None, looks(), seen(type="conductor"), {}),
     "glass": lambda: (None, looks(), seen(type="dielectric"), {}),
@@ -123,7 +123,7 @@ def test_distributed_paths_have_the_requested_number_per_pixel(paths: int):
     assert float(shares.mean()[0]) == pytest.approx(paths / density.size)
     for one in range(density.size):
         assert sorted(number[pixel == one]) == list(range(int(counts[one])))
-    if paths > 1000:  # as wanted, but for those that all have alike
+    if paths > 1000:  # the requested numbers, apart from the even share
         even = int(shares.even[0])
         assert EVEN <= even / paths < EVEN + MOST_SLOTS * density.size / paths
         expected = even / density.size + (paths - even) * density / density.sum()
@@ -187,7 +187,7 @@ def test_the_pilot_finds_pixels_that_only_a_mirror_shows():
     assert density.max() <= MOST * (1 + 1e-5)
     assert density[mirror].mean() > 6 * density[~mirror].mean()
     assert show[mirror].mean() > 0.5
-    # The first gradient notes it; images before that are even.
+    # The first gradient records the pixel shares. Images before this gradient have even shares.
     assert tracer.passes(Job(scene, scene.sensors()[0], mi.UInt32(0), 32))[0].shares is None
     assert tracer.passes(job)[0].shares is not None
 
@@ -257,7 +257,7 @@ def test_light_that_camera_paths_cannot_find_is_left_to_light_paths():
         images(scene, "reslrb", range(at, at + 12), 128, paths=paths, **sizes)
         for at, paths in ((0, "both"), (100, "light"), (200, "camera"))
     )
-    # In the caustic's pixels, which see the floor alone, all is light paths' own, or next event estimation's.
+    # The caustic's pixels see only the floor. All their light comes from light paths or from next event estimation.
     caustic = light.mean((0, 3)) > 2 * alone.mean((0, 3)) + 1e-3
     assert caustic.sum() >= 4
     assert compare(ours[:, caustic][:, None], light[:, caustic][:, None])
@@ -284,7 +284,7 @@ def test_short_paths(depth: int):
 
 # --- gradients --------------------------------------------------------------------------------------------------------
 
-#: Those that both sides can find; camera paths do not know parallel lamps.
+#: Cases whose light both kinds of paths can find. Camera paths cannot find parallel lamps.
 BOTH = [case for case in CASES if case.name not in ("texture_prb", "directionalarea")]
 SOME = ("texture", "mask_texture_in_view", "two_emitters", "visible_lamp", "glass")
 
@@ -334,7 +334,7 @@ def test_gradients_equal_prb(case: GradientCase):
         assert compare(ours, reference, block=None), paths
 
 
-#: Only light paths find caustics in reasonable time.
+#: Cases without caustics, since only light paths find caustics in reasonable time.
 NO_CAUSTICS = [case for case in BOTH if case.name not in ("glass", "mirror")]
 
 
@@ -419,5 +419,5 @@ def test_moving_light_uses_light_paths_in_its_image_too():
     leaves = scene.leaves()
     assert work.plan(scene.scene, job.sensor, scene.params).paths == "light"
     assert work.preparation.plan(scene.scene, job.sensor, scene.params, image=True).paths == "light"
-    assert work.plan(scene.scene, job.sensor).paths == "both"  # nothing moves in an image alone
+    assert work.plan(scene.scene, job.sensor).paths == "both"  # an image has no moving parameters
     scene.release(leaves)

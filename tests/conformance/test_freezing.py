@@ -19,14 +19,14 @@ from reslrb_cli.measure.scenes.small import camera
 
 pytestmark = pytest.mark.usefixtures("llvm")
 BY_NAME = {case.name: case for case in CASES}
-#: Mitsuba's thin lens keeps an array that a recording does not see.
+#: Mitsuba's thin lens keeps an array that a recording does not contain.
 NOT_RECORDED = ("thin_lens",)
-#: One of each kind; the others take minutes in all.
+#: One case of each kind. The other cases take minutes in total.
 QUICK = ("texture", "rgba", "roughplastic", "glass", "mask", "area_texture", "envmap", "visible_lamp")
-#: Of these, by default: one for each estimator.
+#: The cases that the default suite runs: one for each estimator.
 FEWEST = ("texture", "glass", "mask", "visible_lamp")
 ESTIMATORS = ("reservoir", "event", "gather", "stack")
-#: What is recorded, by the way in which a step comes by dL/dI.
+#: Recorded functions, by the way in which a step obtains dL/dI.
 KINDS = {
     "correlated": {"trace", "replay"},
     "independent": {"image", "trace and replay"},
@@ -66,11 +66,11 @@ def recorded_step_is_the_step(case: GradientCase, estimator: str) -> None:
     """Check recorded steps for one kind of dL/dI, which depends on case and estimator."""
     adjoint = list(KINDS)[(ESTIMATORS.index(estimator) + len(case.name)) % len(KINDS)]
     expected, none = gradients(case, adjoint, estimator=estimator, freeze=False)
-    gc.collect()  # the scene: none but its own may be alive
+    gc.collect()  # no other scene may be alive
     found, counts = gradients(case, adjoint, estimator=estimator, freeze=True)
     for step, (a, b) in enumerate(zip(found, expected, strict=True)):
         assert relative(a, b) < 1e-5, f"step {step}, {adjoint}"
-    # The last steps come from recordings, or else nothing was tested.
+    # The last steps must come from recordings. Otherwise the test would check nothing.
     assert none[-1] == {}
     assert set(counts[-1]) == KINDS[adjoint]
     assert counts[-1] == counts[-2]

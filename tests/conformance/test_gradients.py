@@ -32,10 +32,9 @@ from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room, te
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Every estimator in every case: exact ones equal naive AD of the same paths, the others do in expectation.
-#
-# The cases' own references (`test_gradient` below) say that naive AD of our walk is right. Here it is the
-# reference at equal seeds, which sees what a test over many seeds cannot.
+# Every estimator in every case: exact estimators equal naive AD of the same paths, the others equal it in expectation.
+# The cases' own references (`test_gradient` below) show that naive AD of our walk is right. Here naive AD is the
+# reference at equal seeds, which reveals faults that a test over many seeds cannot find.
 
 EXACT = {"gather": {}, "stack": {}, "stack_of_2": {"estimator": "stack", "stack_size": 2}}
 RANDOM = {
@@ -108,9 +107,9 @@ def test_without_light_paths_the_gradient_is_zero(name: str, max_depth: int):
     assert not scene.gradient(integrator("reslrb", estimator=name, max_depth=max_depth), 3, 4).any()
 
 
-# The reservoir estimator's gradient against `ptracer`, `prb` and finite differences: equal in expectation.
+# The gradient of the reservoir estimator against `ptracer`, `prb` and finite differences: equal in expectation.
 
-#: The noise of a comparison may be so much of the gradient, else it could not see a wrong one.
+#: Largest allowed noise of a comparison, as a share of the gradient. With more noise, a wrong gradient would pass.
 RESOLUTION = 0.1
 
 
@@ -149,12 +148,13 @@ def test_gradient_over_64_seeds(case: GradientCase):
     assert result
 
 
-# Naive AD of our walk, forward mode, and the reservoir, each against the others at equal seeds.
+# Naive AD of our walk, forward mode, and the reservoir, each compared with the others at equal seeds.
 
 BY_NAME = {case.name: case for case in CASES}
 
-#: Where stock `ptracer` is right and traces the same paths: not masks, rotated environment maps, bump and normal maps,
-#: nor where its directions move with a parameter, nor textures of lamps, whose black texels it does not draw.
+#: Cases in which stock `ptracer` is right and traces the same paths. Excluded are masks, rotated environment maps, bump
+#: and normal maps, directions that move with a parameter, and textures of lamps, whose black texels `ptracer` does not
+#: draw.
 SAME_PATHS = ("texture", "gaussian", "crop", "rgba", "thin_lens", "twosided", "mirror", "glass", "area",
               "point", "spot", "projector", "directional", "directionalarea", "constant")  # fmt: skip
 
@@ -182,11 +182,12 @@ def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
         image = mi.render(scene.scene, scene.params, integrator=integrator, seed=seed, seed_grad=seed + 1, spp=spp)
         return dr.forward_to(image)
 
-    return scene.along(scene.directions(1)[0], tangent)[:, :, :3]  # derivative of alpha: none
+    return scene.along(scene.directions(1)[0], tangent)[:, :, :3]  # alpha has no derivative
 
 
-#: Forward mode by default: what it does along a path (emission, factors, delta lobes, masks, what is seen), with
-#: films and sensors; the other cases hold other BSDFs and emitters, to which it is the same.
+#: Forward mode in the default suite: everything that it does along a path (emission, factors, delta lobes, masks,
+#: visible emitters), with films and sensors. The other cases have other BSDFs and emitters, which do not change forward
+#: mode.
 QUICK = ("texture", "roulette", "thin_lens", "glass", "mask_texture_in_view", "two_emitters", "visible_lamp")
 
 
@@ -198,7 +199,7 @@ def test_forward_mode_equals_walk_ad(name: str):
     naive = forward(scene, plugin("walk_ad", **options), 3, 32)
     assert np.abs(naive).max() > 0
     assert relative(tangent, naive) < 1e-5
-    # The adjoint of the same derivative: <weights, J v> = <J^T weights, v>, at the seed that forward mode had.
+    # The adjoint of the same derivative: <weights, J v> = <J^T weights, v>, at the same seed as forward mode.
     gradient = scene.gradient(integrator("walk_ad", **options), 4, 32)
     assert np.sum(naive * np.array(scene.weights)) == pytest.approx(gradient @ scene.directions(1)[0], rel=1e-3)
 
@@ -211,7 +212,7 @@ def test_forward_against_backward(name: str):
     options = case.both | case.options
     ours = plugin("reslrb", **options)
     direction = np.abs(scene.directions(1)[0])
-    scene.directions = lambda count: direction[None]  # one sign, so that the product is not lost in its noise
+    scene.directions = lambda count: direction[None]  # one sign keeps the product above its noise
     tangents = np.array([np.sum(forward(scene, ours, s, case.spp) * np.array(scene.weights)) for s in seeds(16)])
     gradients = scene.gradients(integrator("reslrb", **options), seeds(16, 1), case.spp) @ direction
     result = compare(tangents[:, None], gradients[:, None], block=None)
@@ -219,10 +220,9 @@ def test_forward_against_backward(name: str):
     assert result.relative_error < 0.03
 
 
-# Factors that are exactly zero: their derivative is finite, and neither estimator may lose it.
-#
-# The image is a polynomial in each parameter, so that finite differences, one-sided where the domain ends, are exact
-# up to rounding as long as the paths do not depend on the parameter; otherwise they are compared in expectation.
+# Factors that are exactly zero: their derivative is finite, and no estimator may lose it.  The image is a polynomial in
+# each parameter. If the paths do not depend on the parameter, finite differences are exact up to rounding. They are
+# one-sided where the domain ends. Otherwise the gradients are compared in expectation.
 
 
 def tiles(*texels: tuple[float, ...]) -> dict:
@@ -254,7 +254,7 @@ class ZeroCase:
     step: float = 0.1
     spp: int = 64
     max_depth: int = 4
-    lost: str = ""  # why the derivative is not found, where it is known not to be
+    lost: str = ""  # why the derivative is lost, if it is known to be
 
 
 CLIPPED = "Mitsuba clips opacities and weights to [0, 1], and Dr.Jit's clip has no derivative at the lower end"
@@ -319,7 +319,8 @@ def differences(case: ZeroCase, scene: Case, along: np.ndarray, count: int, bloc
     ])  # fmt: skip
 
 
-#: Of the default suite: zeros of texels, lamps, blends and mirrors once; of what is lost, one.
+#: The cases of the default suite: zeros of texels, lamps, blends and mirrors once, and one case whose derivative is
+#: lost.
 QUICK_ZERO = ("texel_zero_in_one_channel", "lamp_texture_zero_in_all", "blend_1", "mirror_zero")
 
 
@@ -340,7 +341,7 @@ def test_zero(case: ZeroCase):
     ours = scene.gradients(integrator("reslrb", case.max_depth), seeds(count), case.spp) @ along.T
     naive = scene.gradients(integrator("walk_ad", case.max_depth), seeds(count), case.spp) @ along.T
     if case.fixed_paths:
-        # At equal seeds nothing but rounding is between naive AD and differences: two seeds tell.
+        # At equal seeds, naive AD and finite differences differ only by rounding, so that two seeds are enough.
         assert relative(naive[:2], differences(case, scene, along, 2, 0)) < 2e-3
         reference = naive
     else:
@@ -354,7 +355,7 @@ def test_zero(case: ZeroCase):
     assert (np.abs(ours.mean(0)) > 3 * ours.std(0) / np.sqrt(count)).mean() > 0.5, "zero within noise"
 
 
-# `trajectory`, Dr.Jit's own reversal of the walk, has the gradient of `walk_ad` at equal seeds.
+# `trajectory`, which is Dr.Jit's own reversal of the walk, has the gradient of `walk_ad` at equal seeds.
 
 FEW_TRAJECTORIES = ("texture", "passes", "glass", "area_texture", "envmap")
 NAMES = ("texture", "roulette", "passes", "gaussian", "thin_lens", "plastic", "glass", "bumpmap", "area_texture",
@@ -420,10 +421,8 @@ def test_a_known_adjoint_gives_the_image_and_gradient_of_a_correlated_step(name:
         np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5 * np.abs(expected).max())
 
 
-# Which samples delta comes from.
-#
-# With one set for image and gradient an L2 gradient is biased by the image's noise; with an independent set, or in
-# batches, it is not.
+# The samples that delta comes from.  If one set of samples serves image and gradient, the image's noise biases an L2
+# gradient. With an independent set, or with batches, there is no bias.
 
 SPP = 4
 COUNT = 64
@@ -530,6 +529,6 @@ def test_sample_sets_equal_those_of_a_step(case_of_two: Case, name: str):
     images = [np.array(render_image(tracer, case_of_two.scene, 0, seed, spp)) for seed, spp in sets]
     expected = np.mean(images, axis=0) if name == "four batches" else images[0]
     np.testing.assert_allclose(np.array(results[0].image), expected, rtol=1e-4, atol=1e-5)
-    # the objective is linear, so that dL/dI is the same for all samples; the first batch gives an image alone
+    # the objective is linear, so that dL/dI is the same for all samples, and the first batch gives only an image
     own = [case_of_two.gradient(tracer, seed, spp) for seed, spp in (sets[1:] or sets)]
     np.testing.assert_allclose(gradient, np.mean(own, axis=0), rtol=1e-3, atol=1e-5 * np.abs(gradient).max())

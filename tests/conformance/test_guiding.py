@@ -21,9 +21,8 @@ from reslrb_cli.measure.scenes.small import SIZE, diffuse, rgb, texture, transfo
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Guided emission is unbiased: with tables as they are after some steps, the means are those of unguided samples.
-#
-# What a table says is a matter of variance alone; what could bias is planted, and has to be missed by the same tests.
+# Guided emission is unbiased: with the tables after some steps, the means equal those of unguided samples.  Table
+# values affect only the variance. Faults that could cause bias are planted, and the same tests must fail with them.
 
 BY_NAME = {case.name: case for case in CASES}
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "gaussian", "area_texture", "glass", "mask", "rgba")
@@ -112,7 +111,7 @@ def strength(ours: Any) -> float:
 def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) -> None:
     """The replay draws the same numbers as the trace, whatever the tables learn in between."""
     scene, ours, plain = guided("two_emitters", 3, estimator=estimator)
-    del ours.preparation.guiding.due  # as it comes: some of the steps learn
+    del ours.preparation.guiding.due  # the default schedule: some steps learn
     found = [scene.gradients(each, seeds(24, block), SPP, adjoint=adjoint) for block, each in enumerate((ours, plain))]
     result = compare(*found, block=None)
     print(estimator, adjoint, result)
@@ -151,7 +150,7 @@ def test_a_recorded_step_equals_the_step() -> None:
     frozen.expect(SPP)
     frozen.plan(scene.scene, scene.scene.sensors()[0], scene.params)
     guiding = frozen.preparation.guiding
-    for steps in range(3):  # tables change, and recordings have them all the same
+    for steps in range(3):  # tables change, and recordings use the new tables
         guiding.learned = dict(ours.preparation.guiding.learned)
         guiding._tables.clear()
         both = [sample(scene, each, 5 + steps) for each in (ours, frozen)]
@@ -243,7 +242,7 @@ def learns_apart(patch: pytest.MonkeyPatch) -> bool:
     from reslrb_cli.guiding import collect
 
     walks: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
-    right, tables = base.walk, []  # held, so that no other has their addresses
+    right, tables = base.walk, []  # held, so that no other table reuses an address
 
     def seen(learning: bool) -> Any:
         def walk(samples: Any, *given: Any) -> Any:
@@ -277,14 +276,14 @@ def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -
     assert not result
 
 
-# A scene that changes so that a table is wrong: a shutter slides from one opening of a room to the other.
+# A scene that changes so that a table becomes wrong: a shutter slides from one opening of a room to the other.
 
-#: Steps with the one opening, and with the other: it slides when tables have just learned, and do not again for as long
-#: as they ever do.
+#: Steps with each of the two openings. The shutter slides just after the tables have learned, so that the time to the
+#: next learning is as long as it ever is.
 BEFORE, WITHIN = 2 * EVERY, 20
-AT_FIRST, AT_LAST = 2.0, 1.1  # how many times the error of unguided samples a step's may have
-TELLING = 0.1  # the largest standard error, as a share of the limit, of which anything is to be said
-RIGHT, LEFT = 0.6, -0.6  # where the shutter is
+AT_FIRST, AT_LAST = 2.0, 1.1  # largest error of a guided step, relative to unguided samples
+TELLING = 0.1  # largest standard error, as a share of the limit, that allows a verdict
+RIGHT, LEFT = 0.6, -0.6  # positions of the shutter
 KEY = "ground.reflectance.data"
 
 

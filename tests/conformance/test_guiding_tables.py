@@ -21,7 +21,7 @@ from reslrb_cli.transport.guide import Guide, Table, apportion, make_grid
 from reslrb_cli.transport.plan import GUIDE_UNIFORM, Grid
 from reslrb_cli.transport.roulette import CELLS
 
-# What tables of guided emission are made of: slots, densities, what has been heard.
+# The parts of the tables of guided emission: slots, densities, recorded contributions.
 
 SCENES = {case.name: case.scene for case in CASES}
 GRIDS = {
@@ -127,7 +127,8 @@ def test_no_group_dominates_and_non_finite_values_are_dropped() -> None:
     first[:16], other[16:] = 1, 1
     quiet = Learned.nothing(SMALL).with_more(SMALL, heard(first, 1e-12 * other, 0, 1), draws)
     density = quiet.density(SMALL, Purpose.GRADIENT.value)
-    # Mean squares 1 / 0.25 and 1 / 0.75, each all over its emitter; the density is their root times the measure.
+    # The mean squares are 1 / 0.25 and 1 / 0.75, each over its whole emitter. The density is their root times the
+    # measure.
     assert density[:16].sum() / density[16:].sum() == pytest.approx((4**0.5 * 0.25) / ((4 / 3) ** 0.5 * 0.75))
     assert quiet.density(SMALL, Purpose.IMAGE.value) == pytest.approx(SMALL.measures())
     both = quiet.density(SMALL, Purpose.BOTH.value)
@@ -243,9 +244,9 @@ def test_tables_of_any_number_of_sensors_use_64_mib() -> None:
         assert len(numbers) * guiding.bytes(1) == guiding.bytes(1000)
 
 
-# How tables of guided emission learn: from recorded walks as from plain ones, of cells that passes can tell apart.
+# How the tables of guided emission learn: from recorded walks as from plain ones, with cells that passes can resolve.
 
-SIDE = 16  # pixels of the film
+SIDE = 16  # film width in pixels
 
 
 def taught(name: str, steps: int, **options: Any) -> Any:
@@ -374,7 +375,7 @@ def test_a_coarse_grid_agrees_with_the_finest() -> None:
         for share in (0.0, 0.5, 1.0):
             expected = finest.summed(both[0].density(finest, share), grid)
             np.testing.assert_allclose(both[1].density(grid, share), expected, rtol=1e-4)
-    again = both[1].on(finest, grid)  # what was learned is kept where cells become finer
+    again = both[1].on(finest, grid)  # a finer grid keeps what was learned
     np.testing.assert_allclose(again.density(finest, 0.2), both[0].density(finest, 0.2), rtol=1e-4)
 
 
@@ -417,7 +418,7 @@ def cells_after(*calls: Any, told: int | None = None) -> list[Grid]:
         for learned in ours.preparation.guiding.learned.values():
             assert learned.draws.size == found[-1].cells
             assert learned.calls == len(gradients)
-            # It has learned from the first two, as far as there are two.
+            # The table has learned from the first two gradients, or from fewer if there were fewer.
             assert learned.draws.sum() > 0.99 * KEEP * SIDE * SIDE * sum(gradients[:2])
         assert (ours.preparation.guiding.learned == {}) == (gradients == [])
     return found
@@ -441,7 +442,7 @@ def test_a_run_with_a_sample_count_has_the_same_grid() -> None:
     assert grids[0] == cells_after((4, True))[0]
 
 
-# What guided emission has learned, as a run's state has it: it comes back as it was; nothing else is taken for it.
+# The learned tables of guided emission in the state of a run: they are restored exactly, and wrong data are rejected.
 
 GRID = make_grid([True] * 4, [1.0, 3.0], 9)
 
@@ -475,7 +476,7 @@ def test_learned_state_is_restored() -> None:
         for share in (0.0, 0.5, 1.0):
             np.testing.assert_array_equal(
                 after.learned[number].density(GRID, share), one.density(GRID, share)
-            )  # bit by bit
+            )  # bit for bit
             found, known = after.learned[number].onward, one.onward
             assert found is not None
             assert known is not None
@@ -486,7 +487,7 @@ def test_learned_state_is_restored() -> None:
 @pytest.mark.parametrize(
     ("name", "wrong"),
     [
-        ("0/sums", lambda sums: np.concatenate([sums, sums])),  # a row for each thing that was heard, as once
+        ("0/sums", lambda sums: np.concatenate([sums, sums])),  # twice the rows, as in an older format
         ("0/sums", lambda sums: sums[:, ::2]),
         ("3/sums", lambda sums: sums[:0]),
         ("3/draws", lambda draws: draws[:-1]),
@@ -510,7 +511,7 @@ def test_state_of_other_cells_is_refused_without_effect(name: str, wrong: Any) -
     assert after.learned == kept
 
 
-# What guided emission costs a step: nothing where it is off, and no kernel that is compiled anew where it learns.
+# The cost of guided emission per step: nothing if it is off, and no new compilation of a kernel when it learns.
 
 
 @pytest.mark.usefixtures("llvm")
@@ -526,7 +527,7 @@ def test_later_steps_compile_nothing() -> None:
     kernels.new(lambda: learn(scene, ours, 0))
     for seed in (1, 2):
         found = kernels.new(lambda: learn(scene, ours, seed))  # noqa: B023
-        # Those that copy a table hang on where NumPy has it.
+        # Small kernels that copy a table depend on the address of the NumPy array.
         assert [kernel["operation_count"] for kernel in found if kernel["operation_count"] >= LARGE] == []
 
 

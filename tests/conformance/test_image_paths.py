@@ -26,7 +26,7 @@ from turns import a_few, taking_turns
 pytestmark = pytest.mark.usefixtures("samples")
 
 
-# Image: depth, roulette, passes, shading normals, masks, shapes: `reslrb` against `path` and `ptracer`.
+# Image: depth, roulette, passes, shading normals, masks and shapes. `reslrb` is compared with `path` and `ptracer`.
 
 TWO_SIDED = {"type": "twosided", "bsdf": RED}
 
@@ -85,7 +85,7 @@ def test_shading_normals(facets, name):
 
 
 def test_mesh_emitter(facets):
-    # Without smooth normals, of which `path`'s two ways to sample an emitter make different things.
+    # The mesh has no smooth normals, because the two ways in which `path` samples an emitter treat them differently.
     emitter = {"type": "area", "radiance": rgb(2, 1, 1)}
     mesh = {"type": "ply", "filename": facets, "bsdf": WHITE, "face_normals": True, "emitter": emitter}
     result = agreement(stage({}, ball=mesh))
@@ -176,7 +176,7 @@ def test_instances():
 
 
 def test_camera_inside_a_closed_room():
-    # No light leaves, so that every path runs to its end.
+    # No light leaves the room, so that every path runs to its end.
     room = {"type": "cube", "flip_normals": True, "bsdf": WHITE,
             "to_world": transform().translate([0, 2, 1]) @ transform().scale([3, 2.5, 4])}  # fmt: skip
     scene = stage(visible(), camera(), room=room)
@@ -207,7 +207,8 @@ def test_filter_equals_ptracer_at_equal_seeds(name):
 
 @pytest.mark.parametrize("name", a_few(FILTERS, ("box", "lanczos")))
 def test_filter(name):
-    # `path` gathers splats from beyond the film's border, which light paths do not reach: 4 pixels are left out.
+    # `path` gathers splats from beyond the film's border, which light paths do not reach. A border of 4 pixels is left
+    # out.
     result = agreement(seen(camera(32, 32, rfilter=name)), border=0 if name == "box" else 4)
     assert result, result
 
@@ -224,7 +225,7 @@ def test_crop_window_is_a_part_of_the_image():
     options = {"max_depth": 5, "rr_depth": 100, "hide_emitters": True}
     (whole,) = images(seen(camera()), "reslrb", range(1), 16, **options)
     (part,) = images(seen(camera(film=CROP)), "reslrb", range(1), 16, **options)
-    # The same light paths, those that miss the crop window lost.
+    # The light paths are the same, but those that miss the crop window are lost.
     assert np.abs(part - whole[5:18, 7:24]).mean() < SAME * whole.mean()
 
 
@@ -233,7 +234,7 @@ def test_pixel_format(kind):
     scene = seen(camera(film={"pixel_format": kind}))
     result = agreement(scene)
     assert result, result
-    # `ptracer` divides colours by an alpha that it never normalises.
+    # `ptracer` divides colours by an alpha that it never normalizes.
     if not kind.endswith("a") and "alpha" not in kind:
         assert difference_from_ptracer(scene) < SAME
 
@@ -249,7 +250,7 @@ def test_half_precision_film():
 
 
 def test_thin_lens():
-    scene = seen(camera(type="thinlens", aperture_radius=0.4, focus_distance=2.0))  # floor and lamp out of focus
+    scene = seen(camera(type="thinlens", aperture_radius=0.4, focus_distance=2.0))  # floor and lamp are out of focus
     result = agreement(scene)
     assert result, result
     assert difference_from_ptracer(scene) < SAME
@@ -289,7 +290,7 @@ LENS = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.2}
 @pytest.mark.parametrize("kind", [{}, LENS], ids=["perspective", "thinlens"])
 @pytest.mark.parametrize("planes", [{"near_clip": 3.9}, {"far_clip": 4.6}], ids=["near", "far"])
 def test_clip_planes(kind, planes):
-    # A screen near the sensor, which the near plane cuts away, and so lets be seen what it hides.
+    # The near plane cuts away a screen near the sensor, so that the objects behind the screen are visible.
     screen = rectangle({"type": "diffuse"}, transform().translate([0.5, 1.3, 3]) @ transform().scale(0.15))
     result = agreement(seen(camera(**kind | planes), **({"screen": screen} if "near_clip" in planes else {})))
     assert result, result
@@ -297,14 +298,15 @@ def test_clip_planes(kind, planes):
 
 @pytest.mark.parametrize("focus", [{}, {"focus_distance": 0.9}, {"focus_distance": 30.0}, {"focus_distance": 2.0}])
 def test_a_lens_focused_outside_its_clip_planes(focus):
-    # Stock light tracing has it see nothing then, or, on the far plane, where it focuses by default, a part.
+    # With such a focus, a lens in stock light tracing sees nothing. If it focuses on the far plane, as by default, it
+    # sees a part.
     result = agreement(seen(camera(type="thinlens", aperture_radius=0.1, near_clip=1.0, far_clip=7.0, **focus)))
     assert result, result
 
 
 @pytest.mark.parametrize("film", [{}, CROP])
 def test_principal_point(film):
-    # `ptracer` clips it to where the film would be without the offset.
+    # `ptracer` clips the image to where the film would be without the offset.
     scene = seen(camera(film=film, principal_point_offset_x=0.2, principal_point_offset_y=-0.1))
     result = agreement(scene)
     assert result, result

@@ -48,7 +48,7 @@ def gray(low: float = 0.1, high: float = 1.0):
 
 
 COPPER = {"type": "roughconductor", "material": "Cu", "alpha": 0.2}
-#: Light paths can connect to the sensor from all of these: images equal `path`'s where the sensor sees them.
+#: Light paths can connect all of these BSDFs to the sensor. Images equal those of `path` where the sensor sees them.
 ROUGH = {
     "diffuse": lambda: {"type": "diffuse", "reflectance": bitmap(8, 8)},
     "roughconductor": lambda: COPPER,
@@ -67,7 +67,7 @@ ROUGH = {
     "blend": lambda: {"type": "blendbsdf", "weight": gray(), "a": WHITE, "b": COPPER},
     "twosided": lambda: {"type": "twosided", "a": WHITE, "b": RED},
 }  # fmt: skip
-#: Light passes straight through these, which stock `ptracer` does not connect through.
+#: Light passes straight through these BSDFs. Stock `ptracer` does not connect through them.
 SEE_THROUGH = {
     "mask": lambda: {"type": "mask", "opacity": gray(low=0), "bsdf": {"type": "twosided", "bsdf": RED}},
     "mask of glass": lambda: {"type": "mask", "opacity": 0.6, "bsdf": {"type": "roughdielectric", "alpha": 0.3}},
@@ -77,7 +77,7 @@ SEE_THROUGH = {
     "polarizer": lambda: {"type": "polarizer"},
     "retarder": lambda: {"type": "retarder"},
 }  # fmt: skip
-#: Their shading normals are hidden inside of the BSDF, where `ptracer`'s correction does not see them.
+#: The shading normals are hidden inside these BSDFs, where `ptracer`'s correction does not see them.
 HIDDEN_NORMALS = {
     "bumpmap": lambda: {"type": "bumpmap", "arbitrary": bitmap(8, 8, channels=1), "scale": 0.15, "bsdf": WHITE},
     "bumpmap of glass": lambda: {"type": "bumpmap", "arbitrary": bitmap(8, 8, channels=1), "scale": 0.05,
@@ -90,8 +90,8 @@ HIDDEN_NORMALS = {
     "masked normalmap": lambda: {"type": "mask", "opacity": 0.7,
                                  "bsdf": {"type": "normalmap", "normalmap": normals(), "bsdf": WHITE}},
 }  # fmt: skip
-#: As these, with delta lobes; what the floor receives of them is judged. Without the shadowing function, which a delta
-#: lobe evaluates in the wrong one of its two directions.
+#: Hidden normals with delta lobes, judged by the light on the floor. The shadowing function is off, because a delta
+#: lobe evaluates it in the wrong one of its two directions.
 HIDDEN_SMOOTH = {
     "normalmap of conductor": lambda: {
         "type": "normalmap",
@@ -112,7 +112,7 @@ HIDDEN_SMOOTH = {
         "use_shadowing_function": False,
     },
 }  # fmt: skip
-#: Lobes that no light path connects to the sensor from: seen directly they lack what they mirror, as with `ptracer`.
+#: No light path can connect these lobes to the sensor. Seen directly they lack what they mirror, as with `ptracer`.
 SMOOTH = {
     "conductor": lambda: {"type": "conductor", "material": "Au"},
     "dielectric": lambda: {"type": "dielectric"},
@@ -124,9 +124,9 @@ SMOOTH = {
     "twosided conductor": lambda: {"type": "twosided", "bsdf": {"type": "conductor"}},
 }
 SEEN = ROUGH | SEE_THROUGH | HIDDEN_NORMALS
-#: A ball refracts light in and out again, which hides what is wrong with one of them; opaque sheets show nothing new.
+#: A ball refracts light in and out again, which can hide a fault of one of the two. Opaque sheets show nothing new.
 SHEETS = ("roughdielectric", "principledthin", "mask of glass")
-#: Of what throws light on the floor, one of each kind of lobe, and of normal maps.
+#: The default suite takes one BSDF of each kind of lobe, and one normal map, of those that throw light on the floor.
 THROWN = ("conductor", "dielectric", "plastic", "normalmap of dielectric")
 
 
@@ -139,7 +139,7 @@ def scene_with(bsdf, holder: str, sensor=None):
     return stage({"lamp": lamp(side=1.5, radiance=rgb(2, 3, 4))}, sensor, ball=thing)
 
 
-#: Of balls, by default: others have `ptracer` as their reference, or what they are made of is here.
+#: The balls of the default suite. The other BSDFs have `ptracer` as their reference, or their parts are listed here.
 BALLS = ("roughdielectric", "blend", "mask", "null", "bumpmap", "normalmap")
 
 
@@ -174,7 +174,7 @@ def test_equals_ptracer_at_equal_seeds(name):
 
 @pytest.mark.usefixtures("samples")
 def test_thin_glass_between_sensor_and_stage():
-    # It reflects nothing but the void behind the camera, so that light paths see all that `path` sees.
+    # The pane reflects only the void behind the camera, so that light paths see all that `path` sees.
     pane = rectangle({"type": "thindielectric"}, transform().translate([0.2, 1.1, 2]) @ transform().scale(0.4))
     result = agreement(stage({"lamp": lamp(side=1.5, radiance=rgb(2, 3, 4))}, pane=pane))
     assert result, result
@@ -232,10 +232,10 @@ EMITTERS = {
                                "to_world": transform().rotate([1, 0, 0], -90)},
 }  # fmt: skip
 ENVIRONMENTS = [name for name in EMITTERS if name.startswith(("constant", "envmap", "sunsky"))]
-#: Stock light tracing places the disk of an environment map wrongly, and does not connect through masks.
+#: Stock light tracing misplaces the disk of an environment map, and does not connect through masks.
 NOT_PTRACER = [name for name in EMITTERS if name.startswith("envmap") or "mask" in name]
 
-#: Those that by default `ptracer` alone is a reference of: like one of the others they are there for.
+#: Emitters with `ptracer` as their only reference in the default suite. Each resembles an emitter that `path` checks.
 BY_PTRACER = ("area", "textured area", "spot", "textured spot", "directional", "sunsky")
 
 
@@ -252,7 +252,7 @@ def test_emitter_against_path(name):
     [pytest.param(n, marks=() if n in ("constant", "envmap, two axes") else pytest.mark.long) for n in ENVIRONMENTS],
 )
 def test_hidden_environment_against_path(name):
-    # Hidden area lights are not compared: `path` looks through them, light paths are stopped by them.
+    # Hidden area lights are not compared: `path` looks through them, but they stop light paths.
     result = agreement(stage({"emitter": EMITTERS[name]()}), hide_emitters=True)
     assert result, result
 
@@ -265,7 +265,7 @@ def test_emitter_against_ptracer_at_equal_seeds(name):
 
 @pytest.mark.usefixtures("samples")
 def test_directionalarea():
-    # `path` cannot see it.
+    # `path` cannot find the light of this emitter.
     scene = stage({"lamp": lamp(type="directionalarea")})
     result = agreement(scene, "ptracer")
     assert result, result
@@ -307,7 +307,7 @@ def test_emitters_with_sampling_weights():
 
 @pytest.mark.usefixtures("samples")
 def test_an_environment_behind_a_floor_only():
-    # The camera stands outside of the scene's bounding sphere, far from what it sees.
+    # The camera stands outside the scene's bounding sphere, far from the objects that it sees.
     floor = rectangle(WHITE, transform().rotate([1, 0, 0], -90) @ transform().scale(0.3))
     sensor = camera(to_world=transform().look_at(origin=[0, 3, 4], target=[0, 0, 0], up=[0, 1, 0]), fov=10)
     result = agreement(stage({"sky": sky(two_axes())}, sensor, ball=None, wall=None, floor=floor))
@@ -317,7 +317,7 @@ def test_an_environment_behind_a_floor_only():
 # Image, for the scenes in `scenes/` and a real room: `reslrb` against `path`, `ptracer` and the analytic answer.
 
 ROOT = Path(__file__).resolve().parents[2]
-#: What judges each scene, and how many samples a pixel it takes. `path` cannot see a caustic of parallel light.
+#: The reference for each scene, and the number of samples per pixel. `path` cannot find a caustic of parallel light.
 SCENES = {"cornell_floor": ("path", 256), "grey_room": ("path", 256), "caustic_slab": ("ptracer", 256),
           "furnace": ("path", 256)}  # fmt: skip
 
@@ -327,20 +327,21 @@ def shipped(name: str):
 
 
 @pytest.mark.usefixtures("samples")
-@pytest.mark.parametrize("name", a_few(SCENES, ["grey_room"]))  # the others by `ptracer` and the analytic answer, below
+@pytest.mark.parametrize("name", a_few(SCENES, ["grey_room"]))  # `ptracer` and the analytic answer check others
 def test_shipped_scene(name):
     reference, spp = SCENES[name]
     result = agreement(shipped(name), reference, spp=spp, max_depth=8, rr_depth=5)
     assert result, result
 
 
-@pytest.mark.parametrize("name", [name for name in SCENES if name != "grey_room"])  # a turned sky
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "grey_room"])  # its sky is rotated
 def test_shipped_scene_equals_ptracer_at_equal_seeds(name):
     assert difference_from_ptracer(shipped(name), max_depth=8) < SAME
 
 
 @pytest.mark.long
-# Not the furnace: `path` gathers 0.2 % too much from a sphere that it samples from inside; see the analytic answer.
+# The furnace is left out: `path` gathers 0.2 % too much from a sphere that it samples from inside (see the analytic
+# answer).
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "furnace"])
 def test_shipped_scene_with_many_samples(name):
     reference, spp = SCENES[name]

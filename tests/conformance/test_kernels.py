@@ -17,7 +17,7 @@ from reslrb_cli.scene.load import load_scene
 pytestmark = pytest.mark.usefixtures("llvm")
 ROOT = Path(__file__).resolve().parents[2]
 
-#: The shipped scenes and what is optimised in them.
+#: The shipped scenes and their optimized parameters.
 SHIPPED = {
     "cornell_floor": ("floor.reflectance.data",),
     "grey_room": ("painting.reflectance.data", "sky.data"),
@@ -64,11 +64,11 @@ def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
         assert not found, f"step {seed} compiled kernels of {[k['operation_count'] for k in found]} operations"
 
 
-#: The cases that are run with independent samples too, unless `-m long` asks for all.
+#: The cases that also run with independent samples. With `-m long`, all cases do.
 INDEPENDENT = ("texture", "passes", "glass", "mask", "area_texture", "envmap", "visible_lamp")
-#: Of these, by default.
+#: The cases that the default suite runs of these.
 FEW = ("texture", "passes", "glass", "mask", "envmap")
-#: Of the others, those that the default suite runs: each has objects of a kind that the rest does not have.
+#: The other cases that the default suite runs. Each has objects of a kind that the remaining cases do not have.
 CORRELATED = ("thin_lens", "principled", "two_emitters")
 
 

@@ -31,7 +31,7 @@ def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **
     import mitsuba as mi
 
     backend = dr.backend_v(mi.Float)
-    # rr_depth beyond any depth: no roulette
+    # rr_depth exceeds every depth, so that there is no roulette
     tracer = integrator(name, max_depth, 1000, **({"estimator": estimator} if estimator else {}))
     case.gradient(tracer, 1, SPP, **step)
     gc.collect()
@@ -62,8 +62,8 @@ def test_reservoir_is_flat(case: Case):
 def test_nothing_is_kept_of_paths_with_a_known_adjoint(case: Case, estimator: str, depths: tuple[int, ...]):
     peaks = {depth: peak(case, "reslrb", depth, estimator, adjoint="independent") for depth in depths}
     print(estimator, peaks)
-    assert max(peaks.values()) < SPP * case.weights.shape[0] * case.weights.shape[1]  # a byte a path
-    # What does not fit on the stack is traced again, and its gradient is another copy of the texture's.
+    assert max(peaks.values()) < SPP * case.weights.shape[0] * case.weights.shape[1]  # one byte per path
+    # Vertices that do not fit on the stack are traced again, which needs another copy of the texture's gradient.
     for depths in ((2, 40), (80, 160)) if estimator == "stack" else (tuple(peaks),):
         assert max(peaks[depth] for depth in depths) <= 1.02 * min(peaks[depth] for depth in depths), peaks
 

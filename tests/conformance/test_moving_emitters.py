@@ -29,9 +29,9 @@ from reslrb_cli.records.measurements import Verdict
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Emitters that move: derivatives by where they are, against finite differences with common random numbers.
+# Emitters that move: derivatives by their position, against finite differences with common random numbers.
 
-#: What derivatives may differ by from finite differences, relative to the root mean square of those of a case.
+#: Allowed difference from finite differences, relative to the root mean square of the derivatives of a case.
 CLOSE = 0.005
 FAMILY = Family(len(CASES), 5 * len(CASES))
 
@@ -123,7 +123,7 @@ def test_what_leaves_the_scene_stays_lit(sky: str, name: str):
     params.update()
     moved, fresh = image(scene, name).sum(), image(load(tiles(4, SKIES[sky])), name).sum()
     assert moved == pytest.approx(fresh, rel=0.03)
-    assert before.sum() < 0.9 * moved  # else nothing left the scene: the squares overlapped
+    assert before.sum() < 0.9 * moved  # otherwise nothing moved out: the squares overlapped
 
 
 def test_a_horizon_is_renewed_only_if_needed():
@@ -260,7 +260,7 @@ FAULTS = {
                       "Emission(dr.detach(ray), weight, emitter)"),
 }  # fmt: skip
 QUICK = "area_of_faces_detached"
-#: What finds a fault that differences have as well.
+#: Tests for faults that finite differences share.
 FOUND_BY = {"turned": test_a_flipped_sphere_emits_outward}
 
 
@@ -288,9 +288,9 @@ def test_faces_of_a_mesh_match_those_that_mitsuba_samples():
                   ).max() < 1e-5  # fmt: skip
 
 
-# Light that moves at the film's border is measured and warned of.
+# Light that moves at the film's border is measured, and a warning is given.
 
-RADIUS = 2.0  # of Mitsuba's gaussian filter, pixels
+RADIUS = 2.0  # radius of Mitsuba's gaussian filter, pixels
 
 
 def moving(scale: float, film: dict[str, Any] | None = None, **things: Any) -> Moving:

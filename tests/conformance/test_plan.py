@@ -23,14 +23,14 @@ from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, texture,
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# What a scene does not need is left out: the kernels shrink, and no result changes.
-#
-# Each omission is undone by force, and the same step, of the same random numbers, is traced with and without it.
+# Code that a scene does not need is left out: the kernels shrink, and no result changes.  Each omission is undone by
+# force. The same step, with the same random numbers, is traced with and without it.
 
 ESTIMATORS = ("reservoir", "gather", "event", "stack")
-#: Those whose draws follow from few features; `event` draws among what can be differentiated.
+#: Estimators whose draws depend on few features. `event` draws among everything that can be differentiated.
 STEADY = ("reservoir", "gather", "stack")
-#: What makes `reservoir` draw among other connections. That both are right is for test_gradients.py.
+#: Features that make `reservoir` draw among other connections. test_gradients.py checks that both kinds of draws are
+#: right.
 CANDIDATES = ("differentiate_null",)
 WALL = "wall.brdf_0.reflectance.value"
 RADIANCE = "lamp.emitter.radiance.value"
@@ -100,8 +100,8 @@ def differs(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(a - b).max() / np.abs(b).max())
 
 
-#: Feature (a member of the plan or of its needs), scene that does not need it, parameters, the estimators whose kernels
-#: shrink.
+#: Each row: the feature (a member of the plan or of its needs), a scene that does not need it, the parameters, and the
+#: estimators whose kernels shrink.
 OMISSIONS = [
     ("has_visible_emitters", in_the_dark, (FLOOR,), STEADY),
     ("has_shading_normals", plain, (FLOOR,), STEADY),
@@ -111,18 +111,18 @@ OMISSIONS = [
     ("principal_point", plain, (FLOOR,), STEADY),
     ("near_clip", plain, (FLOOR,), STEADY),
     ("lens_clip", through_a_lens, (FLOOR,), STEADY),
-    # Without the lamp, which is black: connections from there would be drawn, too.
+    # The scene must not hold the lamp, whose surface is black: connections from there would be drawn, too.
     ("track_zeros", in_the_dark, (FLOOR,), STEADY),
     ("bsdfs_read_geometry", plain, (FLOOR,), ("stack",)),
     ("differentiate_delta", with_glass, (FLOOR,), STEADY),
-    # `gather` then remembers the last vertex with anything to differentiate, in as many operations.
+    # With the feature, `gather` remembers the last vertex with a differentiated parameter, in as many operations.
     ("differentiate_null", with_veil, (FLOOR,), ("reservoir", "stack")),
-    # Dr.Jit drops these by itself, since nothing reads what they compute.
+    # Dr.Jit drops these features by itself, since nothing reads their results.
     ("has_delta_lobes", plain, (FLOOR,), ()),
     ("thin_lens", plain, (FLOOR,), ()),
 ]
 
-#: Of each row, by default, one estimator: the next of those whose kernels are to shrink.
+#: The default suite runs one estimator per row: the next one of those whose kernels shrink.
 QUICK = [(shrinks or STEADY)[number % len(shrinks or STEADY)] for number, (*_, shrinks) in enumerate(OMISSIONS)]
 
 
@@ -143,7 +143,7 @@ def test_an_omission_changes_nothing_and_shrinks_the_kernel(feature, make, keys,
     assert operations < forced if estimator in shrinks else operations <= forced
 
 
-#: What is asked for, and what beside it.
+#: The requested parameters, and the parameters that are added to them.
 ASKED = {
     "emitters only": ((RADIANCE,), (FLOOR,)),
     "BSDFs only": ((FLOOR,), (RADIANCE,)),
@@ -169,7 +169,7 @@ def test_only_requested_parameters_are_differentiated(asked: str, estimator: str
         results.append((kernels, image, gradient[: case.initial[keys[0]].size]))
     (kernels, image, gradient), (all_kernels, all_image, all_gradient) = results
     assert differs(image, all_image) < 1e-6
-    if estimator in ("gather", "stack"):  # what the others draw depends on what can be differentiated
+    if estimator in ("gather", "stack"):  # draws of the others depend on what can be differentiated
         assert differs(gradient, all_gradient) < 1e-6
     assert sum(kernels) < sum(all_kernels)
 
@@ -211,9 +211,8 @@ def test_a_step_makes_one_plan(monkeypatch: pytest.MonkeyPatch) -> None:
         asked.clear()
 
 
-# What comes after the last vertex with anything to differentiate, or has no such vertex, costs nothing.
-#
-# That results stay right is for test_gradients.py, whose cases differentiate one surface of several.
+# Code for what follows the last vertex with a differentiated parameter costs nothing. So does code for paths without
+# such a vertex.  test_gradients.py checks that results stay right: its cases differentiate one surface of several.
 
 FLOOR_ALONE = ("floor.brdf_0.reflectance.value",)
 ALL = (*FLOOR_ALONE, *(f"{name}.reflectance.value" for name in ("wall.brdf_0", "side.brdf_0", "cave.bsdf")))
@@ -268,7 +267,7 @@ def test_connections_without_differentiable_vertices_are_no_candidates(
         return case.gradients(integrator("reslrb", MAX_DEPTH, **options), seeds(24), SPP, adjoint="correlated")
 
     exact = gradients(estimator="gather")
-    # What selection adds to the variance.
+    # The variance that selection adds.
     ours = np.square(gradients(estimator="reservoir") - exact).sum()
     monkeypatch.setattr(reservoir.ReservoirSelection, "concerned", lambda *_: mi.Bool(True))
     of_all = np.square(gradients(estimator="reservoir") - exact).sum()
@@ -291,7 +290,7 @@ def test_without_an_image_other_vertices_are_not_connected(scene: dict, monkeypa
     assert 0 < shares[0] < 0.7 * shares[1]
 
 
-# Steps in which no light path meets anything: their gradient is zero, and nothing fails.
+# Steps in which no light path meets anything: the gradient is zero, and nothing fails.
 
 
 def lit_from_behind() -> mi.Scene:

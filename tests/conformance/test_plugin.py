@@ -139,7 +139,7 @@ def test_defaults_match_ptracer():
         {"max_dpth": 3},
         {"max_depth": "deep"},
         {"capacity": 0},
-        {"capacity": 1025},  # of each its own code in the kernel
+        {"capacity": 1025},  # every capacity has its own kernel code
     ],
     ids=str,
 )
@@ -390,8 +390,8 @@ def test_rr_depth_ends_paths(case: Case):
 def test_samples_per_pass(case: Case):
     whole, parts = integrator("reslrb"), integrator("reslrb", samples_per_pass=16)
     one, several = (np.array(render_image(tracer, case.scene, 0, 1, 64)) for tracer in (whole, parts))
-    assert relative(one, several) > 1e-3  # other samples,
-    assert one.mean() == pytest.approx(several.mean(), rel=0.05)  # as many of them
+    assert relative(one, several) > 1e-3  # the samples differ
+    assert one.mean() == pytest.approx(several.mean(), rel=0.05)  # in the same number
     only = np.array(render_image(integrator("reslrb", samples_per_pass=64), case.scene, 0, 1, 64))
     assert relative(one, only) < 1e-5
 

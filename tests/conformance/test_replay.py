@@ -24,10 +24,10 @@ from reslrb_cli.transport.walk import Hooks
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# A replay stands where the image pass stood: the same vertices, the same factors, up to the kept connection.
+# A replay follows the image pass up to the kept connection, with the same vertices and the same factors.
 
 BY_NAME = {case.name: case for case in CASES}
-#: Every way in which random numbers are drawn: delta lobes, masks, an aperture, several emitters, roulette.
+#: Cases for every way of drawing random numbers: delta lobes, masks, an aperture, several emitters, roulette.
 NAMES = ("texture", "roulette", "thin_lens", "plastic", "blend", "glass", "mirror", "bumpmap", "mask",
          "mask_texture_in_view", "area_texture", "envmap", "two_emitters", "visible_lamp")  # fmt: skip
 
@@ -146,7 +146,7 @@ def test_without_light_there_is_no_replay():
     assert not case.gradient(integrator("reslrb"), 1, 16).any()
 
 
-# Derivatives of a loss that are not finite: every step takes them for 0, and counts them.
+# Derivatives of a loss that are not finite: every step counts them, and replaces them by 0.
 
 PIXELS = ((5, 9), (8, 8), (11, 3))  # row, column
 INTEGRATORS = {
@@ -166,7 +166,7 @@ ADJOINTS = {
     "independent": {"adjoint": "independent"},
     "batched": {"adjoint": "batched", "batches": 2},
 }
-#: Each integrator once, each choice of samples for several.
+#: Each integrator appears once, and each choice of samples with several integrators.
 REFUSED = [(name, "independent") for name in INTEGRATORS]
 REFUSED += [(name, "correlated") for name in ("stack", "gather", "walk_ad", "ptracer", "prb")]
 REFUSED += [(name, adjoint) for name in ("stack", "ptracer") for adjoint in ("batched",)]

@@ -26,13 +26,13 @@ from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Numbers of low discrepancy: evenly spread, and unbiased in every way of a step; what could bias is planted.
+# Low-discrepancy numbers: evenly spread, and unbiased in every kind of step. Faults that could cause bias are planted.
 
 BY_NAME = {case.name: case for case in CASES}
 MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASES)}
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "area_texture", "glass", "mask", "point", "plastic")
 ON: dict[str, Any] = {"sequence": "low_discrepancy"}
-#: So few that a point that is not evenly distributed by itself shows.
+#: Few lanes, so that the test detects a single point that is not evenly distributed by itself.
 LANES = 5
 
 
@@ -146,7 +146,7 @@ def evenly(guiding: str) -> Any:
             few = replace(part, width=LANES, net=Net.of(LANES))
             choice, place, direction = few.emission_numbers(few.sampler())
             early = [number for own in few.early_numbers() for number in (own.bsdf_2d.x, own.bsdf_2d.y, own.bsdf_1d)]
-            # In both passes a lane has its first number in the same stratum.
+            # The first number of a lane lies in the same stratum in both passes, so it is counted once.
             first = [choice] if guiding == "off" and not numbers else []
             numbers += [*first, direction.x, direction.y, place.x, place.y, *early]
         dr.eval(numbers)
@@ -220,7 +220,7 @@ def test_the_plugin_has_the_option() -> None:
         mi.load_dict({"type": "reslrb", "sequence": "halton"})
 
 
-# Points of low discrepancy: Sobol's, and as evenly spread when they are scrambled.
+# Low-discrepancy points: Sobol's, which are as evenly spread after scrambling.
 
 COORDINATES = 10
 

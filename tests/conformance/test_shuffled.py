@@ -44,7 +44,7 @@ def rippling() -> mi.Mesh:
     return sheet("sheet", diffuse(0.5, 0.4, 0.3), -0.6, 4, 1.0, 0.3)
 
 
-#: Each scene with its sets of parameters. A sheet that is flat, and has interpolated normals, may bend.
+#: Each scene with its sets of parameters. A flat sheet with interpolated normals may bend.
 SCENES: dict[str, tuple[Callable[[], dict[str, Any]], list[tuple[str, ...]]]] = {
     "mirror": (lambda: _textured(pane=_pane(MIRROR, **_IN_VIEW), sheet=rippling(), camera=camera("gaussian")),
                [(FLOOR,), (WALL, LAMP), (SHEET,)]),
@@ -67,7 +67,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "reservoir": {"estimator": "reservoir", "sequence": "low_discrepancy"},
     "guided both": {"estimator": "gather", "paths": "both", "guiding": "on"},
 }
-#: What is asked of a tracer: a scene, and the number of a set of parameters; None: an image.
+#: A request to a tracer: a scene, and the number of a set of parameters. None as the number requests an image.
 Visit = tuple[str, int | None]
 
 

@@ -63,7 +63,7 @@ CASES = {
     "third": ExtremeCase("third", "", lambda: third().scene(), (KEY,), Exact(third), "ptracer",
                          options={"max_depth": 1}),
     "two": ExtremeCase("two", "", two, SPECKS, Stock("ptracer"), "ptracer"),
-    # No stock image: `ptracer` loses light where a mask is seen, `path` hardly finds the specks.
+    # There is no stock image: `ptracer` loses light where a mask is seen, and `path` hardly ever finds the specks.
     "veiled": ExtremeCase("veiled", "", veiled, SPECKS, Stock("ptracer"), ""),
     "lens": ExtremeCase("lens", "", through_a_lens, SPECKS, Stock("ptracer"), "ptracer", spp=256),
 }  # fmt: skip
@@ -204,7 +204,7 @@ FAULTS = [
           frozenset({("stack", "ptracer")})),
 ]  # fmt: skip
 
-#: Of the default suite.
+#: The faults that the default suite plants.
 QUICK = ("left_out", "primary_rays_find_them_too")
 
 

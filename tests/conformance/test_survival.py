@@ -24,10 +24,11 @@ from reslrb_cli.transport.roulette import BITS, CELLS, LEAST, SHAPE, Survival
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Roulette by what paths can still say: means stay, whatever the table, and replays follow the same paths.
+# Roulette by the expected later contributions of a path: means are unchanged with every table, and replays follow the
+# same paths.
 
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "glass", "mask", "mask_texture_in_view")
-BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat
+BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat in z
 
 
 def harsh(scene: Case, ours: Any, factor: float = 1.0) -> Any:
@@ -97,7 +98,7 @@ def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -
     assert not means_hold("two_emitters", 32)
 
 
-#: A lamp stands before the slab that moves; a texture and a shell lie behind it.
+#: The parameter of the lamp lies before the moving slab. The parameters of the texture and the shell lie behind it.
 BOUNCES = next(case for case in MOVING if case.name == "bounces")
 
 
@@ -211,7 +212,7 @@ def test_a_recorded_step_equals_the_step() -> None:
     assert frozen.preparation.recordings.counts()["fused"] > 0
 
 
-# What is learned of where paths go on to, and what they end by: against sums in NumPy.
+# What roulette learns about the later vertices and contributions of paths: compared with sums in NumPy.
 
 
 def test_cells_are_indexed_by_position_and_octant() -> None:
@@ -227,7 +228,7 @@ def test_cells_are_indexed_by_position_and_octant() -> None:
     cube = np.clip(np.floor((o.T[3:] - BOX[0]) / size * 2**BITS), 0, 2**BITS - 1).astype(int)
     octant = (d.T[3:] > 0) @ np.array([4, 2, 1])
     expected = np.ravel_multi_index((*cube.T, octant), (2**BITS, 2**BITS, 2**BITS, 8))
-    assert (cell[3:] != expected).mean() < 0.01  # on a border, by rounding
+    assert (cell[3:] != expected).mean() < 0.01  # rounding at the borders of cells
     assert len(np.unique(cell)) > 500
 
 
@@ -269,11 +270,11 @@ def test_cells_share_with_their_neighbours_and_none_is_zero() -> None:
     onward = Onward.nothing(BOX).with_more(walked(squares=squares, followed=2.0 * left, left=left))
     for share, square in ((1.0, 0.25), (0.0, 0.5), (0.5, 0.375)):
         s = onward.chances(share)
-        # (squares in units of light squared over what was said) / (what follows, and what a ray costs)
+        # (squared contributions relative to whole paths, times light squared) / (later vertices plus the cost of a ray)
         assert s[loud] == pytest.approx(SURE * np.sqrt(square * 4 / 2.2 * 3) / 2, rel=2e-3)
         assert s[quiet] == pytest.approx(SURE * np.sqrt(FLOOR * square / 2 * 4 / 2.2 * 3) / 2, rel=2e-3)
         assert (s >= s[quiet] * (1 - 1e-6)).all()
-        assert s[near] == pytest.approx(s[loud], rel=1e-3)  # in the same larger cube
+        assert s[near] == pytest.approx(s[loud], rel=1e-3)  # in the same larger cube as loud
         assert s[far] == pytest.approx(s[loud] / np.sqrt(2), rel=1e-3)  # near neither
     assert 1e6 > 1e3 * LEAN
 
@@ -384,7 +385,7 @@ def test_later_contributions_are_collected_at_the_ray_of_the_bounce() -> None:
     certain(scene, ours)
     found = walk_of(scene, ours, 5)
     job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(5), SPP, scene.params)
-    leaves = scene.leaves()  # what is differentiated has a part in how lamps are drawn
+    leaves = scene.leaves()  # differentiated parameters affect how lamps are drawn
     [samples] = ours.passes(job, Purpose.BOTH)
     scene.release(leaves)
     hooks = Keeping(samples.width)

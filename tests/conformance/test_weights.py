@@ -17,7 +17,7 @@ from turns import a_few
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Scenes: a room of 4 by 4 by 4 that is open in front and above, seen from there.
+# Scenes: a room of 4 by 4 by 4 that is open at the front and the top, where the camera looks in.
 
 
 def place(*translate: float, scale: Any = 1, rotate: Any = None) -> Any:
@@ -56,7 +56,7 @@ def bitmap(height: int, width: int, channels: int = 3) -> Any:
 
 WHITE = {"type": "diffuse", "reflectance": rgb(0.8, 0.7, 0.6)}
 MIRROR, GLASS, ROUGH_GLASS = {"type": "conductor"}, {"type": "dielectric"}, {"type": "roughdielectric", "alpha": 0.3}
-#: Half of its events are delta.
+#: Half of the scattering events are delta events.
 HALF = {"type": "blendbsdf", "weight": 0.5, "a": WHITE, "b": MIRROR}
 VEIL = {"type": "mask", "opacity": 0.4, "bsdf": WHITE}
 PLASTIC = {"type": "plastic", "int_ior": 3.0, "diffuse_reflectance": rgb(0.8, 0.8, 0.8)}
@@ -121,7 +121,7 @@ def lamp(emitter: Any = None) -> dict[str, Any]:
     return plate(WHITE, 0.4, 3.9, 0.2, rotate=([1, 0, 0], 90), scale=[0.5, 0.4, 1]) | {"emitter": emitter or glow()}
 
 
-CUTOFF, FOV = 50.0, 70.0  # of the spot and the projector, in degrees
+CUTOFF, FOV = 50.0, 70.0  # angles of the spot and the projector, in degrees
 MESH = (-0.8, 3.4, 0.6)
 EMITTERS: dict[str, Callable[[], Any]] = {
     "rectangle": lamp,
@@ -184,22 +184,22 @@ class Case:
 
 
 CASES = {
-    # Lights that have a place, sampled unequally.
+    # Emitters with a position, which are sampled with unequal weights.
     "lamps": Case(lambda: room(
         lights("rectangle", "disk", "sphere", "mesh", "point", "spot", "projector", "directional", disk=3, point=0.5),
         ball=ball(GLASS), other=ball(MIRROR, (-0.9, 0.7, 0.5)))),
-    # Every pattern of delta vertices.
+    # All patterns of delta and other vertices.
     "patterns": Case(lambda: room(
         lights("rectangle", "constant", constant=2), walls=HALF, right=plate(HALF, 2, 2, 0, rotate=([0, 1, 0], -90)),
         above=plate(HALF, 0, 4.2, 0, rotate=([1, 0, 0], 90)), ball=ball(PLASTIC), other=ball(GLASS, (-0.8, 0.8, 0))),
         spp=192),
-    # Textures and maps that are differentiated, and so drawn more evenly.
+    # Textures and maps that are differentiated, and are therefore drawn more evenly.
     "evened": Case(lambda: room(
         lights("textured", "textured_mesh", "envmap", textured=2), sensor=SHIFTED, walls=HALF), EVENED),
     "textured": Case(lambda: room(
         lights("textured", "textured_mesh", "constant"), film=CROPPED, sensor={"near_clip": 2.0},
         close=plate(WHITE, 0.4, 2.1, 6, scale=0.1)), light_share=0.2),
-    # Also a hidden lamp before the camera.
+    # A hidden lamp stands before the camera, too.
     "masks": Case(lambda: room(
         lights("sphere", "directionalarea", sphere=3), sensor=SHIFTED, film=CROPPED,
         shade=ball(VEIL, (1.3, 3, -1), 0.7),
@@ -320,7 +320,7 @@ def as_it_stands(name: str) -> dict[str, Comparison]:
 
 
 POINTS = ("PointLight", "SpotLight", "Projector", "DirectionalEmitter")
-#: A few emitters alone, of which the plan is another, are for the default suite.
+#: The default suite also runs a few single emitters, because their plans differ.
 ALONE = ("only_point", "only_directional", "only_constant", "only_inside")
 
 
@@ -375,9 +375,9 @@ def test_the_density_of_rays_matches_the_sampled_ones(name: str):
     np.testing.assert_allclose((own * cos)[fit], e, rtol=TOLERANCE)
 
 
-# Faults: each is found, by the ways that have it.
+# Faults: each one is found, and only by the ways that contain it.
 
-#: Where, the line as it is and as it is broken, the ways whose weights are wrong then.
+#: Each fault: its place, the right line, the broken line, and the ways whose weights it makes wrong.
 FAULTS = {
     "light_without_reverse": ("transport.weights:weight_of_connection", "arrived.V * back", "arrived.V", "L"),
     "met_without_reverse": ("transport.camera:_behind", "here.V * ways.back", "here.V", "HN"),
@@ -404,7 +404,7 @@ FAULTS = {
                                     "2 * width / (n_camera / crop)", "HNL"),
     "crop_forgotten": ("transport.samples:_of_both", "width / (n_camera / crop)", "width / (n_camera / pixels)", "HNL"),
 }  # fmt: skip
-#: Cases that show them.
+#: Cases that show the faults, other than the default case.
 SHOWN = {
     "sides_forgotten": "smooth",
     "crop_forgotten": "cropped",
@@ -428,7 +428,7 @@ def test_a_fault_is_found(name: str, monkeypatch: pytest.MonkeyPatch):
     assert {way for way, one in result.items() if not one.holds} == set(ways)
 
 
-# A fault of the walk back, which weights know nothing of: at equal seeds naive AD finds it.
+# Faults of the walk back, which the weights do not show. Naive AD finds them at equal seeds.
 
 WALKS_BACK = {
     "walk_back_forgets_what_is_met": ("CameraSweep.vertex", "if met is not None:", "if False:", 16),

@@ -24,12 +24,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 VALUES = Path(__file__).with_name("values.json")
 SCHEMA = ROOT / "docs" / "config.schema.json"
-#: As little as still goes through all that a run does: gradients by a descent that hides none of their bits.
+#: The smallest settings that still exercise every part of a run. Plain gradient descent hides no bit of the gradients.
 SMALL = (
     "run.iterations=3", "run.spp=8", "run.final_spp=8", "run.certainty=false",
     "target.render.spp=8", "loss={type: l2}", "optimizer={type: sgd, learning_rate: 10}",
 )  # fmt: skip
-#: Configuration, seed, and settings of each run, by name.
+#: Configuration, seed, and settings of each run, by name of the run.
 RUNS: dict[str, tuple[str, int, tuple[str, ...]]] = {}
 
 
@@ -68,12 +68,12 @@ _run("plate_stack", "stiff/plate", _ours("stack", "batched", "on"))
 _run("wall_gather", "stiff/wall", _ours("gather", "correlated"))
 for _type in ("ptracer", "prb", "walk_ad", "trajectory"):
     _run(f"floor_{_type}", "cornell_floor", f"integrator={{type: {_type}, max_depth: 4}}|run.adjoint=independent")
-#: Commands whose help is compared.
+#: Commands whose help texts are compared.
 COMMANDS = (
     *("", "inspect", "init", "lens", "optimize", "sweep", "example", "render", "export", "gradcheck", "bench"),
     *("convergence", "report", "doctor"),
 )
-#: Tiny measurements, of whose JSON lines the form is compared: names and types, at all depths.
+#: Tiny measurements. The structure of their JSON lines is compared: names and types at all depths.
 _TINY = ("--set", "scene.options.size=8", "--set", "run.spp=4")
 _FLOOR = (
     "configs/cornell_floor.yaml",
@@ -113,7 +113,7 @@ def machine() -> str:
     import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Dr.Jit
 
     words, about = reslrb("doctor").stdout, Path("/proc/cpuinfo").read_text()
-    # Names such as "AMD EPYC" are those of several generations, which compute other bits.
+    # A name such as "AMD EPYC" covers several generations, which compute different bits.
     found = [re.search(rf"^{name}\s*:\s*(.+)$", about, re.MULTILINE) for name in ("model name", "cpu family", "model")]
     name, family, model = (each[1] if each else "unknown" for each in found)
     version = re.search(r"libLLVM[^\n]*?(\d+\.\d+\.\d+)", words)
@@ -151,7 +151,7 @@ def values_of(name: str, other_seed: bool = False) -> dict[str, Any]:
             *own,
             f"run.output={folder}",
         ]
-        if config == "stiff/lamp":  # its target has an integrator of its own
+        if config == "stiff/lamp":  # its target has its own integrator
             words.append("target.render={spp: 8}")
         sets = [part for word in words for part in ("--set", word)]
         words, recorded = ["--quiet", *sets, "--set", "run.name=run"], name != "floor_not_frozen"
@@ -192,7 +192,7 @@ def form_of(name: str) -> list[str]:
         words = [] if name == "inspect" else ["--json", str(file)]
         done = reslrb(*MEASUREMENTS[name], *words)
         text = done.stdout if name == "inspect" else file.read_text() if file.exists() else done.stderr
-        whole = name == "inspect"  # one object over several lines
+        whole = name == "inspect"  # one object on several lines
         lines = (
             [json.loads(text)] if whole else [json.loads(line) for line in text.splitlines() if line.startswith("{")]
         )

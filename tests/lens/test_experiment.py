@@ -80,7 +80,7 @@ def test_a_black_and_white_picture_becomes_a_lens(
     shape: str, side: int, mode: str, pixels: int, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     values = drawn(shape, side)
-    if mode in ("ink", "light"):  # opaque black, or opaque white, on what is transparent
+    if mode in ("ink", "light"):  # opaque black or opaque white on a transparent ground
         alpha, colour = (255 - values, 0) if mode == "ink" else (values, 255)
         image = Image.fromarray(np.stack([np.full_like(values, colour), alpha], axis=-1))
     else:
@@ -89,7 +89,7 @@ def test_a_black_and_white_picture_becomes_a_lens(
     image.save(tmp_path / "p.png")
     light = read_luminance(tmp_path / "p.png")
     assert light == pytest.approx(values / 255, abs=1e-6)
-    monkeypatch.setattr(transport, "STEPS", 0)  # the face itself is tested below
+    monkeypatch.setattr(transport, "STEPS", 0)  # tests below check the face itself
     monkeypatch.setattr(transport, "GOOD", np.inf)
     done("lens", tmp_path / "p.png", "-o", tmp_path / "lens", "--pixels", pixels, "--floor", 0.3)
     seen = read_image(tmp_path / "lens" / "picture.exr")[:, :, 0]
@@ -124,7 +124,7 @@ def test_the_start_casts_the_picture_upright_with_the_right_brightness(kind: str
     likeness = [np.corrcoef(seen.ravel(), turned.ravel())[0, 1] for turned in turns]
     assert likeness[0] > 0.85
     assert max(likeness[1:]) < 0.7
-    assert image.sum() == pytest.approx(target.sum(), rel=0.03)  # no brightness by hand
+    assert image.sum() == pytest.approx(target.sum(), rel=0.03)  # brightness matches by itself
     assert load_configured(load(folder / "lens.yaml")) is not None
 
 
@@ -172,7 +172,7 @@ def test_invalid_input_is_refused_in_one_line_without_output(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options, line = BAD[name]
-    monkeypatch.setattr(transport, "TRIAL", 12)  # what has no face has none on a coarse grid
+    monkeypatch.setattr(transport, "TRIAL", 12)  # what has no face fails on a coarse grid too
     noise = 1 - 0.01 * np.random.default_rng(0).integers(0, 2, (16, 16))
     flat = {"one colour": np.ones((16, 16)), "one pixel": np.ones((1, 1)), "dithered": noise}
     wanted = flat.get(name, picture(16, 16))
@@ -180,7 +180,7 @@ def test_invalid_input_is_refused_in_one_line_without_output(
         wanted = np.where(wanted > 0.9, np.inf, wanted)
     if name == "no image":
         (tmp_path / "p.exr").write_text("a picture")
-    elif name == "too large":  # by what the file says of itself
+    elif name == "too large":  # according to the file's own header
         (tmp_path / "p.exr").write_bytes(b"P6 40000 30000 255\n" + bytes(range(256)))
     elif name != "no picture":
         write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)

@@ -60,7 +60,7 @@ def under(height: Heights) -> Heights:
     return lambda x, y: -8 - 0.7 * height(y, x)
 
 
-#: Of a height field's solid: its options, whether its back is free, and the area about the face.
+#: For each solid of a height field: its options, whether its back is free, and the area around the face.
 SHAPES: dict[str, tuple[dict[str, Any], bool, float]] = {
     "rectangle": ({}, False, 0.0),
     "both faces": ({"faces": ["face", "back"]}, True, 0.0),
@@ -93,7 +93,7 @@ def edge_heights(heights: Heights, outline: str) -> np.ndarray:
 def test_a_solid_is_closed_oriented_outward_and_has_the_volume_of_its_heights(name: str) -> None:
     options, both, beside = SHAPES[name]
     wanted = plan(**options)
-    # Grids of different numbers of vertices: the walls between them have to meet both.
+    # The two grids have different numbers of vertices, and the walls between them must meet both.
     sheets = [sheet(ripples, 241, 161)] + ([sheet(under(ripples), 150, 101, name="back")] if both else [])
     solid = make_solid(sheets, wanted)
     volume = integral(ripples, wanted.outline) - integral(
@@ -105,12 +105,12 @@ def test_a_solid_is_closed_oriented_outward_and_has_the_volume_of_its_heights(na
     assert solid.volume == pytest.approx(volume, rel=1e-3)
     for kind, written in (("stl", solids.stl), ("ply", solids.ply), ("obj", solids.obj)):
         read = trimesh.load(io.BytesIO(written(solid)), file_type=kind)
-        assert read.is_watertight  # each edge in two triangles
+        assert read.is_watertight  # each edge belongs to two triangles
         assert read.is_winding_consistent  # in opposite directions
         assert read.euler_number == 2
         assert len(read.faces) == len(solid.triangles)
         assert read.area_faces.min() > 0
-        assert read.volume == pytest.approx(volume, rel=1e-3)  # above 0: normals point outwards
+        assert read.volume == pytest.approx(volume, rel=1e-3)  # positive, since normals point outwards
         assert np.array(read.extents) == pytest.approx(solid.extent, rel=1e-6)
 
 
@@ -138,7 +138,7 @@ def test_a_round_outline_follows_its_ellipse() -> None:
     edge = points[solids.edge_loop(triangles)]
     assert np.hypot(edge[:, 0] / 30, edge[:, 1] / 20) == pytest.approx(1, abs=1e-12)
     assert solids._areas(points, triangles).min() > 0
-    # Where it is cut the face stays what it was, but for what a moved vertex of a bent face is off it.
+    # The face keeps its heights at the cut, up to the error of a vertex that was moved on a bent face.
     assert edge[:, 2] == pytest.approx(ripples(edge[:, 0], edge[:, 1]), abs=0.02)
 
 
@@ -167,7 +167,7 @@ def test_radius_slope_and_relief_of_a_sphere_are_reported(sign: int, outline: st
         assert face["smallest_concave_radius"] is None
         assert face["share_narrower_than_tool"] == 0
     assert "below 9.5 mm; add" in told["warnings"][-1]
-    # Of a back, whose outside is below, the other sign is hollow.
+    # The outside of a back is below it, so that the opposite sign is hollow.
     below = solids.hollows(faces[0], wanted, -1)
     assert below.max() == pytest.approx(-1 / radius if sign > 0 else 1 / radius, rel=2e-3)
 
@@ -179,7 +179,7 @@ def test_hollows_are_found_in_every_direction() -> None:
         def trough(x: np.ndarray, y: np.ndarray, angle: float = angle) -> np.ndarray:
             return (x * np.cos(angle) + y * np.sin(angle)) ** 2 / (2 * 25)
 
-        # Of a parabola the radius is least where it is flat.
+        # A parabola has its smallest radius where it is flat.
         assert 1 / solids.hollows(sheet(trough), wanted, 1).max() == pytest.approx(25, rel=1e-3)
 
 
@@ -198,7 +198,7 @@ def test_invalid_solids_are_refused() -> None:
     torn, scattered, holed = points.copy(), points.copy(), triangles[:-7]
     torn[5, 2] = np.nan
     scattered[900, 0] += 0.3
-    dome = sheet(lambda x, y: -(x**2) / 450)  # 2 mm deep, at its edge
+    dome = sheet(lambda x, y: -(x**2) / 450)  # 2 mm deep at its edge
     back = as_sheet("back", *grid(lambda x, y: np.full_like(x, -1.5)))
     one = sheet()
     cases: list[tuple[Callable[[], object], str]] = [
@@ -218,7 +218,7 @@ def test_invalid_solids_are_refused() -> None:
         with pytest.raises(ConfigError) as error:
             make()
         assert line in str(error.value)
-    assert make_solid([dome], plan(thickness=2.05)).volume > 0  # it is the rim that crosses above
+    assert make_solid([dome], plan(thickness=2.05)).volume > 0  # the overlap above comes from the rim
 
 
 # ---- by the command
@@ -233,7 +233,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "16")
     sets = [f"run.output={folder}/runs", "run.iterations=1", "run.spp=4", "run.final_spp=4", "run.certainty=false"]
     said = done("optimize", folder / "lens/lens.yaml", *(word for line in sets for word in ("--set", line))).output
-    assert "runs/lens -o FOLDER` writes the solid" in said  # what comes next
+    assert "runs/lens -o FOLDER` writes the solid" in said  # the next command
     return folder / "runs/lens"
 
 
@@ -253,7 +253,7 @@ def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: P
     assert "lens.stl: 75 x 100 x" in said
     assert "below 30 mm; add" in said
     assert told["warnings"][0] in said
-    # Heights: as seen from the receiver's side, y up.
+    # Heights as seen from the receiver's side, with y up.
     map = told["faces"]["face"]["heights"]
     wanted = points[:, 2].reshape(48, 36)[::-1]  # three vertices per pixel
     numbers = np.array(mi.Bitmap(str(out / "heights.png")))
@@ -268,7 +268,7 @@ def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: P
 def read_back(path: Path) -> trimesh.Trimesh:
     """Return the solid in a file. The library that reads the solid did not write the file."""
     if path.suffix == ".3mf":
-        pytest.importorskip("lib3mf")  # without it that file is left out
+        pytest.importorskip("lib3mf")  # without it the 3MF file is skipped
         pytest.importorskip("lxml")
     return trimesh.load(path, force="mesh")
 
@@ -306,18 +306,18 @@ def test_the_reloaded_solid_casts_the_image_of_the_scene(kind: str, run: Path, t
     (tmp_path / "out/made.xml").write_text(own.replace("</scene>", made))
     solid = mi.load_file(str(tmp_path / "out/made.xml"), optimize=False)
     images = [np.array(mi.render(scene, spp=64, seed=1)) for scene in (shown, solid)]
-    # The same light paths, but for rounding.
+    # The light paths are the same up to rounding.
     assert np.abs(images[0] - images[1]).mean() < 1e-3 * images[0].mean()
     target = np.array(mi.Bitmap(str(run.parents[1] / "lens/target.exr")))
     losses = [float(np.mean((image - target) ** 2)) for image in images]
     assert losses[1] == pytest.approx(losses[0], rel=0.02)
-    # As told: of as many samples as it says.
+    # The reported loss holds for the reported number of samples.
     loss = told["loss"]
     assert loss["integrator"] == "ptracer"
     assert f"difference from the target is {loss['l2']:.4g}, also for the solid" in said
     again = np.array(mi.render(solid, spp=loss["spp"], seed=loss["seed"]))
     assert loss["l2"] == pytest.approx(float(np.mean((again - target) ** 2)), rel=0.02)
-    # Light goes in once and out once wherever it passes: nothing crosses.
+    # Every ray enters once and leaves once, so that no surfaces cross.
     x, y = (np.random.default_rng(3).uniform(-0.49, 0.49, (2, 4096)) * [[75], [100]]).astype(np.float32)
     ray, count = mi.Ray3f(mi.Point3f(x, y, 99), mi.Vector3f(0, 0, -1)), 0
     alone = mi.load_dict({"type": "scene", "it": {"type": "ply", "filename": str(tmp_path / "out/made.ply")}})
@@ -341,7 +341,7 @@ def test_interpolated_normals_give_a_warning(run: Path, tmp_path: Path) -> None:
 
 def test_3mf_is_reloaded_in_millimetres(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("lib3mf")
-    with contextlib.suppress(locale.Error):  # a machine without it
+    with contextlib.suppress(locale.Error):  # this locale may be missing
         locale.setlocale(locale.LC_CTYPE, "C.UTF-8")
     before = locale.setlocale(locale.LC_ALL)
     done("export", run, "-o", tmp_path / "a.3mf")
@@ -380,12 +380,12 @@ def test_invalid_files_are_refused_in_one_line(run: Path, tmp_path: Path, monkey
         assert isinstance(result.exception, ConfigError) or result.exit_code == ExitCode.USAGE
         assert line in f"{result.output}{result.exception}"
         assert sorted(path.name for path in tmp_path.iterdir()) == ["there.stl"]
-    # Without that section there is a scene, and how to have a solid.
+    # Without the section `fabrication`, the export writes a scene and tells how to get a solid.
     said = done("export", run, "-o", tmp_path / "bare", "--set", "fabrication=null").output
     assert "no solid was made of `face`: --set fabrication.thickness=25 makes one of that thickness" in said
     done("export", run, "-o", tmp_path / "b.stl", "--set", "fabrication=null", "--set", "fabrication.thickness=25")
     assert trimesh.load(tmp_path / "b.stl").is_watertight
-    # A folder has what can be written, and the line says what is missing.
+    # A folder gets all files that can be written, and a line says which one is missing.
     said = done("export", run, "-o", tmp_path / "out").output
     assert "lens.3mf is not written: lib3mf is missing" in said
     assert {"lens.stl", "lens.obj", "lens.ply"} < {path.name for path in (tmp_path / "out").iterdir()}

@@ -75,12 +75,12 @@ def test_a_face_is_half_as_deep_at_twice_the_distance() -> None:
 def test_rays_of_a_point_light_thin_out_through_the_glass() -> None:
     distance, thickness, ior = 120.0, 30.0, 1.49
     rays = Rays(replace(LENS, light_distance=distance, thickness=thickness))
-    r = np.linspace(0.01, 55.0, 20_001)  # where they enter
+    r = np.linspace(0.01, 55.0, 20_001)  # radii where rays enter
     direction, enters = bent(
         np.stack([r, 0 * r, 0 * r + distance]) / np.hypot(r, distance), UP[:, None] + 0 * r, 1 / ior
     )
     _, leaves = bent(direction, UP[:, None] + 0 * r, ior)
-    radius = r + thickness * direction[0] / direction[2]  # where they meet the face
+    radius = r + thickness * direction[0] / direction[2]  # radii where rays meet the face
     solid_angle = distance / np.hypot(r, distance) ** 3 * r
     light = solid_angle / np.gradient(radius, r) / radius * enters * leaves
     at = radius < 50

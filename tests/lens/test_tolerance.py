@@ -40,17 +40,17 @@ FLAT = Fabrication(thickness=25.0)
 
 def test_a_ball_fits_into_wide_hollows_and_fills_narrow_ones() -> None:
     x = np.linspace(-20, 20, 81)
-    wide = np.tile(30 - np.sqrt(30**2 - x**2), (5, 1))  # a trough of 30 mm in radius
+    wide = np.tile(30 - np.sqrt(30**2 - x**2), (5, 1))  # a trough with a radius of 30 mm
     pitch = (float(x[1] - x[0]), 20.0)
-    middle = slice(16, -16)  # beyond the edge the trough does not go on
+    middle = slice(16, -16)  # the trough ends at the edges of the grid
     assert closed_by_ball(wide, pitch, 10)[2, middle] == pytest.approx(wide[2, middle], abs=0.02)
     filled = closed_by_ball(np.minimum(wide, 2), pitch, 60)[2]
-    # A ball of 60 mm lies on the brims of what is 2 mm deep, which are at 11 mm.
+    # A ball with a radius of 60 mm lies on the brims of the 2 mm deep trough, which are at 11 mm.
     assert filled.min() == pytest.approx(2 - (60 - np.sqrt(60**2 - 11**2)), abs=1e-6)
     slit = np.zeros((5, 81))
     slit[:, 40] = -5
     left = closed_by_ball(slit, pitch, 3)[2, 40]
-    assert left == pytest.approx(np.sqrt(9 - pitch[0] ** 2) - 3, abs=1e-6)  # between brims one pitch from its middle
+    assert left == pytest.approx(np.sqrt(9 - pitch[0] ** 2) - 3, abs=1e-6)  # brims are one pitch off its middle
 
 
 def test_shift_and_figures_match_a_known_change_of_a_picture() -> None:
@@ -126,9 +126,9 @@ def with_face(folder: Path, heights: Callable[[np.ndarray], np.ndarray]) -> Opti
 
 def light_of(made: OpticalBench) -> dict[str, float]:
     target = np.zeros((40, 40))
-    target[4:36, 4:36] = 1  # an eighth of 32 pixels is beside the picture
+    target[4:36, 4:36] = 1  # the margin, an eighth of 32 pixels, counts as beside
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tolerance, "RAYS", 2**18)  # a share has an error of at most 1e-3
+        patch.setattr(tolerance, "RAYS", 2**18)  # the error of a share is at most 1e-3
         return where_light_goes(made.scene, made.scene.sensors()[0], made.plan, target)
 
 
@@ -137,7 +137,7 @@ def test_light_is_classified_by_its_destination(folder: Path) -> None:
     the film.
     """
     assert light_of(with_face(folder, np.zeros_like)) == {"inside": 1, "beside": 0, "beyond": 0}
-    wide = 100 / 95  # of its 95 columns of triangles ten are a wedge
+    wide = 100 / 95  # ten of the 95 columns of triangles form a wedge
     for aside, name, share in ((8.0, "beside", 8 / 100), (30.0, "beyond", 10 * wide / 100)):
         slope = np.tan(np.arctan(aside / 200) / 0.49)
 
@@ -200,7 +200,7 @@ def test_a_displaced_part_matches_a_scene_of_its_own(name: str, folder: Path) ->
     wanted = OpticalBench(other, mi.traverse(other), FLAT, mi.load_dict(PTRACER), 0).render(16)
     assert np.abs(seen - wanted).mean() < 3e-4 * wanted.mean()  # the same light paths
     assert np.abs(seen - planned).mean() > 4e-3 * wanted.mean()
-    assert np.array_equal(made.render(16), planned)  # all is back in its place
+    assert np.array_equal(made.render(16), planned)  # the original state is restored
 
 
 def test_a_lens_rotates_with_both_faces_about_the_middle_of_its_front(folder: Path) -> None:
@@ -221,15 +221,15 @@ def test_a_wide_light_is_the_mean_of_rotated_ones(folder: Path) -> None:
     made.plan = Fabrication(thickness=25.0, sun=4.0)
     wide, planned = made.sun(56), made.render(56)
     assert all(np.linalg.norm(axis) == pytest.approx(1) for axis, _ in angles)
-    # Of a disc of radius R the mean of the squared distance from its middle is R^2 / 2.
+    # In a disc of radius R, the mean squared distance from the centre is R^2 / 2.
     assert sum(degrees**2 for _, degrees in angles) / (len(angles) + 1) == pytest.approx(2.0**2 / 2)
     assert sum(np.array(axis) * degrees for axis, degrees in angles) == pytest.approx(0, abs=1e-9)
     assert wide.std() < planned.std()  # blurred
-    # As little noise as so many samples have: that of light of no width is that of an image.
+    # The noise is as low as this number of samples allows: a sun of no width has about the noise of an ordinary image.
     made.plan = Fabrication(thickness=25.0, sun=1e-6)
     exact = made.render(512, seed=99)
     noise = [float(np.mean((image - exact) ** 2)) for image in (made.sun(56), planned)]
-    assert noise[0] < 2.5 * noise[1]  # of equal seeds it is about seven times as large
+    assert noise[0] < 2.5 * noise[1]  # with equal seeds it is about seven times as large
     assert wide.sum() == pytest.approx(planned.sum(), rel=0.05)
 
 
@@ -250,9 +250,9 @@ def test_a_tool_ball_touches_the_vertices_of_the_face(folder: Path) -> None:
     before = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
     sheet = as_sheet("face", before, np.array(made.params["face.faces"]).reshape(-1, 3))
     after = np.array(made.tooled([sheet], 1e-3)["face.vertex_positions"]).reshape(-1, 3)
-    assert after == pytest.approx(before, abs=1e-4)  # a ball that fits everywhere
+    assert after == pytest.approx(before, abs=1e-4)  # this ball fits everywhere
     before[np.argsort(np.hypot(before[:, 0] - 10, before[:, 1]))[:2], 2] -= (
-        0.5  # two pits, which no ball of 60 mm enters
+        0.5  # two pits that a ball of 60 mm cannot enter
     )
     sheet = as_sheet("face", before, np.array(made.params["face.faces"]).reshape(-1, 3))
     rough = np.array(made.tooled([sheet], 60.0)["face.vertex_positions"]).reshape(-1, 3)
@@ -271,7 +271,8 @@ def test_the_command_reports_all_figures(folder: Path) -> None:
     light = json.loads((folder / "out/fabrication.json").read_text())["light"]
     assert f"of the light that leaves it, {100 * light['inside']:.4g} % falls in the picture" in said
     assert all(f"{name}: SSIM {entry['ssim']:.3f}, " in said for name, entry in told.items())
-    # Light that is turned goes the distance times the angle aside: 200 mm, pixels of 100 / 32 mm.
+    # Turned light shifts the image by the distance times the angle. The distance is 200 mm, and a pixel has 100 / 32
+    # mm.
     for axis in "xy":
         shift = told[f"light turned by {tolerance.TURN:g} degree about {axis}"]["shift"]
         assert np.hypot(*shift) == pytest.approx(200 * np.tan(np.radians(1)) / (100 / 32), abs=0.15)
@@ -294,14 +295,14 @@ def test_the_page_of_a_run_has_the_figures_for_the_maker(
     numbers = json.loads((run / "fabrication.json").read_text())
     final, target = (np.array(mi.Bitmap(str(run / f"images/{name}.exr")))[:, :, :3] for name in ("final", "target"))
     weights = np.array([0.212671, 0.715160, 0.072169])
-    inside = slice(2, 18), slice(2, 18)  # an eighth of 16 pixels is beside the picture
+    inside = slice(2, 18), slice(2, 18)  # each margin has 2 pixels, an eighth of 16
     seen, wanted = (image @ weights for image in (final, target))
     divided = [image[inside] / image[inside].mean() for image in (seen, wanted)]
     thrown = numbers["thrown"]
     assert thrown["ssim"] == pytest.approx(structural_similarity(*divided, data_range=divided[1].max()), abs=1e-6)
     assert thrown["inside"] == pytest.approx(seen[inside].sum() / seen.sum(), rel=1e-6)
     assert thrown["contrast"] == pytest.approx(divided[0].std(), rel=1e-6)
-    picture = tones / tones.mean()  # as it was, darker than the floor
+    picture = tones / tones.mean()  # original picture, darker than the floor
     with_it = structural_similarity(divided[0], picture, data_range=picture.max())
     assert thrown["ssim_of_picture"] == pytest.approx(with_it, abs=1e-5)
     assert abs(thrown["ssim_of_picture"] - thrown["ssim"]) > 1e-3
@@ -331,7 +332,7 @@ def test_the_page_of_a_run_has_the_figures_for_the_maker(
     off, allowed = found.pop("tolerances"), found.pop("allowed_errors")
     assert allowed.keys() == {"distance", "light turned", "solid turned", "index"}
     assert off.keys() >= {"as planned", "distance +2 %", "index -0.005"}
-    images = len(off) - 1 + len(tolerance._DIRECTIONS)  # a wide light is the mean of so many
+    images = len(off) - 1 + len(tolerance._DIRECTIONS)  # a wide light averages these directions
     images += len(export.DIRECTIONS)  # views of the solid
     assert called == [tmp_path / "l/target.exr", *["image"] * images]  # nothing is read or rendered twice
     assert found == numbers
@@ -341,6 +342,6 @@ def test_the_page_of_a_run_has_the_figures_for_the_maker(
         assert f"±{number(allowed['distance']['value'], 2)} mm" in text
         assert text.count('class="sketch"') == 1
     shutil.rmtree(run / "images")
-    (run / "fabrication.json").unlink()  # a run of before
+    (run / "fabrication.json").unlink()  # like an older run
     result = done("export", run, "-o", tmp_path / "again", "--tolerances", *settings("run.final_spp=8"))
     assert "the page does not show the tolerances" in result.output

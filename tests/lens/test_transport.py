@@ -29,7 +29,7 @@ def test_a_product_of_densities_uses_the_quantiles_of_each_axis() -> None:
         edges = np.concatenate([[0], np.cumsum(nu)]) / nu.sum()
         exact = np.interp(below, edges, (np.linspace(0, 1, nu.size + 1) - 0.5) * target[axis])
         found = made.T[axis].mean(axis=axis)
-        assert np.sqrt(np.mean((found - exact)[2:-2] ** 2)) < 0.1 * target[axis] / mu.size  # of a cell
+        assert np.sqrt(np.mean((found - exact)[2:-2] ** 2)) < 0.1 * target[axis] / mu.size  # of a cell's width
 
 
 def test_light_is_transported_to_the_picture() -> None:
@@ -63,7 +63,7 @@ def test_the_derivative_of_the_equation_matches_differences() -> None:
     found = made[1].along(v) / made[1].scale
     expected = (made[2].F - made[0].F) / 2e-5
     inner = (slice(1, -1), slice(1, -1))
-    # the mean of the picture over a cell is differentiated as if all of its points moved with the middle
+    # The derivative of the picture's mean over a cell assumes that all points of the cell move with its centre
     difference = (found - found.mean() - expected)[inner]
     assert np.sqrt(np.mean(difference**2)) < 0.03 * np.sqrt(np.mean(expected**2))
 
@@ -91,7 +91,7 @@ def test_a_resized_black_and_white_picture_stays_within_black_and_white(side: in
         for size in (7, 32, 45, 64, 127, 128, 256, 511):
             for between in (False, True):
                 made = resized(light, (size, max(2, size - 7)), between)
-                assert made.min() >= 0  # -1e-16 is negative to who asks
+                assert made.min() >= 0  # -1e-16 would count as negative
                 assert made.max() <= 1 + 1e-12
                 if not between:
                     assert made.mean() == pytest.approx(light.mean(), rel=1e-12)

@@ -50,7 +50,7 @@ def caustic(made: Surface, shape: tuple[int, int], rays: int = 400, wider: float
 
     lens = s.kind == "lens"
     toward = turned([0, 0, 1], s.incidence) if lens else turned([0, 0, -1], -s.incidence)
-    first = -s.thickness if lens else made.heights.max() + 5  # a plane that all rays pass before they meet the face
+    first = -s.thickness if lens else made.heights.max() + 5  # a plane that all rays cross before the face
     spread = 1.3
     at = (np.arange(rays) + 0.5) / rays - 0.5
     px, py = (a.ravel() for a in np.meshgrid(at * width * spread, at * height * spread))
@@ -70,7 +70,7 @@ def caustic(made: Surface, shape: tuple[int, int], rays: int = 400, wider: float
         d, passes = bent(d, np.repeat(np.array([[0.0], [0], [1]]), px.size, 1), 1 / s.ior)
         light = light * passes
     t = (0 - points[2]) / d[2]
-    for _ in range(8):  # where the ray is as high as the face
+    for _ in range(8):  # finds the point where the ray meets the face
         p = points + t * d
         t = t + (face.ev(p[1], p[0]) - p[2]) / d[2]
     p = points + t * d
@@ -90,7 +90,7 @@ def caustic(made: Surface, shape: tuple[int, int], rays: int = 400, wider: float
         forward = turned([0, 0, 1], s.incidence)
     if lens and np.isfinite(s.light_distance):
         assert s.incidence == 0
-    # the receiver: a frame that looks along the central ray, nodded and turned
+    # The receiver's frame looks along the central ray, nodded and turned
     right, up = -turned([1, 0, 0], s.incidence), np.array([0.0, 1, 0])
     nod, turn = np.radians(s.tilt)
     up, ahead = np.cos(nod) * up + np.sin(nod) * forward, np.cos(nod) * forward - np.sin(nod) * up
@@ -102,14 +102,14 @@ def caustic(made: Surface, shape: tuple[int, int], rays: int = 400, wider: float
         columns = -columns
     w, h = s.picture_size[0] * wider, s.picture_size[1] * wider
     column, row = (columns / w + 0.5) * shape[1] - 0.5, (rows / h + 0.5) * shape[0] - 0.5
-    result = np.zeros((shape[0] + 2, shape[1] + 2))  # each ray a pixel wide, in a frame for what falls just beside
+    result = np.zeros((shape[0] + 2, shape[1] + 2))  # rays are a pixel wide, and a border takes light just outside
     seen = (column > -0.5) & (column < shape[1] - 0.5) & (row > -0.5) & (row < shape[0] - 0.5)
     column, row, light = column[seen] + 1, row[seen] + 1, light[seen]
     i, j = column.astype(int), row.astype(int)
     for dj, down in ((0, 1 - row + j), (1, row - j)):
         for di, across in ((0, 1 - column + i), (1, column - i)):
             np.add.at(result, (j + dj, i + di), light * down * across)
-    for axis in (0, 1):  # at the picture's edges it is folded back
+    for axis in (0, 1):  # light in the border is added to the edge pixels
         result = np.moveaxis(result, axis, 0)
         result[1] += result[0]
         result[-2] += result[-1]

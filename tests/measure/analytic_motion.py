@@ -26,7 +26,7 @@ from reslrb_cli.measure.scenes.small import glass, lit_square, rectangle, rgb, t
 
 Array = NDArray[np.float64]
 
-#: Reflectance of the receiver, as `setting` has it.
+#: Reflectance of the receiver, as in `setting`.
 RHO = np.array([0.8, 0.7, 0.6])
 
 #: Area of a pixel on the receiver.
@@ -119,7 +119,7 @@ def lamp_over_plane(position: tuple[float, float, float] = (0.1, 0.7, 0.2), node
     """
     G = smooth_weights(SIZE, SIZE)
     at, weight = np.polynomial.legendre.leggauss(nodes)
-    u = (np.arange(SIZE)[:, None] + (at + 1) / 2).ravel()  # pixels
+    u = (np.arange(SIZE)[:, None] + (at + 1) / 2).ravel()  # in pixels
     g = np.einsum("ip,jq,pqc->ijc", _filter(u), _filter(u), G, optimize=True)
     x = 2 * u / SIZE - 1
     dx, dz, h = position[0] - x[None, :], position[2] - x[:, None], position[1]

@@ -13,10 +13,10 @@ import numpy as np
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.moving import AMPLITUDES, Move, moving_case
 
-#: Pixels of a film, each way.
+#: Width and height of a film in pixels.
 SIZE = 32
 
-#: At how many seeds truncation is measured, by differences of twice the step: one in so many, and at least that many.
+#: Seeds at which differences of twice the step measure truncation: one in this many, and at least this many.
 ONE_IN, EXTRAPOLATED = 4, 3
 
 

@@ -127,10 +127,10 @@ def by(estimators: str, *references: str) -> frozenset[tuple[str | None, str]]:
     return frozenset((None if e == "image" else e, r) for e in estimators.split() for r in references)
 
 
-GRADIENT = ("walk_ad", "finite_difference", "forward_mode")  # of an estimator whose walk is right
+GRADIENT = ("walk_ad", "finite_difference", "forward_mode")  # references of estimators with a correct walk
 WALK = "transport.walk:walk"
 BACK = "estimators.attached:AttachedFrame.differentiate"
-MOVED = ("walk_ad", "ptracer", "finite_difference")  # of a mesh that moves
+MOVED = ("walk_ad", "ptracer", "finite_difference")  # references of a moving mesh
 
 FAULTS = [
     # ---- Light paths: naive AD and differences share the fault, a stock integrator does not ----

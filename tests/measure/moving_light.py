@@ -212,7 +212,7 @@ GLASS_SCENES = [
 
 MIRROR = {"type": "conductor", "material": "none", "specular_reflectance": rgb(0.9, 0.8, 0.7)}
 
-#: Its samples do not depend on the incident direction: those of visible normals have derivatives of heavy tails.
+#: Its samples do not depend on the incident direction. With sampling of visible normals, derivatives have heavy tails.
 BRUSHED = {"type": "roughconductor", "material": "none", "alpha": 0.1, "sample_visible": False}
 
 

@@ -68,7 +68,7 @@ class Replay(RBIntegrator):
             ray = si.spawn_ray(si.to_world(bs.wo))
             L = L + Le + direct if primal else L - Le - direct
             behind = mi.Spectrum(L)
-            if dr.hint(wrong == "kept", mode="scalar"):  # what is left behind this vertex has this vertex's light too
+            if dr.hint(wrong == "kept", mode="scalar"):  # the remaining light wrongly includes this vertex's own light
                 behind = L + Le + direct
             before = mi.Spectrum(β)
             η *= bs.eta

@@ -17,7 +17,7 @@ from reslrb_cli.measure.methods import Plan, parse_cases
 from reslrb_cli.measure.processes import Ended, Refused, Stopped
 from reslrb_cli.records.measurements import BenchStatus, MethodRecord
 
-# Processes that only pretend to measure, for tests of what a sweep does with them.
+# Processes that only pretend to measure, for tests of sweeps.
 
 
 class Pretended:
@@ -59,9 +59,9 @@ class Pretended:
         self.closed = True
 
 
-# Methods of known cost, noise and bias in place of processes, for tests of what `convergence` makes of them.
+# Methods of known cost, noise and bias replace processes in tests of `convergence`.
 
-#: What all unbiased methods estimate: two parameters, one of them of colours.
+#: Shapes and true values of two parameters, which all unbiased methods estimate. One parameter has colours.
 SHAPES = {"a": [4, 5, 3], "b": [3]}
 TRUTH = np.concatenate([np.random.default_rng(3).uniform(0.5, 1.5, 60), [2.0, -1.0, 0.5]])
 
@@ -84,7 +84,7 @@ class Pretence:
     ends: int | None = None
     refuses: bool = False
     nan_at: int | None = None
-    #: Steps of which each is so many times as noisy as the others.
+    #: Noisier steps, and the factor by which their noise exceeds the noise of the others.
     outliers: tuple[int, ...] = ()
     outlier: float = 100.0
     steps: list[int] = field(default_factory=list)

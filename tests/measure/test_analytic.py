@@ -32,7 +32,7 @@ from reslrb_cli.measure.scenes.small import SIZE, diffuse, pinhole, rectangle, r
 from reslrb_cli.records.measurements import Verdict
 from reslrb_cli.transport.walk import Segment
 
-# Scenes with known images: the formulas against themselves, Mitsuba's integrators, and our gradients.
+# Scenes with known images test the formulas' consistency, Mitsuba's integrators, and our gradients.
 
 LIGHT = (0.4, 0.8, -0.3)
 
@@ -104,7 +104,7 @@ def test_black_furnace_reflects_once_to_first_order():
 def test_fresnel():
     assert fresnel(np.array(0.0), 1.5) == pytest.approx(0.04)
     assert fresnel(np.array(0.7), 1.0) == pytest.approx(0)
-    brewster = np.arctan(1.5)  # one polarisation alone is reflected
+    brewster = np.arctan(1.5)  # light of only one polarisation is reflected
     assert fresnel(np.array(brewster), 1.5) == pytest.approx(np.sin(2 * brewster - np.pi / 2) ** 2 / 2)
     assert fresnel(np.array(np.pi / 2), 1.5) == pytest.approx(1)
 
@@ -156,7 +156,7 @@ def test_gradients(name: str, estimator: str, llvm: str):
     assert error < 0.05, "too noisy to see a fault"
 
 
-# Derivatives of motions against geometrical optics.
+# Derivatives of motions, compared with geometrical optics.
 
 MOTIONS: dict[str, Callable[[], KnownMotion]] = {
     "tilted_surface": tilted_surface,
@@ -184,7 +184,8 @@ def test_derivatives(name: str):
     motion = MOTIONS[name]()
     ours = gradients(motion)
     largest = float(np.abs(motion.derivatives).max())
-    # Of what the formula leaves out, and of each derivative: those of the ball differ by their nature.
+    # The formula omits some terms. The bias is relative to each derivative, because the ball's derivatives differ in
+    # kind.
     bias = motion.tolerance * np.maximum(np.abs(motion.derivatives), 0.01 * largest)
     found = compare_expectations(ours, motion.derivatives, Family(rows=1, entries=ours.shape[1]), bias=bias)
     print(name, ours.mean(0), motion.derivatives, found)

@@ -69,14 +69,14 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert row["step_ms"]["median"] > row["kernel_ms"]["median"]
         assert row["cold_ms"] > row["step_ms"]["median"]
         assert row["cold_ms"] > row["cold_codegen_ms"] > row["codegen_ms"]["median"] >= 0
-        # Each step is the sum of its parts; medians are not.
+        # Each step time is the sum of its parts, but medians do not add up.
         parts = [row[key] for key in ("kernel_ms", "codegen_ms", "tracing_ms")]
         assert sum(part["min"] for part in parts) <= 1.001 * row["step_ms"]["min"]
         assert sum(part["max"] for part in parts) >= 0.999 * row["step_ms"]["max"]
         assert row["tracing_ms"]["min"] > 0
         assert row["peak_mib"] > 0
     assert [row["scratch_bytes"] > 0 for row in rows] == [False, True, False] * 2
-    # Three vertices in place of one, and one place for what is not pushed.
+    # Depth 4 stores three vertices, and depth 2 stores one. Both have one more slot for entries that are not pushed.
     assert rows[4]["scratch_bytes"] == 2 * rows[1]["scratch_bytes"]
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines[3:9]] == [
@@ -128,7 +128,7 @@ def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureF
     assert [row["status"] for row in read(file)] == ["ok", "failed"]
     printed = capsys.readouterr()
     assert "depth 2, trajectory: UnsupportedScene: trajectory: Dr.Jit cannot reverse" in printed.out
-    assert printed.err.count("toWorld") == 1  # both processes mend the scene
+    assert printed.err.count("toWorld") == 1  # both mend the scene, one line is shown
 
 
 @pytest.mark.usefixtures("llvm")
@@ -136,7 +136,7 @@ def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureF
 def test_an_end_at_a_low_limit_is_attributed_to_memory(limit: str, tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     args = ["--max-depth", "2", "--integrators", "reslrb:stack", "--memory-limit", limit, "--json", str(file)]
-    assert call(*SMALL, *args) in (0, 4)  # how much a process needs depends on the number of cores
+    assert call(*SMALL, *args) in (0, 4)  # memory use depends on the number of cores
     assert read(file)[0]["status"] in ("ok", "out_of_memory")
 
 
@@ -223,7 +223,7 @@ MASKED = """<scene version="3.0.0">
 """
 
 
-# What `bench` measures where parameters move light: every integrator that can takes steps, and memory stays flat.
+# What `bench` measures if parameters move light: all capable integrators take steps, and memory stays constant.
 
 
 def peak(name: str, depth: int) -> float:
@@ -248,8 +248,8 @@ def peaks(name: str) -> list[float]:
 @pytest.mark.long
 def test_memory_of_stack_does_not_grow_with_depth():
     shallow, deep = peaks("reslrb:stack")
-    assert 0 < shallow  # else the watermark sees nothing
-    assert deep < 1.1 * shallow  # so small that what the allocator rounds to shows
+    assert 0 < shallow  # otherwise the watermark shows nothing
+    assert deep < 1.1 * shallow  # sizes are so small that allocator rounding shows
 
 
 @pytest.mark.usefixtures("llvm")
@@ -259,7 +259,7 @@ def test_memory_of_naive_ad_grows_with_depth():
     assert deep > 2 * shallow > 4 * peak("reslrb:stack", 4)
 
 
-# How the end of a process is read, and what kernels say of thread-local memory.
+# How the end of a process is interpreted, and what kernels report about thread-local memory.
 
 FIRST = {"memory_limit": None}
 FAILED, OUT_OF_MEMORY = BenchStatus.FAILED, BenchStatus.OUT_OF_MEMORY
@@ -297,7 +297,7 @@ def test_kinds_of_ends_are_distinguished(script: str, status: BenchStatus, reaso
 
 def test_a_crash_near_the_limit_is_attributed_to_memory() -> None:
     crash = "time.sleep(0.3); os.kill(os.getpid(), signal.SIGSEGV)"
-    end = end_of(crash, limit=4 * 2**20)  # not set by this process, but in use many times over
+    end = end_of(crash, limit=4 * 2**20)  # the process sets no limit, but uses many times 4 MiB
     assert end.status is OUT_OF_MEMORY
     assert "of 4 MiB seen in use" in end.reason
     assert end_of(crash, limit=2**50).status is FAILED

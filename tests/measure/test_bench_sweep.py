@@ -21,7 +21,7 @@ from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
 from reslrb_cli.report.tables import bench_cells, bench_columns
 
-# The order of a sweep, and what becomes of cases that end: with processes that only pretend.
+# The order of a sweep, and the handling of cases that end. The processes only pretend to measure.
 
 CONFIG = """\
 scene: {file: scene.xml}
@@ -65,7 +65,7 @@ def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[BenchResu
 def test_steps_are_interleaved_in_rotating_order() -> None:
     run(sweep(values=[2]))
     types = ["ptracer", "reslrb", "walk_ad"]
-    warm = [(2, name, 0) for name in types for _ in range(3)]  # one cold step, two until no kernel is new
+    warm = [(2, name, 0) for name in types for _ in range(3)]  # one cold step, then two until no kernel is new
     rounds = [(2, types[(r + k) % 3], r + 1) for r in range(MIN_ROUNDS) for k in range(3)]
     assert Pretended.log == warm + rounds
 
@@ -84,7 +84,7 @@ def test_records() -> None:
     assert (stack.codegen_ms, stack.tracing_ms) == (Spread(1.5, 1.0, 2.0), Spread(4.5, 3.0, 6.0))
     assert stack.cold_codegen_ms == 0.5
     assert (stack.cold_ms, stack.peak_mib, stack.scratch_bytes) == (4.0, 1.5, 60)
-    assert rows[1].step_ratio == rows[1].kernel_ratio == Spread(0.5, 0.5, 0.5)  # in pairs, as all get slower
+    assert rows[1].step_ratio == rows[1].kernel_ratio == Spread(0.5, 0.5, 0.5)  # taken in pairs, because all slow down
     assert rows[0].step_ratio == Spread(1.0, 1.0, 1.0)
 
 
@@ -99,7 +99,7 @@ def test_an_ended_case_is_recorded_and_the_rest_continues(question: int) -> None
     assert measured == (None,) * 5
     assert (rows[2].reason, rows[2].step_ratio) == ("ended by SIGSEGV", None)
     assert [row.record.repeats for row in rows] == [3, 3, 0, 3, 3, 3]
-    assert rows[5].record.status is BenchStatus.OK  # it is tried again at the next depth
+    assert rows[5].record.status is BenchStatus.OK  # the case is tried again at the next depth
 
 
 @pytest.mark.usefixtures("_clean")
@@ -158,13 +158,14 @@ def test_pace_divides_the_budget() -> None:
             done += 1
         return done
 
-    # 100 s in shares of 1, 1.3 and 1.69: 25.1 s; of the other 77, 33.5 s; and what is left.
+    # The shares of 100 s are 1, 1.3 and 1.69, so the first depth gets 25.1 s. The second depth gets 33.5 s of the
+    # remaining 77 s. The third depth gets the rest.
     assert rounds(2.0, 3.0) == 7
     assert rounds(3.0, 4.0) == 7
     assert rounds(1.0, 5.0) == 9
     assert 95.0 < now[0] <= 100.0
     assert rounds(1.0, 30.0, spent) == MIN_ROUNDS
-    assert rounds(1.0, 50.0, Pace(100.0, 1, now=lambda: now[0])) == 1  # a second one would overrun the whole
+    assert rounds(1.0, 50.0, Pace(100.0, 1, now=lambda: now[0])) == 1  # a second round would exceed the whole budget
     assert rounds(1.0, 50.0, Pace(0.0, 1, rounds=7, now=lambda: now[0])) == 7
     cheap = Pace(1e6, 1, now=lambda: 0.0)
     cheap.begin_depth()
@@ -176,7 +177,8 @@ def test_pace_divides_the_budget() -> None:
     ("budget_s", "measured", "left"),
     [
         (1000.0, {2: LIST.split(","), 4: LIST.split(",")}, []),
-        # Of the second depth only the first has compiled when time is up; what has compiled is measured all the same.
+        # At the second depth, only the first case has compiled when time is up. Compiled cases are measured all the
+        # same.
         (130.0, {2: LIST.split(","), 4: ["ptracer"]}, ["depth 4, reslrb:stack, walk_ad"]),
         (85.0, {2: LIST.split(",")[:2]}, ["depth 2, walk_ad", "depth 4"]),
         (10.0, {}, ["depth 2, ptracer, reslrb:stack, walk_ad", "depth 4"]),
@@ -306,7 +308,7 @@ def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool
     assert Pretended.alive == 0
 
 
-# What `bench --sweep` varies: samples, and sizes of film and textures; with processes that only pretend.
+# What `bench --sweep` varies: sample counts, film sizes and texture sizes. The processes only pretend to measure.
 
 
 class Sized(Pretended):
@@ -418,7 +420,7 @@ def test_bad_input_is_one_located_line(args: tuple[str, ...], line: str, capsys:
     assert len(printed.err.splitlines()) == 1
 
 
-# A `bench` that goes on from another one: what counts, what is measured again, and what is refused.
+# A `bench` that continues an earlier one: which measurements count, which are repeated, and what is refused.
 
 
 def session(what: Sweep, earlier: Earlier | None = None, stop: Callable[[], bool] = lambda: False) -> Bench:
@@ -447,7 +449,7 @@ def test_continued_rounds_give_the_records_of_one_session() -> None:
     Pretended.log.clear()
     whole = measure(sweep(rounds=7), again(short))
     asked = [round for depth, name, round in Pretended.log if (depth, name) == (2, "ptracer") and round > 0]
-    assert asked == [4, 5, 6, 7]  # whose seeds are new
+    assert asked == [4, 5, 6, 7]  # rounds with new seeds
     expected = measure(sweep(rounds=7)).results()
     assert [result.record for result in whole.results()] == [result.record for result in expected]
     assert [result.step_ratio for result in whole.results()] == [result.step_ratio for result in expected]

@@ -32,7 +32,7 @@ from reslrb_cli.records.cache import PilotCache, key_of
 from reslrb_cli.runs.sweep import make_plan, opened
 from reslrb_cli.scene.files import files_of
 
-#: Every text has a number that is changed: 0.25 becomes 0.75, so that the size stays.
+#: Each text contains a number that tests change from 0.25 to 0.75, so that the size stays the same.
 LIGHTS = """<scene version="3.0.0">
     <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
     <emitter type="point"><point name="position" x="0" y="1" z="3"/><rgb name="intensity" value="0.25"/></emitter>
@@ -64,7 +64,7 @@ target: {file: photo.exr, mask: {file: weights.exr, border: false}}
 """
 CAMERAS = PHOTO.replace("file: photo.exr, ", "")
 
-#: The settings that lead to the files, by file.
+#: The setting that leads to each file.
 FILES = {
     "scene.xml": "scene.file",
     "lights.xml": "scene.file (lights.xml)",
@@ -247,7 +247,7 @@ def test_measurements_of_another_experiment_are_not_continued(folder: Path, comm
     name, *options = command
     words = [name, "photo.yaml", *options, *settings("loss={type: l2}"), "--json"]
     result = reslrb(*words, "first.jsonl")
-    assert result.exit_code in (0, 1), result.output  # so few samples need not agree
+    assert result.exit_code in (0, 1), result.output  # the check can fail with so few samples
     for file, place in OF_PHOTO.items():
         if place == "loss.file":
             continue

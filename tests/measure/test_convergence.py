@@ -24,7 +24,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.convergence_tables import closing_sentence, notes
 
-# What `convergence` makes of methods whose cost, noise and bias are known: with processes that only pretend.
+# What `convergence` reports about methods of known cost, noise and bias. The processes only pretend to measure.
 
 
 def test_cost_error_slope_and_efficiency_match_the_methods(tmp_path: Path) -> None:
@@ -55,7 +55,8 @@ def test_a_planted_bias_of_three_percent_is_reported(tmp_path: Path) -> None:
     assert biased.bias == pytest.approx(0.03, rel=0.2)
     assert biased.bias_z > biased.bias_z_limit
     assert (biased.bias_reference, biased.independent) == ("ptracer", True)
-    # Squared bias counts as variance does, and keeps the error from 1 %; without it this would be the most efficient.
+    # Squared bias counts like variance, and keeps the error above 1 %. Without bias, this method would be the most
+    # efficient.
     assert biased.efficiency.low < 1 / (0.05 * (0.1**2 + 0.03**2)) < biased.efficiency.high
     assert biased.efficiency.value > 2 * sound.efficiency.value
     assert (biased.seconds_to["0.01"], sound.seconds_to["0.01"] is not None) == (None, True)
@@ -77,10 +78,10 @@ def test_too_heavy_tails_for_intervals_are_reported(tmp_path: Path) -> None:
     for key in (*SHAPES, "all"):
         flagged, sound = of(results, "reslrb:stack", key), of(results, "reslrb:event", key)
         assert "dominate the variance" in flagged.message, key
-        assert flagged.biased is None  # its z scores prove nothing either
+        assert flagged.biased is None  # heavy tails also make z scores unreliable
         assert (sound.message, sound.biased) == ("", False)
     [member] = [member for member in session.of(Role.CASE) if member.label == "reslrb:stack"]
-    assert Judgement(session).overall(member).message == HEAVY  # also in the lines that come while it goes on
+    assert Judgement(session).overall(member).message == HEAVY  # also in the lines printed during the measurement
     lucky = play(tmp_path, Stage(case_reslrb_stack=Pretence(0.1, 0.1)), plan())[1]
     assert of(lucky, "reslrb:stack").efficiency.low > 10 * of(results, "reslrb:stack").efficiency.value
     assert any(note.startswith("reslrb:stack, all: single") for note in notes(results.methods))
@@ -111,7 +112,7 @@ def test_references_of_errors_are_checked_too(tmp_path: Path) -> None:
     assert of(results, "reslrb:stack").biased is False
     event = of(results, "reslrb:event", "a")
     assert event.biased is True
-    assert event.bias == pytest.approx(0.1, rel=0.2)  # against ptracer, not against what is as wrong
+    assert event.bias == pytest.approx(0.1, rel=0.2)  # against ptracer, not against the biased reference
 
 
 def test_a_missing_independent_reference_is_reported(tmp_path: Path) -> None:
@@ -170,16 +171,17 @@ def test_lines_of_json(tmp_path: Path) -> None:
     assert list(method)[: len(common)] == common
     assert set(method["slope"]) == set(method["efficiency"]) == {"value", "low", "high"}
     assert list(method["seconds_to"]) == ["0.1", "0.03", "0.01"]
-    assert method["seconds_to"] == {"0.1": None, "0.03": None, "0.01": None}  # none can be reached
+    assert method["seconds_to"] == {"0.1": None, "0.03": None, "0.01": None}  # no target can be reached
     assert method["bias_z"] > 0
     assert [json.loads(r.to_json())["kind"] for r in results.references] == ["reference"] * 3
     assert {r.parameter for r in results.methods} == {*SHAPES, "all"}
 
 
-# Errors, slopes, efficiencies and times from samples whose law is known.
+# Errors, slopes, efficiencies and times from samples of a known distribution.
 
 REPETITIONS = 200
-#: How many of the repetitions may cover the truth where each does with a probability of 95 %: all but one in 1000.
+#: Least and most repetitions that may cover the truth if each does with a probability of 95 %. One test in 1000 exceeds
+#: these limits by chance.
 LEAST, MOST = (int(stats.binom.ppf(p, REPETITIONS, 0.95)) for p in (0.0005, 0.9995))
 TRUTH = np.random.default_rng(2).uniform(0.5, 2.0, 40)
 SIGNAL = float(TRUTH @ TRUTH)
@@ -218,7 +220,8 @@ def test_errors_are_those_of_averages_without_that_of_the_reference() -> None:
         assert {point.steps for point in found} == {2**level}
         assert {point.repeats for point in found} == {64 // 2**level}
         assert found[0].elapsed_s == pytest.approx(2**level * made[0].step_s)
-        # A point drowns, and is None, where the estimate of its square is negative; squares are what is unbiased.
+        # A point drowns in noise and is None if the estimate of its square is negative. The squares are the unbiased
+        # estimates.
         squares = [
             float(np.square(s.deviations[: 64 // 2**level * 2**level].reshape(-1, 2**level, 40).mean(1)).sum(1).mean())
             - s.reference.noise
@@ -329,7 +332,7 @@ def test_times() -> None:
     assert samples.seconds_to(100.0, False) == (samples.step_s, False)
     rough = make(5, steps=64, rows=3, per_row=1)
     assert rough.reference.floor > 0.3
-    assert rough.seconds_to(0.3, False)[1]  # within the steps, but not to be told
+    assert rough.seconds_to(0.3, False)[1]  # within the steps, but below the noise floor
 
 
 def test_times_prevented_by_a_bias() -> None:
@@ -348,13 +351,14 @@ def test_too_few_steps_have_no_intervals() -> None:
     assert make(7, steps=16, per_turn=1).slope() is not None
 
 
-# `convergence` on the scenes that come with their configurations: fixed seeds, and steps that no clock counts.
+# `convergence` on the scenes of the shipped configurations, with fixed seeds and a step count that does not depend on
+# time.
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = "reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack"
-#: Without roulette, which naive AD does not differentiate rightly.
+#: Without roulette, because naive AD does not differentiate roulette correctly.
 PTRACER = "ptracer(rr_depth=1000000)"
-#: Probability that all slopes of a scene are within their intervals, widened for their number.
+#: Probability that all slopes of a scene are within their intervals, which are widened for the number of slopes.
 CONFIDENCE = 0.99
 
 
@@ -389,7 +393,7 @@ def test_unbiased_methods(tmp_path: Path, scene: str, size: tuple[int, int], spp
     assert {line["label"] for line in found} == set(cases.split(","))
     keys = {line["parameter"] for line in found}
     count = len({line["label"] for line in found}) * max(len(keys) - 1, 1)
-    # The intervals are of 95 %, by Student's t with as many degrees of freedom as there are groups of steps less one.
+    # The 95 % intervals use Student's t. The degrees of freedom are the number of groups of steps minus one.
     for line in found:
         freedom = next(groups for steps, groups in GROUPS.items() if line["steps"] >= steps) - 1
         wider = stats.t.isf((1 - CONFIDENCE) / 2 / count, freedom) / stats.t.isf(0.025, freedom)
@@ -443,7 +447,7 @@ def test_the_intervals_have_their_coverage_on_a_scene(tmp_path: Path) -> None:
     assert all(least <= count <= most for count in covered.values()), covered
 
 
-# What is found out before anything is measured: references, dL/dI, and the border of the film.
+# Facts that are found before any measurement: references, dL/dI, and the border of the film.
 
 GAUSSIAN = ('<rfilter type="box"/>', '<rfilter type="gaussian"/>')
 
@@ -505,7 +509,7 @@ def test_a_method_that_is_never_right_is_reported(tmp_path: Path) -> None:
     assert list(facts["without"]) == ["prb"]
     assert "directionalarea" in facts["without"]["prb"]
     assert facts["independent"] == {KEY: "ptracer"}
-    assert arrays["mask"].all()  # it takes no part
+    assert arrays["mask"].all()  # prb takes no part
 
 
 @pytest.mark.usefixtures("llvm")

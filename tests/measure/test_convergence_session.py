@@ -29,10 +29,10 @@ def test_steps_continue_after_compilation_with_distinct_seeds(tmp_path: Path) ->
     names = ["case ptracer", "case reslrb:stack", "case reslrb:event", "reference reslrb:stack"]
     assert list(dict.fromkeys(question["of"] for question in stage.asked if question["of"])) == names
     for member in session.members:
-        assert member.taken == 2 + 4 * member.count  # one cold, one without a new kernel, then turns
+        assert member.taken == 2 + 4 * member.count  # a cold step, one without a new kernel, then rounds
     for method in stage.methods.values():
         assert method.steps == list(range(len(method.steps)))
-    purposes = {player.first["purpose"] for player in ()}  # the names, by which seeds differ, are the players' own
+    purposes = {player.first["purpose"] for player in ()}  # seeds differ by the names of the players
     assert purposes == set()
     assert stage.purposes == [f"convergence, {name}" for name in names]
 
@@ -64,7 +64,7 @@ def test_a_number_of_rounds_fixes_the_steps_everywhere(tmp_path: Path) -> None:
 
 def test_ptracer_among_the_methods_is_its_own_reference(tmp_path: Path) -> None:
     session, results, _ = play(tmp_path, Stage(), plan(rounds=8))
-    assert not session.of(Role.INDEPENDENT)  # no roulette at this depth: the same integrator
+    assert not session.of(Role.INDEPENDENT)  # without roulette, both integrators are the same
     assert of(results, "ptracer").bias_reference == "reslrb:stack"
     assert of(results, "reslrb:event").bias_reference == "ptracer"
 
@@ -89,7 +89,7 @@ def test_an_ended_method_is_recorded_and_the_rest_continues(tmp_path: Path) -> N
     assert sound.biased is False
     assert closing_sentence(results.methods) == "Best for this scene: ptracer, the only one that was measured."
     assert "reslrb:stack, all: ended by SIGKILL" in notes(results.methods)
-    assert said[0] == "old"  # what every process warns of is said once
+    assert said[0] == "old"  # a warning of every process is printed once
     assert said.count("old") == 1
 
 
@@ -193,7 +193,7 @@ def test_a_second_budget_too_small_for_a_round_is_reported(tmp_path: Path) -> No
     earlier = Earlier("convergence", Path("c.jsonl"), *kept)
     again, results, said = play(tmp_path, Stage(), plan(rounds=None, budget_s=7.5), earlier=earlier)
     assert again.rounds == first.rounds
-    assert of(results, "ptracer").efficiency is not None  # by what there was
+    assert of(results, "ptracer").efficiency is not None  # from the earlier samples
     assert said[-1].startswith("no round was added; allow about ")
 
 

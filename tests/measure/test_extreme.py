@@ -11,8 +11,8 @@ from reslrb_cli.measure.extreme import CASES, LISTED, run_suite
 from reslrb_cli.measure.extreme.suite import WAYS
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
-#: By default: no path that connects, values that are not finite, a lamp of which no point can be drawn; roulette and
-#: its fault, and a furnace, stand below.
+#: Cases of the default suite: no path that connects, values that are not finite, and a lamp of which no point can be
+#: drawn. Tests of roulette with its fault, and of a furnace, stand below.
 FEW = ("no_connection", "nan_loss", "black_lamp")
 
 
@@ -104,7 +104,8 @@ def test_roulette_by_power_loses_dim_lamps(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.long
 def test_sampling_by_radiance_undersamples_the_sky_beside_a_sun(monkeypatch: pytest.MonkeyPatch):
     def variance() -> float:
-        # Half of the seeds: of eight, a variance is known to a half, and what is looked for is a factor of a hundred.
+        # Half of the seeds are enough. Eight seeds give the variance to within a half, and the test looks for a factor
+        # of 100.
         rows = run_suite(["sun_1e6"], ["stack"], seeds=8)
         [ratio] = [row.variance_ratio for row in rows if row.parameter == "sky.data" and row.reference == "prb"]
         assert ratio is not None

@@ -21,7 +21,7 @@ from reslrb_cli.measure.comparison import Family, compare_expectations, entry_co
 from reslrb_cli.measure.processes import Ended
 from reslrb_cli.records.measurements import BenchStatus, Verdict
 
-# Figure 1: its checks see what they are to see, its gradients agree, and its table says what came of it.
+# Figure 1: its checks detect what they should, its gradients agree, and its table reports the results.
 
 SMALL = [
     "scene.options={resx: 16, resy: 16, blur: 1.0}",
@@ -163,7 +163,7 @@ def test_unsupported_figures_are_refused(setting: str, key: str) -> None:
         figure1.measure(load(figure1.CONFIG, [setting]), figure1.Plan(), lambda line: None)
 
 
-# Figure 5: its checks see what they are to see, and its experiment is made of the room that it is given.
+# Figure 5: its checks detect what they should, and its experiment uses the given room.
 
 BOX = figure1.CONFIG.parents[1] / "cornell_floor.yaml"
 SMALL_ROOM = [

@@ -53,7 +53,7 @@ from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Ve
 from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior
 
-# Gradcheck on a small Cornell box: it holds as the code stands, and what is broken on purpose is found and named.
+# Gradcheck on a small Cornell box: the current code passes, and planted faults are found and named.
 
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
 SMALL += ["integrator.guiding=off"]  # guided steps have their own test
@@ -291,7 +291,7 @@ def test_ptracer_is_no_reference_with_cutting_clip_planes():
         scene = Case(room(camera=camera() | changes), [])
         return ptracer_image(Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, 4, False))
 
-    assert why() is why(**lens) is why(far_clip=4.1) is None  # stock light tracing has a pinhole's far plane
+    assert why() is why(**lens) is why(far_clip=4.1) is None  # stock light tracing supports a pinhole's far plane
     assert "`thinlens`" in why(**lens | {"far_clip": 4.1})
     assert "`thinlens`" in why(**lens | {"focus_distance": 2e4})
     assert "before the sensor's near clip" in why(near_clip=4.0)
@@ -377,7 +377,7 @@ def test_directions_stay_within_the_bounds():
     assert natural_bounds("bsdf", np.array([-1.5])) == (-np.inf, np.inf)
 
 
-# Camera paths: compared with what sees the same, and with naive AD of the same paths at equal seeds.
+# Camera paths, compared with integrators that see the same light, and with naive AD of the same paths at equal seeds.
 
 WAYS = "stack,stack(paths=both,light_share=0.25),stack(paths=camera)"
 
@@ -554,7 +554,7 @@ def test_smooth_directions():
     assert weights[0].max() == weights[:, -1].max() == 0
 
 
-# A gradcheck that goes on from another one: at the same seeds it comes to what a single one comes to.
+# A gradcheck that continues an earlier one gives the results of a single check at the same seeds.
 
 
 def check_again(
@@ -582,12 +582,12 @@ def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path, m
     more, _ = check_again(6, tmp_path / "c.npz", earlier)
     assert [(r.reference, r.verdict, r.seeds) for r in more] == [(r.reference, r.verdict, r.seeds) for r in whole]
     for one, other in zip(more, whole, strict=True):
-        # What differs by rounding alone has no figures that would be the same twice.
+        # If gradients differ only by rounding, these statistics are not reproducible.
         noisy = one.reference is Reference.PTRACER
         for name in ("relative_l2", "z_max", "z_rms", "variance_ratio") if noisy else ("relative_l2",):
             assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-2, abs=1e-4), (one.reference, name)
     assert {record.verdict for record in more} == {Verdict.HOLDS}
-    # A seed that is on file is not taken again.
+    # A seed in the file is not taken again.
     monkeypatch.setattr(Participants, "sample", None)
     monkeypatch.setattr(Participants, "choose_steps", None)
     same, _ = check_again(6, tmp_path / "d.npz", Earlier(KIND, Path("g.jsonl"), *read_samples(tmp_path / "c.npz")))
@@ -670,7 +670,7 @@ def test_a_second_budget_adds_new_seeds_and_is_kept(monkeypatch: pytest.MonkeyPa
     assert all(len(second.of(name)) > before.get(name, 0) for name in NAMES)
     for label, seeds in Directed.seeds.items():
         assert not set(seeds) & set(firsts.get(label, ()))
-    # The step of differences is that of the first session, and is not chosen again.
+    # The step of finite differences is the step of the first session. It is not chosen again.
     assert second.participants.directions["a"][0].step == 0.01
     assert second.participants.directions["a"][0].truncation == 0.5
     assert ("differences", "a") not in before or ("choose", "a") not in second.participants.known

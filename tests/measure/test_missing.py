@@ -34,7 +34,7 @@ from reslrb_cli.transport import bsdf, connection
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.walk import Segment
 
-# The share of a derivative that attached gradients lack, where it is known.
+# The share of a derivative that attached gradients lack, in scenes where this share is known.
 
 HALF, EDGE, HEIGHT, TILT, IOR, SLAB = 0.6, 0.2, 1.4, 0.5, 1.5, 0.3
 SPP, SEEDS = 64, 24
@@ -129,7 +129,8 @@ def test_a_texture_has_a_complete_derivative():
 @pytest.mark.parametrize(
     ("scene", "known"),
     [
-        # The beam's right end brings HALF, of which what lands already brings its own width.
+        # The beam's right end contributes HALF to the derivative. Attached gradients contain the width of the landing
+        # light.
         (lambda: half_covered("lamp"), EDGE / HALF),
         pytest.param(lambda: half_covered("cover"), 1.0, marks=pytest.mark.long),
         pytest.param(slab_in_a_beam, slab_share(), marks=pytest.mark.long),
@@ -219,7 +220,7 @@ def test_the_command_and_more_seeds(
     """Two calls give the result of one call, around the same steps. The command refuses to continue another
     measurement.
     """
-    monkeypatch.setattr(missing_check, "IMAGE_PATHS", 2**16)  # of noise in dL/dI, which is the same for all
+    monkeypatch.setattr(missing_check, "IMAGE_PATHS", 2**16)  # noisier dL/dI, which is the same for all
     config = tmp_path / "lamp.yaml"
     config.write_text(LAMP.format(folder=Path(__file__).parent))
     whole, part = (tmp_path / f"{name}.jsonl" for name in ("whole", "part"))
@@ -235,7 +236,7 @@ def test_the_command_and_more_seeds(
     assert call(str(config), *again, "--seeds", "6", "--json", str(part)) == 0
     other = json.loads(part.read_text().splitlines()[-1])
     assert other["seeds"] == 6
-    for name in ("share", "standard_error"):  # threads add up in any order
+    for name in ("share", "standard_error"):  # threads add in varying order
         assert other[name] == pytest.approx(row[name], rel=1e-3, abs=1e-5)
     capsys.readouterr()
     with monkeypatch.context() as patch:
@@ -275,9 +276,10 @@ def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
         MissingCheck(config, 0, 2, 16, 1)
 
 
-# Derivatives of what moves light against finite differences: a few scenes by default, all with `-m long`.
+# Derivatives of parameters that move light, compared with finite differences. A few scenes run by default, and all with
+# `-m long`.
 
-#: Of the root mean square of the derivatives.
+#: Limits relative to the root mean square of the derivatives.
 ERROR, STANDARD_ERROR = 5e-3, 1e-3
 
 
@@ -286,7 +288,7 @@ def test_enough():
     assert len(SCENES) >= 16
 
 
-#: Rooms in which light bounces are too noisy for that.
+#: Scenes without the rooms, in which bouncing light is too noisy for these limits.
 STEADY = [name for name in SCENES if name not in {room.name for room in ROOMS}]
 
 

@@ -15,7 +15,7 @@ from measure.faults import CHECKS, FAULTS, Fault
 
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
-#: Of the default suite: it shows that the machinery works, and all others take minutes.
+#: The only fault in the default suite. It shows that the machinery works, and all others take minutes.
 QUICK = ("stack_without_last_vertex",)
 
 
@@ -48,7 +48,8 @@ def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
     found = failures(CHECKS[fault.check]())
     assert fault.fails <= found
-    # Nothing but what has the fault. Camera paths beside light paths, or in their place, use the code of the estimator.
+    # Only methods with the fault fail. Camera paths beside light paths, or in their place, use the code of the same
+    # estimator.
     assert {name and re.sub(r"\(paths=\w+\)$", "", name) for name, _ in found} == {name for name, _ in fault.fails}
 
 
@@ -74,7 +75,7 @@ def plant(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
     function = getattr(function, "__func__", function)
     source = textwrap.dedent(inspect.getsource(function))
     assert source.count(fault.right) == 1, f"{fault.where} has no such line any more: {fault.right}"
-    # Annotations name what is imported for type checkers alone.
+    # Annotations name types that are imported only for type checkers.
     broken_source = "from __future__ import annotations\n" + source.replace(fault.right, fault.wrong)
     scope = dict(function.__globals__)
     exec(compile(broken_source, fault.where, "exec", dont_inherit=True), scope)

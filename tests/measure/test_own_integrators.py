@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 FILE = Path(__file__).with_name("own_replay.py")
 
-#: A floor of two materials, mixed by a texture, beside a wall; two lamps.
+#: A floor of two materials that a texture mixes, a wall beside it, and two lamps.
 SCENE = """<scene version="3.0.0">
     <sensor type="perspective" id="camera">
         <float name="fov" value="60"/>
@@ -67,10 +67,10 @@ integrator: {type: reslrb, max_depth: 5, rr_depth: 1, paths: camera, estimator: 
 run: {iterations: 2, spp: 64}
 """
 
-#: What finds large faults.
+#: Options that are enough to find large faults.
 FEW = ["--seeds", "12", "--spp", "32", "--set", "integrator.max_depth=4"]
 
-#: Both parameters.
+#: Setting that recovers both parameters.
 TWO = "parameters=[{key: floor.bsdf.weight.color0.value, initial: 0.3}, {key: wall.bsdf.reflectance.value}]"
 
 
@@ -106,7 +106,7 @@ def test_a_correct_integrator_holds_and_its_cost_is_reported(capsys: pytest.Capt
     assert "times the variance and" in lines[0]
 
 
-#: Faults, and what the sentence has to say of them.
+#: Faults, and the phrases that the message about each fault must contain.
 FOUND = {
     "fault=cosine": ["its derivative by all emission is 1.", "direct light of a lamp", "its cosine"],
     "fault=replay": ["varies by", "other paths than the first"],
@@ -120,7 +120,7 @@ FOUND = {
     "fault=depth": ["a segment too soon"],
     "primal_fault=emitters": ["its image is", "check the image first", "from paths of 2 segments on"],
 }
-#: The default suite looks for these in paths that are no longer than they need.
+#: Faults that the default suite looks for, with the shortest maximal depth that shows each fault.
 QUICK = {"fault=cosine": 3, "fault=roulette": 4}
 
 
@@ -139,7 +139,7 @@ def test_a_fault_is_found_and_explained(capsys: pytest.CaptureFixture[str], faul
     assert "upper limit" not in lines[1], lines[1]
 
 
-#: A Cornell box, all of it diffuse.
+#: Settings of a small Cornell box with only diffuse surfaces.
 DIFFUSE = ["--set", "scene.options.size=16", "--set", "integrator.max_depth=5", "--set",
            "integrator.hide_emitters=false"]  # fmt: skip
 
@@ -159,7 +159,7 @@ def test_clamped_values_are_detected_in_darker_scenes(capsys: pytest.CaptureFixt
     assert f"wrong from paths of {3 if options.endswith('clamp') else 2} segments on" in said, said
 
 
-#: Mitsuba's own, as users' files name them, and what they are checked on.
+#: Integrators of Mitsuba, imported as in users' files, and the configuration that checks them.
 MITSUBAS = """from mitsuba.ad.integrators.direct_projective import DirectProjectiveIntegrator
 from mitsuba.ad.integrators.prb_basic import BasicPRBIntegrator
 """
@@ -180,7 +180,8 @@ def test_correct_integrators_of_mitsuba_hold(capsys: pytest.CaptureFixture[str])
     assert check("room.yaml", "DirectProjectiveIntegrator", "integrator.max_depth=2") == 0
 
 
-#: Something that moves in view, over a floor below a lamp; and what it may be: the corners of triangles.
+#: A scene with an object that moves in view, over a floor below a lamp. The objects are given by the corners of
+#: triangles.
 MOVING_SCENE = """<scene version="3.0.0">
     <sensor type="perspective">
         <float name="fov" value="45"/>

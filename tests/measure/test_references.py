@@ -32,7 +32,7 @@ def test_the_interval_has_its_coverage(entries):
         low, high = low * race.TIMING_NOISE, high / race.TIMING_NOISE
         assert low < value < high
         inside += low < 2.0 < high
-    # 190 of 200 are expected; fewer than 176 have a probability of 1e-4.
+    # Of 200 intervals, 190 are expected. A count below 176 has a probability of 1e-4.
     assert inside >= 176
 
 
@@ -41,7 +41,7 @@ def test_equal_methods_are_rarely_called_better():
         race.compare(samples(1.0, 8, 2 * seed), [3.0] * 8, samples(1.0, 8, 2 * seed + 1), [3.0] * 8)[1] > 1
         for seed in range(200)
     )
-    assert better <= 13  # 5 are expected on this side without what times may be off
+    assert better <= 13  # 5 are expected on this side without the allowance for times
 
 
 def test_zero_noise_cannot_be_compared():
@@ -57,10 +57,10 @@ def test_gradients_without_light_are_undecided():
 CAMERA_CASES = [
     ("ptracer,reslrb:stack", "reslrb:stack", (False, True, True)),
     ("prb,reslrb:stack", "reslrb:stack", (True, True, True)),
-    ("reslrb:stack", "prb", (True, True, True)),  # what errors are taken from is a side too
+    ("reslrb:stack", "prb", (True, True, True)),  # the reference of errors counts as a side too
     ("reslrb:stack(paths=both),reslrb:event", "reslrb:stack", (True, True, True)),
     ("reslrb:stack", "reslrb:stack(paths=auto)", (True, True, True)),
-    ("prb,reslrb:stack(paths=camera)", "reslrb:stack(paths=both)", (True, True, False)),  # all alike
+    ("prb,reslrb:stack(paths=camera)", "reslrb:stack(paths=both)", (True, True, False)),  # all use the camera
 ]
 
 

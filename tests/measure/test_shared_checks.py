@@ -26,7 +26,7 @@ checks = pytest.importorskip("reslrb_cli.cluster.checks", reason="pip install re
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-#: A start that no file of an experiment has: that of each part of a motion.
+#: Initial values that no file of an experiment contains: a start for each part of a motion.
 MOTION = (
     "parameters=[{motion: {of: wall, free: [translation, scale]}, initial: {translation: [0.1, 0, 0.2], scale: 0.9}}]"
 )

@@ -32,7 +32,7 @@ from reslrb_cli.measure.sampling import FEWEST, LEAST_SEEDS, MOST_SEEDS, Name, S
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
 from reslrb_cli.report.tables import cells, failure_line, gradcheck_columns
 
-# The statistics that the conformance tests rest on: they hold for equal expectations, and see a small bias.
+# Statistics of the conformance tests: they hold for equal expectations, and detect a small bias.
 
 
 def noise(seed: int, shape=(12, 32, 32, 3), mean: float = 1.0) -> np.ndarray:
@@ -112,10 +112,11 @@ def test_correlated_entries_do_not_count_separately():
         assert result.z_rms_threshold > 1.35 * z_rms_limit(60, 1e-2)
         failed += not result
         assert not compare(a + np.repeat([0.0, 0, 1.6, 0, 0], 12), b, block=None)
-    assert failed <= 9  # of 200, at 1 % for either criterion: more in one of 60 cases
+    assert failed <= 9  # of 200, at 1 % per criterion, with more in one of 60 cases
 
 
-# Whether two gradients agree: what is equal holds, what is not fails, and what cannot be told is not called a pass.
+# Whether two gradients agree: equal gradients hold, different gradients fail, and undecided cases do not count as
+# passed.
 
 FAMILY = Family(rows=20, entries=400, alpha=1e-4)
 TRUTH = np.linspace(-2, 3, 24)
@@ -141,7 +142,7 @@ def test_a_detectable_deviation_is_found(paired: bool):
         reference = noisy(k + 100)
         size = compare_expectations(noisy(k), reference, FAMILY, paired=paired).detectable
         seen.append(compare_expectations(noisy(k) + size * TRUTH, reference, FAMILY, paired=paired).verdict)
-    assert seen.count(Verdict.FAILS) >= 85  # 90 are expected, and more by z rms
+    assert seen.count(Verdict.FAILS) >= 85  # 90 of 100 are expected, and more by z rms
 
 
 def test_shared_noise_sharpens_a_paired_comparison():
@@ -174,7 +175,7 @@ def test_a_single_dominant_seed_does_not_pass():
 def test_tails_of_negligible_noise_do_not_matter():
     reference = np.ones((16, 4))
     ours = reference + 1e-4
-    ours[3] += 3e-2  # one seed carries the variance, of a standard error of 2e-3
+    ours[3] += 3e-2  # one seed causes the variance, with a standard error of 2e-3
     assert compare_expectations(ours, reference, FAMILY, bias=5e-3).verdict is Verdict.HEAVY_TAILED
     assert compare_expectations(ours, reference, FAMILY, bias=5e-2).verdict is Verdict.HOLDS
     assert compare_expectations(ours + 0.1, reference, FAMILY, bias=5e-2).verdict is Verdict.FAILS
@@ -222,7 +223,7 @@ def test_tiles_and_projections_of_a_texture():
     assert tiles.sum(1) == pytest.approx(gradient.sum(1))
     grid = gradient.reshape(2, 20, 30, 3)
     assert tiles[1, 0] == pytest.approx(grid[1, :2, :3, 0].sum())
-    # Two texels of one tile change places: sums are the same, projections are not.
+    # Two texels of a tile swap places. Sums stay the same, but projections change.
     swapped = grid.copy()
     swapped[:, 0, 0], swapped[:, 0, 1] = grid[:, 0, 1], grid[:, 0, 0]
     assert parts(swapped.reshape(2, -1), shape, 8) == pytest.approx(tiles)
@@ -285,7 +286,7 @@ def test_the_table_and_the_line_of_a_failure():
     )
 
 
-# How a gradcheck spends its budget: with samples that only pretend, on a clock of their own.
+# How a gradcheck spends its budget. The samples only pretend, and the tests have their own clock.
 
 NAMES: list[Name] = [
     ("image", "walk_ad"), ("image", "ptracer"), ("gradient", "reslrb:event"), ("gradient", "walk_ad"),

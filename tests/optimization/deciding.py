@@ -29,7 +29,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
 
 SMALL = ["scene.size=[32, 32]", "run.spp=64", "run.iterations=2", "run.certainty=false"]
-SMALL += ["run.measuring=1000"]  # though iterations are so few
+SMALL += ["run.measuring=1000"]  # despite so few iterations
 SIZES = Sizes(step=64, call=16, part=16, alone=False, rounds=ROUNDS, lessons=1 / 7, longer=GUIDING_LONGER)
 
 
@@ -75,7 +75,7 @@ class World:
         )  # fmt: skip
 
     def _noisy(self, random: np.random.Generator, variance: float) -> np.ndarray:
-        # Sparse noise, of variance 1 as well, is of a number of paths each of which says the same.
+        # Sparse noise also has variance 1. It comes from a random number of paths with equal contributions.
         noise = (random.poisson(4, self.entries) - 4) / 2 if self.sparse else random.normal(size=self.entries)
         return 1 + np.sqrt(variance) * noise
 

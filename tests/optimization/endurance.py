@@ -17,9 +17,9 @@ import numpy as np
 from scipy import stats
 
 MIB = 2.0**20
-#: Blocks in a window.
+#: Number of blocks in a window.
 BLOCKS = 10
-#: A level of significance, so that of dozens of runs not one fails by chance.
+#: Significance level, so low that none of dozens of runs fails by chance.
 LEVEL = 1e-3
 
 

@@ -91,7 +91,7 @@ def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     settings = [f"parameters=[{parameters}]", f"run.seed={seed}", *toy.settings]
     problem = assemble(load(folder / "toy.yaml", settings))
     true = {key: np.asarray(value, dtype=np.float64) for key, value in problem.truth.items()}
-    problem.truth.clear()  # nothing is judged by it
+    problem.truth.clear()  # no verdict uses the truth
     certainty = Certainty(problem)
     state = standing(problem)
     for after, record in iterate(Stages(problem), state):
@@ -100,7 +100,7 @@ def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     before = {key: value.copy() for key, value in problem.values().items()}
     found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
     assert found is not None
-    for key, value in problem.values().items():  # it measures, and leaves all as it was
+    for key, value in problem.values().items():  # measuring changes no value and no gradient
         np.testing.assert_array_equal(value, before[key])
         assert not np.any(np.array(problem.optimizer.gradient(key)))
     return Outcome(found, {key: value.astype(np.float64) for key, value in problem.values().items()}, true)

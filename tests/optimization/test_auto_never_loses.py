@@ -38,24 +38,24 @@ from reslrb_cli.records.images import write_file
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
 FOLDER = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in FOLDER.rglob("*.yaml"))
-#: Films of which a step takes a second at the most.
+#: Film sizes at which a step takes a second at most.
 SMALLER = {
     "grey_room": ["scene.options.resx=120", "scene.options.resy=90"],
     "cornell_floor": ["scene.options.resx=128", "scene.options.resy=128"],
 }
-#: Whose target is a picture.
+#: Experiments whose target is a picture.
 PICTURED = ("mixed_room",)
 AUTO = ["integrator.guiding=auto", "integrator.sequence=auto", "run.measuring=1000"]
-#: Scenes in which gradients break, each with another reason to draw samples otherwise: a sun, a lamp that is a dot,
-#: parallel light that grazes a floor, glass in glass, texels that are black, a film of one column.
+#: Scenes in which gradients break, each with another reason to draw samples differently. They have a sun, a tiny lamp,
+#: parallel light that grazes a floor, glass in glass, black texels, or a film of one column.
 EXTREME = ["sun_1e6", "lamp_of_area_1e-8", "grazing_light", "nested_dielectrics", "albedo_0_roulette", "film_1x4096"]
 PREFIX = "extreme/"
-#: Light paths of a step of theirs.
+#: Light paths in a step of these scenes.
 PATHS = 2**20
-#: The last round is begun while there is time for one like that before it. Beside others' work on the machine it may
-#: take so many times as long as the mean of all: where steps take milliseconds, that is a part that counts.
+#: The last round starts while time remains for a round like the previous one. Under other load on the machine, a round
+#: may take this many times the mean. Where steps take milliseconds, this excess is noticeable.
 OVERRUN = 2
-#: What decides on the integrator.
+#: Function that decides on the integrator.
 SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], Problem]] = {"settle": settle}
 
 
@@ -131,7 +131,7 @@ def test_no_scene_loses(name: str, tmp_path: Path) -> None:
     if problem.sides is not None:
         both = [f"integrator.light_share={problem.sides.light_share}"] if problem.sides.paths == "both" else []
         settings += [f"integrator.paths={problem.sides.paths}", *both]
-    if camera:  # of which none begins at a lamp
+    if camera:  # no path starts at a lamp
         assert sequence is None
     else:
         assert sequence is not None
@@ -160,7 +160,7 @@ def test_losses_are_found(fault: str, tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(sys.modules[__name__], "AUTO", [*AUTO, "integrator.paths=light"])
     if fault == "on whatever is found":
         monkeypatch.setattr(GuidingPilot, "_record", forced(GuidingPilot._record, True))
-        # What would take the place of guiding here.
+        # Otherwise, low-discrepancy sequences would take the place of guiding here.
         monkeypatch.setattr(SequencePilot, "_record", forced(SequencePilot._record, False))
     else:
 

@@ -34,7 +34,7 @@ from reslrb_cli.optimization.uncertainty import measuring
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS, Certainty
 from reslrb_cli.statistics import rms
 
-# What is said of runs whose truth is known, half of them made to fail: verdicts are right, and none is too kind.
+# Verdicts about runs with known truth, of which half are made to fail. Verdicts are right, and none is too favourable.
 
 SETTLED, MOVING, BOUND = "settled", "still moving", "at its bound"
 NOISE, UNDETERMINED, NONE = "below the noise", "not determined", "no effect"
@@ -76,7 +76,7 @@ FAIL = [
     Toy("a lamp's noise", {TWIN: FAST}, {TWIN: NOISE}, ("run.spp=1", "run.adjoint=independent")),
     Toy("a texture's noise", {POSTER: COLOR}, {POSTER: NOISE}, ("run.spp=4",)),
 ]  # fmt: skip
-#: Of the long runs, those that every change is tried with.
+#: Runs among the long ones that every change is tested with.
 SHORT = [FAIL[0], FAIL[3], FAIL[6]]
 
 
@@ -140,7 +140,7 @@ def test_verdicts_of_twenty_runs(folder, seed):
     assert np.sqrt(np.mean(np.square(ratios))) < 1.5  # a spread that is too small would be worse than none
 
 
-#: A texture that its regularizer holds far from what the images alone would have it be.
+#: A texture that its regularizer keeps far from the result of the images alone.
 HELD = Toy("a texture that is held even", {POSTER: f"{COLOR}, regularizers: [{{type: laplacian, weight: 1.0e-5}}]"},
            {POSTER: SETTLED}, ("run.spp=160", "run.iterations=80",
                                "optimizer={type: adam, learning_rate: 0.02, schedule: cosine}"))  # fmt: skip
@@ -169,7 +169,7 @@ def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
     seen = np.mean(images, axis=0)
     added = gradients[0].mean(axis=0) - seen
     assert rms(added) > 0
-    assert added @ seen < -0.7 * np.linalg.norm(added) * np.linalg.norm(seen)  # they pull against each other
+    assert added @ seen < -0.7 * np.linalg.norm(added) * np.linalg.norm(seen)  # both gradients oppose each other
     loose = run(folder, replace(HELD, parameters={POSTER: COLOR}))
     spreads = [np.median(each.certainty.parameters[POSTER].spread) for each in (held, loose)]
     assert spreads[0] < 0.7 * spreads[1]
@@ -194,7 +194,7 @@ def test_noisy_curvature_is_measured_again_with_all_samples(folder, monkeypatch)
     assert [each.verdict for each in found.values()] == [SETTLED, SETTLED, NOISE]
 
 
-#: Parameters, and the target's samples per pixel, whose noise is most of what is wrong with them.
+#: Parameters, and the target's samples per pixel. Noise in the target causes most of the error of these parameters.
 NOISY = {
     "a colour": ({WALL: COLOR}, 64), "a roughness": ({ALPHA: METAL}, 64), "a lamp": ({LEFT: FAST}, 64),
     "colour and roughness": ({WALL: COLOR, ALPHA: METAL}, 64), "a texture": ({POSTER: COLOR}, 64),
@@ -246,13 +246,14 @@ def test_the_truth_is_within_spreads_with_the_noise_of_the_target(folder, name, 
             settled += about.verdict == SETTLED and bool(np.sqrt(np.mean(np.square(errors / spread))) > 3)
     size, bare = (np.sqrt(np.nanmean(np.square(each))) for each in (z, without))
     print(f"{name}, {loss}: {len(z)} errors over spreads, rms {size:.2f}; without the target's noise {bare:.2f}")
-    # A relative loss weighs what noise has darkened, by which it is pulled further than its spread says.
+    # A relative loss gives more weight to pixels that noise has darkened. The loss pulls parameters further than their
+    # spread says.
     assert 0.3 < size < (1.5 if loss == "l2" else 2.5)
     assert bare > 1.5
     assert not settled
 
 
-# Five lamps and four roughnesses at once: whatever is wrong of them is told to be.
+# Five lamps and four roughnesses at once: all wrong values are reported.
 
 LAMPS = {
     "a": (-2.4, "9, 6, 4"),
@@ -267,7 +268,7 @@ SCENE = scene(
     shape("rectangle", "back", diffuse("0.6, 0.4, 0.25"), place='<scale value="3"/><translate z="-0.5"/>'),
     "BODY",
 )
-#: How far off a value may be that is said to be settled: in standard deviations of its spread, and as a share of it.
+#: Largest error of a value with the verdict settled: in standard deviations of its spread, and as a share of the value.
 SPREADS, SHARE = 3.0, 0.15
 
 
@@ -303,16 +304,16 @@ def test_wrong_values_are_reported(llvm, tmp_path, spp):
     print(
         f"{wrong} of {len(found.certainty.parameters)} wrong; measured in {found.certainty.share:.3f} of the run's time"
     )
-    assert wrong >= 3  # else nothing is shown
+    assert wrong >= 3  # else the test shows nothing
     assert not kind
 
 
-# How certain values are beside an exposure and under a mask: what a mask takes away is missed, and named.
+# How certain values are with an exposure and under a mask. The loss of the masked information is detected and named.
 
 EXPOSURE = "exposure"
 COLOR_OF_BACK = {WALL: "initial: 0.5, bounds: [0, 1]"}
 SETTINGS = ("run.spp=64", "target.exposure=auto")
-#: What it takes to tell them apart by what little is known in view.
+#: Settings that separate exposure and colour by the small known part in view.
 ENOUGH = ("run.spp=512", "run.iterations=200", "optimizer.schedule=cosine", "target.exposure=auto")
 SUBPIXELS = 4
 
@@ -356,7 +357,7 @@ def test_with_a_mask_colour_and_exposure_compensate_for_each_other(folder_of_vie
     assert (wall.partner, exposure.partner) == (EXPOSURE, WALL)
 
 
-# When nothing is measured of how certain values are: runs that are short, and those that are told to stop.
+# Certainty is not measured in short runs and in runs that are told to stop.
 
 
 def test_short_and_stopped_runs_have_no_verdicts(tmp_path, monkeypatch):
@@ -370,7 +371,7 @@ def test_short_and_stopped_runs_have_no_verdicts(tmp_path, monkeypatch):
     assert certainty.measure(LEAST_ITERATIONS - 1, 1.0, lambda: False) is None
     assert certainty.measure(100, 1.0, lambda: True) is None
     assert asked == []
-    assert certainty.measure(100, 1.0, lambda: len(asked) == 2) is None  # Ctrl-C in the midst of it
+    assert certainty.measure(100, 1.0, lambda: len(asked) == 2) is None  # Ctrl-C during the measurement
     assert asked == [0, 1]
     np.testing.assert_array_equal(problem.values()["albedo"], before)
 

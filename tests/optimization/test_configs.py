@@ -13,7 +13,7 @@ from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.sensitivity import measure_conditioning
 
-# The stiff experiments in `configs/stiff/`: they load, and are as stiff as they say.
+# The stiff experiments in `configs/stiff/`: they load, and have the stated stiffness.
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "stiff"
 SMALL = ["scene.options={resx: 16, resy: 16}", "target.render.spp=16"]
@@ -47,10 +47,10 @@ def test_the_mixed_room_is_recovered_if_only_the_mirror_shows_it():
     key = "print.reflectance.data"
     error = (problem.values()[key] - problem.truth[key])[4:22]
     assert np.sqrt((error[:, 14:] ** 2).mean()) < 0.05
-    assert np.sqrt((error[:, :10] ** 2).mean()) < 0.12  # only the mirror shows it
+    assert np.sqrt((error[:, :10] ** 2).mean()) < 0.12  # only the mirror shows this part
 
 
-# The shipped configurations whose parameters move light recover them to a tenth.
+# The shipped configurations whose parameters move light reduce the parameters' errors to a tenth.
 
 MOVING_CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

@@ -28,9 +28,9 @@ from reslrb_cli.records.clock import MIB, StepClock, peak_mib, reset_peak
 from reslrb_cli.runs import prepare
 from reslrb_cli.runs import recorder as recording
 
-# Long runs: neither memory nor the time of a step grows; and what grows is seen.
+# Long runs: memory and step time do not grow, and planted growth is detected.
 
-#: Iterations of the toy, by default, and of a block of these.
+#: Iterations of the toy by default, and iterations of a block.
 FEW, BLOCK = 600, 2
 
 
@@ -82,7 +82,7 @@ def test_a_leak_outside_the_allocator_is_found(toy: Any) -> None:
     kept = []
 
     def leak(call: int) -> float:
-        kept.append(np.full(2**18, call % 7, np.uint8))  # 256 kB, written to: more than was free within the process
+        kept.append(np.full(2**18, call % 7, np.uint8))  # 256 kB of written memory, more than the process had free
         return 0.0
 
     toy.loss = leak
@@ -93,7 +93,7 @@ def test_a_leak_outside_the_allocator_is_found(toy: Any) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_slowdown_is_found(toy: Any) -> None:
     def slow(call: int) -> float:
-        until = time.process_time() + 1e-3 * call / FEW  # a fifth of a step or so, at the end
+        until = time.process_time() + 1e-3 * call / FEW  # about a fifth of a step at the end
         while time.process_time() < until:
             pass
         return 0.0
@@ -104,9 +104,9 @@ def test_a_slowdown_is_found(toy: Any) -> None:
     assert any(fault.startswith("steps grow by ") for fault in watched.faults())
 
 
-# Clock and allocator's peak against costs that are planted: a kernel, a sleep, files that take long, a leak.
+# The clock and the allocator's peak, tested with planted costs: a kernel, a sleep, slow files, a leak.
 
-#: Lanes of the kernels, and turns of the loop of the cheaper one: some ten milliseconds.
+#: Lanes of the kernels, and loop turns of the cheaper kernel, which takes about ten milliseconds.
 LANES, TURNS = 2**16, 256
 SLEEP_S = 0.2
 
@@ -139,7 +139,7 @@ def test_a_kernel_of_known_cost() -> None:
                 for _ in range(launches):
                     chain(turns)
             assert step.kernel_ms + step.codegen_ms <= 1.01 * step.wall_ms + 0.1
-            if repetition == 0:  # which compiles
+            if repetition == 0:  # the first one compiles
                 continue
             assert step.new_kernels == 0
             kernel_ms[turns] = min(step.kernel_ms, kernel_ms.get(turns, math.inf))
@@ -155,7 +155,7 @@ def _as_expected(kernel_ms: dict[int, float], wall_ms: dict[int, float]) -> bool
     return bool(
         long / short == pytest.approx(16, rel=0.35)
         and twice / long == pytest.approx(2, rel=0.25)
-        and long == pytest.approx(wall, rel=0.25)  # there is hardly anything else
+        and long == pytest.approx(wall, rel=0.25)  # other work takes hardly any time
     )
 
 

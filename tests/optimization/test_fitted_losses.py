@@ -20,7 +20,7 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.views import View, make_loss, slope, to_tensor
 
-# Fitted scales, against double precision.
+# Fitted scales, compared with double precision.
 
 
 def plain_in_numpy(function, image, target, weights):
@@ -80,7 +80,7 @@ def test_a_fitted_loss_ignores_brightness(name):
     assert abs(along) < 1e-5 * size
 
 
-# Noise.
+# Effect of noise on fitted gradients and scales.
 
 
 def slopes_along(view, images, directions):
@@ -156,7 +156,7 @@ def test_a_rendered_parameter_at_equal_seeds(folder, name, fits):
     for side in (1, -1):
         problem.selection.set_arrays({KEY: base + side * 0.1 * direction})
         sides.append(np.array(render_image(problem.integrator, problem.scene, 0, 3, 64), dtype=np.float64))
-    image, change = 0.5 * (sides[0] + sides[1]), (sides[0] - sides[1]) / 0.2  # light is scattered once: it is linear
+    image, change = 0.5 * (sides[0] + sides[1]), (sides[0] - sides[1]) / 0.2  # linear, because light scatters once
     target, weights = np.array(view.target, dtype=np.float64), np.ones(image.shape)
     of = fitted_in_numpy if fits == "fitted" else plain_in_numpy
     up, down = (of(REFERENCES[name][0], image + side * 1e-6 * change, target, weights) for side in (1, -1))

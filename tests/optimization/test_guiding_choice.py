@@ -53,14 +53,13 @@ from reslrb_cli.records.checkpoint import STATE_FILE, read_state
 from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, SequenceRecord
 from reslrb_cli.records.manifest import read_manifest
 
-# `guiding: auto` in whole runs of a small scene: what is decided, what is then traced, and what is kept of it.
-#
-# Times are given, so that it is decided alike on every machine; variances are those of the scene, whose lamp sends
-# one path in twenty to where anything is seen.
+# `guiding: auto` in whole runs of a small scene: the decision, the paths that are then traced, and what is kept.  Times
+# are given, so that every machine decides alike. Variances come from the scene, whose lamp sends one path in twenty to
+# a visible place.
 
 AUTO = ["integrator.guiding=auto", *SMALL]
 RUN = Path("runs/tiny")
-#: A problem's field for what is decided on an option, and the option's words, off and on.
+#: Field of a problem that holds the decision on an option, and the option's words for off and on.
 FIELD = {"guiding": "guided", "sequence": "sequence"}
 WORDS = {"guiding": ("off", "on"), "sequence": ("independent", "low_discrepancy")}
 
@@ -111,7 +110,7 @@ def test_on_enables_guiding_and_off_removes_it(
         assert not any(np.any(np.array(problem.optimizer.gradient(key))) for key in problem.selection.keys)
         counts.append(operations(problem))
         del problem, guiding
-        gc.collect()  # scenes that are alive at the same time show in each other's kernels
+        gc.collect()  # scenes alive at the same time change each other's kernels
     on, off, plain = counts
     assert off == plain
     assert on != plain
@@ -149,7 +148,7 @@ def test_images_are_not_guided_if_it_does_not_pay(experiment: Path, monkeypatch:
     ]
     plain = assemble(load("tiny.yaml", [*AUTO[1:], "run.adjoint=independent"]))
     images = [each.render(0, 4, 3, "test") for each in (problem, plain)]
-    np.testing.assert_allclose(images[0], images[1], rtol=1e-5)  # the same paths
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-5)  # both use the same paths
 
 
 def seeds_of_parts(monkeypatch: pytest.MonkeyPatch, experiment: Path) -> tuple[set[int], set[int]]:
@@ -237,7 +236,7 @@ def test_a_run_reports_remembers_and_records_the_decision(
     assert is_even(again) == (option == "sequence")
     row = next(line for line in inspected(capsys, str(RUN)) if part in line)
     assert row.split()[0] == "needed"
-    # No more cells than the 16,384 paths of a batch can tell apart.
+    # At most as many cells as the 16,384 paths of a batch can distinguish.
     assert option != "guiding" or "65536 cells, 6.1 MiB" in row
     assert f"{option}: auto, {gain}" in row
     row = next(line for line in inspected(capsys, "tiny.yaml", "--set", settings[0]) if part in line)
@@ -327,7 +326,8 @@ def test_an_explicit_choice_is_not_measured(option: str, experiment: Path, monke
         assert is_even(problem) == (is_on and option == "sequence")
 
 
-# Whether guided emission pays, decided on fabricated steps: what is on, what is off, at what cost, how sure.
+# Whether guided emission pays, decided on fabricated steps: what is on, what is off, at what cost, and with what
+# confidence.
 
 
 def gain(world: World, sizes: Sizes = SIZES) -> float:
@@ -344,7 +344,7 @@ def gain(world: World, sizes: Sizes = SIZES) -> float:
         (World(1.0, 1.0), False),
         (World(0.5, 1.0), True),
         (World(3.0, 0.5), False),
-        (World(0.1, 2.2, image=3.0), False),  # the image would pay for it
+        (World(0.1, 2.2, image=3.0), False),  # the image would lose efficiency
         (World(0.1, 2.2, image=0.4), True),
         (World(0.1, 2.2, sparse=True), True),
     ],
@@ -374,7 +374,7 @@ def test_the_interval_of_the_gain_has_its_coverage(entries: int, sparse: bool) -
         assert record.high is not None
         inside += record.low * TIMING_NOISE < gain(world) < record.high / TIMING_NOISE
     print(entries, sparse, inside)
-    # 95 of 100 are expected; fewer than 86 have a probability of 1e-4.
+    # Of 100 intervals, 95 are expected. A count below 86 has a probability of 1e-4.
     assert inside >= 86
 
 
@@ -384,10 +384,10 @@ def on_by_accident(**world: Any) -> int:
 
 
 def test_it_is_rarely_on_if_it_does_not_pay() -> None:
-    # What it gains, learning costs again: 0.8 * (1 + 0.1 + 0.15).
+    # Learning costs as much as guiding gains: 0.8 * (1 + 0.1 + 0.15).
     world = {"variance": 0.8, "walk": 0.7, "python": 16.8}
     assert gain(World(**world)) == pytest.approx(1)
-    # 2.5 are expected on this side, were times not allowed to be off, and one more for the looks before the last.
+    # Without the allowance for times, 2.5 are expected on this side. The looks before the last add one more.
     assert on_by_accident(**world) <= 9
     assert on_by_accident(**world, entries=3) <= 9
 
@@ -428,7 +428,7 @@ def test_its_share_of_the_time_is_kept(spp: int, overhead: float, python: float,
     else:
         assert record.rounds >= LEAST_ROUNDS
         assert 1 <= [call[0] for call in taken].count("learn") <= LEARNINGS
-    # The last round may be longer than those before.
+    # The last round may take longer than the earlier rounds.
     assert record.share <= GUIDING_SHARE * 1.05
     assert record.share * ITERATIONS * (spp + overhead) == pytest.approx(1e3 * record.measure_s, rel=1e-6)
 
@@ -450,7 +450,7 @@ def test_costs_outside_kernels_count_as_often_as_in_a_run() -> None:
 def test_a_second_walk_is_left_out_without_time(python: float, walks: int) -> None:
     world = World(0.1, 1.0, overhead=1.0, python=python, walk=1.5)
     record = world.run(Sizes(16, 16, 16, False, 8, 1 / 7, GUIDING_LONGER), GUIDING_SHARE)
-    assert [call[0] for call in world.calls].count("learn") == max(walks, 1)  # one, to see what it takes
+    assert [call[0] for call in world.calls].count("learn") == max(walks, 1)  # one walk, to measure its cost
     assert (record.rounds >= LEAST_ROUNDS) == (walks > 0)
     assert record.share <= GUIDING_SHARE * 1.05
 
@@ -473,7 +473,7 @@ def test_images_with_their_own_samples_are_guided_if_it_pays() -> None:
         assert record.guided
         assert record.images == guided
         assert record.line().startswith("guiding on: " if guided else "guiding on for gradients, off for images: ")
-        # What the image takes is a part of the step.
+        # The time of the image is a part of the step time.
         own = image_time if guided else 1.0
         learning = (16 + 1) * SIZES.lessons / 16
         assert record.gain == pytest.approx((1 + 1) / (0.05 * (2 + own + learning)), rel=0.2)
@@ -517,7 +517,7 @@ def test_learning_walks_come_before_all_guided_steps() -> None:
     assert LEARNINGS == kinds.count("learn")
 
 
-# How much of a run is learning: by its length, and what a forecast makes of steps that learned.
+# Share of learning in a run: by the run's length, and in the forecast from steps that learned.
 
 
 @pytest.mark.parametrize("iterations", [1, 3, 23])

@@ -20,7 +20,7 @@ from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.metrics import ClampTally
 from reslrb_cli.records.tree import entries
 
-# The loop on a problem whose image is its parameter: what it records.
+# The loop on a problem whose image is its parameter, and the records of the loop.
 
 
 def test_records_follow_gradient_descent(tmp_path, steps):
@@ -68,7 +68,7 @@ def test_the_time_limit_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch
         ]
         assert [record.lr for _, record in found] == pytest.approx(rates)
     assert len(run("run.max_seconds=0.5")) == 1  # the first iteration is always completed
-    # iterations that are further than the time decide the schedule
+    # The schedule follows the iterations if they are further along than the time
     last = run("run.max_seconds=1000000", "run.iterations=4")[-1]
     assert (last[1].lr, last[0].stopped) == (pytest.approx(0.02), "")
 
@@ -97,7 +97,7 @@ def test_each_view_and_iteration_has_its_own_seed(tmp_path, steps):
     list(loop.optimize(problem))
     assert [call.sensor for call in steps.calls[:3]] == [0, 1, 2]
     assert len({call.seed for call in steps.calls}) == 60
-    assert {call.adjoint for call in steps.calls} == {"independent"}  # four batches do not divide 3 samples
+    assert {call.adjoint for call in steps.calls} == {"independent"}  # 3 samples do not divide into four batches
 
 
 def test_equal_states_have_equal_successors(tmp_path, steps):
@@ -146,7 +146,7 @@ def test_counting_does_not_change_finite_entries():
     assert float(finite_square_norm(color)[0]) == pytest.approx(5.0)
 
 
-# What the loop does with values that are not finite, by each policy.
+# How the loop treats values that are not finite, by policy.
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -325,7 +325,7 @@ def test_after_a_non_finite_loss_nothing_moves(tmp_path, steps, kind):
     assert values["albedo"][0] == values["albedo"][1] != values["albedo"][2]
 
 
-# The clamp against outliers in gradients: what it takes, and what it says of that.
+# The clamp against outliers in gradients: which entries it clamps, and what it reports.
 
 
 def leaf(kind, shape):
@@ -404,7 +404,7 @@ def test_outliers_of_one_sign_are_a_bias():
 def test_colours_and_numbers_are_clamped_too():
     for kind, channels in ((mi.Color3f, 3), (mi.Float, 1)):
         gradients = np.ones((10, channels, 1), np.float32)
-        gradients[9, 0] = 1e30  # whose square would overflow
+        gradients[9, 0] = 1e30  # its square would overflow
         clamped, said = clamp_all(5.0, gradients, kind)
         assert clamped[9, 0, 0] == pytest.approx(5)
         assert said[9].entries == 1
@@ -450,7 +450,7 @@ def test_a_run_clamps_and_says_so(tmp_path, steps):
     steps_taken = np.diff(values)
     assert steps_taken[1] / steps_taken[0] == pytest.approx(3 * records[2].lr / records[1].lr, rel=0.05)
     assert (tally.iterations, tally.entries) == (1, 1)
-    # of 12 gradients of the same size over 5 iterations, 997 of another one
+    # The sum is 12 equal gradients over 5 iterations plus 999 of the outlier, from which the clamp takes 997
     assert tally.bias["albedo"] == pytest.approx(997 / (60 + 999), rel=0.01)
     assert "1 entries of gradients clamped in 1 iterations: a bias of 94 % of that of albedo" in str(tally)
     assert '"bias": {"albedo": ' in records[2].to_json()

@@ -21,7 +21,7 @@ from reslrb_cli.optimization.losses import LOSSES, weighted
 from reslrb_cli.optimization.sensitivity import measure_sensitivities, sample_gradient, see_images, take_gradient
 from reslrb_cli.optimization.views import View, make_loss, make_views, slope, view_records
 
-# Losses against NumPy, values and gradients.
+# Losses: values and gradients, compared with NumPy.
 
 EPSILON = 0.02
 REFERENCES = {
@@ -29,7 +29,7 @@ REFERENCES = {
     "l2": (lambda i, t: (i - t) ** 2, lambda i, t: 2 * (i - t)),
     "relative_l2": (lambda i, t: (i - t) ** 2 / (t**2 + EPSILON), lambda i, t: 2 * (i - t) / (t**2 + EPSILON)),
 }
-#: Those of each pixel by itself.
+#: Losses that treat each pixel by itself.
 POINTWISE = tuple(REFERENCES)
 
 
@@ -256,9 +256,9 @@ def test_ssim_of_a_too_small_image(tmp_path):
         make_views(read(tmp_path, "[{type: l2}, {type: ssim}]"), scene)
 
 
-# Exposures that are recovered: their gradient, and where the images cannot tell them from parameters.
+# Recovery of exposures: their gradient, and cases where images cannot tell exposures from parameters.
 
-#: Exposures that gradients are taken at.
+#: Exposures at which gradients are taken.
 AT = {"auto": [1.3], "per_channel": [1.3, 0.7, 2.0]}
 ROUNDS = 200
 LAMP = "lamp.emitter.radiance.value"
@@ -298,7 +298,7 @@ def test_the_gradient_equals_that_of_the_mean_image(folder, kind, adjoint):
     image, target = problem.render(0, 8192, 0, "mean").astype(np.float64), np.array(problem.views[0].target)
     exact = 2 * (np.array(AT[kind]) * image - target) * image / image.size
     exact = exact.sum((0, 1)) if kind == "per_channel" else np.array([exact.sum()])
-    reference = np.stack([exact, exact])  # without noise to speak of
+    reference = np.stack([exact, exact])  # with negligible noise
     found = compare(np.array(rows, np.float64)[:, None, None], reference[:, None, None], 1)
     assert found.holds == (adjoint != "correlated"), found
 
@@ -339,9 +339,9 @@ def test_a_colour_beside_a_known_one_is_recovered_with_the_exposure(folder):
     np.testing.assert_allclose(problem.selection.array(side), [0.1, 0.6, 0.3], atol=0.04)
 
 
-# Masks: which pixels they leave out, and that nothing of those counts.
+# Masks: which pixels they leave out, and that these pixels have no effect.
 
-#: Pixels (y, x) of the target that are not to be trusted, one of each kind.
+#: Pixels (y, x) of the target with unreliable values, one of each kind.
 CLIPPED, CLEAR, BROKEN = (1, 2), (3, 4), (5, 6)
 GLASS = """
     <shape type="sphere" id="ball">
@@ -416,7 +416,7 @@ def test_kinds_of_a_file(masked_folder):
 
 def test_pixels_mixed_with_clipped_ones_are_excluded(masked_folder):
     scene = masked_folder / "scene.xml"
-    scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))  # of radius 2
+    scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))  # its radius is 2
     problem, lines = make_masked(masked_folder, "target.file=photo.png", "target.mask={border: false}")
     y, x = CLIPPED
     near = {(v, u) for v in range(max(y - 2, 0), min(y + 3, 8)) for u in range(max(x - 2, 0), min(x + 3, 8))}
@@ -436,7 +436,7 @@ def test_a_file_can_show_the_values_of_the_scene(masked_folder):
     assert rendered.truth.keys() == problem.truth.keys() == set(problem.selection.keys)
     for key, value in rendered.truth.items():
         np.testing.assert_array_equal(problem.truth[key], value)
-        assert not np.array_equal(value, problem.selection.array(key))  # where the run begins
+        assert not np.array_equal(value, problem.selection.array(key))  # the run starts elsewhere
 
 
 def test_photograph_and_weights_are_rotated_by_their_own_exif(masked_folder):
@@ -477,7 +477,7 @@ def test_weights_of_a_file(masked_folder):
     mi.Bitmap(weights).write(str(masked_folder / "weights.png"))
     problem, _ = make_masked(masked_folder, "target.file=photo.png", "target.mask=weights.png")
     found = np.array(problem.views[0].weights)[:, :, 0]
-    assert left_out(problem) == [(0, 0)]  # alone: what is clipped counts
+    assert left_out(problem) == [(0, 0)]  # clipped pixels still count
     np.testing.assert_allclose(found[7, 7] / found[1, 2], 255 / 128, rtol=1e-5)
     np.testing.assert_allclose(found.mean(), 1, rtol=1e-5)
     problem, _ = make_masked(masked_folder, "target.file=photo.png", "target.mask={file: weights.png}")
@@ -494,7 +494,7 @@ def test_the_border_is_excluded_unless_both_are_light_traced(masked_folder, make
     render = f"target.render={{spp: 4, integrator: {{type: {maker}, max_depth: 3}}}}"
     assert len(left_out(assemble(load(masked_folder / "tiny.yaml", [render])))) == count
     assert not left_out(assemble(load(masked_folder / "tiny.yaml", [render, "target.mask={border: false}"])))
-    if maker == "prb":  # paths from the camera lose nothing there
+    if maker == "prb":  # camera paths lose no light at the border
         for same in ("type: prb", "paths: camera", "paths: both, light_share: 0.5"):
             sets = [f"integrator={{{same}, max_depth: 3}}", render]
             assert not left_out(assemble(load(masked_folder / "tiny.yaml", sets)))

@@ -24,7 +24,7 @@ MOTIONS = "parameters=[{motion: {of: slab, free: [translation, rotation, scale],
 MOTIONS += "{heightmap: {mesh: slab, resolution: [5, 4]}}, {motion: {of: lamp}}]"
 NO_TRUTH = "target.render.parameters={}"
 FLOOR = "parameters=[{key: floor.bsdf.reflectance.value}]"
-#: Steps of central differences, by what is recovered.
+#: Step of central differences for each kind of parameter.
 STEPS = {"translation": 1e-2, "rotation": 0.3, "scale": 1e-2, "heightmap": 2e-3}
 
 
@@ -64,8 +64,8 @@ def differences(problem: Any, key: str, directions: list[np.ndarray]) -> list[fl
 
 def test_gradients_match_finite_differences(tmp_path):
     problem = glass.assemble(tmp_path, MOTIONS, NO_TRUTH)
-    # The slab stays flat: where it is bent, correction for shading normals steps from triangle to triangle, which
-    # differences see and derivatives do not.
+    # The slab stays flat. On a bent slab, the correction for shading normals jumps between triangles. Differences
+    # include these jumps, and derivatives do not.
     start = {"slab.rotation": np.array([3, -4, 2], np.float32), "slab.scale": np.array(1.1, np.float32),
              "lamp.rotation": np.array([1, 2, -1], np.float32)}  # fmt: skip
     problem = glass_at(problem, start)
@@ -163,7 +163,7 @@ def test_roughness_stays_detached_by_default(tmp_path):
         assert np.isfinite(gradients(problem, 16)[f"glass.{key}"]).all()
 
 
-#: Settings, and where the error is and what it holds.
+#: Settings, the location of the error, and a part of its text.
 REFUSED = {
     "estimator": (["integrator.estimator=event"], "integrator.estimator", "use reservoir, stack"),
     "detached": (["integrator.attached=false"], "integrator.attached", "use auto"),

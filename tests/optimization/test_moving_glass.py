@@ -78,14 +78,14 @@ def test_the_mask_follows_the_glass(llvm: str, tmp_path: Path) -> None:
     assert loss < 0.1 * float(view.compare(image)[0])
     move(problem, [0.8, -0.6, 0])
     assert np.array_equal(left_out(problem), start)
-    set_targets(problem.views, arrays)  # as on a worker, which began when the glass was elsewhere
+    set_targets(problem.views, arrays)  # as on a worker that started with the glass elsewhere
     problem.apply()
     assert np.array_equal(left_out(problem), start)
     move(coarse, [0, 0, 0])
     assert left_out(coarse)[seen_by(coarse)].all()
     bare = began & ~left_out(coarse)
     assert bare.any()
-    assert np.all(np.array(coarse.views[0].target)[bare] > 0)  # the start's glass hides no target
+    assert np.all(np.array(coarse.views[0].target)[bare] > 0)  # glass at the start hides no target
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer, Variable, 
 from reslrb_cli.optimization.precondition import make_smoother
 from reslrb_cli.records.clock import StepClock
 
-# Optimisers against their published formulas; clamping, rates, parameters that sit out.
+# Optimisers, compared with their published formulas. Clamping, learning rates, and parameters that sit out a step.
 
 RATE = 0.05
 START = np.array([0.9, -0.4, 0.2, 1.5])
@@ -184,7 +184,7 @@ def test_step_lengths_at_given_values():
         assert optimizer.first_step("a") == (None if step is None else pytest.approx(step, rel=1e-5))
 
 
-# Reparameterisations: there and back, the chain rule, where values end, and what the optimiser makes of them.
+# Reparameterisations: round trips, the chain rule, limits of values, and the effect on the optimiser.
 
 #: Transform, bounds, values.
 TRANSFORMS = [
@@ -194,7 +194,7 @@ TRANSFORMS = [
     ("log", (0.01, 1e3), [0.011, 1.0, 900.0]),
     ("softplus", None, [1e-12, 1e-3, 0.4, 7.0, 100.0, 1e6]),
 ]
-#: The same functions, written down in double precision.
+#: The same functions in double precision.
 REFERENCE = {
     "sigmoid": lambda u, low, high: low + (high - low) / (1 + np.exp(-u)),
     "log": lambda u, low, high: np.exp(u),
@@ -332,7 +332,7 @@ def test_an_overflowing_update_of_a_transformed_parameter_is_undone():
     np.testing.assert_array_equal(np.array(optimizer["p"]), [1.0])
     dr.backward(dr.sum(optimizer["p"] * 1e-30, axis=None))
     assert optimizer.step(1.0) == {}
-    # v = log(e - 1), T' = 1 - 1/e: from there, by the second gradient alone
+    # The start is v = log(e - 1) with T' = 1 - 1/e. Only the second gradient acts
     np.testing.assert_allclose(np.array(optimizer["p"]), np.logaddexp(0, np.log(np.e - 1) - (1 - 1 / np.e)), rtol=1e-5)
 
 
@@ -375,10 +375,10 @@ def test_smoothing_its_inverse_and_the_gradient_between(kind):
     operator, rng = smoother.operator, np.random.default_rng(4)
     np.testing.assert_allclose(operator.smooth(operator.roughen(value)), value, rtol=1e-9, atol=1e-9)
     v, g = operator.roughen(value), rng.normal(size=value.shape)
-    # <S v, g> = <v, S' g>, on what the optimiser can reach: vertices at one place are one
+    # <S v, g> = <v, S' g> holds for all that the optimiser can reach. Vertices at the same place act as one vertex
     assert np.sum(operator.smooth(v) * g) == pytest.approx(np.sum(v * operator.adjoint(g)), rel=1e-9)
     assert np.std(operator.smooth(g)) < 0.5 * np.std(g)
-    np.testing.assert_allclose(operator.smooth(np.ones_like(value)), 1, rtol=1e-9)  # a constant has nothing to smooth
+    np.testing.assert_allclose(operator.smooth(np.ones_like(value)), 1, rtol=1e-9)  # smoothing keeps a constant
 
 
 def test_a_length_is_independent_of_the_resolution():

@@ -32,10 +32,10 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 AUTO = ["integrator.paths=auto", "integrator.estimator=stack", *SMALL]
 OTHERS = (0.0, *FEWER, *MORE)
-#: A run of a second: its measuring may take a tenth of that.
+#: Settings of a run of one second, of which measuring may take a tenth.
 SHORT = ["integrator.paths=auto", "integrator.estimator=stack", "scene.size=[32, 32]", "run.spp=16"]
 SHORT += ["run.iterations=100", "run.certainty=false"]
-#: A glass ball before the poster, and a lamp that is a point behind it.
+#: A glass ball in front of the poster, and a point lamp behind the ball.
 GLASS = """<shape type="sphere"><point name="center" value="0.4, 0.3, 1"/><float name="radius" value="0.3"/>
         <bsdf type="dielectric"/></shape>
     <emitter type="point"><point name="position" value="0.6, 0.45, 3"/><rgb name="intensity" value="40"/></emitter>
@@ -318,7 +318,7 @@ def test_a_memory_budget_includes_the_distribution_of_paths():
         assert problem.memory is not None
         return problem.memory.expected_bytes.total
 
-    expected("even")  # what is made once is there then
+    expected("even")  # creates everything that is made once
     more = expected("measured") - expected("even")
     assert more == pytest.approx(PixelShares.bytes(256 * 256), rel=0.1)
 

@@ -91,7 +91,7 @@ def test_parts_have_their_own_samples_and_steps_keep_no_memory(tmp_path: Path) -
         plugin: Any = problem.integrator
         plugin.plugin.octree_contruction_thres = threshold
         result = gradient(problem, spp)
-        assert plugin.plugin.octree_contruction_thres == 0  # what an earlier step left
+        assert plugin.plugin.octree_contruction_thres == 0  # the step resets the earlier value
         return result
 
     smooth = "integrator.sppp=0", "integrator.sppi=0"
@@ -102,7 +102,7 @@ def test_parts_have_their_own_samples_and_steps_keep_no_memory(tmp_path: Path) -
     assert not np.array_equal(found("integrator.sppc=8", *smooth), found(*smooth))
 
 
-#: Settings, whether there is a spot lamp, and where the error is and what it holds.
+#: Settings, whether a spot lamp exists, the location of the error, and a part of its text.
 REFUSED = {
     "prb": (["integrator.type=prb"], False, "integrator.type", "prb_projective"),
     "lens": (["scene.options.sensor=orthographic"], False, "integrator.type", "only for perspective sensors, and"),

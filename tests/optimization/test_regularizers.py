@@ -66,7 +66,7 @@ def test_lengths_are_in_scene_units():
     limit = 1 / 10
     value, _ = make_cost(Curvature(radius=10), spans)(bowl)
     assert value == pytest.approx(4 * (1 / 5 - limit) ** 2, rel=1e-2)
-    assert make_cost(Curvature(radius=10), spans)(-bowl)[0] == 0  # a hill takes no tool
+    assert make_cost(Curvature(radius=10), spans)(-bowl)[0] == 0  # a hill does not limit a tool
     assert make_cost(Curvature(radius=4.9), spans)(bowl)[0] == 0
     ramp = 2 * x[:, :, None]
     assert make_cost(Slope(degrees=45), spans)(ramp)[0] == pytest.approx(4 * 1.0, rel=1e-6)
@@ -98,7 +98,7 @@ def test_a_mesh_costs_the_same_as_its_map():
     assert sum(spans[0].weights(97, 0.5, 96.5)) == pytest.approx(WIDE)
     assert found == pytest.approx(make_cost(Laplacian(), spans)(bent[:, 2].reshape(97, 97, 1))[0], rel=0.06)
     inner = mesh_cost(1, *sheet(49, depth=0)[:2])(sheet(49)[0].ravel())[0]
-    assert inner == pytest.approx(found, rel=0.06)  # the rim is left out
+    assert inner == pytest.approx(found, rel=0.06)  # the cost leaves out the rim
     rng = np.random.default_rng(0)
     small, faces, _ = sheet(6)
     cost, way = mesh_cost(3, small, faces), rng.normal(size=small.size)
@@ -169,7 +169,7 @@ def test_vertices_of_a_scene_have_a_laplacian(tmp_path):
     cost = problem.regularizers[key]["laplacian"]
     points = flat.reshape(-1, 3)
     middle = int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))
-    up = int(np.argmin(np.ptp(points, axis=0)))  # a flat face's normal
+    up = int(np.argmin(np.ptp(points, axis=0)))  # axis of the flat face's normal
     points = points.copy()
     points[middle, up] += 0.01
     rest, (value, gradient) = cost(flat)[0], cost(points.ravel())
@@ -268,7 +268,7 @@ def test_a_plate_of_two_free_faces_measures_their_distance():
     def height(x, y):
         return 0.1 * np.sin(x) + 0.05 * y
 
-    # uv at texels' centres is where the mesh's vertices are, half a texel of the mesh within its edges
+    # The mesh's vertices have uv at texel centres, half a texel of the mesh inside the mesh's edges
     own, there = (
         height(*(((np.stack([a, b]) + 0.5) / [[[n]], [[m]]] - 0.5) * 24 / 23 + 0.5) * [[[WIDE]], [[HIGH]]])
         for a, b, n, m in ((x, y, 48, 32), (39 - u, v, 40, 24))
@@ -290,7 +290,7 @@ def test_both_derivatives_of_a_plate_match_finite_differences():
             slope = (plate.cost(h + 1e-6 * own, g + 1e-6 * there)[0]
                      - plate.cost(h - 1e-6 * own, g - 1e-6 * there)[0]) / 2e-6  # fmt: skip
             assert np.sum(by_h * own) + np.sum(by_g * there) == pytest.approx(slope, rel=1e-5)
-    # over a flat face on the other side it is what it was
+    # Over a flat face on the other side, the cost is the same as without a free opposite face
     flat = make_cost(Thickness(thickness=0.5, least=0.4, weight=3.0), plate.spans)(h)
     assert plate.cost(h, 0 * g)[0] == pytest.approx(flat[0])
     assert plate.cost(h, 0 * g)[1] == pytest.approx(flat[1])
@@ -349,12 +349,12 @@ def test_a_step_that_would_cross_both_faces_is_limited(llvm, tmp_path):
     thin = plate.thickness(face, back)
     least = plate.settings.thinnest
     assert thin.min() == pytest.approx(least, rel=1e-2)
-    assert np.min(face) < -1  # both went
+    assert np.min(face) < -1  # both faces moved
     assert np.min(back) < -1
     meshes = [np.array(problem.selection.params[f"{name}.vertex_positions"]) for name in ("face", "back")]
     assert np.min(meshes[0][2::3] - meshes[1][2::3]) > 0.9 * least
     assert record.regularized.held["face.heightmap"] > 50
-    # and the next step begins at what was held
+    # The next step starts at the held values
     assert np.array(problem.optimizer["face.heightmap"]).ravel() == pytest.approx(face.ravel(), abs=1e-6)
 
 

@@ -20,7 +20,7 @@ from reslrb_cli.optimization.errors import ErrorMeter, nearest, quantity
 from reslrb_cli.optimization.results import WINDOW, Best, Results, summary
 from reslrb_cli.scene.values import resample
 
-# Parameters in a few numbers, and results that are there whenever a run ends.
+# Parameters summarised in a few numbers, and results that exist whenever a run ends.
 
 
 def test_small_parameters_are_reported_in_full():
@@ -34,7 +34,7 @@ def test_textures_are_reported_by_mean_and_range_of_reached_texels():
     value[0, 0], value[0, 1], value[1] = (1, 2, 3), (3, 4, 5), 100
     mask = np.array([[True, True], [False, False]])
     assert summary(value, mask) == {"mean": [2.0, 3.0, 4.0], "min": 1.0, "max": 5.0}
-    assert summary(value, np.zeros((2, 2), dtype=bool))["max"] == 100  # nothing is reached: all counts
+    assert summary(value, np.zeros((2, 2), dtype=bool))["max"] == 100  # if nothing is reached, all entries count
     finer = np.repeat(np.repeat(mask, 3, axis=0), 2, axis=1)
     assert summary(value, finer) == summary(value, mask)
 
@@ -93,7 +93,7 @@ def test_an_image_of_each_sensor_is_requested(tmp_path):
     assert results.to_json()["image_loss"]["final"] == pytest.approx(0.04, rel=1e-4)
 
 
-# Errors of parameters: over what is reached, in units that add up or do not, and at resolutions that differ.
+# Errors of parameters: over the reached entries, in units that add up or do not, and at different resolutions.
 
 
 def texture(height, width, seed=0):
@@ -213,7 +213,7 @@ def test_quantities(name):
     assert quantity(params, key) == expected
 
 
-# The best parameters of a run: by the mean of some losses, or by views that are held out.
+# How a run chooses its best parameters: by the mean of several losses, or by held-out views.
 
 
 def seen(losses, held_out=None):
@@ -265,7 +265,7 @@ def test_the_best_values_survive_a_resume(at):
     assert again.values == whole.values
 
 
-# Images that are saved: which of them are recorded.
+# Which of the saved images are recorded.
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2"]

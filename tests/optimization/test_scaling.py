@@ -52,7 +52,7 @@ def test_a_planted_ratio_is_found():
     after = measured("parameters[1].initial=3e12", f"target.render.parameters.{LAMP}=[1.2e13, 1.0e13, 0.6e13]")
     assert before[LAMP].change / after[LAMP].change == pytest.approx(1e6, rel=1e-3)
     assert after[LAMP].length / before[LAMP].length == pytest.approx(1e6, rel=1e-3)
-    # the loss goes with the square of the image
+    # The loss grows with the square of the image
     assert after[LAMP].gradient / before[LAMP].gradient == pytest.approx(1e6, rel=1e-3)
     assert after[FLOOR].gradient / before[FLOOR].gradient == pytest.approx(1e12, rel=1e-3)
     assert after[FLOOR].change == pytest.approx(before[FLOOR].change, rel=1e-3)
@@ -65,7 +65,7 @@ def test_the_length_of_a_single_lamp_is_its_intensity():
     assert found[LAMP].length == pytest.approx(1e7, rel=0.05)
     assert found[LAMP].change == pytest.approx(1e-7, rel=0.05)
     assert (found[LAMP].entries, found[LAMP].value) == (3, 1e7)
-    # direct light is proportional to the albedo of what it falls on, in a part of the picture
+    # In a part of the image, direct light is proportional to the albedo of the surface that it hits
     assert found[FLOOR].length == pytest.approx(0.5, rel=0.05)
     assert found[FLOOR].change < 1 / 0.5
 
@@ -187,7 +187,7 @@ def test_the_first_step_matches_the_printed_line(transform):
         assert "in its logarithm" in line
         return
     step = float(line.rpartition("at first by about ")[2])
-    # the line tells the farther of up and down
+    # The line reports the larger of the changes up and down
     assert np.all(np.abs(moved - 1) * before <= 1.01 * step)
     assert np.abs((moved - 1) * before).max() > 0.7 * step
     assert ("logit between the bounds" in line) == (transform == "sigmoid")

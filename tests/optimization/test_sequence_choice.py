@@ -35,9 +35,8 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.decisions import GuidedRecord
 
-# `sequence: auto` in whole runs of a small scene: what is decided, what is then traced, and what is kept of it.
-#
-# Times are given, so that it is decided alike on every machine; variances are those of the scene.
+# `sequence: auto` in whole runs of a small scene: the decision, the sequence that is then traced, and the part that is
+# kept.  Step times are given, so every machine decides alike. Variances are those of the scene.
 
 AUTO = ["integrator.sequence=auto", *SMALL]
 BOTH = ["integrator.guiding=auto", *AUTO]
@@ -103,10 +102,10 @@ def test_it_is_measured_with_the_decision_on_guiding(
     is_on = (found or asked) == "on"
     seen = spied(monkeypatch, [f"integrator.guiding={asked}", *AUTO], 0.1 if is_on else 1000.0)
     steps = [row for row in seen if row[0] == "sequence" and row[1] != "learn"]
-    first = 0 if asked == "auto" else 2  # steps before what is learned
+    first = 0 if asked == "auto" else 2  # steps before the first learning
     assert {row[3] == row[1] for row in steps} == {True}
     assert [row[1] for row in seen if row[0] == "sequence"].count("learn") == (2 if asked == "on" else 0)
-    # In place of guiding: without it, beside steps that are guided, where that was measured to be on.
+    # If guiding was measured to be on, low-discrepancy steps without guiding also compete with guided steps.
     alone = [row for row in seen if row[0] == "sequence alone"]
     assert bool(alone) == (guiding == "auto, on")
     assert all((row[2] is None) == row[1] == row[3] for row in alone)
@@ -144,7 +143,7 @@ def test_without_guiding_it_replaces_guiding_if_it_is_better(experiment: Path, m
         gc.collect()
     assert counts[0] == counts[1]
     assert plans[0].total == pytest.approx(plans[1].total, rel=0.01)
-    # What was kept of both decisions says so again.
+    # The kept outcomes of both decisions give the same result again.
     told: list[str] = []
     again = made([*BOTH, budget], say=told.append, cache=PilotCache())
     assert not [line for line in told if "measuring" in line]
@@ -164,7 +163,7 @@ def test_separate_tables_for_both_are_found(experiment: Path, monkeypatch: pytes
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.long  # the run says so too
+@pytest.mark.long  # the run reports it as well
 def test_a_dry_run_measures_it_for_the_run(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -184,7 +183,8 @@ def test_compared_options_are_named() -> None:
     assert left.at(config, 4, known=False, auto=True).integrator.options()["sequence"] == "auto"
 
 
-# Whether low-discrepancy numbers pay, decided on fabricated steps; and what of a run's time may be measured away.
+# Decisions on fabricated steps about whether low-discrepancy numbers pay, and the share of a run's time that measuring
+# may take.
 
 
 def world(variance: float, time: float, **options: Any) -> World:
@@ -204,9 +204,9 @@ def sizes(share: float, step: int = 64) -> Sizes:
         ({"variance": 1.0, "time": 1.0}, False),
         ({"variance": 0.95, "time": 1.1}, False),
         ({"variance": 2.0, "time": 1.1}, False),
-        ({"variance": 0.05, "time": 1.1, "image": 3.0}, False),  # the image would pay for it
+        ({"variance": 0.05, "time": 1.1, "image": 3.0}, False),  # the image would get worse
         ({"variance": 0.05, "time": 1.1, "image": 0.9}, True),
-        ({"variance": 0.05, "time": 1.1, "image": 3.0, "alone": True}, False),  # one switch is for both
+        ({"variance": 0.05, "time": 1.1, "image": 3.0, "alone": True}, False),  # one switch controls both
         ({"variance": 0.05, "time": 1.1, "image": 0.9, "alone": True}, True),
         ({"variance": 0.05, "time": 1.1, "sparse": True}, True),
     ],
@@ -228,9 +228,9 @@ def on_by_accident(**options: Any) -> int:
 
 
 def test_it_is_rarely_on_without_a_gain(monkeypatch: pytest.MonkeyPatch) -> None:
-    # 2.5 are expected on this side, were times not allowed to be off, and one more for the looks before the last.
+    # Without the tolerance for times, 2.5 worlds are expected on this side. The looks before the last add one more.
     assert on_by_accident(variance=0.9, time=1 / 0.9) <= 9
-    # A fault that takes the gain itself for what it is at least is seen by that.
+    # This check finds a fault that uses the gain itself as the gain's lower bound.
     gain = SequencePilot._gain
     monkeypatch.setattr(SequencePilot, "_gain", lambda *args: (lambda g: (g[0], g[0], g[2]))(gain(*args)))
     assert on_by_accident(variance=0.9, time=1 / 0.9) > 30
@@ -244,7 +244,7 @@ def test_an_untrained_table_learns_before_all_counted_steps() -> None:
     assert kinds[:4] == [False, False, "learn", "learn"]
     assert kinds.count("learn") == LEARNINGS
     assert kinds[4:] == [True, *[False, True] * record.rounds]
-    # Both sides go on learning: what that takes is no part of the gain.
+    # Both sides keep learning, so the time for learning is no part of the gain.
     assert record.gain == pytest.approx(1 / (0.1 * 1.1), rel=0.2)
 
 
@@ -260,7 +260,7 @@ def test_its_share_of_the_time_is_kept(share: float, step: int, overhead: float,
         dear = re.fullmatch(r"measuring it would take more than [\d.e+-]+ iterations?", record.note)
         assert dear or "too few to decide" in record.note
         assert not record.low_discrepancy
-        # A step is what it takes to know what one takes.
+        # One step is always needed to measure the duration of a step.
         assert record.share * ITERATIONS * (step + overhead) <= max(
             used.trial + overhead, 1.3 * share * ITERATIONS * (step + overhead)
         )

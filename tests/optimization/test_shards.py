@@ -26,7 +26,7 @@ from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.records.clock import peak_mib, reset_peak
 
 OTHERS = "run.adjoint=others"
-#: A colour beside the texture, and an exposure of each view's own.
+#: Two views, each with an exposure of its own.
 TWO_VIEWS = "views=[{sensor: 0, weight: 3, exposure: 1}, {sensor: 1, exposure: auto}]"
 
 
@@ -82,7 +82,7 @@ def test_gradients_are_unbiased(folder, way):
     sets, iterations = WAYS[way]
     loss = [each for each in sets if each.startswith("loss")]
     problem, plain = make(folder, *sets), make(folder, "run.adjoint=independent", *loss)
-    plain.views[0].see(np.array(problem.views[0].target))  # which a guided one renders otherwise
+    plain.views[0].see(np.array(problem.views[0].target))  # a guided problem renders another target
     found = compare(rows(problem, iterations), independent(plain, 16, 1024), block=None)
     assert found, found
 
@@ -212,7 +212,7 @@ def test_a_subset_of_the_views_is_sharded(folder):
             others = (sum(images) - image) / 3
             delta = scale / 3 * 2 * (others - np.array(view.target)) / others.size
             leaf = problem.optimizer[KEY]
-            dr.accum_grad(leaf, dr.full(type(leaf), 1, leaf.shape))  # nothing of which is to be in the result
+            dr.accum_grad(leaf, dr.full(type(leaf), 1, leaf.shape))  # must not show in the result
             expected += shards.shard_gradient(problem, task, delta).gradients[KEY].ravel() / 4
         shards.add_gradient(problem, iteration, lambda: None, lambda: None)
         np.testing.assert_allclose(take_gradient(problem)[KEY], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())

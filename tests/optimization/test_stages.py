@@ -51,7 +51,7 @@ def test_each_iteration_has_the_resolution_of_its_stage(experiment: Path) -> Non
         assert (record.spp, record.lr) == (8, 0.5)
         seen.append((array.shape[0], target.shape[0], state.stage))
     assert seen == [(2, 2, 0)] * 2 + [(2, 4, 1)] * 2 + [(4, 4, 2)] * 2 + [(4, 8, 3)] * 2 + [(4, 8, 4)] * 2
-    assert now.scene is problem.scene  # the run as it is configured works on its own problem
+    assert now.scene is problem.scene  # after all stages, the run uses the original problem
 
 
 def test_parameters_too_fine_for_a_stage_stay_unchanged(experiment: Path) -> None:
@@ -84,7 +84,7 @@ def test_values_are_carried_over_within_their_bounds(experiment: Path) -> None:
         assert np.array_equal(value, np.clip(value, np.float32(0.2), np.float32(0.7)))
         errors.append(record.parameter_rmse)
     assert errors[8] < 0.9 * errors[0]
-    assert errors[9] == pytest.approx(errors[8], rel=0.1)  # what the coarse stage found is there in the fine one
+    assert errors[9] == pytest.approx(errors[8], rel=0.1)  # the fine stage starts from the coarse result
 
 
 def test_a_smaller_film_sees_the_weighted_mean_of_the_target(experiment: Path) -> None:

@@ -19,7 +19,7 @@ from reslrb_cli.optimization.stopping import Watch, lowered
 from reslrb_cli.records.decisions import GuidedRecord
 from reslrb_cli.records.metrics import Record
 
-# What is decided, of losses that are made up.
+# Decisions on made-up losses.
 
 
 def config(tmp_path: Path, *sets: str) -> Config:

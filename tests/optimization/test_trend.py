@@ -10,7 +10,7 @@ import pytest
 from reslrb_cli.optimization.trend import Change, find_trend, levels_of, stands
 from reslrb_cli.statistics import Array
 
-#: A hundred consecutive losses of grey_room by light paths (48 x 36 pixels, 4 samples), over their trend.
+#: A hundred consecutive losses of grey_room by light paths (48 x 36 pixels, 4 samples), divided by their trend.
 REAL = np.array([
     0.92, 1.35, 0.85, 0.72, 0.95, 0.81, 0.84, 1.03, 1.12, 0.65, 1.13, 0.99, 0.81, 12.8, 1.14, 0.91, 1.5, 3.27, 1.26,
     0.79, 0.65, 1.22, 0.89, 0.81, 0.93, 0.7, 1.28, 0.66, 64.55, 1.4, 0.86, 1.54, 0.95, 300.42, 0.99, 0.69, 1.09, 1.07,
@@ -75,7 +75,7 @@ def check_stops(kind: str, runs: int, iterations: int) -> None:
         stopped = ends(window ** (at / PATIENCE) * NOISE[kind](random, (runs, iterations))) <= iterations
         exact = window == 1 - RELATIVE
         assert stopped.mean() <= 0.05 + tolerance * exact, (kind, window, stopped.mean())
-    # A fall that fades out: none may stop while it is faster.
+    # The fall fades out. Runs must not stop while the fall is faster than the limit.
     floor = 1 + 9 * 0.5 ** (at / 50)
     standing = int(np.argmax(1 - floor[PATIENCE:] / floor[:-PATIENCE] < RELATIVE)) + PATIENCE
     assert np.mean(ends(floor * NOISE[kind](random, (runs, iterations))) < standing) <= 0.05

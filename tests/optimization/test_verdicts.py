@@ -22,7 +22,7 @@ from reslrb_cli.optimization.uncertainty.verdicts import (
     weigh,
 )
 
-# The rules of verdicts, one by one, and the posterior that they rest on, against runs of the model itself.
+# The rules of verdicts, one by one. The posterior behind the verdicts is compared with runs of the model itself.
 
 
 def judged(*entries: dict[str, float | bool]) -> list[ParameterVerdict]:
@@ -49,23 +49,25 @@ def judged(*entries: dict[str, float | bool]) -> list[ParameterVerdict]:
     ({"spread": 0.051, "alone": 0.05}, ParameterVerdict.BELOW_NOISE),
     ({"spread": 0.2, "alone": 0.2, "to_go": 0.19, "to_go_error": 0.05}, ParameterVerdict.STILL_MOVING),
     ({"spread": 0.2, "alone": 0.2, "to_go": -0.19, "to_go_error": 0.05}, ParameterVerdict.STILL_MOVING),
-    # As near to where its target has it as noise lets it be; that is somewhere else.
+    # The value is as near to the optimum of its noisy target as noise permits. This optimum differs from the true
+    # value.
     ({"spread": 0.2, "alone": 0.2, "of_run": 0.049, "to_go": 0.045}, ParameterVerdict.BELOW_NOISE),
     ({"spread": 0.2, "alone": 0.2, "of_run": 0.051, "to_go": 0.045}, ParameterVerdict.STILL_MOVING),
     ({"spread": 0.2, "alone": 0.2, "to_go": 0.09, "to_go_error": 0.05}, ParameterVerdict.BELOW_NOISE),
     ({"spread": 0.2, "alone": 0.02, "to_go": 0.01, "to_go_error": 0.2}, ParameterVerdict.NOT_DETERMINED),
     ({"touched": False, "spread": 0.2}, ParameterVerdict.NO_EFFECT),
-    # It ran to its bound, where no gradient is left; and it began there, and never had one.
+    # The first two values ran to a bound, where no gradient is left. The third value began at its bound and never had a
+    # gradient.
     ({"touched": False, "value": 0.0}, ParameterVerdict.AT_BOUND),
     ({"touched": False, "value": 1.0}, ParameterVerdict.AT_BOUND),
     ({"touched": False, "value": 0.0, "start": 0.0}, ParameterVerdict.NO_EFFECT),
-    # At a bound, where the gradient holds it there: L falls downwards where dL/dx > 0.
+    # The value is at a bound, and the gradient holds it there: L falls downwards where dL/dx > 0.
     ({"value": 0.0, "gradient": 5.0, "spread": 0.2}, ParameterVerdict.AT_BOUND),
     ({"value": 0.0, "gradient": 0.5, "spread": 0.2}, ParameterVerdict.AT_BOUND),
     ({"value": 0.0, "gradient": -5.0}, ParameterVerdict.SETTLED),
     ({"value": 1.0, "gradient": -5.0, "spread": 0.2}, ParameterVerdict.AT_BOUND),
     ({"value": 1.0, "gradient": 5.0}, ParameterVerdict.SETTLED),
-    # Shaken off it by noise, by less than a few steps.
+    # Noise moved the value off the bound, by less than a few steps.
     ({"value": 0.02, "gradient": 5.0, "spread": 0.2}, ParameterVerdict.AT_BOUND),
     ({"value": 0.02, "gradient": 0.5}, ParameterVerdict.SETTLED),
     ({"value": 0.2, "gradient": 5.0}, ParameterVerdict.SETTLED),
@@ -141,7 +143,7 @@ def test_offsets_of_the_model_are_as_wide_as_stated(iterations, target):
     offset, gradient = simulate(H, response, scale, noise, 5, rates, runs, np.random.default_rng(3), fixed)
     found = [joint(H, response, scale, noise, unit, 5, rates, fixed) for unit in np.eye(3)]
     assert bool(target) is bool(np.all(found[0].of_target > 0))
-    to_go = gradient @ np.array([each.to_go for each in found])  # it is linear in the gradient
+    to_go = gradient @ np.array([each.to_go for each in found])  # the estimate is linear in the gradient
     left = offset - to_go
     # A standard deviation from n normal deviates has a relative standard error of 1 / sqrt(2 n).
     z = (left.std(axis=0) / found[0].error - 1) * np.sqrt(2 * runs)
@@ -186,7 +188,7 @@ def test_unforeseen_gradients_are_believed():
     assert found.to_go[0] == pytest.approx(0.25, rel=0.02)
     assert found.error[0] == pytest.approx(0.05 / 2, rel=0.02)
     assert found.error[1] == pytest.approx(foreseen.error[1], rel=1e-6)
-    far = joint(H, *given, np.array([50.0, 0.0]), few, [1.0] * 100)  # farther than anything was at the start
+    far = joint(H, *given, np.array([50.0, 0.0]), few, [1.0] * 100)  # farther than any parameter at the start
     assert far.to_go[0] < 26
 
 
@@ -229,9 +231,9 @@ def test_an_entry_that_no_step_moves_stays():
     assert found.error[0] < 0.5
 
 
-#: A wall that most of the image shows, and a ceiling that it shows little of; both take light from one another.
+#: A wall that fills most of the image, and a ceiling that fills little of it. Each receives light from the other.
 ROOM, START, RATE = np.array([[1.0, 0.11], [0.11, 0.075]]), np.array([0.3, -0.3]), 0.03
-#: A tenth of the scale of either.
+#: A tenth of the scale of either parameter.
 CLOSE = 0.06
 
 
@@ -309,7 +311,7 @@ def test_a_creeping_value_under_heavy_tailed_noise_is_not_settled(monkeypatch):
             continue
         off += 1
         told.append(told_of(measured)["ceiling"])
-        with monkeypatch.context() as patch:  # as if nothing were known but what is measured at the end
+        with monkeypatch.context() as patch:  # uses only the measurements at the end
             patch.setattr(posterior, "SURPRISE", np.inf)
             bare = {key: replace(own, last=None, pace=None) for key, own in measured.items()}
             before += told_of(bare)["ceiling"] == "settled"
@@ -362,10 +364,10 @@ def test_entries_of_a_motion_have_their_own_noise():
     given = {"value": sizes, "bounds": (-np.inf, np.inf), "scale": 1.0, "gradients": gradients, "is_small": True}
     own, shared = (Measured(**given, response=sizes, rates=[1.0], recent=each) for each in (sizes**2, None))
     assert np.all(own.noise < 9 * sizes**2)
-    assert np.all(shared.noise > 0.05)  # nothing but three samples is known: those of all entries
+    assert np.all(shared.noise > 0.05)  # with only three samples, all entries share their noise
 
 
-# Whether a loss fell, told from its noise: how often the verdict is right, and what it never says.
+# Whether a loss fell beyond its noise: how often the verdict is right, and which verdicts never occur.
 
 ROUNDS = 400
 
@@ -449,7 +451,8 @@ def test_the_levels_are_the_first_and_the_last_tenth():
     values = np.concatenate([np.tile([1.0, 3.0], 10), np.full(160, 9.0), np.tile([0.4, 0.6], 10)])
     trend = find_trend(values)
     assert (trend.start.mean, trend.end.mean) == (pytest.approx(2.0), pytest.approx(0.5))
-    # An interquartile mean leaves out half of the values, and what it keeps of these two is as far apart as all.
+    # An interquartile mean leaves out half of the values. The kept half of these two values has the same spread as all
+    # values.
     assert trend.start.error == pytest.approx(2 * np.std(values[:20], ddof=1) / np.sqrt(20))
     assert trend.to_json()["change"] == "fell"
     assert window(200) == 20
@@ -472,12 +475,12 @@ def test_worse_parameters():
     rising, random = np.linspace(0.2, 0.3, 50), np.random.default_rng(1)
     assert got_worse(list(rising), 0.3)
     assert not got_worse(list(rising[::-1]), 0.2)
-    assert not got_worse(list(rising[:19]), 0.21)  # too short to say
+    assert not got_worse(list(rising[:19]), 0.21)  # too short for a verdict
     assert got_worse(list(rising[:19]), 0.3)
     assert not got_worse([], 0.3)
     assert not got_worse([0.2] * 50, 0.2)
-    assert not got_worse([0.2] * 50, 0.2019)  # below what is worth a word
-    # wandering about its start: some of the last are below
+    assert not got_worse([0.2] * 50, 0.2019)  # too small to report
+    # The values wander about their start, and some of the last are below it
     assert not got_worse(list(0.2 + 0.01 * random.normal(size=100)), 0.21)
-    # it came back at the end
+    # The values return to the start at the end
     assert not got_worse([*rising, *rising[::-1]], 0.2)

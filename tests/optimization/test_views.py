@@ -111,7 +111,7 @@ def test_an_iteration_uses_the_drawn_views(tmp_path, steps):
     problem = make_problem(tmp_path, views=3, sets=["run.views_per_iteration=1", "run.iterations=6"])
     losses = [record.loss for record in optimize(problem)]
     assert [call.sensor for call in steps.calls] == [problem.drawn(iteration)[0][0].sensor for iteration in range(6)]
-    assert losses[0] == pytest.approx(0.3**2)  # not a third of it
+    assert losses[0] == pytest.approx(0.3**2)  # not divided by three
 
 
 def test_held_out_views_are_recorded_and_not_trained_on(folder):

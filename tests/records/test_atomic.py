@@ -18,7 +18,7 @@ from reslrb_cli.records.atomic import remove_parts, remove_unfinished, unfinishe
 from reslrb_cli.records.checkpoint import newest_checkpoint, read_state, save_checkpoint
 from reslrb_cli.records.images import MOST_BYTES, file_stem
 
-# Files are whole or absent, and what was never finished is removed.
+# Files are whole or absent, and unfinished files are removed.
 
 
 def names(folder: Path) -> list[str]:
@@ -95,7 +95,7 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
     assert all(path.exists() for path in kept)
 
 
-# What is left of a checkpoint whose writing ends at any moment.
+# The remains of a checkpoint whose writing ends at any moment.
 
 
 def save(folder: Path, iteration: int, size: int = 64) -> None:
@@ -163,7 +163,7 @@ def test_unopenable_files_are_located(tmp_path: Path) -> None:
     assert newest_checkpoint(tmp_path / "none") is None
 
 
-# Every parameter has files of its own, whatever its key is.
+# Every parameter has its own files, whatever its key is.
 
 
 @pytest.mark.parametrize("key", ["wall.reflectance.data", "Sphere_3.emitter.radiance.value", "Wände.alpha-2"])

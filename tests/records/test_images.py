@@ -10,7 +10,7 @@ import pytest
 
 from reslrb_cli.records.images import read_layers, write_layers
 
-# Images are whole or absent, in every format, and show what they were given.
+# Images are whole or absent in every format, and contain the given values.
 
 
 def make_image(channels=3):
@@ -81,10 +81,10 @@ def test_a_heightmap_is_shown_from_lowest_to_highest(tmp_path):
 def test_an_incomplete_checkpoint_keeps_the_previous_one(tmp_path, file_size_limit, monkeypatch):
     from reslrb_cli.records.checkpoint import save_checkpoint
 
-    said = []  # by archives that are thrown away
+    said = []  # errors of discarded archives
     monkeypatch.setattr(sys, "unraisablehook", said.append)
     save_checkpoint(tmp_path, 1, {"a": np.zeros(3)}, {})
-    for size in (100, 2000, 9000):  # among the headers, in the first array, in the last one
+    for size in (100, 2000, 9000):  # in the headers, in the first array, in the last array
         with file_size_limit(size), pytest.raises(OSError, match=r"state\.npz"):
             save_checkpoint(tmp_path, 2, {"a": np.zeros(999), "b": np.zeros(999)}, {})
     with np.load(tmp_path / "state.npz") as state:
@@ -93,7 +93,7 @@ def test_an_incomplete_checkpoint_keeps_the_previous_one(tmp_path, file_size_lim
     assert said == []
 
 
-# EXR files of named layers: whole or absent, readable by others, and never a surprise when they are damaged.
+# EXR files with named layers: whole or absent, readable by other programs, and reported when they are damaged.
 
 
 def layers():

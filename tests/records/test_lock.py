@@ -84,7 +84,7 @@ def test_only_a_folder_can_be_locked(tmp_path: Path, kind: str) -> None:
 
 def test_a_file_system_without_locks_locks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(descriptor: int, operation: int) -> None:
-        raise OSError(9, "Bad file descriptor")  # as NFS says of folders
+        raise OSError(9, "Bad file descriptor")  # as NFS reports for folders
 
     monkeypatch.setattr(locks.fcntl, "flock", fail)
     with FolderLock(tmp_path) as first, FolderLock(tmp_path) as second:
@@ -102,9 +102,9 @@ def test_dead_holders_with_locks(tmp_path: Path) -> None:
     with FolderLock(tmp_path):
         for holder in (here, replace(here, pid=ended_pid()), replace(here, boot="earlier")):
             assert not holder.is_gone(tmp_path)
-    # The number of a process means nothing: this one has it, too.
+    # The process number proves nothing, because this process has the same number.
     assert here.is_gone(tmp_path)
-    # so it is after a reboot, and in another container of the same machine
+    # After a reboot, and in another container of the same machine, the holder is also gone
     assert replace(here, boot="earlier").is_gone(tmp_path)
     assert replace(here, host="elsewhere").is_gone(tmp_path)
 

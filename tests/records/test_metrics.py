@@ -18,7 +18,7 @@ from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Origin, read_lines, read_origin
 from reslrb_cli.records.metrics import Clamped, MetricsWriter, Record, cut_back, finite, read_records
 
-# metrics.jsonl: its keys, what has no number, and lines that a crash cut short.
+# metrics.jsonl: its keys, values without a number, and lines that a crash cut short.
 
 KEYS = [
     "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
@@ -67,7 +67,7 @@ def test_a_torn_last_line_is_repaired_before_the_next_one(tmp_path):
 
 def test_a_missing_file_has_no_records(tmp_path):
     with MetricsWriter(tmp_path):
-        assert list(tmp_path.iterdir()) == []  # nor is one ever seen empty
+        assert list(tmp_path.iterdir()) == []  # no reader ever sees an empty file
 
 
 def test_an_incomplete_line_leaves_complete_ones(tmp_path, file_size_limit):
@@ -112,10 +112,10 @@ def test_non_finite_values_and_bad_lines_are_reported_on_reading(tmp_path):
     assert found.objects == [{"a": None, "b": [None, None, {"c": None}], "d": 1.5, "e": 7}, {"a": 2}]
     assert found.damaged == [3, 4, 5]
     file.write_text('{"a": 2}\n{"a"')
-    assert read_lines(file).damaged == []  # somebody is about to end it
+    assert read_lines(file).damaged == []  # a writer may still complete it
 
 
-# The part of `metrics.jsonl` that a run goes on from.
+# The part of `metrics.jsonl` from which a run resumes.
 
 RECORD = Record(
     iteration=0, loss=0.1 + 0.2, step_ms=1.5, primal_ms=None, adjoint_ms=None, codegen_ms=0.0, elapsed_s=1 / 3,
@@ -188,7 +188,7 @@ def test_missing_lines_are_reported(tmp_path: Path) -> None:
         read_records(tmp_path, 4, replace(RECORD, iteration=3))
 
 
-# The first line of a file of measurements: what it says, and what of it survives damage.
+# The first line of a file of measurements: its content, and the parts that survive damage.
 
 EMPTY = Origin(device="", variant="", command=[], versions={}, platform="", written="")
 

@@ -26,7 +26,7 @@ from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
 from reslrb_cli.records.run_folder import RunFolder, check_output
 
-# Run folders: names, what --force may replace, and that nothing half-made stays.
+# Run folders: their names, what --force may replace, and that no half-made folder remains.
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -275,7 +275,7 @@ def test_concurrent_runs_either_replace_or_are_refused(tmp_path, count, each):
     assert [err for _, err in done] == [""] * count
     outcomes = [line for out, _ in done for line in out.splitlines()]
     assert len(outcomes) == count * each
-    assert set(outcomes) == {"ran", "refused"}  # who waits for more than a second
+    assert set(outcomes) == {"ran", "refused"}  # refused after waiting over a second
     assert names(tmp_path) == ["run"]
     [mark] = {path.read_text() for path in (tmp_path / "run").rglob("*") if path.is_file() and path.suffix != ".json"}
     content = read_manifest(tmp_path / "run")
@@ -293,7 +293,7 @@ def test_the_end_is_written(tmp_path):
     assert not [name for name in names(folder.path) if name.endswith(".part")]
 
 
-# Manifests: what they say once their process has gone.
+# The content of manifests after their process has ended.
 
 
 def abandoned(folder: Path) -> Manifest:
@@ -316,7 +316,7 @@ def test_a_killed_run_is_interrupted(tmp_path):
     content = read_manifest(tmp_path)
     assert (content["status"], content["ended"]) == ("interrupted", "2033-05-18T03:33:20+00:00")
     assert "ended before the run did" in content["error"]
-    # on the disk too, with what the process left behind
+    # The disk is repaired too, with the files that the process left behind
     assert stored(tmp_path) == content == read_manifest(tmp_path)
     assert (tmp_path / "metrics.jsonl").read_text() == '{"iteration": 0}\n'
     assert sorted(os.listdir(tmp_path)) == [MANIFEST_FILE, "metrics.jsonl"]
@@ -398,7 +398,7 @@ def test_the_last_status_of_an_exiting_process_stays(tmp_path, monkeypatch):
     manifest.write(tmp_path)
     for work in (
         lambda: manifest.end_for_good(tmp_path, Status.INTERRUPTED),
-        lambda: manifest.end(tmp_path, Status.FINISHED),  # the thread that works knows nothing of it
+        lambda: manifest.end(tmp_path, Status.FINISHED),  # the worker thread does not know of the end
     ):
         thread = threading.Thread(target=work, daemon=True)
         thread.start()

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-#: The first is the one that `scripts/setup --test` unpacks.
+#: The first name is the Chromium that `scripts/setup --test` unpacks.
 NAMES = (
     str(Path(__file__).resolve().parents[2] / ".cache" / "bin" / "chromium"),
     "chromium", "chromium-headless-shell", "chromium-browser", "google-chrome", "google-chrome-stable",
@@ -21,7 +21,7 @@ SWITCHES = (
     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage", "--hide-scrollbars",
     "--remote-debugging-pipe",
 )  # fmt: skip
-#: Seconds after which a browser that says nothing is taken for broken.
+#: Seconds after which a silent browser counts as broken.
 PATIENCE = 60.0
 
 
@@ -38,7 +38,7 @@ class Chromium:
         self._read, from_browser = os.pipe()
 
         def as_the_browser_has_them() -> None:
-            # By way of numbers that neither pipe has, which 3 and 4 may well be.
+            # The descriptors move through numbers that neither pipe has. The pipes themselves may have 3 and 4.
             inward, outward = os.dup(to_browser), os.dup(from_browser)
             high = os.dup2(inward, 90), os.dup2(outward, 91)
             os.dup2(high[0], 3)

@@ -25,7 +25,7 @@ from reslrb_cli.records.measurements import (
 from reslrb_cli.records.metrics import MetricsWriter
 from reslrb_cli.report.tonemap import write_error_map
 
-# Files as `bench`, `gradcheck` and `convergence` write them, made without measuring anything.
+# Files as `bench`, `gradcheck` and `convergence` write them, made without any measurement.
 
 ORIGIN = Origin("a machine, 3 threads", "llvm_ad_rgb", ["reslrb", "bench", "my <box>.yaml"], {"mitsuba": "3.9.1"},
                 "Plan 9", "2026-01-02T03:04:05+00:00")  # fmt: skip
@@ -93,7 +93,7 @@ def write_maps(folder, name="floor-stack"):
     write_layers(folder / f"{name}.exr", layers)
 
 
-# A run folder as `reslrb optimize` leaves it, made without rendering anything.
+# A run folder as `reslrb optimize` leaves it, made without rendering.
 
 FLOOR, LAMP = "floor.reflectance.data", "lamp.intensity.value"
 MEMORY = {

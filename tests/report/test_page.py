@@ -35,7 +35,7 @@ from reslrb_cli.report.perceptual import with_seen_errors
 from reslrb_cli.report.sources import ShownRun, read_sources
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
-# What stands on a run's page.
+# The content of a run's page.
 
 
 class Page(html.parser.HTMLParser):
@@ -205,7 +205,7 @@ def test_swatches_have_the_colours_of_the_values(tmp_path):
     ]
     lamp = swatches[3:]
     assert len(lamp) == 3
-    assert lamp[2] == (255, 188, 137)  # 4, 2, 1 over 4, encoded
+    assert lamp[2] == (255, 188, 137)  # 4, 2, 1 divided by 4, in sRGB
     assert lamp[0] == (188, 137, 99)
 
 
@@ -285,7 +285,7 @@ def test_names_stay_text(tmp_path):
     (folder / "config.yaml").write_text("name: </pre><script>alert(1)</script>\n")
     markup = render_run(folder)
     page = Page(markup)
-    assert page.tags.count("script") == 1  # the page's own
+    assert page.tags.count("script") == 1  # the page's own script
     assert page.tags.count("img") == len(page.pictures) == 9
     assert page.row("Parameters", EVIL)
     assert "\x1b" not in markup
@@ -347,14 +347,14 @@ def test_a_visible_lamp_does_not_darken_the_rest():
     lamps = np.zeros((64, 64), bool)
     lamps[:8, :8] = True
     lit = np.where(lamps[:, :, None], np.float32(50), room)
-    assert exposure_for(lit) == 0.016  # where nothing is known of it
+    assert exposure_for(lit) == 0.016  # without known lamps
     assert exposure_for(lit, lamps) == exposure_for(room)
     assert 0.7 < 0.02 * exposure_for(lit, lamps) < 0.9
-    # What is not much brighter than the rest is shown with it, and so is a lamp that fills the view.
+    # An area that is not much brighter than the rest counts for the exposure, and so does a lamp that fills the view.
     assert exposure_for(np.where(lamps[:, :, None], np.float32(0.05), room), lamps) == pytest.approx(16)
     assert exposure_for(lit, np.ones_like(lamps)) == exposure_for(lit)
     assert exposure_for(np.where(lamps[:, :, None], np.float32(50), 0), lamps) == 0.016
-    # Fireflies beside it count for nothing.
+    # Fireflies outside the lamp do not count.
     few = lit.copy()
     few[40, ::20] = 1e6
     assert exposure_for(few, lamps) == pytest.approx(exposure_for(room), rel=0.05)
@@ -393,7 +393,7 @@ def test_images_have_the_exposure_of_the_manifest(tmp_path):
     assert shown_exposures([{"sensor": 3, "shown": 2}]) == {"": 2.0}
 
 
-# Pages as a browser lays them out: no sideways scrolling on a phone or a wide screen, nothing loaded, no script.
+# The layout of pages in a browser: no sideways scrolling on a phone or a wide screen, nothing loaded, and no script.
 
 LONG = "wall_of_the_north_western_corridor_behind_the_second_door_0123456789_" * 3 + ".brdf_0.reflectance.value"
 NOISY = {"start": {"mean": 1.31e-7, "error": 4e-9}, "end": {"mean": 1.33e-7, "error": 4e-9}, "change": "flat"}
@@ -428,7 +428,7 @@ def pages(llvm, tmp_path_factory):
     return written
 
 
-#: The text of elements that stick out of the window, or are cut off by the one that holds them.
+#: The text of elements that extend beyond the window, or that their container cuts off.
 OUTSIDE = """[...document.querySelectorAll('body *')].filter(e => {
     const box = e.getBoundingClientRect();
     return box.right > WIDTH + 0.5 || box.left < -0.5 || (e.scrollWidth > e.clientWidth + 1 && e.clientWidth > 0

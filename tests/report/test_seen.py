@@ -28,7 +28,7 @@ def test_colours_are_linear_srgb():
     red, green, blue = np.eye(3)
     assert [ciede2000(red, green), ciede2000(red, blue)] == pytest.approx(
         [86.61, 52.88], abs=0.02
-    )  # CIE 1976: 171, 176
+    )  # CIE 1976 gives 171 and 176
     assert ciede2000(np.zeros(3), np.ones(3)) == pytest.approx(100, abs=0.01)
     assert ciede2000(np.full(3, 5.0), np.ones(3)) == pytest.approx(0, abs=1e-9)
 
@@ -116,7 +116,7 @@ def test_files_of_a_run_folder(tmp_path):
     target, final = (load_image(folder / "images" / f"{name}-1.exr") for name in ("target", "final"))
     again = image_errors(final, target, 1.0)
     assert {key: found["images"]["-1"]["final"][key] for key in again} == again
-    assert list(found["colors"]) == [FLOOR]  # not the lamp's
+    assert list(found["colors"]) == [FLOOR]  # the lamp is left out
     assert found["colors"][FLOOR]["initial"]["mean"] > found["colors"][FLOOR]["final"]["mean"] > 0
     for path in folder.glob("images/final*.exr"):
         path.write_bytes(path.read_bytes()[:200])

@@ -31,7 +31,7 @@ from reslrb_cli.report.page.run import DAMAGED
 from reslrb_cli.report.plots import COLORS
 from reslrb_cli.report.sources import Maps, Measurements, ShownRun, read_sources
 
-# One page about several runs and measurements: what stands on it, and what is damaged or hostile in it.
+# One page about several runs and measurements: its content, and damaged or hostile input.
 
 PLAN = {"integrator": "reslrb", "estimator": "stack", "rows": [
     {"feature": "roulette", "needed": False, "reason": "paths are short"},
@@ -53,7 +53,7 @@ def test_all_runs_are_in_one_picture(tmp_path):
     runs = [make_run(tmp_path / name, iterations=count) for name, count in (("a", 30), ("b", 20), ("c", 10))]
     markup = render(read_sources(runs))
     page = Page(markup)
-    # loss, error of all parameters, and of each of two: against iterations and time
+    # Loss, error of all parameters, and error of each of two: each against iterations and time
     assert lines_drawn(markup)[:8] == [list(COLORS[:3])] * 8
     assert [row[0] for row in page.cells["Runs"][1:]] == ["a", "b", "c"]
     assert page.row("Runs", "b")[3] == "20"
@@ -158,7 +158,7 @@ def test_a_gradcheck(tmp_path):
     page = page_of(tmp_path / "check.jsonl")
     text, cells = page.sections["Gradients against references: check.jsonl"], page.cells[
         "Gradients against references: check.jsonl"]  # fmt: skip
-    assert cells[1][1] == "reslrb:gather"  # what fails comes first
+    assert cells[1][1] == "reslrb:gather"  # failures come first
     assert (cells[1][-1], cells[2][-1]) == ("fails", "holds")
     assert "reslrb:gather against ptracer: max |z| 9, limit 4" in text
     assert "1 of 2 comparisons hold, 1 fail" in text
@@ -217,7 +217,7 @@ def test_names_stay_text(tmp_path):
     write_maps(tmp_path / "m", "<script>")
     markup = render(read_sources([folder, *(tmp_path / name for name in ("<script>alert(2)<>.jsonl", "g", "c", "m"))]))
     page = Page(markup)
-    assert page.tags.count("script") == 1  # the page's own
+    assert page.tags.count("script") == 1  # the page's own script
     assert "\x1b" not in markup
     assert DAMAGED not in markup
     assert "<script>alert(2)" in page.sections[""]
@@ -331,7 +331,7 @@ def test_many_runs_have_colours_and_dashes(tmp_path):
     assert "run00, run01, run02 and 7 more" in Page(markup).sections[""]
 
 
-# Versions, and the command that does it again, on the page of every kind of file.
+# The page of every kind of file shows the versions, and the command that produces the file again.
 
 
 KINDS = {
@@ -347,7 +347,7 @@ def test_the_page_gives_the_command_to_repeat_it(tmp_path: Path, heading: str) -
     KINDS[heading](file)
     title = f"{heading}: a.jsonl"
     without = page_of(file)
-    assert "versions" not in without.sections[title]  # an older file
+    assert "versions" not in without.sections[title]  # as in an older file
     file.write_text(ORIGIN.to_json() + "\n" + file.read_text())
     markup = render(read_sources([file]))
     page = page_of(file)

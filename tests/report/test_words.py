@@ -154,17 +154,17 @@ def judged(about, **measured):
 
 
 @pytest.mark.parametrize(("found", "words", "setting"), [
-    # Its steps took it one way all the time, and not far enough: what a lamp's unit is has to be measured.
+    # The steps moved the lamp in one direction all the time, but not far enough. The unit of a lamp has to be measured.
     (judged({}), "scale: auto", "--set optimizer.scale=auto"),
     (judged({}, scale="auto"), "a higher rate", "--set optimizer.learning_rate=0.2"),
     (judged({"rate": 0.5}, scale="auto"), "a higher rate", "its own learning_rate: 3"),
-    # They would have taken it far enough, and did not: it goes to and fro, or along a valley.
+    # The steps were long enough in total, but the lamp did not arrive. It oscillates, or moves along a valley.
     (judged({"reach": 60.0}), "more iterations", "--set run.iterations=680"),
     (judged({"reach": 60.0, "moved": 0.0}), "more iterations", "--set run.iterations=1000"),
     (judged({"reach": None}), "more iterations", "--set run.iterations=680"),
     (judged({}, trend={"change": "rose", "start": {"mean": 1, "error": 0.1}, "end": {"mean": 2, "error": 0.1}}),
      "a lower rate", "--set optimizer.learning_rate=0.01"),
-    # The loss fell at first, and stands since then: more of the same steps do not help.
+    # The loss fell at first and is flat since then, so more of the same steps do not help.
     (judged({"reach": 60.0}, trend=trend("fell", 26.0, 0.3) | {"late": "flat"}),
      "a new run from here", "initial: {run: RUN} for each parameter"),
     (judged({"reach": 60.0}, trend=trend("fell", 26.0, 0.3) | {"late": "fell"}),

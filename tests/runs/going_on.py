@@ -23,9 +23,9 @@ from reslrb_cli.records.checkpoint import read_state
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.runs import recorder as recording
 
-#: What two runs of one experiment do not share: times, and the allocator's peak.
+#: Metrics that differ between two runs of one experiment: times, and the allocator's peak.
 TIMES = ("step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib")
-#: A texture and a colour; and, to be added, a place and a size, and heights.
+#: A texture and a colour. Cases can add a place and a size, and heights.
 LAMP = "lamp.emitter.radiance.value"
 PARAMETERS = (
     f"[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAMP}, initial: [3, 4, 5], bounds: [0, 20]}}]"
@@ -117,7 +117,7 @@ def run_and_kill(
         if record.iteration + 1 == at and not left.exists():
             shutil.copytree(run, left)
             with (left / "metrics.jsonl").open("a") as file:
-                file.write('{"iteration": ')  # in the midst of a line
+                file.write('{"iteration": ')  # in the middle of a line
 
     with monkeypatch.context() as patch:
         patch.setattr(progress.Progress, "show", copying)

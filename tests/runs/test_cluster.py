@@ -37,7 +37,8 @@ worker = pytest.importorskip("reslrb_cli.cluster.worker", reason="pip install re
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
 SETS = ["run.iterations=3", "run.spp=8", "run.measuring=0", "run.certainty=false"]
-#: Experiments by name: two rounds and one, guided emission, views, exposures, what moves, passes, a loss in halves.
+#: Experiments by name: two rounds and one round, guided emission, views, exposures, motion, passes, and a loss in
+#: halves.
 CASES = {
     "guided, scaled": ["run.shards=4", "integrator.guiding=on", "optimizer.scale=auto", "run.views_per_iteration=2"],
     "views": ["run.shards=3", "run.adjoint=batched", "integrator.guiding=on"],
@@ -97,7 +98,7 @@ def own(image, target):
     return dr.mean(dr.abs(image - target), axis=None)
 """
 
-#: Both run on workers: of `batched` shards each takes dL/dI by itself.
+#: Workers run both the loss and the integrator. With `batched`, each shard computes dL/dI by itself.
 OWN_SETS = ["run.shards=3", "run.adjoint=batched", "loss={type: custom, file: own.py:own}",
             "integrator={type: custom, file: own.py:BasicPRBIntegrator, max_depth: 3}"]  # fmt: skip
 
@@ -163,7 +164,7 @@ def test_a_bundle_contains_all_files_of_an_experiment(
         "</emitter></scene>"
     )
     (where / "parts" / "quad.obj").write_text(QUAD)
-    # The bounds below leave out what the scene has: it is not to be looked at.
+    # The bounds below exclude the scene's own values, which must not be checked.
     for name, size, low in (("sky.exr", 4, 0.2), ("textures/print.exr", 6, 0.2), ("start.exr", 6, 0.85)):
         mi.Bitmap(rng.uniform(low, low + 0.1, (size, size, 3)).astype(np.float32)).write(str(where / name))
     (where / "scene.xml").write_text(SCENE)
@@ -348,7 +349,7 @@ def test_thirty_kills_lose_nothing(experiment: Path) -> None:
 
     def kill(pids: list[int], wait: float) -> None:
         time.sleep(wait)
-        for pid in pids:  # one may have just been replaced
+        for pid in pids:  # a process may have just been replaced
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
                 killed.append(pid)

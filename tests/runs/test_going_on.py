@@ -38,10 +38,10 @@ from reslrb_cli.optimization import loop, optimizers
 from reslrb_cli.records.checkpoint import STATE_FILE, read_state
 from reslrb_cli.records.manifest import read_manifest
 
-# A run that goes on ends where it would have ended: bit by bit, with one thread.
+# A resumed run ends where the whole run would have ended, bit for bit, with one thread.
 
 RUN = Path("runs/tiny")
-#: Enough for the best to be known when the run is killed.
+#: Enough iterations for the best parameters to be known when the run is killed.
 ITERATIONS = [
     word
     for setting in ("run.iterations=18", "run.checkpoint_every={iterations: 6}", "run.certainty=false")
@@ -51,11 +51,11 @@ BATCHED = ["run.spp=8", "run.adjoint=batched"]
 
 #: The texture alone.
 SIMPLE = ["--set", f"parameters=[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}]"]
-#: From so far away that losses fall from the first iteration to the last.
+#: The start is so far away that losses fall from the first iteration to the last.
 VIEWS = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
 FALLING = ["--set", f"parameters=[{{key: {tiny.KEY}, initial: 0.05, bounds: [0, 1]}}]"]
 
-#: Settings by name. Every optimiser, schedule and transform; what is measured before the first iteration; views.
+#: Settings by name: every optimiser, schedule and transform, measurements before the first iteration, and views.
 CASES: dict[str, list[str]] = {
     "adam": [],
     "cosine": ["optimizer.schedule=cosine"],
@@ -113,12 +113,12 @@ CASES: dict[str, list[str]] = {
     "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
 }
 FEW = ("pixels", "scale auto, sigmoid, clamp", "held out", "shards", "stages", "plateau")
-#: After how many iterations a run is killed, and how many its newest state has then; what certainty asks for is noted
-#: at four fifths of the iterations, which has to be before that.
+#: The number of iterations after which a run is killed, and the number in its newest state at that time. Certainty
+#: makes its notes at four fifths of the iterations, which must come before this state.
 KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20), "held out, plateau": (63, 60)}
 
 
-#: Each a fifth of the run.
+#: Each stage takes a fifth of the run.
 FIVE_STAGES = (
     "run.stages=[{until: 0.2, resolution: 0.25, film: 0.25}, {until: 0.4, resolution: 0.5, film: 0.5},"
     " {until: 0.6, resolution: 0.5}, {until: 0.8}]"
@@ -137,7 +137,7 @@ def test_a_killed_run_resumes_to_the_same_end(case: str, experiment: Path, monke
     sets = [word for setting in CASES[case] for word in ("--set", setting)]
     at, newest = KILLED.get(case, (15, 12))
     whole, left = run_and_kill(monkeypatch, at, *ITERATIONS, *sets)
-    shutil.rmtree(experiment / "cache", ignore_errors=True)  # nor what an earlier pilot learned
+    shutil.rmtree(experiment / "cache", ignore_errors=True)  # remove outcomes of earlier pilots
     assert int(state_of(left)["iteration"]) == newest
     assert optimize("--resume", str(left), "--quiet") == 0
     assert differences(whole, left) == []
@@ -157,7 +157,7 @@ def test_a_run_killed_in_five_stages_resumes_to_the_same_end(experiment: Path, m
     sets = [word for setting in settings for word in ("--set", setting)]
     whole, left = run_and_kill(monkeypatch, 2, *ITERATIONS[:2], *sets)
     show = progress.Progress.show
-    for at in (7, 8, 13, 16):  # the second is the first iteration of the third stage
+    for at in (7, 8, 13, 16):  # 8 is the first iteration of the third stage
         life = Path(shutil.move(left, f"runs/until{at}"))
 
         def copying(self: progress.Progress, record: Any, at: int = at, life: Path = life) -> None:
@@ -246,9 +246,10 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
         restore(self, stored, records)
         self.certainty.last = {}
 
-    # A state in the last fifth of the run has all parts; and losses that fall have the best of the run after it.
+    # A state in the last fifth of the run has all parts. With falling losses, the best of the run comes after this
+    # state.
     sets = ["--set", "optimizer.clamp_gradient=1.5", "--set", "run.checkpoint_every={iterations: 15}"]
-    begun = FALLING if fault != "no last steps" else []  # of small parameters, such as the lamp's
+    begun = FALLING if fault != "no last steps" else []  # only small parameters have last steps
     whole, left = run_and_kill(monkeypatch, 17, *ITERATIONS, *sets, *begun)
     places = {
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
@@ -297,15 +298,15 @@ def test_the_best_values_have_the_lowest_mean(experiment: Path) -> None:
     assert (RUN / "parameters/best/parameters.npz").exists()
 
 
-# Runs that are killed at random moments, and on disks that are too small, until they have come to their end.
+# Runs that are killed at random moments, or whose disks are too small, until they finish.
 
-#: The program, whose steps one thread computes.
+#: The program, with steps computed by one thread.
 SCRIPT = f"""import sys; sys.path[:0] = [{str(tiny.ROOT)!r}, {str(tiny.ROOT / "tests")!r}]; sys.argv[0] = 'reslrb'
 import pytest, reslrb_cli
 from runs.going_on import work_alone
 work_alone(pytest.MonkeyPatch())
 from reslrb_cli.cli import run; run()"""
-#: A state after each iteration: a good part of the time goes into writing them.
+#: A state is saved after each iteration, so writing states takes a large part of the time.
 SETS = ["--set", "run.checkpoint_every={iterations: 1}", "--set", "run.certainty=false", "--quiet"]
 
 
@@ -363,7 +364,7 @@ def test_a_repeatedly_killed_run_reaches_the_same_end(tmp_path: Path, kills: int
             manifest = read_manifest(run)
             assert manifest is not None
             assert manifest["status"] in ("interrupted", "finished")
-            assert left_over(run) == []  # a reader has put it right
+            assert left_over(run) == []  # a reader has repaired the folder
             if (run / "checkpoint/state.npz").exists():
                 done = int(state_of(run)["iteration"])
                 assert done <= count(run)
@@ -436,7 +437,7 @@ def test_a_run_with_a_full_disk_resumes_when_there_is_room(tmp_path: Path, disk:
     length = ["--set", f"run.iterations={iterations}"]
     assert end(start(tmp_path, "--resume", str(run), "--quiet", *length)) == (0, "")
     assert end(start(tmp_path, "tiny.yaml", *SETS, *length)) == (0, "")
-    # What certainty asks for is noted at four fifths of the iterations, which were 20000 before.
+    # Certainty makes its notes at four fifths of the iterations, and the run had 20000 iterations before.
     found = differences(tmp_path / "runs/tiny", run)
     asked = ("squares/", "last steps/", "noted_by")
     assert [name for name in found if not any(part in name for part in asked)] == []

@@ -109,7 +109,7 @@ def test_the_previous_state_is_used_and_reported(run: Path, capsys: pytest.Captu
     assert "continuing from the previous state, after 3 iterations" in err
     assert [record["iteration"] for record in records_of(run)] == list(range(6))
     assert int(state_of(run)["iteration"]) == 6
-    with np.load(run / PREVIOUS) as previous:  # not the damaged one
+    with np.load(run / PREVIOUS) as previous:  # not the damaged state
         assert int(previous["iteration"]) == 5
 
 
@@ -190,7 +190,7 @@ def test_lost_lines_are_reported(run: Path, capsys: pytest.CaptureFixture[str]) 
     assert told(capsys, run).startswith("metrics.jsonl: holds 2 of the 4 iterations of the checkpoint; put it back")
     (run / "metrics.jsonl").write_bytes(b"".join([lines[0], lines[2], *lines[2:]]))
     assert told(capsys, run).startswith("metrics.jsonl: line 2: is not what a run writes")
-    (run / "metrics.jsonl").write_bytes(b"".join(lines[:3]))  # the last one is in the state as well
+    (run / "metrics.jsonl").write_bytes(b"".join(lines[:3]))  # the state also contains the last record
     assert optimize("--resume", str(run), "--quiet") == 0
     assert [record["iteration"] for record in records_of(run)] == list(range(6))
 

@@ -16,11 +16,11 @@ from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.load import load_scene
 
 WIDTH, HEIGHT, FOCAL, CENTER = 40, 24, 50.0, (23.0, 9.0)
-#: A pose: from the axes x right, y down, z forward to the world.
+#: A pose, from camera axes (x right, y down, z forward) to the world.
 ROTATION = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
 ROTATION *= np.linalg.det(ROTATION)
 EYE = np.array([0.3, -0.2, 4.0])
-#: Pixels, and where the camera looks in them, in its own axes.
+#: Pixels, and the viewing directions at these pixels in the camera's own axes.
 PIXELS = np.array([[5.0, 4.0], [31.0, 20.0], [20.0, 12.0]])
 RAYS = np.column_stack([(PIXELS - CENTER) / FOCAL, np.ones(3)])
 

@@ -184,7 +184,7 @@ def test_interpolated_normals_follow(scene):
     selection = select(scene, motion("box", "rotation", initial=[0, 0, 90]))
     normals = np.array(selection.params["box.vertex_normals"]).reshape(-1, 3)
     plain = np.array(select(scene, motion("ball")).params["box.vertex_normals"]).reshape(-1, 3)
-    assert np.allclose(normals, plain, atol=1e-5)  # the same scene, which has moved
+    assert np.allclose(normals, plain, atol=1e-5)  # the same scene after the motion
     assert not np.allclose(normals[0], [0, -1, 0], atol=0.1)
 
 
@@ -205,11 +205,11 @@ def test_gradients_reach_the_moving_parameters(scene):
     assert dr.grad_enabled(selection.params["box.vertex_normals"])
     by_vertex = random.normal(size=positions(selection).size)
     by_place = random.normal(size=(4, 4))
-    for _ in range(2):  # as two views do
+    for _ in range(2):  # as with two views
         dr.set_grad(selection.params[MESH], mi.Float(by_vertex))
         dr.set_grad(selection.params["ball.to_world"].matrix, mi.Matrix4f(by_place))
         selection.collect()
-    selection.collect()  # nothing is left to bring back
+    selection.collect()  # no gradient is left to collect
     found = {key: np.array(dr.grad(leaf), np.float64).ravel() / 2 for key, leaf in leaves.items()}
     for key, gradient in found.items():
         base, h = selection.array(key), {"box.rotation": 0.1}.get(key, 1e-2)
@@ -329,4 +329,4 @@ def test_an_emitting_mesh_moves(scene):
     selection = select(scene, motion("glow", "translation"))
     assert selection.keys == ["glow.translation"]
     assert selection.scene_keys == ["glow.vertex_positions"]
-    assert np.array_equal(positions(selection), before)  # the box stays
+    assert np.array_equal(positions(selection), before)  # the box does not move

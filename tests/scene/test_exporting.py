@@ -23,8 +23,8 @@ from reslrb_cli.scene.xml.read import Description
 pytestmark = pytest.mark.usefixtures("llvm")
 BITMAP = '<string name="filename" value="{}"/><string name="format" value="variant"/>'
 EIGHT_BITS = '<string name="filename" value="{}"/>'
-#: Every way in which a scene says what can be recovered: by number, colour, image, index, mesh and place, with and
-#: without ids, referred to and included, in folders of its own and elsewhere.
+#: A scene with every way to specify a recoverable parameter: by number, colour, image, index, mesh and place. Objects
+#: are with and without ids, referenced and included, in the scene's own folders and elsewhere.
 SCENE = f"""<scene version="3.0.0">
 <default name="resx" value="48"/> <default name="resy" value="32"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="$resx"/>
@@ -75,7 +75,7 @@ LIGHTS = f"""<scene version="3.0.0">
     <transform name="to_world"><lookat origin="3, 4, 3" target="0, 0, 0" up="0, 1, 0"/></transform></emitter>
 </scene>
 """
-#: What is recovered, and what is added to its values.
+#: Each recovered parameter, and the amount that is added to its values.
 KINDS: dict[str, tuple[dict[str, object], float]] = {
     "texture": ({"key": "floor.bsdf.reflectance.data"}, 0.2),
     "finer texture": ({"key": "floor.bsdf.reflectance.data", "resolution": [12, 10]}, 0.2),
@@ -104,7 +104,7 @@ KINDS: dict[str, tuple[dict[str, object], float]] = {
     "cylinder in motion": ({"motion": {"of": "Cylinder_1"}}, 0.3),
     "lights in motion": ({"motion": {"of": ["Point_1", "Spot_1", "Projector_1"], "free": ["translation"]}}, 0.8),
 }
-#: Those of `KINDS` that can be recovered beside one another.
+#: The entries of `KINDS` that can be recovered together.
 TOGETHER = [name for name in KINDS if name not in ("finer texture", "colour", "heightmap", "rectangle in motion")]
 
 
@@ -165,7 +165,7 @@ def changed(file: Path, names: list[str]) -> tuple[mi.Scene, Description, Select
     random = np.random.default_rng(1)
     values = {key: selection.array(key) for key in selection.keys}
     amounts = dict.fromkeys(values, KINDS[names[0]][1])
-    if len(names) > 1:  # each in its own unit
+    if len(names) > 1:  # each amount in its own unit
         amounts = {key: 0.3 if "value" in key or "data" in key else 0.1 for key in values}
     selection.set_arrays(
         {key: value + amounts[key] * random.uniform(0.5, 1, value.shape) for key, value in values.items()}
@@ -228,7 +228,7 @@ def test_it_is_loaded_by_mitsuba_alone_from_any_folder(file: Path, tmp_path: Pat
     text = (moved / "scene.xml").read_text()
     for word in ("$", str(tmp_path.parent), "unheard_of", "include"):
         assert word not in text
-    # With one thread, as a process of one core has, Mitsuba never comes to the end of an EXR file.
+    # With one thread, as in a process on one core, Mitsuba never finishes reading an EXR file.
     script = f"""import drjit as dr, mitsuba as mi
 mi.set_variant("scalar_rgb")
 dr.set_thread_count(2)

@@ -17,11 +17,11 @@ from reslrb_cli.scene.load import load_scene
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Scenes of other versions and exporters: what is mended, what is left out, what is said of it, and what is refused.
+# Scenes of other versions and exporters: repairs, omissions, messages about them, and refusals.
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = sorted((ROOT / "scenes").rglob("*.xml"))
-#: A scene in which one thing can be exchanged for another; each stands in a line of its own.
+#: A scene with parts that can be exchanged one at a time. Each part has its own line.
 PARTS = {
     "head": '<scene version="3.0.0">',
     "integrator": '<integrator type="path"/>',
@@ -66,10 +66,10 @@ def assert_same(found: dict[str, Any], expected: dict[str, Any]) -> None:
         np.testing.assert_array_equal(value, reference, err_msg=key)
 
 
-#: Of the shipped scenes, those whose images are compared too.
+#: The shipped scenes whose images are also compared.
 RENDERED = ("cornell_floor", "grey_room", "caustic_heightmap")
 
-#: The others have nothing that these do not have; their textures take seconds.
+#: Scenes with nothing that the other scenes lack. Their textures take seconds.
 SIMILAR = ("lens_pose", "caustic_slab", "caustic_heightmap")
 
 
@@ -135,7 +135,7 @@ def test_any_name_is_a_variable(tmp_path, name):
     assert values(load_scene(file, {name: 3}))["Sphere_1.to_world"][0, 0, 0] == 3
 
 
-# part of the scene, what stands there instead, and what is said of it, after file and line
+# Part of the scene, its replacement, and the message after file and line
 MENDED = [
     ("head", "<scene>", "the version is missing: taken for 3.0.0"),
     ("head", '<scene version="3">', "version `3` is not three numbers: taken for 3.0.0"),
@@ -233,7 +233,7 @@ def test_similar_repairs_are_one_line(tmp_path, caplog):
     shape = PARTS["shape"].replace("<ref", '<float name="weight" value="3"/><ref')
     file = write(tmp_path, shape="\n".join([shape] * 9))
     load_scene(file)
-    load_scene(file)  # as for a target that is rendered
+    load_scene(file)  # as for a rendered target
     [record] = caplog.records
     said = "sphere has no parameter `weight` in Mitsuba 3: left out (also in line 12, 13, 14, 15, 16 and 3 more)"
     assert record.getMessage() == f"{file}:11: {said}"
@@ -271,7 +271,7 @@ def test_references_to_omitted_objects_are_omitted(tmp_path, caplog):
 
 
 def test_objects_with_one_name_are_all_kept(tmp_path):
-    # Mitsuba drops the first: a name is that of a parameter
+    # Mitsuba drops the first object, because it takes a name for that of a parameter
     shape = PARTS["shape"].replace("<shape", '<shape name="mesh"')
     assert len(load_scene(write(tmp_path, shape=shape + shape)).shapes()) == 2
 
@@ -321,7 +321,7 @@ def test_irreparable_scenes_are_refused(tmp_path, part, text, said):
     assert said in str(error.value)
 
 
-# Spectra by wavelength, which RGB variants cannot evaluate: read as the colours that they have, or refused.
+# Spectra by wavelength, which RGB variants cannot evaluate: converted to their colours, or refused.
 
 SCENE = """<scene version="3.0.0">
 <sensor type="perspective"/>
@@ -333,7 +333,7 @@ IRREGULAR = """<spectrum type="irregular" {}><string name="wavelengths" value="4
 <string name="values" value="0.1, 0.5 0.8"/></spectrum>"""
 REGULAR = """<spectrum type="regular" {}><integer name="wavelength_min" value="420"/>
 <float name="wavelength_max" value="680"/><string name="values" value="0.1, 0.5, 0.8"/></spectrum>"""
-#: Planck's law, of CODATA's constants.
+#: Constants of Planck's law, from CODATA.
 PLANCK, LIGHT, BOLTZMANN = 6.62607015e-34, 299792458.0, 1.380649e-23
 
 

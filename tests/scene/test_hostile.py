@@ -19,7 +19,7 @@ TEXTURE = (
     '<bsdf type="diffuse">\n<texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'
     "</bsdf>"
 )
-#: Two objects that use each other, each in a line of its own.
+#: Two objects that use each other, each on its own line.
 CIRCLE = "<bsdf type='twosided' id='a'><ref id='b'/></bsdf>\n<bsdf type='twosided' id='b'><ref id='a'/></bsdf></scene>"
 
 
@@ -52,7 +52,7 @@ def test_refused_at_once(tmp_path, text, line, said):
 
 
 NAMED = '<string name="filename" value="pipe"/>'
-#: An object for each way in which a plugin, or the parser, opens a file (Mitsuba 3.9.1).
+#: One object for each way in which a plugin or the parser opens a file (Mitsuba 3.9.1).
 OPENED = {
     **{f"shape {type}": f'<shape type="{type}">{NAMED}</shape>'
        for type in ("obj", "ply", "serialized", "linearcurve", "bsplinecurve", "sdfgrid", "ellipsoids",
@@ -79,7 +79,7 @@ def test_no_pipe_is_opened(kind: str, tmp_path: Path) -> None:
     for pipe in pipes:
         os.mkfifo(pipe)
     write(tmp_path, f'<scene version="3.0.0">{OPENED["spectrum"]}</scene>', "part.xml")
-    opened = "".join(f": <> {pipe}; " for pipe in pipes)  # frees who waits there, so that the test fails, not hangs
+    opened = "".join(f": <> {pipe}; " for pipe in pipes)  # frees blocked readers, so that the test fails, not hangs
     with subprocess.Popen(["sh", "-c", f"sleep 30; {opened}"]) as freeing:
         start = time.monotonic()
         with pytest.raises(ConfigError, match=r"no regular file|not a regular file|folder `pipe` not found"):
@@ -161,7 +161,7 @@ def test_a_damaged_texture_is_refused_with_a_location(tmp_path):
     with pytest.raises(ConfigError) as error:
         load_scene(file)
     assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: is damaged or truncated; copy or save it again"
-    (tmp_path / "a.hdr").write_bytes(b"P6\n8 0\n255\n" + bytes(24))  # of which Mitsuba makes a texture without texels
+    (tmp_path / "a.hdr").write_bytes(b"P6\n8 0\n255\n" + bytes(24))  # Mitsuba makes a texture without texels of it
     with pytest.raises(ConfigError) as error:
         load_scene(file)
     assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: claims 8x0 pixels; save it again"

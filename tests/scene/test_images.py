@@ -20,9 +20,8 @@ from reslrb_cli.scene.proposal import open_photograph, write_smaller
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Files that are no whole images: cut off, padded, damaged, larger than they could be, and no files at all.
-#
-# And whole ones whose EXIF says how they are to be turned.
+# Files that are not whole images: truncated, padded, damaged, larger than possible, or no files at all.  Also whole
+# images whose EXIF data gives their orientation.
 
 
 def picture():
@@ -62,7 +61,7 @@ def refused(path, **options):
 
 def test_a_complete_file_is_read(image, capfd):
     assert read_image(image, size=(128, 96)).shape == (96, 128, 3)
-    image.write_bytes(image.read_bytes() + b"\0" * 500)  # what cameras and copies put behind the image
+    image.write_bytes(image.read_bytes() + b"\0" * 500)  # cameras and copies append such bytes
     assert read_image(image).shape == (96, 128, 3)
     assert capfd.readouterr() == ("", "")
 
@@ -72,10 +71,11 @@ def test_a_truncated_file_is_refused(image, share, capfd):
     data = image.read_bytes()
     image.write_bytes(data[: min(int(share * len(data)), len(data) - 1)])
     assert refused(image).startswith(("is truncated", "is damaged or truncated", "is not a readable image"))
-    assert capfd.readouterr() == ("", "")  # libjpeg's own words do not reach the terminal
+    assert capfd.readouterr() == ("", "")  # libjpeg's messages do not reach the terminal
 
 
-#: Zeros are black pixels in the last three formats, and part of the last lines of an EXR file, which have no checksum.
+#: In the last three formats, zeros are black pixels. Zeros also occur in the last lines of an EXR file, which have no
+#: checksum.
 PADDED = [(name, share) for name in NAMES[:-3] for share in (0.25, 0.5, 0.9) if (name, share) != ("a.exr", 0.9)]
 
 
@@ -151,7 +151,7 @@ def exr(right, bottom):
 def test_a_file_with_a_huge_size_is_not_decoded(tmp_path, monkeypatch, name, data):
     path = tmp_path / name
     path.write_bytes(data)
-    monkeypatch.setattr(images, "mi", None)  # so that nothing can be
+    monkeypatch.setattr(images, "mi", None)  # so that nothing can be decoded
     assert refused(path) == "is 60000x60000 pixels; the limit is 134217728 pixels"
     assert refused(path, size=(6, 4)) == "is 60000x60000 pixels; it must be 6x4"
 
@@ -219,7 +219,7 @@ def test_lines_of_a_radiance_image_are_checked_before_decoding(width, tmp_path):
 
     path = tmp_path / "a.hdr"
     array = np.random.default_rng(5).uniform(0, 2, (9, width, 3)).astype(np.float32)
-    array[2:5] = 0.5  # long runs, too
+    array[2:5] = 0.5  # includes long runs
     mi.Bitmap(array).write(str(path))
     assert np.allclose(read_image(path), array, atol=0.01)
     if width < 8:
@@ -307,14 +307,14 @@ def test_other_entries_and_segments_are_skipped(order, tmp_path):
         b"XX\0*" + exif([SIX])[4:],
         exif([SIX])[:-4],  # cut off within the entry
         exif([SIX], place=2**32 - 1),
-        exif([SIX], place=4),  # a directory that begins within what points to it
+        exif([SIX], place=4),  # a directory inside the pointer to it
         exif([], count=65535),
         exif([], count=65535) + bytes(60_000),
         exif([(0x0112, 3, 1, 0)]),
         exif([(0x0112, 3, 1, 9)]),
         exif([(0x0112, 3, 2**32 - 1, 6)]),
         exif([(0x0112, 2, 1, 6)]),
-        exif([(0x8769, 4, 1, 0), (0x014A, 4, 1, 0)] * 1000),  # directories within directories, all of them this one
+        exif([(0x8769, 4, 1, 0), (0x014A, 4, 1, 0)] * 1000),  # nested directories that all point to this one
     ],
 )
 def test_exif_without_orientation_rotates_nothing(data, tmp_path):
@@ -354,7 +354,7 @@ def test_a_texture_is_read_unrotated_with_a_message(tmp_path, caplog):
     assert f"{path}: the stored orientation is used, not turned by 90 degrees counter" in caplog.text
 
 
-# Images: formats, colour spaces, and what is refused.
+# Images: formats, colour spaces, and refused files.
 
 
 def write(path, array):
@@ -440,7 +440,7 @@ def test_missing_and_unreadable(tmp_path):
             read_image(tmp_path / name)
 
 
-# Photographs at the size of a film: means of light, and marks of what is clipped or transparent that stay.
+# Photographs at the size of a film: pixels are means of light, and marks of clipped or transparent pixels stay.
 
 
 def smaller(path: Path, values: np.ndarray, size: tuple[int, int]) -> Path:
@@ -460,13 +460,13 @@ def test_pixels_are_means_of_light(tmp_path: Path) -> None:
     values = np.random.default_rng(0).integers(0, 250, (12, 20, 3), dtype=np.uint8)
     found = read_image(smaller(tmp_path, values, (5, 4)))
     expected = decode_srgb(values.astype(np.float32) / 255).reshape(4, 3, 5, 4, 3).mean(axis=(1, 3))
-    assert np.allclose(found, expected, atol=2e-5)  # of 16 bits
+    assert np.allclose(found, expected, atol=2e-5)  # 16-bit precision
 
 
 def test_partly_covered_pixels_are_weighted(tmp_path: Path) -> None:
     values = np.random.default_rng(0).uniform(0, 5, (5, 7, 3)).astype(np.float32)
     found = read_image(smaller(tmp_path, values, (3, 2)))
-    fine = np.repeat(np.repeat(values, 2, axis=0), 3, axis=1)  # by which both sizes divide
+    fine = np.repeat(np.repeat(values, 2, axis=0), 3, axis=1)  # divisible by both sizes
     assert np.allclose(found, fine.reshape(2, 5, 3, 7, 3).mean(axis=(1, 3)), rtol=1e-5)
 
 

@@ -22,7 +22,7 @@ from reslrb_cli.scene.parameters import select_parameters
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Scene files: what loads, and one located line for what does not.
+# Scene files: which files load, and the one located line for each file that does not.
 
 LIT_SPHERE = (
     '<scene version="3.0.0">\n<sensor type="perspective"/>\n<emitter type="constant"/>\n'
@@ -161,12 +161,12 @@ def test_light_lost_by_ray_offsets_gives_a_warning(tmp_path, caplog, scale: floa
 
 
 RAW = '<boolean name="raw" value="true"/>'
-#: How a texture is said to be looked up, none of which is to be lost.
+#: Options of a texture lookup, all of which must be kept.
 LOOKED_UP = (
     '<string name="format" value="fp16"/><string name="filter_type" value="nearest"/>'
     '<string name="wrap_mode" value="mirror"/><transform name="to_uv"><scale x="2.5" y="1.5"/></transform>'
 )
-#: A wall and a sphere with a texture each, and a lamp.
+#: A wall and a sphere, each with a texture, and a lamp.
 WALLS = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/>
 <integer name="height" value="16"/></film>
 <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
@@ -175,7 +175,7 @@ WALLS = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm
 <texture type="bitmap" name="reflectance"><string name="filename" value="other.png"/></texture></bsdf></shape>
 </scene>"""
 DIFFUSE = '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{}</texture></bsdf>'
-#: Materials with a texture, and the name of its file.
+#: Materials with a texture, and the name of the texture's file.
 TEXTURES = {
     "RGB": (DIFFUSE, "a.png"),
     "alpha": (DIFFUSE, "rgba.png"),
@@ -300,13 +300,13 @@ def moved(z: float, scale: float = 1) -> str:
         ),
         (WHITE, obj("a", "both", FLAT), "`a`"),
         (BOTH_SIDES, obj("a", "both", FLAT), None),
-        (BOTH_SIDES, obj("a", "both"), "`a`"),  # the corners' normals are means of both faces', which is 0
+        (BOTH_SIDES, obj("a", "both"), "`a`"),  # each corner normal is the mean of both faces' normals, 0
         (WHITE, obj("a", "twice"), None),
         (WHITE, obj("a", "one") + obj("b", "one"), None),
         (WHITE, obj("a", "one") + obj("b", "other"), "`a` and `b`"),
         (BOTH_SIDES, obj("a", "one") + obj("b", "other"), None),
         (BOTH_SIDES, obj("a", "one") + obj("b", "one", '<bsdf type="diffuse"/>'), "`a` and `b`"),
-        # No ray comes to what is inside of a box.
+        # No ray reaches the inside of a box.
         (WHITE, obj("a", "one") + obj("b", "other") + f'<shape type="cube">{moved(z=0, scale=3)}</shape>', None),
     ],
 )
@@ -326,11 +326,12 @@ def test_coincident_faces_give_a_warning(tmp_path, caplog, bsdf, shapes, names):
     assert "remove one of each" in line
 
 
-# Lasting names: an object without an id goes by its kind and number in the file, in every load alike.
+# Lasting names: an object without an id is named by its kind and its number in the file. The name is the same in every
+# load.
 
 SENSOR = '<sensor type="perspective"><film type="hdrfilm"/></sensor>'
 LAMP = '<shape type="sphere"><emitter type="area"><rgb name="radiance" value="$power"/></emitter></shape>'
-#: Seven kinds of objects, most of them without an id, and several of a kind.
+#: Seven kinds of objects. Most objects have no id, and several kinds occur more than once.
 HOUSE = f"""<scene version="3.0.0"><default name="power" value="3"/>
 {SENSOR}
 <sensor type="thinlens"><float name="aperture_radius" value="0.1"/><film type="hdrfilm"/></sensor>
@@ -375,7 +376,7 @@ def test_names_have_kind_and_number(tmp_path):
         *("Perspective_1", "Thinlens_1", "Twosided_1", "Diffuse_2", "Checkerboard_2"),
         *("Sphere_1", "middle", "Sphere_3", "Rectangle_1", "Cube_1", "Point_1", "Point_2"),
     ]
-    # below them Mitsuba's own names stay, which say the role that an object plays
+    # Below the objects, Mitsuba's own names stay, because they describe the role of an object
     assert {
         "Sphere_3.emitter.radiance.value",
         "Twosided_1.brdf_0.reflectance.value",
@@ -461,7 +462,7 @@ def test_shapes_in_groups_keep_the_names_of_mitsuba(tmp_path):
 
 
 def test_ids_that_mitsuba_ignores(tmp_path, caplog):
-    # as `mi.parser.write_file` writes them
+    # Ids as `mi.parser.write_file` writes them
     shapes = (
         '<bsdf type="diffuse" id="_unnamed_3"/><shape type="sphere" id="_unnamed_4"><ref id="_unnamed_3"/></shape>'
         '<shape type="sphere" id=""><float name="radius" value="2"/></shape>'
@@ -472,7 +473,7 @@ def test_ids_that_mitsuba_ignores(tmp_path, caplog):
 
 def test_unusual_ids_are_kept_if_possible(tmp_path, caplog):
     odd = ["a.b", "two words", "wall [1]*", "lampe-é", "../x"]
-    balls = [(name, f'<float name="radius" value="{k + 1}"/>') for k, name in enumerate(odd)]  # none where another is
+    balls = [(name, f'<float name="radius" value="{k + 1}"/>') for k, name in enumerate(odd)]  # no two balls coincide
     shapes = "".join(f'<shape type="sphere" id="{name}">{radius}</shape>' for name, radius in balls)
     found = keys(write(tmp_path, lit(shapes)))
     assert {f"{name}.to_world" for name in odd} <= set(found)
@@ -505,4 +506,4 @@ def test_a_reference_to_two_objects_is_refused(tmp_path):
     file = write(tmp_path, lit(bsdf + bsdf.replace("0.1", "0.2") + use))
     with pytest.raises(ConfigError, match=f"refers to `paint`, the id of two objects .{file}:4 and {file}:5"):
         load_scene(file)
-    assert "paint.reflectance.value" in keys(write(tmp_path, lit(bsdf + bsdf + use)))  # they say the same
+    assert "paint.reflectance.value" in keys(write(tmp_path, lit(bsdf + bsdf + use)))  # both are identical

@@ -32,7 +32,7 @@ from reslrb_cli.scene.visibility import (
     visible_texels,
 )
 
-# What a scene needs, and scenes that light tracing cannot render.
+# The needs of a scene, and scenes that light tracing cannot render.
 
 GLASS = {"type": "dielectric"}
 
@@ -114,7 +114,7 @@ def test_view(make_scene):
     assert view.emission == pytest.approx(view.nothing)
     scene = make_scene(camera={"type": "perspective", "to_world": far})
     assert look(scene, scene.sensors()[0]).nothing == 1
-    check_paths(scene, scene.sensors()[0], "light")  # black, but rightly so
+    check_paths(scene, scene.sensors()[0], "light")  # correctly black
 
 
 @pytest.mark.usefixtures("_without_scenes_of_before")
@@ -299,7 +299,7 @@ def test_asymmetric_materials_are_refused_for_light_paths(make_scene, bsdf, same
     assert (paths_obstacle(scene, scene.sensors()[0], "light") is None) is same
 
 
-# How deep paths have to be: in a closed sphere that glows, whose light of every depth is known.
+# The required depth of paths, in a closed glowing sphere whose light of every depth is known.
 
 
 def inside(albedo: float) -> mi.Scene:
@@ -369,7 +369,7 @@ def test_proposals_see_through_eight_panes(make_scene):
 def test_crop_window_and_orientation(make_scene):
     import mitsuba as mi
 
-    # The lower left quarter of the film: its rows run downwards, the texture's rows with v, upwards.
+    # The lower left quarter of the film. The film's rows run downwards, and the texture's rows run upwards, with v.
     film = {"type": "hdrfilm", "width": 16, "height": 16, "crop_offset_x": 0, "crop_offset_y": 8, "crop_width": 8,
             "crop_height": 8}  # fmt: skip
     to_world = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0])
@@ -393,7 +393,7 @@ def test_camera_paths_see_through_glass(make_scene):
     seen, all_of_it = (visible_texels(scene, scene.sensors(), KEY, (), each) for each in (False, True))
     assert not seen.any()
     assert all_of_it.any()
-    scene = mirrored(make_scene, {"type": "conductor"})  # which shows what is behind the sensor
+    scene = mirrored(make_scene, {"type": "conductor"})  # the mirror shows what is behind the sensor
     assert not visible_texels(scene, scene.sensors(), KEY, (), True).any()
 
 
@@ -440,9 +440,10 @@ def test_emission_does_not_affect_visibility(make_scene):
     assert visible_texels(scene, scene.sensors(), "sky.data").all()
 
 
-# Pixels that see smooth specular lobes: which surfaces count, through what, and how far the filter spreads them.
+# Pixels that see smooth specular lobes: which surfaces count, through which surfaces, and how far the filter spreads
+# these pixels.
 
-#: Columns of a film of 16x8 pixels, in a view of 4 by 2, that a pane from 0 to 1 covers.
+#: The columns that a pane from 0 to 1 covers, on a film of 16x8 pixels with a view of 4 by 2.
 COVERED = slice(8, 12)
 MIRROR = {"type": "conductor"}
 DIFFUSE = {"type": "diffuse"}
@@ -539,7 +540,7 @@ def test_pixels_that_see_lamps(size: int, sensor: dict) -> None:
     }
     dark = mi.load_dict(scene | {"light": {"type": "point", "position": [0, 0, 50]}}, optimize=False)
     assert not sees_lamps(dark, dark.sensors()[0]).any()
-    place = T().translate([0.5, 0, 0]).scale([0.5, 0.25, 1])  # columns 1/2 to 3/4, rows 3/8 to 5/8, where it is sharp
+    place = T().translate([0.5, 0, 0]).scale([0.5, 0.25, 1])  # sharp at columns 1/2 to 3/4, rows 3/8 to 5/8
     lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
     lit = mi.load_dict(scene | {"lamp": lamp}, optimize=False)
     found = sees_lamps(lit, lit.sensors()[0])
@@ -548,16 +549,16 @@ def test_pixels_that_see_lamps(size: int, sensor: dict) -> None:
     x, y = width / size, height / (size // 2)
     inside = ((y > 3 / 8) & (y < 5 / 8))[:, None] & ((x > 1 / 2) & (x < 3 / 4))
     assert found[inside].all()
-    # A lens that is focused on half the distance spreads a lamp over the whole of this film.
+    # A lens focused at half the distance spreads a lamp over this whole film.
     near = 2.0 / 4 * 1.1 if sensor else 1.5 / min(size // 2, 128)
     far = ((y < 3 / 8 - 2 * near) | (y > 5 / 8 + 2 * near))[:, None] | ((x < 1 / 2 - near) | (x > 3 / 4 + near))
     assert not found[far].any()
     assert found.sum() > (1.5 if sensor else 0.9) * inside.sum()
 
 
-# Glass that rays jump over is warned of when a scene is loaded.
+# Loading a scene gives a warning about glass that rays jump over.
 
-OFFSET = 8.94e-5 * (1 + 3)  # of a ray, where the slab is
+OFFSET = 8.94e-5 * (1 + 3)  # ray offset at the slab
 
 SCENE = """\
 <scene version="3.0.0">
@@ -591,7 +592,7 @@ def test_thin(offsets: float, tmp_path: Path, caplog: pytest.LogCaptureFixture, 
     assert "light passes through surfaces" in line
     assert "make the glass thicker" in line
     measured = float(line.partition(" that are ")[2].split()[0])
-    assert 0.8 * offsets < measured < 1.4 * offsets  # obliquely it is thicker
+    assert 0.8 * offsets < measured < 1.4 * offsets  # the slab is thicker at an angle
 
 
 @pytest.mark.parametrize("thickness", [15 * OFFSET, 0.2])

@@ -78,7 +78,7 @@ def test_file_fills_a_texture(make_scene, tmp_path):
 
 
 def test_globs_match_recoverable_parameters(make_scene):
-    selection = select(make_scene(), {"key": "floor.*"})  # not `to_uv`
+    selection = select(make_scene(), {"key": "floor.*"})  # excludes `to_uv`
     assert selection.keys == [TEXTURE]
 
 

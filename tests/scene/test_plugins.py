@@ -22,7 +22,7 @@ SCENE = (
     '<scene version="3.0.0">\n<sensor type="perspective"/>\n<emitter type="constant"/>\n'
     '<shape type="sphere"><point name="center" x="0" y="0" z="3"/></shape>\n{}\n</scene>'
 )
-#: Writes a file when it is loaded, as the constructor of any library could.
+#: This library writes a file when it is loaded, as the constructor of any library could.
 LIBRARY = """#include <stdio.h>
 __attribute__((constructor)) static void run(void) { FILE *file = fopen("%s", "w"); if (file) fclose(file); }
 """
@@ -125,7 +125,7 @@ def test_the_plugin_of_mitsuba_wins_over_one_of_the_scene(trap):
     ]
     for objects in ('<shape type="disk"><bsdf type="principledthin"/></shape>', '<emitter type="spot"/>', *kinds[1:]):
         load_scene(trap.write(objects))
-    with pytest.raises(ConfigError):  # it needs a file
+    with pytest.raises(ConfigError):  # the plugin needs a file
         load_scene(trap.write(kinds[0]))
     assert not trap.is_sprung
 

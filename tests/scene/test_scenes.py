@@ -74,7 +74,7 @@ def test_moving_light_stays_off_the_border(name):
     image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "ptracer", "max_depth": 5}))).mean(axis=2)
     total = image.sum()
     image[2:-2, 2:-2] = 0
-    assert image.sum() < 2e-3 * total  # what glass reflects within itself
+    assert image.sum() < 2e-3 * total  # light from reflections inside the glass
 
 
 def test_floor_has_detail_at_the_scale_of_its_texels():
@@ -119,8 +119,8 @@ def test_grey_room_is_lit_only_by_a_rotated_sky():
     needs = scene_needs(scene, scene.sensors()[0])
     assert needs.emitters == ("EnvironmentMapEmitter",)
     axes = np.array(mi.traverse(scene)["sky.to_world"].matrix).reshape(4, 4)[:3, :3]
-    assert (np.abs(axes) > 0.2).sum() >= 6  # turned about two axes
-    assert 0.02 < look(scene, scene.sensors()[0]).nothing < 0.3  # the windows
+    assert (np.abs(axes) > 0.2).sum() >= 6  # rotated about two axes
+    assert 0.02 < look(scene, scene.sensors()[0]).nothing < 0.3  # through the windows
 
 
 def test_caustic_is_not_seen_through_the_glass():
@@ -172,5 +172,6 @@ def test_furnace_is_exact():
         "type": "path", "max_depth": depth, "rr_depth": 100})))  # fmt: skip
     expected = emitted * sum(rho**k for k in range(depth))
     assert np.allclose(image, expected, rtol=0.02)
-    # Not closer: Mitsuba 3.9's `path` gathers 0.2 % too much from a sphere when it samples it from inside.
+    # The tolerance cannot be smaller: Mitsuba 3.9's `path` gathers 0.2 % too much from a sphere when it samples it from
+    # inside.
     assert np.allclose(image.mean((0, 1)), expected, rtol=3e-3)
