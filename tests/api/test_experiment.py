@@ -258,9 +258,6 @@ def test_arguments_are_named_in_errors(folder: Path, call: Callable[[], Any], li
 
 # --- measuring --------------------------------------------------------------------------------------------------------
 
-#: Setting that makes the lamp's radiance the second parameter.
-SIMPLE = {"parameters[1]": {"key": LAMP, "initial": [3, 4, 5]}}
-
 
 def lines_of(file: str) -> list[dict[str, Any]]:
     """Return the lines of a `--json` file without the first line, which describes the origin of the measurement."""

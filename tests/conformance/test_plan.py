@@ -193,7 +193,7 @@ def test_rows_explain_needed_features() -> None:
     assert all(row.reason for row in rows)
 
 
-def test_a_step_makes_one_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_makes_two_plans(monkeypatch: pytest.MonkeyPatch) -> None:
     """A batched step makes one plan for the image of the first batch, and one plan for everything that is
     differentiated. The step does not make a plan for each batch.
     """

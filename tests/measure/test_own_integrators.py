@@ -287,7 +287,7 @@ def test_a_nan_image_fails(capsys: pytest.CaptureFixture[str]) -> None:
     assert "image: own_replay.py:Replay(primal_fault=nan)" in said
 
 
-def test_a_run_by_an_own_integrator_equals_prb(capsys: pytest.CaptureFixture[str]) -> None:
+def test_own_integrators_need_permission_and_unchanged_files(capsys: pytest.CaptureFixture[str]) -> None:
     """A run with `integrator.type: custom` needs `--allow-code` to start and to resume. After a change of the
     integrator's file, the run does not resume.
     """

@@ -445,7 +445,7 @@ def test_isolated_hosts_give_the_same(net, tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("whom", ["scheduler", "coordinator"])
-def test_a_single_worker_survives_five_kills(net, tmp_path: Path, whom: str) -> None:
+def test_a_run_survives_five_kills_of_scheduler_or_coordinator(net, tmp_path: Path, whom: str) -> None:
     """If the scheduler is killed, one line appears within a minute. `--resume` gives the same parameters."""
     more = tiny.settings("run.iterations=60", "run.spp=64", "run.checkpoint_every={iterations: 5}")
     local = reslrb(net, 2, *RUN, *more, "--cluster", "local:2", "--set", "run.name=local")
