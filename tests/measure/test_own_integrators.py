@@ -261,7 +261,7 @@ def test_two_black_images_agree() -> None:
         ("own_replay.py:NONE", "has a int, not a function, of the name"),
         ("own_replay.py:makes_none", "is not a Mitsuba integrator, but creates a str"),
         ("own_replay.py:Replay(falt=cosine)", "has no option falt"),
-        ("own_replay.py:Replay(fault=raises)", "making it raises in line 23 RuntimeError: of all things"),
+        ("own_replay.py:Replay(fault=raises)", "making it raises in line 25 RuntimeError: of all things"),
         ("own_replay.py:Black(what=raises)", "its render raises in line"),
         ("own_replay.py:Black(what=list)", "its render returns list, not mi.TensorXf"),
         ("own_replay.py:Black(what=wide)", "its image is 16x17x3, not 16x16 (height, width) with channels"),
