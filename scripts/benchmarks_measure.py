@@ -154,26 +154,23 @@ def _changed(commit: str, place: str) -> int:
     not count.
     """
     files = (_git("diff", "--name-only", "--no-renames", commit, "HEAD", "--", place, *UNMEASURED) or "").splitlines()
-    read = {".py": _syntax, ".yaml": _settings}
-    made = {file: read.get(Path(file).suffix) for file in files}
-    return sum(make is None or make(commit, file) != make("HEAD", file) for file, make in made.items())
+    return sum(_differs(commit, file) for file in files)
 
 
-def _settings(commit: str, file: str) -> Any:
-    """Return the content of a YAML file at a commit, or None if the file does not exist there."""
-    text = _git("show", f"{commit}:{file}")
-    return None if text is None else yaml.safe_load(text)
+def _differs(commit: str, file: str) -> bool:
+    """Return whether a file that has changed since a commit may lead to other figures."""
+    read = {".py": _syntax, ".yaml": yaml.safe_load}.get(Path(file).suffix)
+    if read is None:
+        return True
+    old, new = (_git("show", f"{each}:{file}") for each in (commit, "HEAD"))
+    return old is None or new is None or read(old) != read(new)
 
 
-def _syntax(commit: str, file: str) -> str | None:
-    """Return the syntax tree of a Python file at a commit, without docstrings and messages. Return None if the file
-    does not exist there.
+def _syntax(text: str) -> str:
+    """Return the syntax tree of a Python file without docstrings and messages.
 
     Messages are texts of at least two words on one line. No figure depends on messages.
     """
-    text = _git("show", f"{commit}:{file}")
-    if text is None:
-        return None
     tree = ast.parse(text)
     for node in ast.walk(tree):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:

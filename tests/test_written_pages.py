@@ -84,9 +84,9 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, content in {
-        "configs/room.yaml": "scene: {file: ../scenes/room/scene.xml}", "scenes/room/scene.xml": "", "docs/a.md": "",
-        "reslrb_cli/transport/walk.py": 'a = f"must be less than {1}"', "reslrb_cli/measure/bench.py": "",
-        "reslrb_cli/cli/bench.py": "",
+        "configs/room.yaml": "scene: {file: ../scenes/room/scene.xml}\nrun: {spp: 1}", "scenes/room/scene.xml": "",
+        "docs/a.md": "", "reslrb_cli/measure/bench.py": "", "reslrb_cli/cli/bench.py": "",
+        "reslrb_cli/transport/walk.py": 'a = f"must be less than {1}"',
     }.items():  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content)
@@ -103,22 +103,25 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
         origin = {"kind": "origin", "command": command} | state
         (tmp_path / "docs" / "benchmarks" / f"{name}.jsonl").write_text(json.dumps(origin) + "\n")
     (tmp_path / "reslrb_cli/cli/bench.py").write_text("1")  # no figure depends on it, nor on words
+    (tmp_path / "configs/room.yaml").write_text("# a room\nscene:\n  file: ../scenes/room/scene.xml\nrun: {spp: 1}\n")
     (tmp_path / "reslrb_cli/transport/walk.py").write_text('"""Walk."""  # along a path\na = "this is another message"')
     assert benchmarks_measure.code_state()["clean"] is False
     commit_all(tmp_path)
     assert main(["stale"]) == 0
     for place, names in {
-        "reslrb_cli/measure/bench.py": ["depth"], "scenes/room/scene.xml": ["depth", "room"],
+        "reslrb_cli/measure/bench.py": ["depth"], "configs/room.yaml": ["depth", "room"],
+        "scenes/room/scene.xml": ["depth", "room"],
         "reslrb_cli/transport/walk.py": ["depth", "room"],
     }.items():  # fmt: skip
         capsys.readouterr()
-        (tmp_path / place).write_text("a = 1")
+        (tmp_path / place).write_text("scene: {file: ../scenes/room/scene.xml}" if place.endswith(".yaml") else "a = 1")
         commit_all(tmp_path)
         assert main(["stale"]) == 1
         lines = capsys.readouterr().out.splitlines()
         assert [line.split(":")[0] for line in lines] == names
     assert lines[1] == (
-        f"room: measured at {state['commit']}; files changed since then: reslrb_cli/transport (1), scenes/room (1)"
+        f"room: measured at {state['commit']}; files changed since then: reslrb_cli/transport (1), "
+        "configs/room.yaml (1), scenes/room (1)"
     )
     record = tmp_path / "docs" / "benchmarks" / "room.jsonl"
     record.write_text(json.dumps({"kind": "origin", "command": commands["room"], "commit": "0" * 12}) + "\n")

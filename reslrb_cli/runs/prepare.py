@@ -275,10 +275,9 @@ class RunProgress:
         """Return the last losses of the run's own problem, as far as the current number of iterations tells."""
         if not self._is_whole(self.state):
             return []
-        config = self.problem.config
-        starts = [max(each.iteration - 1, 0) / config.run.iterations for each in records[-WINDOW:]]
-        whole = [self.stages.is_whole(config.stage_number(start)) for start in starts]
-        return [each.loss for each, counts in zip(records[-WINDOW:], whole, strict=True) if counts]
+        config, recent = self.problem.config, records[-WINDOW:]
+        stages = [config.stage_number(max(each.iteration - 1, 0) / config.run.iterations) for each in recent]
+        return [each.loss for each, stage in zip(recent, stages, strict=True) if self.stages.is_whole(stage)]
 
     def values(self) -> dict[str, Array]:
         """Return the newest values, in the form of `Problem.values`."""

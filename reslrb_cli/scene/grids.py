@@ -58,8 +58,8 @@ def _corners_of(element: Element, description: Description) -> Corners | None:
     """Return the parallelogram that a mesh file describes, or None for other meshes.
 
     The result contains a corner, and the ends of the corner's edges along u and along v. The result also tells whether
-    the v edge is to the right of the u edge, seen from outside. If four vertices have no texture coordinates, u is
-    chosen so that the mesh is to the left of u.
+    the v edge is to the right of the u edge, seen from outside. If four vertices have no texture coordinates, u runs
+    along the edge that has the mesh on its left.
     """
     name = element.find("filename")
     path = None if name is None else description.find_file(name.value)
