@@ -339,8 +339,7 @@ def traced(manifest: Mapping[str, Any]) -> dict[str, Any]:
         return {"paths": None, "light_share": None, "guided": None}
     found = re.match(r"paths: (\w+)", camera["reason"]) if camera["needed"] else None
     paths = found[1] if found else "light"
-    chosen = (manifest.get("paths") or {}).get("light_share")
-    share = {"light": 1.0, "camera": 0.0}.get(paths, chosen)
+    share = {"light": 1.0, "camera": 0.0}.get(paths)  # with both kinds, the configuration has the share
     return {"paths": paths, "light_share": share, "guided": rows["guided emission"]["needed"]}
 
 

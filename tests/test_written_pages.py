@@ -213,23 +213,21 @@ def test_the_readme_uses_figures_of_records(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("needed", "reason", "chosen", "shown"),
+    ("needed", "reason", "shown"),
     [
-        (True, "paths: both; paths: auto, 2 times", {"light_share": 0.2}, "20% light, guided"),
-        (True, "paths: both", None, "both, guided"),
-        (True, "paths: camera; paths: auto, 3 times", {"light_share": 0.0}, "camera, guided"),
-        (False, "paths: light; paths: auto, 3 times", {"light_share": 1.0}, "light, guided"),
-        (False, "paths: light", None, "light, guided"),
+        (True, "paths: both", "both, guided"),
+        (True, "paths: camera; paths: auto, 3 times", "camera, guided"),
+        (False, "paths: light; paths: auto, 3 times", "light, guided"),
     ],
 )
-def test_the_paths_of_a_run_match_its_manifest(needed: bool, reason: str, chosen: dict | None, shown: str) -> None:
+def test_the_paths_of_a_run_match_its_manifest(needed: bool, reason: str, shown: str) -> None:
     rows = [
         {"feature": "camera paths", "needed": needed, "reason": reason},
         {"feature": "guided emission", "needed": True, "reason": ""},
     ]
-    row = benchmarks_measure.traced({"plan": {"rows": rows}, "paths": chosen})
+    row = benchmarks_measure.traced({"plan": {"rows": rows}})
     assert pages.paths_of(pages.Record({}, [row])) == shown
-    of_prb = benchmarks_measure.traced({"plan": {"rows": []}, "paths": None})
+    of_prb = benchmarks_measure.traced({"plan": {"rows": []}})
     assert pages.paths_of(pages.Record({}, [of_prb])) == ""
 
 

@@ -195,9 +195,9 @@ def gradient(
         from reslrb_cli.optimization.assemble import assemble, set_values
         from reslrb_cli.optimization.loop import Split
         from reslrb_cli.optimization.loop import gradient as step_gradient
-        from reslrb_cli.records.cache import PilotCache
+        from reslrb_cli.records.decisions import DecisionCache
 
-        problem = assemble(config, logger.info, PilotCache())
+        problem = assemble(config, logger.info, DecisionCache())
         if values is not None:
             problem = set_values(problem, values)
         problem = replace(problem, config=reseeded)

@@ -358,27 +358,27 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
     """
     import drjit as dr
 
-    from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, plan_rows, with_reason
+    from reslrb_cli.integrators.plan_report import plan_rows
     from reslrb_cli.integrators.reslrb import Reslrb
-    from reslrb_cli.optimization.loading import choose_sensors, pass_spp, paths_of
+    from reslrb_cli.optimization.autotune.sampling import as_decided, decided, explained, open_settings
+    from reslrb_cli.optimization.loading import choose_sensors, make_configured, pass_spp, paths_of
     from reslrb_cli.optimization.moving import moves_anything
+    from reslrb_cli.records.decisions import Decision
 
     config = subject.config
     if isinstance(selection, str):
         return selection
     if config.integrator.type != "reslrb":
         return f"integrator.type is {config.integrator.type}; only `reslrb` has a plan"
-    options = config.integrator.options()
-    if options.get("estimator") == "auto":
-        options["estimator"] = "stack"  # a run chooses for `auto`
-    reasons = {}
-    for feature, option in ((GUIDED, "guiding"), (SEQUENCE, "sequence"), (PIXELS, "pixels")):
-        options[option], reasons[feature] = sampling_of(subject, option)
+    try:
+        decisions = decided(config, map(Decision.from_json, (subject.run or {}).get("decisions", ())))
+    except TypeError:  # the manifest is damaged
+        decisions = []
     try:
         [sensor, *_] = sensors = choose_sensors(config, scene)
-        options["paths"] = paths_of(config.integrator, scene, sensors, moves_anything(config, selection))
-        options |= sides_of(subject, options, reasons)
-        integrator = Reslrb.of(**options)
+        paths = paths_of(config.integrator, scene, sensors, moves_anything(config, selection))
+        integrator = as_decided(make_configured(config, config.integrator, paths), decisions)
+        assert isinstance(integrator, Reslrb)
         integrator.expect(pass_spp(config))
         params = selection.params
         for key in selection.scene_keys:
@@ -389,51 +389,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
         rows = plan_rows(integrator.plan(scene, scene.sensors()[sensor], params))
     except (ConfigError, UnsupportedScene) as error:
         return str(error)
-    if integrator.paths == "camera":  # a run chooses the other features for light paths only
-        reasons = {feature: reasons.get(feature, "") for feature in (PATHS_FROM, PIXELS)}
-    for feature, why in reasons.items():
-        rows = with_reason(rows, feature, why) if why else rows
-    return rows
-
-
-def sides_of(subject: Subject, options: dict[str, Any], reasons: dict[str, str]) -> dict[str, Any]:
-    """Return a run's `paths` and `light_share`. Before a run, return the default values. Adds explanations to the
-    `reasons` of features.
-    """
-    from reslrb_cli.config.integrators import UNDECIDED
-    from reslrb_cli.integrators.plan_report import PATHS_FROM
-    from reslrb_cli.records.decisions import PathsRecord
-
-    asked = subject.config.integrator.options()
-    if options["paths"] != "both" or "auto" not in (asked["paths"], asked["light_share"]):
-        return {"light_share": UNDECIDED["light_share"] if asked["light_share"] == "auto" else asked["light_share"]}
-    try:
-        record = PathsRecord.from_json(dict((subject.run or {}).get("paths") or {}))
-    except (TypeError, ValueError):
-        reasons[PATHS_FROM] = "light_share: auto, which a run decides by measurement"
-        return {"light_share": UNDECIDED["light_share"]}
-    reasons[PATHS_FROM] = f"paths: auto, {record.why()}"
-    return {"paths": record.paths, "light_share": record.light_share}
-
-
-def sampling_of(subject: Subject, option: str) -> tuple[str, str]:
-    """Return the value of `guiding`, `sequence` or `pixels`. Also return the reason if a run chooses this value,
-    otherwise an empty text.
-    """
-    from reslrb_cli.config.integrators import UNDECIDED
-    from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, PixelsRecord, SequenceRecord
-
-    asked = str(subject.config.integrator.options()[option])
-    if asked != "auto":
-        return asked, ""
-    kinds: dict[str, tuple[type[PaidRecord] | type[PixelsRecord], str]] = {
-        "guiding": (GuidedRecord, "guided"),
-        "sequence": (SequenceRecord, "sequence"),
-        "pixels": (PixelsRecord, "pixels"),
-    }
-    kind, name = kinds[option]
-    try:
-        record = kind.from_json(dict((subject.run or {}).get(name) or {}))
-    except (TypeError, ValueError):  # there is no run yet, or its manifest is damaged
-        return str(UNDECIDED[option]), f"{option}: auto, which a run decides by measurement"
-    return record.setting, f"{option}: auto, {record.why()}"
+    if not decisions:
+        open_ = open_settings(config, paths)
+        decisions = [Decision(setting=setting, value="auto", why="which a run decides") for setting in open_]
+    return explained(rows, decisions)

@@ -354,7 +354,7 @@ def _forecast(plan: Plan) -> int:
     """Print the number of runs, and the time and memory for each combination; write nothing."""
     from reslrb_cli.config.files import duration, in_words
     from reslrb_cli.optimization.forecast import make_forecast
-    from reslrb_cli.records.cache import PilotCache
+    from reslrb_cli.records.decisions import DecisionCache
     from reslrb_cli.records.sweeps import label
     from reslrb_cli.report.format import count, table
 
@@ -370,7 +370,7 @@ def _forecast(plan: Plan) -> int:
             config: Config = plan.configs[combination.name]
             start_variant(config)
             try:
-                forecast = make_forecast(config, logger.info, PilotCache())
+                forecast = make_forecast(config, logger.info, DecisionCache())
             except (ConfigError, UnsupportedScene) as error:
                 rows.append((shorten(label(combination.settings), 60), f"will fail: {error}"))
                 continue

@@ -36,7 +36,7 @@ _EXPECTED = {
 }
 
 
-#: Advice for removed settings, by the last two names of the key or by the value of a `type`.
+#: Advice for removed settings, by the last two names of the key, with the value if other values remain.
 REMOVED = {
     "scene.sensors": "list them in `views`, such as views: [{sensor: 0}, {sensor: 1}]; all of scene.cameras are used",
     "views.loss": "all views have the loss that `loss` says",
@@ -44,6 +44,7 @@ REMOVED = {
     "integrator.freeze": "steps are always recorded; remove it",
     "integrator.jacobian_damping": "it is always 0.1; remove it",
     "integrator.stack_size": "64 vertices are stored, and longer paths are traced again; remove it",
+    "integrator.light_share: auto": "take 0.5, which is the default",
     "integrator.type: direct_projective": "take prb_projective with max_depth: 2",
     "loss.scales": "lower the film's resolution at first, by run.stages",
     "loss.data_range": "it is always the target's largest value; remove it",
@@ -120,6 +121,8 @@ def _problem(detail: ErrorDetails, data: Any) -> SettingError:
         return SettingError(key, "must have at least one entry")
     if kind == "wrong":
         return SettingError(key, _but_is(context.get("message") or detail["msg"], value))
+    if isinstance(value, str) and (advice := _removed(location, value)):
+        return SettingError(key, f"{value} {advice}")
     if kind == "literal_error":
         return SettingError(
             key, _but_is("must be " + _one_of(re.findall(r"'([^']*)'", context["expected"]), value), value)

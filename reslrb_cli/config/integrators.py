@@ -103,7 +103,8 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "stack": (),
 }
 
-#: Options that a run chooses by measurement if they are `auto`, and their values without a measurement.
+#: Options that a run decides if they are `auto` (`optimization/autotune/sampling.py`), and their values without a
+#: decision. `light_share` is never `auto`; measurements of single steps take its value from here.
 UNDECIDED: dict[str, str | float] = {
     "paths": "light",
     "light_share": 0.5,
@@ -147,29 +148,26 @@ class Reslrb(AttachingTracer):
     no caustics of small lamps. Only with estimators `auto` and `stack`. `both`: at both, with each path weighted by how
     likely either side was to find it, so that the image has all light. `auto`: usually `both`. It is `camera` if camera
     paths find all light and a few steps before the first iteration show that they are more efficient. It is `light` if
-    `both` and `camera` cannot render the scene or find none of its light. Runs that move geometry or lamps always use
-    `light`. The default is `auto` with estimator `auto`, and `light` with an estimator that you name."""
-    light_share: Annotated[
-        Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), mark("number")]
-        | Annotated[Literal["auto"], mark("text")],
-        Discriminator(lambda value: MARK + ("text" if isinstance(value, str) else "number")),
-    ] = "auto"
+    `both` and `camera` cannot render the scene or find none of its light, or if guided light paths are more efficient.
+    Runs that move geometry or lamps always use `light`. The default is `auto` with estimator `auto`, and `light` with
+    an estimator that you name."""
+    light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.5
     """Fraction of the samples that are light paths, with `paths: both`. With 0 or 1 the code of the other side is not
-    compiled. `auto`: the most efficient fraction in a few steps before the first iteration, or 0.5 if nothing is
-    measured."""
+    compiled."""
     guiding: Literal["auto", "on", "off"] = "auto"
     """Importance sampling of light paths, learned in earlier steps. `on`: paths start where earlier paths contributed
     to the gradient and the image (at least a quarter start anywhere), and end early where earlier paths contributed
     little. In scenes with glossy surfaces, paths are also aimed at points that the sensor sees. From the second step
     on, this reduces noise where few paths contribute, as in a room lit through windows or in a caustic. A few of the
     first steps, and one in sixteen later steps, trace as many paths again to learn. `auto`: `on` if a few steps with
-    and without guiding, before the first iteration, show that it is more efficient. The default is `auto` with
+    and without guiding, before the first iteration, show that it is more efficient. Runs that move geometry or lamps
+    are not guided. The default is `auto` with
     estimator `auto`, and `off` with an estimator that you name."""
     sequence: Literal["auto", "independent", "low_discrepancy"] = "auto"
     """Random numbers that decide where light paths start and how they first scatter. `low_discrepancy`: spread evenly
     over all paths of a step, and independent between steps. This reduces noise where little else decides where light
-    goes, as in a beam through glass, and a little elsewhere. `auto`: `low_discrepancy` if a few steps with and without
-    it, before the first iteration, show that it is more efficient. The default is `auto` with estimator `auto`, and
+    goes, as in a beam through glass, and a little elsewhere. `auto`: `low_discrepancy`, or `independent` if
+    paths are guided. The default is `auto` with estimator `auto`, and
     `independent` with an estimator that you name."""
     pixels: Literal["auto", "even", "measured"] = "auto"
     """Number of camera paths in each pixel. `even`: the same in all pixels. `measured`: a quarter of the paths is
@@ -297,8 +295,8 @@ AnyIntegrator = Annotated[
 ]
 
 
-def _check_share(paths: str, light_share: float | str) -> None:
-    if light_share not in ("auto", UNDECIDED["light_share"]) and paths in ("light", "camera"):
+def _check_share(paths: str, light_share: float) -> None:
+    if light_share != UNDECIDED["light_share"] and paths in ("light", "camera"):
         raise located("light_share", f"has no effect with paths: {paths}, only with both; remove it")
 
 

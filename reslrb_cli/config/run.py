@@ -186,10 +186,10 @@ class RunConfig(Section):
     of its image without the suffix. The loss of these views is recorded every 10 iterations (`held_out`), and for the
     first and the last image."""
     measuring: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
-    """Time limit for the measurement of automatic integrator settings (`auto`) before the first iteration, as a
-    fraction of the expected time of the run. It includes the compilation of kernels for the measurement. First steps of
-    camera paths, which most runs need anyway, may take longer. Settings that there is no time for are chosen by
-    features of the scene. 0: measure nothing."""
+    """Time limit for measurements before the first iteration, as a fraction of the expected time of the run. They
+    decide `integrator.paths` and `integrator.guiding` if these are `auto`. The limit includes the compilation of
+    kernels for the measurement. First steps of camera paths, which most runs need anyway, may take longer. If there is
+    no time for a measurement, `paths` is `both`, and `guiding` is `off`. 0: measure nothing."""
     accept_incomplete: bool = False
     """Run even if more than half of the derivative of the loss is missing for a parameter that moves light. The
     derivative lacks silhouettes and shadow edges. A run measures their share before its first iteration, with a

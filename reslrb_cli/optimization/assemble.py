@@ -40,7 +40,7 @@ from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regula
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import View, expose, make_views
-from reslrb_cli.records.cache import PilotCache
+from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.parameters import Selection, select_parameters
 from reslrb_cli.scene.values import resample
@@ -51,7 +51,7 @@ Array = np.ndarray[Any, Any]
 def assemble(
     config: Config,
     say: Callable[[str], None] = lambda line: None,
-    cache: PilotCache | None = None,
+    cache: DecisionCache | None = None,
     to_run: bool = False,
     settled: Stored | None = None,
 ) -> Problem:
@@ -246,8 +246,7 @@ def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None =
         integrator.expect(pass_spp(config))
     return replace(
         made, integrator=integrator, samples_per_pass=size, paths=problem.paths, truth=problem.truth,
-        masks=problem.masks, guided=problem.guided, sequence=problem.sequence, sides=problem.sides,
-        pixels=problem.pixels,
+        masks=problem.masks, decisions=problem.decisions,
     )  # fmt: skip
 
 

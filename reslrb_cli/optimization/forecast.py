@@ -29,8 +29,8 @@ from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
-from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import MIB
+from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.metrics import Record
 
 #: Seconds of a step above which steps with fewer samples are measured instead, and the seconds for them.
@@ -198,7 +198,7 @@ class Forecast(Steps):
 def make_forecast(
     config: Config,
     say: Callable[[str], None],
-    cache: PilotCache | None = None,
+    cache: DecisionCache | None = None,
     before: Callable[[Problem], object] = lambda problem: None,
 ) -> Forecast:
     """Measure a few steps of the run that `config` describes. A variant must be set.

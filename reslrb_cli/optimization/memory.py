@@ -23,10 +23,10 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators.base import entry_bytes
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
-from reslrb_cli.optimization.decisions import Estimate, MemoryPlan
 from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import MIB, peak_mib, reset_peak
+from reslrb_cli.records.decisions import Estimate, MemoryPlan
 from reslrb_cli.scene.xml.check import film_sizes
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.transport.plan import Plan

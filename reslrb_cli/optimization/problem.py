@@ -15,20 +15,13 @@ from reslrb_cli.config.parameters import HEIGHTMAP, Laplacian, Thickness
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
-from reslrb_cli.optimization.decisions import Allowance, MemoryPlan
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
 from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, mesh_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
-from reslrb_cli.records.decisions import (
-    GuidedRecord,
-    Jsonable,
-    PathsRecord,
-    PixelsRecord,
-    SequenceRecord,
-)
+from reslrb_cli.records.decisions import Decision, MemoryPlan
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 
@@ -72,25 +65,13 @@ class Problem:
     paths: str = "light"
     #: Whether parameters move emitters or surfaces on light paths.
     moves: bool = False
-    #: Limit for measuring before the first iteration, if any option is measured and not cached.
-    allowance: Allowance | None = None
-    #: Results of measuring and planning before the first iteration.
-    sides: PathsRecord | None = None
-    guided: GuidedRecord | None = None
-    sequence: SequenceRecord | None = None
-    pixels: PixelsRecord | None = None
+    #: Decisions on settings of the integrator that are `auto` (`autotune/sampling.py`).
+    decisions: list[Decision] = field(default_factory=list)
     memory: MemoryPlan | None = None
     #: Regularizers of the values, by key and type.
     regularizers: dict[str, dict[str, Cost | Plate]] = field(default_factory=dict)
     #: Computes the shards of a step (`shards.Engine`); None: this process, one by one.
     engine: Callable[..., Any] | None = None
-
-    def decisions(self) -> dict[str, dict[str, Any] | None]:
-        """Return the named measurements and plans from before the first iteration, for manifests and checkpoints."""
-        made: dict[str, Jsonable | None] = {"guided": self.guided, "sequence": self.sequence}
-        made["memory"] = self.memory
-        made |= {name: own for name, own in (("paths", self.sides), ("pixels", self.pixels)) if own is not None}
-        return {name: None if each is None else each.to_json() for name, each in made.items()}
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
         """Write the optimiser's values to the scene, and update the masks of moving shapes. `others` limits the
@@ -213,8 +194,7 @@ class Problem:
         """Seconds that this run has spent on measurements that decide settings. The time of earlier runs does not
         count.
         """
-        made = (self.sides, self.guided, self.sequence, self.pixels)
-        return sum(each.measure_s + each.compile_s for each in made if each is not None and not each.cached)
+        return sum(each.seconds for each in self.decisions if not each.cached)
 
     @property
     def limit_s(self) -> float | None:

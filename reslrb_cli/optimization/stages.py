@@ -93,11 +93,13 @@ class Stages:
         if number == state.stage:
             return self.at(number), state
         if self.whole.config.stage(number).grain == self.whole.config.stage(state.stage).grain:
-            return self.at(number), replace(state, stage=number)
+            return self.at(number), replace(state, stage=number, stage_began=state.iteration)
         self.bring(state)
         problem = self.at(number)
         base = {} if self.is_whole(number) else {key: np.array(value) for key, value in self.whole.values().items()}
-        began = replace(state, stage=number, base=base, clamp={}, clamp_sums={}, scaling=None)
+        began = replace(
+            state, stage=number, stage_began=state.iteration, base=base, clamp={}, clamp_sums={}, scaling=None
+        )
         began = standing(problem, began)
         if number == self.last and self._learned is not None:  # independent of the images rendered since
             began = replace(began, guiding=self._learned[0], learned=self._learned[1])

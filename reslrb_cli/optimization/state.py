@@ -21,14 +21,12 @@ import drjit as dr
 
 from reslrb_cli.guiding.tables import KNOWN, Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.optimization.autotune.race import is_auto
-from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
-from reslrb_cli.optimization.decisions import MemoryPlan, Scaled
+from reslrb_cli.optimization.autotune.sampling import as_decided, decided
 from reslrb_cli.optimization.memory import in_passes
 from reslrb_cli.optimization.optimizers import SUMS
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.checkpoint import entries_below
-from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, PixelsRecord, SequenceRecord
+from reslrb_cli.records.decisions import Decision, MemoryPlan, Scaled
 from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expected, like, to_array
 
 
@@ -45,8 +43,8 @@ class State:
         named `<sensor>/<what>`.
     - `values` are the scene's, in the optimiser's form. A file has their displayed form. In a file, `halo` has the
         complete arrays of parameters whose displayed form lacks data.
-    - `stage` is the number of the state's stage. For a stage with its own problem (`stages`), `base` has the run's
-        values at the start of the stage.
+    - `stage` is the number of the state's stage, which started after `stage_began` iterations. For a stage with its own
+        problem (`stages`), `base` has the run's values at the start of the stage.
     - `drops` counts the reductions of the rate by a plateau. `since` is the number of iterations before the last
         reduction.
     - `stopped` is the reason why the run ends as finished. `end` is the reason why the run fails. Without a reason, the
@@ -64,6 +62,7 @@ class State:
     scaling: list[Scaled] | None = None
     guiding: dict[str, int] | None = None
     stage: int = 0
+    stage_began: int = 0
     drops: int = 0
     since: int = 0
     stopped: str = ""
@@ -193,20 +192,17 @@ class Settled:
     """Data common to all processes of a run.
 
     `Settled` has the settings in the form of a file, `variant`, and the digests of the `files`. `Settled` also has the
-    measured decisions, the parameters' initial values, and the `masks` of a `Problem`.
+    `decisions`, the parameters' initial values, and the `masks` of a `Problem`.
     """
 
     config: str
     variant: str
     files: dict[str, str] = field(default_factory=dict)
-    guided: GuidedRecord | None = None
-    sequence: SequenceRecord | None = None
-    paths: PathsRecord | None = None
+    decisions: list[Decision] = field(default_factory=list)
     memory: MemoryPlan | None = None
     initial: Arrays = field(default_factory=dict, metadata=entry("initial"))
     initial_halo: Arrays = field(default_factory=dict, metadata=entry("initial with halo"))
     masks: Arrays = field(default_factory=dict, metadata=entry("mask"))
-    pixels: PixelsRecord | None = None
     #: Distribution of camera paths over the pixels (H, W), by the number of the sensor.
     shares: Arrays = field(default_factory=dict, metadata=entry("pixels"))
 
@@ -223,18 +219,15 @@ def begin_as(problem: Problem, stored: Stored) -> None:
 def decide_as(problem: Problem, stored: Stored) -> Problem:
     """Return `problem` with the run's decisions about the samples per pass and the sampling methods."""
     settled = stored.read(Settled)
-    guided = settled.guided if is_auto(problem.config, "guiding") else None
-    sequence = settled.sequence if is_auto(problem.config, "sequence") else None
-    sides = settled.paths if is_auto(problem.config, "paths") else None
-    pixels = settled.pixels if is_auto(problem.config, "pixels") else None
+    decisions = decided(problem.config, settled.decisions)
     if problem.memory is not None and settled.memory is not None:
         before = settled.memory  # the passes determine the order of the sums
         plan = MemoryPlan(problem.memory.budget_bytes, before.samples_per_pass, before.passes, before.expected_bytes)
         problem = in_passes(problem, plan)
-    integrator = as_decided(with_sides(problem.integrator, sides), guided, sequence)
+    integrator = as_decided(problem.integrator, decisions)
     if shares := entries_below(stored.arrays, "pixels/"):
         integrator = integrator.shared_out(shares)
-    return replace(problem, sides=sides, guided=guided, sequence=sequence, pixels=pixels, integrator=integrator)
+    return replace(problem, decisions=decisions, integrator=integrator)
 
 
 def reach_as(problem: Problem, stored: Stored) -> Problem:

@@ -76,28 +76,21 @@ class Watch:
         """
         self.add(record)
         stop, optimizer, done = self.config.run.stop, self.config.optimizer, state.iteration
-        began = max(self._first, state.since)
+        if state.stage < len(self.config.run.stages):
+            return state
+        began = max(state.stage_began, state.since)
         if optimizer.schedule == "plateau" and lowered(optimizer, state.drops) > optimizer.final_fraction:
-            if self._stands(stop or StopRule(), began, done):
+            if self._stands(stop or StopRule(), began, state):
                 return replace(state, drops=state.drops + 1, since=done)
-        elif stop is not None and (said := self._stands(stop, began, done)):
+        elif stop is not None and (said := self._stands(stop, began, state)):
             return replace(state, stopped=said)
         return state
 
-    @property
-    def _first(self) -> int:
-        """Index of the first iteration whose loss is tested. Without stages, the index is 0.
-
-        With stages, the first iteration of the run as configured is skipped.
+    def _stands(self, asked: StopRule, began: int, state: State) -> str:
+        """Return a message about a flat loss in windows that start after `began` iterations. The message is "" if the
+        loss is not flat, or if the state does not end a window.
         """
-        stages, iterations = self.config.run.stages, self.config.run.iterations
-        return math.ceil(stages[-1].until * iterations) + 1 if stages else 0
-
-    def _stands(self, asked: StopRule, began: int, done: int) -> str:
-        """Return a message about a flat loss after `done` iterations. The message is "" if the loss is not flat, or if
-        `done` iterations do not end a window.
-        """
-        span = asked.patience
+        span, done = asked.patience, state.iteration
         if (done - began) % span:
             return ""
         levels: list[float] = []
@@ -106,7 +99,7 @@ class Watch:
             if len(values) < 2:
                 break
             levels.insert(0, float(levels_of(np.array(values))))
-        if not (count := int(stands(np.array(levels), asked.relative, (done - self._first) // span))):
+        if not (count := int(stands(np.array(levels), asked.relative, (done - state.stage_began) // span))):
             return ""
         last = np.array(levels[-count:])
         fall, error = (float(each) / max(abs(float(np.median(last))), 1e-300) for each in line(last))

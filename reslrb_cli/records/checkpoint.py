@@ -57,7 +57,7 @@ STATE_FILE, PREVIOUS_FILE_NAME, _NEXT_FILE = "state.npz", "previous.npz", "next.
 NONFINITE_FILE_NAME = "nonfinite.npz"
 
 #: Format version in the JSON of a state. It changes when the meaning of an entry changes.
-FORMAT = 2
+FORMAT = 3
 
 
 def save_checkpoint(
@@ -102,7 +102,9 @@ def read_state(path: Path) -> tuple[dict[str, Array], dict[str, Any]]:
     except ValueError as error:
         raise ConfigError(path, "state", f"is no JSON, as a run writes it ({error})") from None
     if not isinstance(values, dict) or values.get("format") != FORMAT:
-        raise ConfigError(path, "state", "is of another version of reslrb; go on with that one")
+        raise ConfigError(
+            path, "state", "is of another version of reslrb; continue the run with that version, or start a new run"
+        )
     return arrays, values
 
 

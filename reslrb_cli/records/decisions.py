@@ -1,22 +1,25 @@
-"""Records of the settings that a run chose by measurement. Manifest, checkpoints and cache contain the records.
+"""Decisions, plans and measurements from before the first iteration, as manifest, checkpoints and cache store them.
 
-PathsRecord     light paths, camera paths or both
-GuidedRecord    guided or unguided emission
-SequenceRecord  low-discrepancy or independent numbers
-PixelsRecord    camera paths distributed over the pixels by measurement or evenly
+Decision                setting that was `auto`: its value, and why
+DecisionCache           decisions of earlier runs, for the next run of the same scene and parameters
+Estimate, MemoryPlan    memory budget of a run
+Sensitivity, Scaled     measured sensitivity of a parameter
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from typing_extensions import Self
 
-#: Minimum relative efficiency of the image for a sampling method that serves both image and gradient.
-LEAST_IMAGE = 0.95
+from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.records.clock import MIB
 
 
 class Jsonable:
@@ -39,148 +42,163 @@ class Jsonable:
             raise TypeError(f"no {cls.__name__}: {error}") from None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding(Jsonable):
-    """Base class of all decisions by measurement.
-
-    The measured steps have `spp` samples per pixel and took `measure_s` seconds, including training. The first steps,
-    which compile, took `compile_s` seconds. `note` says why nothing was measured, or adds to the figures. `cached` is
-    true if an earlier run made the measurement.
-    """
-
-    spp: int = 0
-    measure_s: float = 0.0
-    compile_s: float = 0.0
-    note: str = ""
-    cached: bool = False
-
-    def decision(self) -> str:
-        """Return the decision in words."""
-        raise NotImplementedError
-
-    def why(self) -> str:
-        """Return the measurement in words."""
-        raise NotImplementedError
-
-    def line(self, cost: bool = False) -> str:
-        """Return the line for the user, with the time of the measurement if `cost` is set."""
-        line = f"{self.decision()}: {self.why()}"
-        if not cost or not (self.cached or self.measure_s or self.compile_s):
-            return line
-        took = f"measured in {self.measure_s:.1f} s and {self.compile_s:.1f} s of first steps"
-        return f"{line} ({'as an earlier run measured' if self.cached else took})"
-
-
-def _times(gain: float | None, low: float | None, high: float | None, note: str) -> str:
-    """Return a ratio of efficiencies and its interval in words. Return only the note if the ratio was not measured."""
-    if gain is None or low is None or high is None:
-        return note
-    found = f"{gain:.2g} times the efficiency here ({low:.2g} to {high:.2g})"
-    return f"{found}; {note}" if note else found
+# --- decisions --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaidRecord(Finding):
-    """Measured gain of an alternative sampling method.
+class Decision(Jsonable):
+    """Setting of the integrator that was `auto`, with its `value` in this run.
 
-    The gradient's efficiency is 1 / (variance * time). `gain` is the efficiency with the method divided by the
-    efficiency without the method. `low` and `high` are the ends of the 95 % interval of `gain`. `image_gain`,
-    `image_low` and `image_high` are the corresponding values for the image. If images have their own samples, these
-    samples give the values. Values that were not measured are None. If the method is off despite its gain, `note` gives
-    the reason. `rounds` is the number of measured steps of each kind. `share` is the cost of measuring, relative to the
-    time of 200 iterations.
+    `why` is the reason in words. If a measurement decided, `gain` is the efficiency of one way of sampling divided by
+    the efficiency of another. The efficiency is 1 / (variance * time). `low` and `high` are the ends of the gain's 95 %
+    interval. Without a measurement, all three are None. The measurement took `seconds`. `cached` is true if an earlier
+    run made it.
     """
 
+    setting: str
+    value: str
+    why: str
     gain: float | None = None
     low: float | None = None
     high: float | None = None
-    image_gain: float | None = None
-    image_low: float | None = None
-    image_high: float | None = None
-    rounds: int = 0
-    share: float = 0.0
+    seconds: float = 0.0
+    cached: bool = False
 
-    @property
-    def setting(self) -> str:
-        """The chosen value of the option."""
-        raise NotImplementedError
-
-    def why(self) -> str:
-        return _times(self.gain, self.low, self.high, self.note)
+    def line(self, cost: bool = False) -> str:
+        """Return the line for the user, with the time of the measurement if `cost` is set."""
+        line = f"{self.setting} {self.value}: {self.why}"
+        if not cost or not self.seconds:
+            return line
+        return f"{line} ({'as an earlier run measured' if self.cached else f'measured in {self.seconds:.1f} s'})"
 
 
-@dataclass(frozen=True, kw_only=True)
-class PathsRecord(PaidRecord):
-    """Choice of `paths` (light, camera, both). If `paths` is `both`, `light_share` is the share of light paths.
+#: The file of the cache, and the maximum number of entries; the oldest are dropped.
+CACHE_FILE, MOST = "decisions.json", 200
 
-    If a tried share was better, `gain` compares the chosen share with the best share before it. Otherwise, `gain`
-    compares the share that was tried last with the chosen share. `note` names the other share, or gives a reason.
+
+def cache_folder() -> Path:
+    """Return $RESLRB_CACHE, or `reslrb` in the user's cache folder."""
+    if own := os.environ.get("RESLRB_CACHE"):
+        return Path(own)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "reslrb"
+
+
+def key_of(what: dict[str, Any]) -> str:
+    """Return the key of an entry, a hash of all plain values that the entry depends on."""
+    return hashlib.blake2b(json.dumps(what, sort_keys=True, default=str).encode(), digest_size=16).hexdigest()
+
+
+class DecisionCache:
+    """JSON file of decisions by key.
+
+    An unreadable file counts as empty. If writing fails, the file is unchanged and `keeps` becomes False.
     """
 
-    paths: str
-    light_share: float = 0.5
+    def __init__(self, folder: Path | None = None) -> None:
+        self._given = folder
+        self.keeps = True
 
-    @property
-    def setting(self) -> str:
-        return self.paths
+    def get(self, key: str) -> Decision | None:
+        """Return the decision of `key`, or None if there is none that this version can read."""
+        try:
+            return Decision.from_json(self._read().get(key))
+        except TypeError:
+            return None
 
-    def decision(self) -> str:
-        share = f", {100 * self.light_share:.3g} % light paths" if self.paths == "both" else ""
-        return f"paths {self.paths}{share}"
+    def put(self, key: str, decision: Decision) -> None:
+        """Store a decision as the newest entry."""
+        entries = {name: value for name, value in self._read().items() if name != key}
+        entries = {**dict(list(entries.items())[1 - MOST :]), key: decision.to_json()}
+        text = json.dumps(entries, indent=1)
+        try:
+            path = self._path()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, lambda file: file.write(text.encode() + b"\n"))
+        except (OSError, RuntimeError):  # RuntimeError: no home folder
+            self.keeps = False
+
+    def _path(self) -> Path:
+        return (self._given or cache_folder()) / CACHE_FILE
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            content = json.loads(self._path().read_text(encoding="utf-8"))
+        except (OSError, ValueError, RuntimeError):
+            return {}
+        return content if isinstance(content, dict) else {}
 
 
-@dataclass(frozen=True, kw_only=True)
-class GuidedRecord(PaidRecord):
-    """Choice of guided emission, for gradients (`guided`) and for samples used only for an image (`images`)."""
-
-    guided: bool
-    images: bool = False
-
-    @property
-    def setting(self) -> str:
-        return "on" if self.guided else "off"
-
-    def decision(self) -> str:
-        apart = self.guided and not self.images
-        return "guiding on for gradients, off for images" if apart else f"guiding {self.setting}"
+# --- memory and sensitivities -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class SequenceRecord(PaidRecord):
-    """Choice of low-discrepancy numbers, for both gradients and images.
+@dataclass(frozen=True)
+class Estimate:
+    """Expected bytes of a step, in four parts.
 
-    `alone` is true if low-discrepancy numbers were measured as a replacement for guided emission. If `alone` is true,
-    an earlier decision had chosen guided emission. If `alone` is true, `gain` is relative to guided emission.
+    `fixed` is data before the step and targets, `images` is images and parameters, `scratch` is thread-local memory,
+    and `paths` is the stored data of the paths of one pass.
     """
 
-    low_discrepancy: bool
-    alone: bool = False
+    fixed: int
+    images: int
+    scratch: int
+    paths: int
 
     @property
-    def setting(self) -> str:
-        return "low_discrepancy" if self.low_discrepancy else "independent"
-
-    def decision(self) -> str:
-        instead = ", guiding off" if self.alone and self.low_discrepancy else ""
-        return f"sequence {self.setting}{instead}"
+    def total(self) -> int:
+        """Sum of all parts."""
+        return self.fixed + self.images + self.scratch + self.paths
 
 
-@dataclass(frozen=True, kw_only=True)
-class PixelsRecord(Finding):
-    """Choice of the distribution of camera paths over the pixels: by measured need (`measured`) or evenly.
+@dataclass
+class MemoryPlan(Jsonable):
+    """Memory budget, samples per pass and expected bytes. After the first iterations, also the peak."""
 
-    `note` gives the reason.
+    budget_bytes: int
+    samples_per_pass: int
+    passes: int
+    expected_bytes: Estimate
+    peak_mib: float | None = None
+    exceeded: bool = False
+
+    def check(self, peak: float) -> str | None:
+        """Record the allocator's peak in MiB. Returns a warning when the used memory first exceeds the budget."""
+        self.peak_mib = peak
+        used, before = peak * MIB + self.expected_bytes.scratch, self.exceeded
+        self.exceeded = used > self.budget_bytes
+        if not self.exceeded or before:
+            return None
+        allowed = f"{self.budget_bytes / MIB:.1f} MiB"
+        return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the budget of {allowed}"
+
+
+@dataclass(frozen=True)
+class Sensitivity(Jsonable):
+    """Measured sensitivity of a parameter with `entries` numbers, in the scene's units.
+
+    `value`, `gradient` and `noise` are root mean squares over the entries. `gradient` is 0 if it cannot be
+    distinguished from noise, and `noise` is the standard deviation of one step's gradient. `change` is relative, per
+    unit. `change`, `curvature` (loss per unit²) and `length` are None if the image did not change.
     """
 
-    measured: bool
+    key: str
+    entries: int
+    value: float
+    gradient: float
+    noise: float
+    change: float | None = None
+    curvature: float | None = None
+    length: float | None = None
 
-    @property
-    def setting(self) -> str:
-        """The chosen value of the option."""
-        return "measured" if self.measured else "even"
 
-    def decision(self) -> str:
-        return f"pixels {self.setting}"
+@dataclass(frozen=True)
+class Scaled(Sensitivity):
+    """Sensitivity of a parameter, and the resulting scale.
 
-    def why(self) -> str:
-        return self.note
+    `own_length` is `length` in the optimiser's variable. `first_step` is how far one learning rate initially moves the
+    value, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled.
+    """
+
+    own_length: float | None = None
+    first_step: float | None = None

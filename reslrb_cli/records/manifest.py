@@ -62,7 +62,7 @@ class Manifest:
 
     - `process`: the process that uses the folder.
     - `plan`: the parts of a step.
-    - `paths`, `guided`, `sequence`, `pixels`: settings chosen by measurement (`records/decisions.py`).
+    - `decisions`: settings of the integrator that were `auto` (`Decision`).
     - `incomplete`: the missing share of the derivative, for each parameter that moves light (`MissingRecord`).
     - `memory`: how the run keeps its memory budget.
     - `scaling`: the measurements of each parameter for `scale: auto`.
@@ -90,10 +90,7 @@ class Manifest:
     ended: str | None = None
     error: str | None = None
     plan: dict[str, Any] | None = None
-    guided: dict[str, Any] | None = None
-    sequence: dict[str, Any] | None = None
-    paths: dict[str, Any] | None = None
-    pixels: dict[str, Any] | None = None
+    decisions: list[dict[str, Any]] = field(default_factory=list)
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
     views: list[dict[str, Any]] | None = None

@@ -13,7 +13,6 @@ from textwrap import wrap
 from typing import Any, NamedTuple
 
 from reslrb_cli.optimization.errors import ErrorMeter
-from reslrb_cli.records.decisions import Finding
 from reslrb_cli.records.measurements import INCOMPLETE, incomplete_records
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
@@ -174,14 +173,6 @@ def noise_line(results: Mapping[str, Any]) -> str:
         return ""
     which = "" if measured["target_noise"] == "left out" else " that are files"
     return f"spread: by the noise of the run; noise and errors of targets{which} are not in it"
-
-
-def measured_line(kind: type[Finding], measured: Mapping[str, Any] | None) -> str:
-    """Return a line about a setting chosen by measurement before the run. The result is empty if there is none."""
-    try:
-        return kind.from_json(dict(measured or {})).line(cost=True)
-    except TypeError:  # missing, or of another version
-        return ""
 
 
 def _is_of_target(about: Mapping[str, Any]) -> bool:

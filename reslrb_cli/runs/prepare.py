@@ -24,10 +24,11 @@ from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
-from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, plan_rows, with_reason
+from reslrb_cli.integrators.plan_report import plan_rows
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.sampling import explained
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
@@ -36,9 +37,9 @@ from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_fil
 from reslrb_cli.optimization.stopping import Watch
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
-from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
 from reslrb_cli.records.clock import SharedTime
+from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
 from reslrb_cli.records.run_folder import RunFolder
@@ -58,16 +59,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
     if not isinstance(integrator, Reslrb):
         return {"integrator": config.type, "estimator": None, "rows": []}
     plan = integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]], problem.selection.params)
-    found = plan_rows(plan)
-    if problem.guided is not None:
-        found = with_reason(found, GUIDED, f"guiding: auto, {problem.guided.why()}")
-    if problem.sequence is not None:
-        found = with_reason(found, SEQUENCE, f"sequence: auto, {problem.sequence.why()}")
-    if problem.pixels is not None:
-        found = with_reason(found, PIXELS, f"pixels: auto, {problem.pixels.why()}")
-    if problem.sides is not None:
-        found = with_reason(found, PATHS_FROM, f"paths: auto, {problem.sides.why()}")
-    rows = [vars(row) for row in found]
+    rows = [vars(row) for row in explained(plan_rows(plan), problem.decisions)]
     estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
     assert isinstance(config, ReslrbConfig)
     return {"integrator": config.type, "estimator": estimator, "rows": rows}
@@ -148,7 +140,7 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgr
 
     `say` is called with lines about slow steps, `warn` with warnings. Raises ConfigError and UnsupportedScene.
     """
-    problem = assemble(config, say, PilotCache(), to_run=True)
+    problem = assemble(config, say, DecisionCache(), to_run=True)
     warn_of_border(problem, warn)
     missing = check_missing(problem, warn)
     if missing:  # the check moves geometry, possibly beyond the bounding sphere of the lamps at infinity
@@ -170,8 +162,8 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
         # Primary rays may fail, too, in a scene that light paths do not support.
         lamps = sees_lamps(problem.scene, sensor) if unsupported_part(problem.scene, sensor) is None else None
         record["shown"] = exposure_for(np.array(view.target), lamps)
-    for name, decided in problem.decisions().items():
-        setattr(manifest, name, decided)
+    manifest.decisions = [each.to_json() for each in problem.decisions]
+    manifest.memory = None if problem.memory is None else problem.memory.to_json()
     return manifest
 
 
@@ -183,8 +175,8 @@ def settled_of(problem: Problem, variant: str) -> Settled:
     """
     initial, halo = on_file(problem, standing(problem).values)
     return Settled(
-        dump(problem.config), variant, digests(problem.config), problem.guided, problem.sequence, problem.sides,
-        problem.memory, initial, halo, problem.masks, problem.pixels, noted_of(problem),
+        dump(problem.config), variant, digests(problem.config), problem.decisions, problem.memory, initial, halo,
+        problem.masks, noted_of(problem),
     )  # fmt: skip
 
 

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault
-from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
@@ -28,6 +27,7 @@ from reslrb_cli.records.checkpoint import (
     STATE_FILE,
     newest_checkpoint,
 )
+from reslrb_cli.records.decisions import Scaled
 from reslrb_cli.records.images import load_image, write_image, write_mask, write_parameters
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.measurement_files import LivePage

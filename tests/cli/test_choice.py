@@ -5,6 +5,7 @@ the manifest.
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +51,8 @@ def wide(*settings: str) -> list[str]:
 
 
 def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatch):
-    """Without enough time for measuring in a tenth of the run, the scene decides the `auto` options. With more time,
-    measurements decide them.
+    """Without enough time for measuring in a tenth of the run, rules decide the `auto` options. With more time,
+    measurements decide two of them.
     """
     from reslrb_cli.optimization.autotune.race import Turns
 
@@ -62,36 +63,23 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
     assert code == 0, err
     assert "measuring which" not in err
     because = "not measured (over 10 % of this run); "
-    chosen = "paths both, 50 % light paths, guiding off, sequence low_discrepancy, pixels even"
+    sequence = "sequence low_discrepancy: evenly spread numbers have been no loss in any scene"
+    chosen = "sequence low_discrepancy, paths both, pixels even, guiding off"
     assert f"chosen without measuring: {chosen} (-v gives the reasons)" in err.splitlines()
     manifest = read_manifest(Path("runs/box"))
     assert manifest["plan"]["estimator"] == "stack"
-    assert manifest["sequence"]["low_discrepancy"]
+    assert [each["setting"] for each in manifest["decisions"]] == ["sequence", "paths", "pixels", "guiding"]
     page = Path("runs/box/report.html").read_text()
     assert f"guiding off: {because}it pays in long runs" in page
-    assert f"sequence low_discrepancy: {because}evenly spread ones" in page
+    assert sequence in page
     code, err = optimize(capsys, *options, verbose=True)
     assert f"guiding off: {because}it pays in long runs" in err.splitlines()
     code, err = optimize(capsys, *options, "run.measuring=1000")
     assert code == 0, err
     assert "measuring which sampling is most efficient" in err  # the unmeasured decision is not stored as measured
-    assert "chosen by measurement: paths" in err
+    assert re.search("^chosen by measurement: .*paths (both|camera), ", err, re.MULTILINE)
     opening = err.splitlines()[: next(place for place, line in enumerate(err.splitlines()) if line.startswith("1/3: "))]
     assert 0 < len(opening) <= 6, opening
-
-
-@pytest.mark.parametrize(("light", "parallel"), [("point", True), ("area", False)])
-def test_the_scene_decides_if_nothing_is_measured(experiment, light, parallel):
-    from reslrb_cli.config.loader import load
-    from reslrb_cli.optimization.assemble import assemble_scene
-    from reslrb_cli.optimization.autotune import sampling
-
-    if light == "point":
-        lamp = SCENE[SCENE.index('<shape type="rectangle" id="lamp">') : SCENE.index("</scene>")]
-        point = """<emitter type="point"><point name="position" x="0" y="0" z="2"/></emitter>\n"""
-        Path("scene.xml").write_text(SCENE.replace(lamp, point))
-    problem = assemble_scene(load("box.yaml", []))
-    assert (sampling.suits_even_numbers(problem) is not None) == parallel
 
 
 def test_other_settings_are_another_situation(experiment):
@@ -100,8 +88,8 @@ def test_other_settings_are_another_situation(experiment):
     """
     from reslrb_cli.config.loader import load
     from reslrb_cli.optimization.assemble import assemble_scene
-    from reslrb_cli.optimization.autotune.race import situation
-    from reslrb_cli.records.cache import key_of
+    from reslrb_cli.optimization.autotune.sampling import situation
+    from reslrb_cli.records.decisions import key_of
 
     def key(*settings):
         return key_of(situation(assemble_scene(load("box.yaml", settings))))
@@ -128,18 +116,21 @@ def test_measuring_does_not_change_the_run(experiment):
     from reslrb_cli.optimization.assemble import assemble
 
     def first_step(*settings):
-        problem = assemble(load("box.yaml", settings))
+        # A target with the integrator of the run would depend on its sequence.
+        target = "target.render.integrator={max_depth: 4, estimator: stack}"
+        problem = assemble(load("box.yaml", [target, *settings]))
         assert not np.any(np.array(problem.optimizer.gradient(KEY)))
         value = problem.selection.array(KEY).copy()
         loss, *_ = loop.gradient(problem, 0, loop.Split())
         dr.eval(loss)
         return value, float(loss[0]), problem
 
-    value, loss, problem = first_step("integrator={max_depth: 4, paths: light, guiding: off}")
-    sequence = problem.sequence
-    assert sequence.rounds > 0
-    named = first_step(f"integrator={{max_depth: 4, estimator: stack, sequence: {sequence.setting}}}")
-    assert named[2].sequence is None
+    value, loss, problem = first_step("integrator={max_depth: 4, paths: light}")
+    sequence, guiding = problem.decisions
+    assert guiding.gain is not None
+    named = first_step(f"integrator={{max_depth: 4, estimator: stack, paths: light, sequence: {sequence.value}, "
+                       f"guiding: {guiding.value}}}")  # fmt: skip
+    assert named[2].decisions == []
     np.testing.assert_array_equal(value, named[0])
     assert loss == pytest.approx(named[1], rel=1e-5)
 
@@ -172,7 +163,7 @@ def test_auto_works_with_batches_and_several_views(experiment, capsys):
     settings = ["run.adjoint=batched", "views=[{sensor: 0}, {sensor: 1}]", "run.spp=8", "run.iterations=1"]
     code, err = optimize(capsys, "integrator.guiding=auto", *settings)
     assert code == 0, err
-    assert read_manifest(Path("runs/box"))["guided"]["spp"] in (4, 8)
+    assert read_manifest(Path("runs/box"))["decisions"][-1]["gain"] is not None
 
 
 def test_auto_is_not_an_option_of_the_plugin(llvm):

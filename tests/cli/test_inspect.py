@@ -272,8 +272,8 @@ def test_conditioning_as_a_table_and_as_json():
 
 
 def test_a_spread_needs_two_samples():
-    from reslrb_cli.optimization.decisions import Sensitivity
     from reslrb_cli.optimization.sensitivity import Conditioning
+    from reslrb_cli.records.decisions import Sensitivity
 
     rows = [Sensitivity("a", 1, 1.0, 2.0, 0.1, change=4.0), Sensitivity("b", 1, 1.0, 0.0, 0.1)]
     assert Conditioning(rows, 2, 1, 0).spread("change") is None

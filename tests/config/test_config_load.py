@@ -72,7 +72,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto",
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
-        "paths": "auto", "light_share": "auto",
+        "paths": "auto", "light_share": 0.5,
         "sequence": "auto", "pixels": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
@@ -401,7 +401,7 @@ def test_options_and_defaults_match_the_estimators(name: str) -> None:
 
 
 def test_paths_unsupported_by_the_named_estimator() -> None:
-    assert (Reslrb().paths, Reslrb().light_share) == ("auto", "auto")
+    assert (Reslrb().paths, Reslrb().light_share) == ("auto", 0.5)
     assert Reslrb(estimator="stack").paths == "light"
     named = Reslrb(estimator="stack", paths="both")
     assert (named.paths, named.light_share) == ("both", 0.5)

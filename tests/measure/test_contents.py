@@ -27,8 +27,8 @@ from reslrb_cli.measure.resume_store import first_difference
 from reslrb_cli.measure.resume_store import settings as measured_as
 from reslrb_cli.measure.sampling import settings as sampled_as
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
-from reslrb_cli.optimization.autotune.race import situation
-from reslrb_cli.records.cache import PilotCache, key_of
+from reslrb_cli.optimization.autotune.sampling import situation
+from reslrb_cli.records.decisions import DecisionCache, key_of
 from reslrb_cli.runs.sweep import make_plan, opened
 from reslrb_cli.scene.files import files_of
 
@@ -222,12 +222,11 @@ def test_a_sweep_continues_with_its_original_files(folder: Path) -> None:
 @pytest.mark.parametrize("files", [("parts/quad.obj",), pytest.param(tuple(OF_PHOTO), marks=pytest.mark.long)])
 def test_decisions_of_another_experiment_are_not_used(folder: Path, files: tuple[str, ...]) -> None:
     sets = ["run.measuring=1000", "integrator.guiding=auto"]
-    cache = PilotCache(folder / "cache")
+    cache = DecisionCache(folder / "cache")
 
     def is_known() -> bool:
-        record = assemble(load("photo.yaml", sets).with_code(), cache=cache, to_run=True).guided
-        assert record is not None
-        return record.cached
+        decisions = assemble(load("photo.yaml", sets).with_code(), cache=cache, to_run=True).decisions
+        return decisions[-1].cached
 
     assert [is_known(), is_known()] == [False, True]
     for file in files:

@@ -16,17 +16,20 @@ from cli import tiny
 from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.autotune import race
-from reslrb_cli.optimization.autotune.race import GUIDING_SHARE, Sizes, Step, Turns
-from reslrb_cli.optimization.autotune.sampling import (
+from reslrb_cli.optimization.autotune.race import (
     FEW_ENTRIES,
-    GUIDING_LONGER,
     ROUNDS,
     ROUNDS_OF_FEW,
-    GuidingPilot,
+    Finding,
+    Sizes,
+    Step,
     StepTrial,
+    Turns,
 )
+from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
+from reslrb_cli.records.decisions import Decision
 
 SMALL = ["scene.size=[32, 32]", "run.spp=64", "run.iterations=2", "run.certainty=false"]
 SMALL += ["run.measuring=1000"]  # despite so few iterations
@@ -54,9 +57,6 @@ class World:
     alone: bool = False
     calls: list[Any] = field(default_factory=list)
 
-    learns: bool = True
-    pilot: type[Turns[Any]] = GuidingPilot
-
     def learn(self, round: int, spp: int) -> Step:
         self.calls.append(("learn", round, spp))
         return Step(kernel_ms=self.walk * spp, wall_ms=self.walk * spp + self.python, compile_ms=5.0)
@@ -79,11 +79,11 @@ class World:
         noise = (random.poisson(4, self.entries) - 4) / 2 if self.sparse else random.normal(size=self.entries)
         return 1 + np.sqrt(variance) * noise
 
-    def run(self, sizes: Sizes = SIZES, share: float = 2 * GUIDING_SHARE) -> Any:
-        """Return the record of the decision."""
+    def race(self, sizes: Sizes = SIZES, limit_s: float = 1e6, guides: bool = True) -> Finding:
+        """Return the result of a race between both kinds of steps."""
         rounds = ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS
-        sizes, learn = replace(sizes, rounds=rounds, alone=self.alone), self.learn if self.learns else None
-        return self.pilot(self.take, sizes, 1.0, share, learn=learn).run()
+        sizes = replace(sizes, rounds=rounds, alone=self.alone)
+        return Turns(self.take, sizes, limit_s, self.learn, guides).run()
 
 
 def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -109,6 +109,11 @@ def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) ->
         return taken
 
     monkeypatch.setattr(StepTrial, "take", timed)
+
+
+def decision(problem: Problem, setting: str) -> Decision | None:
+    """Return the decision on a setting, or None if there is none."""
+    return next((each for each in problem.decisions if each.setting == setting), None)
 
 
 def is_even(problem: Problem) -> bool:

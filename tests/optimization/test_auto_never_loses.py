@@ -1,9 +1,9 @@
-"""`guiding: auto` and `sequence: auto` reduce the efficiency of no scene. The tests cover all shipped configurations,
-and scenes of the extreme suite.
+"""`guiding: auto` reduces the efficiency of no scene. The tests cover all shipped configurations, and scenes of the
+extreme suite.
 
-An enabled option has a gain whose interval lies above 1. A disabled option traces the same operations as `off`. All
-measurements together stay within their allowed share of time. Shipped films keep their size, or are smaller where an
-iteration takes seconds. Scenes of the extreme suite have so many samples that there is time to measure.
+If guiding is on, its gain has an interval above 1. If it is off, a step traces the same operations as with `off`.
+Shipped films keep their size, or are smaller where an iteration takes seconds. Scenes of the extreme suite have so many
+samples that there is time to measure.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ import gc
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from optimization.deciding import operations
+from optimization.deciding import decision, operations
 
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.schema import Config
@@ -27,12 +26,11 @@ from reslrb_cli.measure.extreme.suite import ExtremeCase
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.race import NOTHING, SHARE, Gain, is_auto
-from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle
+from reslrb_cli.optimization.autotune.race import Finding, Turns
+from reslrb_cli.optimization.autotune.sampling import is_auto, settle
 from reslrb_cli.optimization.memory import fit_memory
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
-from reslrb_cli.records.decisions import LEAST_IMAGE, PaidRecord
 from reslrb_cli.records.images import write_file
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
@@ -52,9 +50,6 @@ EXTREME = ["sun_1e6", "lamp_of_area_1e-8", "grazing_light", "nested_dielectrics"
 PREFIX = "extreme/"
 #: Light paths in a step of these scenes.
 PATHS = 2**20
-#: The last round starts while time remains for a round like the previous one. Under other load on the machine, a round
-#: may take this many times the mean. Where steps take milliseconds, this excess is noticeable.
-OVERRUN = 2
 #: Function that decides on the integrator.
 SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], Problem]] = {"settle": settle}
 
@@ -98,58 +93,23 @@ def config_of(name: str, case: ExtremeCase | None, folder: Path, *settings: str)
     return load(FOLDER / f"{name}.yaml", [*target, *SMALLER.get(name, ()), *settings])
 
 
-def judged(record: PaidRecord | None, on: bool, alone: bool) -> list[str]:
-    """Return the faults of a decision."""
-    if record is None:
-        return ["nothing was decided"]
-    if not on:
-        return []
-    assert record.low is not None
-    assert record.image_high is not None
-    found = [f"on, and the gain is {record.low:.3g} at least"] if record.low <= 1 else []
-    if not alone and record.image_high < LEAST_IMAGE:
-        found.append(f"on, and the image's efficiency falls to {record.image_high:.3g} at most")
-    return found
-
-
 @pytest.mark.parametrize("name", [*SHIPPED, *(PREFIX + name for name in EXTREME)])
 def test_no_scene_loses(name: str, tmp_path: Path) -> None:
     case = CASES[name.removeprefix(PREFIX)] if name.startswith(PREFIX) else None
     problem = decided(config_of(name, case, tmp_path, *AUTO), case)
-    sides, guided, sequence = problem.sides, problem.guided, problem.sequence
-    share = sum(each.share for each in (sides, guided, sequence) if each is not None)
-    round_share = max(each.share / max(each.rounds, 1) for each in (guided, sequence) if each is not None)
-    print(name, *(each.line() for each in (sides, guided, sequence) if each is not None), f"{share:.2%}", sep="\n  ")
+    print(name, *(each.line(cost=True) for each in problem.decisions), sep="\n  ")
+    guided, values = decision(problem, "guiding"), {each.setting: each.value for each in problem.decisions}
     assert guided is not None
-    alone = problem.config.adjoint == "independent"
-    assert judged(guided, guided.guided, alone) == []
-    assert share <= SHARE + OVERRUN * round_share
-    if guided.guided:
+    if guided.value != "off":
+        assert guided.low is not None
+        assert guided.low > 1
         return
-    camera = problem.integrator.paths == "camera"
-    settings = ["integrator.estimator=stack", f"integrator.guiding={guided.setting}"]
-    if problem.sides is not None:
-        both = [f"integrator.light_share={problem.sides.light_share}"] if problem.sides.paths == "both" else []
-        settings += [f"integrator.paths={problem.sides.paths}", *both]
-    if camera:  # no path starts at a lamp
-        assert sequence is None
-    else:
-        assert sequence is not None
-        assert judged(sequence, sequence.low_discrepancy, False) == []
-        settings += [f"integrator.sequence={sequence.setting}"]
+    assert ("sequence" in values) == (problem.integrator.paths != "camera")  # no camera path uses it
+    settings = [f"integrator.{setting}={value}" for setting, value in values.items()]
     found = operations(problem)
     del problem
     gc.collect()
-    assert found == operations(decided(config_of(name, case, tmp_path, *settings), case))
-
-
-def forced(record: Callable[..., PaidRecord], on: bool) -> Callable[..., PaidRecord]:
-    """Return a replacement for a pilot's `_record` that decides `on` instead."""
-
-    def decided(pilot: Any, note: str, gain: Gain = NOTHING, picture: Gain = NOTHING, *decision: bool) -> PaidRecord:
-        return record(pilot, note, gain, picture, on, on)
-
-    return decided
+    assert found == operations(decided(config_of(name, case, tmp_path, "integrator.estimator=stack", *settings), case))
 
 
 @pytest.mark.parametrize("fault", ["on whatever is found", "off with a grid"])
@@ -159,9 +119,12 @@ def test_losses_are_found(fault: str, tmp_path: Path, monkeypatch: pytest.Monkey
     """
     monkeypatch.setattr(sys.modules[__name__], "AUTO", [*AUTO, "integrator.paths=light"])
     if fault == "on whatever is found":
-        monkeypatch.setattr(GuidingPilot, "_record", forced(GuidingPilot._record, True))
-        # Otherwise, low-discrepancy sequences would take the place of guiding here.
-        monkeypatch.setattr(SequencePilot, "_record", forced(SequencePilot._record, False))
+        run = Turns.run
+
+        def forced(self: Turns) -> Finding:
+            return dataclasses.replace(run(self), other=True, images=True)
+
+        monkeypatch.setattr(Turns, "run", forced)
     else:
 
         def wrong(problem: Problem, say: Callable[[str], None]) -> Problem:

@@ -523,7 +523,7 @@ def test_an_empty_mask_is_refused(masked_folder):
 
 
 def test_excluded_pixels_do_not_count(masked_folder):
-    """Pixels with an alpha of 0 affect neither the gradients, as the pilot takes them, nor the sensitivities."""
+    """Pixels with an alpha of 0 affect neither the gradients, as measured steps take them, nor the sensitivities."""
     found = []
     for value in (60, 200):
         pixels = np.array(mi.Bitmap(str(masked_folder / "photo.png")))

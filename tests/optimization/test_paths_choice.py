@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from optimization.deciding import SMALL, begin, fix_times
+from optimization.deciding import SMALL, begin, decision, fix_times
 from runs.going_on import optimize
 
 from reslrb_cli.config.integrators import Reslrb
@@ -17,13 +17,12 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune import race, sampling
-from reslrb_cli.optimization.autotune.sampling import FEWER, FIRST_SHARE, MORE, CameraPilot, with_sides
+from reslrb_cli.optimization.autotune.sampling import as_decided
 from reslrb_cli.optimization.loading import paths_of
 from reslrb_cli.optimization.losses import make_loss
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import View
-from reslrb_cli.records.cache import PilotCache
-from reslrb_cli.records.decisions import PathsRecord
+from reslrb_cli.records.decisions import Decision, DecisionCache
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
 from reslrb_cli.transport.film import PixelShares
@@ -31,7 +30,6 @@ from reslrb_cli.transport.film import PixelShares
 pytestmark = pytest.mark.usefixtures("llvm")
 
 AUTO = ["integrator.paths=auto", "integrator.estimator=stack", *SMALL]
-OTHERS = (0.0, *FEWER, *MORE)
 #: Settings of a run of one second, of which measuring may take a tenth.
 SHORT = ["integrator.paths=auto", "integrator.estimator=stack", "scene.size=[32, 32]", "run.spp=16"]
 SHORT += ["run.iterations=100", "run.certainty=false"]
@@ -51,13 +49,10 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def decided(
-    monkeypatch: pytest.MonkeyPatch, other_ms: float, *settings: str, cache: PilotCache | None = None,
-    apart: dict[float, float] | None = None,
-) -> Problem:  # fmt: skip
-    """Return the problem with given step times. Steps of another share take `other_ms` times as long as steps of the
-    best share so far. `apart` gives separate times for some shares.
-    """
-    fix_times(monkeypatch, {f"paths {share:g}": (apart or {}).get(share, other_ms) for share in OTHERS})
+    monkeypatch: pytest.MonkeyPatch, camera_ms: float, *settings: str, cache: DecisionCache | None = None
+) -> Problem:
+    """Return the problem. Steps with camera paths alone take `camera_ms` times as long as steps with both kinds."""
+    fix_times(monkeypatch, {"paths": camera_ms})
     return assemble(load("tiny.yaml", [*AUTO, *settings]), cache=cache)
 
 
@@ -73,68 +68,90 @@ def share_of(problem: Problem) -> tuple[str, float]:
     return problem.integrator.paths, problem.integrator.light_share
 
 
-def test_camera_paths_are_tried_first_if_they_find_all_light(monkeypatch: pytest.MonkeyPatch):
-    """All surfaces of the scene are diffuse."""
-    problem = decided(monkeypatch, 100.0, apart={0.0: 0.01})
-    assert problem.sides is not None
-    assert (problem.sides.paths, problem.sides.light_share) == ("camera", 0.0)
-    assert share_of(problem)[0] == "camera"
-    assert problem.sides.low > 1
+def test_camera_paths_are_used_if_they_find_all_light_and_are_faster(monkeypatch: pytest.MonkeyPatch):
+    """All surfaces of the scene are diffuse. No camera path uses the sequence, so it is not reported."""
+    problem = decided(monkeypatch, 0.01, "integrator.sequence=auto")
+    [found] = problem.decisions
+    assert (found.setting, found.value, share_of(problem)[0]) == ("paths", "camera", "camera")
+    assert found.low is not None
+    assert found.low > 1
+    assert found.why.startswith(f"camera paths have {found.gain:.2g} times the efficiency here (")
 
 
-def test_a_faster_share_is_pursued_to_the_end(monkeypatch: pytest.MonkeyPatch):
-    """The trials add a few light paths to camera paths alone, and then more. Where light paths are better or necessary,
-    trials start from a half and take fewer.
-    """
-    assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[0])
-    assert share_of(decided(monkeypatch, 0.01, apart={FEWER[0]: 100.0})) == ("both", FEWER[1])
-    assert share_of(decided(monkeypatch, 0.01, apart={0.0: 100.0})) == ("both", FEWER[1])
+def test_slower_camera_paths_are_dropped(monkeypatch: pytest.MonkeyPatch):
+    for settings, share in ([], 0.5), (["integrator.light_share=0.25"], 0.25):
+        problem = decided(monkeypatch, 100.0, *settings)
+        [found] = problem.decisions
+        assert (found.value, *share_of(problem)) == ("both", "both", share)
+        assert found.gain is not None
+        assert found.gain < 1
+
+
+def test_nothing_is_measured_if_camera_paths_miss_light_or_paths_are_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(race.Turns, "run", lambda *args: pytest.fail("measured"))
+    assert decided(monkeypatch, 0.01, "integrator.paths=both").decisions == []
     monkeypatch.setattr(sampling, "camera_finds_all", lambda *scene: False)
-    assert share_of(decided(monkeypatch, 0.01)) == ("both", FEWER[1])
-
-
-def test_a_slower_share_is_dropped(monkeypatch: pytest.MonkeyPatch):
-    problem = decided(monkeypatch, 100.0)
-    assert share_of(problem) == ("both", FIRST_SHARE)
-    assert problem.sides.gain < 1
-
-
-def test_a_share_is_measured_with_fixed_paths(monkeypatch: pytest.MonkeyPatch):
-    problem = decided(monkeypatch, 100.0, "integrator.paths=both", "integrator.light_share=auto")
-    assert share_of(problem) == ("both", FIRST_SHARE)
-    assert problem.sides is not None
-    problem = decided(monkeypatch, 100.0, "integrator.paths=both", "integrator.light_share=0.25")
-    assert share_of(problem) == ("both", 0.25)
-    assert problem.sides is None
+    problem = decided(monkeypatch, 0.01)
+    assert [each.line() for each in problem.decisions] == ["paths both: camera paths do not find all light here"]
+    assert share_of(problem) == ("both", 0.5)
 
 
 def test_without_time_half_of_the_paths_are_light_paths(monkeypatch: pytest.MonkeyPatch):
-    problem = decided(monkeypatch, 1.0, "run.measuring=0")
-    assert share_of(problem) == ("both", FIRST_SHARE)
-    assert "not measured" in problem.sides.note
+    """With `run.measuring: 0`, not even the two steps that determine the limit are taken."""
+    for measuring in ("1e-9", "0"):
+        problem = decided(monkeypatch, 0.01, f"run.measuring={measuring}")
+        assert share_of(problem) == ("both", 0.5)
+        assert "not measured" in problem.decisions[0].why
+        monkeypatch.setattr(sampling, "measured_step", lambda *args: pytest.fail("measured"))
+
+
+def test_the_limit_of_measuring_includes_the_time_limit_of_the_run(monkeypatch: pytest.MonkeyPatch):
+    """The race of camera paths needs the time of three iterations. `fix_times` gives them 1 ms or more each."""
+    found = [decided(monkeypatch, 0.01, f"run.max_seconds={limit}").decisions[0] for limit in ("1e-7", "1000")]
+    assert [each.gain is None for each in found] == [True, False]
+
+
+def test_all_races_together_keep_the_limit(monkeypatch: pytest.MonkeyPatch):
+    """The race of camera paths has taken all the time, so that guiding is not raced."""
+    right = sampling.Tuner.race
+
+    def race_slowly(self: sampling.Tuner, *args: Any) -> Decision:
+        found = right(self, *args)
+        self._spent_s += 1e9
+        return found
+
+    monkeypatch.setattr(sampling.Tuner, "race", race_slowly)
+    fix_times(monkeypatch, {"paths": 100.0})
+    problem = assemble(load("tiny.yaml", [*AUTO, "integrator.guiding=auto"]))
+    assert [(each.setting, each.gain is None) for each in problem.decisions] == [("paths", False), ("guiding", True)]
 
 
 def test_the_decision_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    cache = PilotCache(tmp_path / "kept")
+    cache = DecisionCache(tmp_path / "kept")
     first, second = (decided(monkeypatch, 0.01, cache=cache) for _ in range(2))
-    assert not first.sides.cached
-    assert second.sides.cached
+    assert [each.decisions[0].cached for each in (first, second)] == [False, True]
     assert share_of(first) == share_of(second)
 
 
 def test_only_light_paths_that_find_everything_are_guided(monkeypatch: pytest.MonkeyPatch):
     """Guided light paths keep the film's border as `paths: both` does, and the target has this border. A resumed run
-    keeps the border too.
+    keeps the border too. The time of the first race still counts, and nothing is reported of camera paths.
     """
-    fix_times(monkeypatch, {f"paths {share:g}": 100.0 for share in OTHERS} | {"guiding": 1e-6})
-    problem = assemble(load("tiny.yaml", [*AUTO, "integrator.guiding=auto"]))
-    assert problem.guided.guided
-    assert (problem.sides.paths, problem.sides.light_share) == ("both", 1.0)
-    assert problem.sides.line().startswith("paths both, 100 % light paths: guided, they have ")
+    fix_times(monkeypatch, {"paths": 100.0, "guiding": 1e-6})
+    settings = ["integrator.guiding=auto", "integrator.sequence=auto", "integrator.pixels=auto"]
+    problem = assemble(load("tiny.yaml", [*AUTO, *settings]))
+    values = {each.setting: each.value for each in problem.decisions}
+    assert values == {"paths": "light", "guiding": "on", "sequence": "independent"}
+    paths, guiding = decision(problem, "paths"), decision(problem, "guiding")
+    assert paths is not None
+    assert guiding is not None
+    assert paths.line().startswith("paths light: guided, they have ")
+    assert min(paths.seconds, guiding.seconds) > 0
+    assert problem.measured_s == paths.seconds + guiding.seconds
     assert problem.integrator.paths == "light"
     assert problem.integrator.preparation.whole
     assert problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).whole
-    assert with_sides(problem.integrator, problem.sides).preparation.whole
+    assert as_decided(problem.integrator, problem.decisions).preparation.whole
 
 
 def test_light_paths_find_all_except_mirrors_and_light_hidden_by_lamps():
@@ -169,14 +186,17 @@ def test_a_short_run_uses_camera_paths_if_they_find_all_light():
     """In the furnace, camera paths have at least a thousand times the efficiency."""
     problem = assemble(load(ROOT / "configs" / "furnace.yaml", ["target.render.spp=64"]))
     assert problem.config.run.measuring == 0.1
-    assert (problem.sides.paths, problem.integrator.paths) == ("camera", "camera")
-    assert problem.sides.low > 10
+    found = decision(problem, "paths")
+    assert found is not None
+    assert (found.value, problem.integrator.paths) == ("camera", "camera")
+    assert found.low is not None
+    assert found.low > 10
 
 
 @pytest.mark.parametrize("paths", ["auto", "camera"])
 def test_camera_paths_of_a_guided_run_are_unchanged(paths: str, monkeypatch: pytest.MonkeyPatch):
     """No table determines where camera paths begin, whether camera paths were found to pay or were requested."""
-    fix_times(monkeypatch, {f"paths {share:g}": 0.01 if share == 0 else 100.0 for share in OTHERS})
+    fix_times(monkeypatch, {"paths": 0.01})
     words = [*SMALL, "integrator.guiding=on", "integrator.estimator=stack", f"integrator.paths={paths}"]
     assert optimize("tiny.yaml", *tiny.settings(*words)) == 0
     rows = {row["feature"]: row for row in read_manifest(RUN)["plan"]["rows"]}
@@ -189,8 +209,7 @@ def test_a_short_run_keeps_its_caustic():
     """No camera path finds the caustic. Camera paths therefore seem to have hardly any noise."""
     _put_glass()
     problem = assemble(load("tiny.yaml", [*SHORT, "integrator.max_depth=6"]))
-    assert problem.sides.paths == "both"
-    assert problem.integrator.light_share >= min(FEWER)
+    assert share_of(problem) == ("both", 0.5)
 
 
 @pytest.mark.parametrize(("spp", "rounds"), [(1, race.LEAST_ROUNDS), (8, 8), (16, 16), (1024, 16)])
@@ -207,9 +226,9 @@ def test_the_decision_for_camera_paths_uses_all_rounds_without_python_time(spp: 
         return taken[-1]
 
     sizes = race.Sizes(spp, spp, spp, False, 16, 0.0, 2.0, planned=1.2)
-    found = CameraPilot(take, sizes, 1.0, share=1e-9).run()
+    found = race.Turns(take, sizes, 1e-9, sure=True).run()
     assert found.rounds == rounds
-    assert found.paths == "other"
+    assert found.other
 
 
 def test_beams_and_scaled_emitters_are_left_to_light_paths():
@@ -240,19 +259,15 @@ def test_a_resumed_run_keeps_its_paths(settings: list[str], monkeypatch: pytest.
     words = tiny.settings(*settings)
     assert optimize("tiny.yaml", *words) == 0
     found = read_manifest(RUN)
-    assert found["paths"]["paths"] in ("both", "camera")
-    assert "not measured" not in found["paths"]["note"]
-    assert PathsRecord.from_json(found["paths"]).line() in (RUN / "report.html").read_text()
-    for decision in ("decide", "allowance"):  # nothing is measured again
-
-        def refuse(*given: Any, **options: Any) -> Any:
-            raise AssertionError("measured")
-
-        monkeypatch.setattr(race.Tuner, decision, refuse)
+    [paths] = map(Decision.from_json, found["decisions"])
+    assert (paths.setting, paths.gain is None) == ("paths", False)
+    assert paths.line() in (RUN / "report.html").read_text()
+    # Nothing is measured again.
+    monkeypatch.setattr(sampling.Tuner, "race", lambda *given: pytest.fail("measured"))
     iterations = load("tiny.yaml", settings).run.iterations + 2
     assert optimize("--resume", str(RUN), "--set", f"run.iterations={iterations}") == 0
     again = read_manifest(RUN)
-    assert again["paths"] == found["paths"]
+    assert again["decisions"] == found["decisions"]
     assert again["plan"] == found["plan"]
 
 
@@ -286,8 +301,9 @@ def test_auto_distributes_paths_only_for_l2(monkeypatch: pytest.MonkeyPatch):
     ):  # fmt: skip
         integrator = f"integrator={{estimator: stack, paths: both, pixels: {pixels}}}"
         problem = assemble(load("tiny.yaml", [integrator, *SMALL, *settings]))
-        assert (problem.pixels is None) == (pixels == "measured")
-        assert problem.pixels is None or problem.pixels.measured is shared
+        found = decision(problem, "pixels")
+        assert (found is None) == (pixels == "measured")
+        assert found is None or found.value == ("measured" if shared else "even")
         assert problem.integrator.preparation.shares_out is shared
         densities += [problem.integrator.preparation.given[0]] if shared else []
         assert not shared or bool(densities[-1][:4].any()) == (mask not in settings)

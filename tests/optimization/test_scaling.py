@@ -15,7 +15,6 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.optimizers import Optimizer, Variable, make_transform
@@ -28,6 +27,7 @@ from reslrb_cli.optimization.sensitivity import (
     step_line,
 )
 from reslrb_cli.optimization.state import standing
+from reslrb_cli.records.decisions import Scaled
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "integrator.paths=light", "run.spp=32",

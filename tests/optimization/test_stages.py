@@ -50,6 +50,7 @@ def test_each_iteration_has_the_resolution_of_its_stage(experiment: Path) -> Non
         assert next(iter(state.values.values())).shape == array.shape
         assert (record.spp, record.lr) == (8, 0.5)
         seen.append((array.shape[0], target.shape[0], state.stage))
+        assert state.stage_began == 2 * state.stage
     assert seen == [(2, 2, 0)] * 2 + [(2, 4, 1)] * 2 + [(4, 4, 2)] * 2 + [(4, 8, 3)] * 2 + [(4, 8, 4)] * 2
     assert now.scene is problem.scene  # after all stages, the run uses the original problem
 

@@ -16,7 +16,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.stopping import Watch, lowered
-from reslrb_cli.records.decisions import GuidedRecord
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.metrics import Record
 
 # Decisions on made-up losses.
@@ -34,7 +34,10 @@ def follow(given: Config, losses: np.ndarray, held_out: dict[int, float] | None 
     for number, loss in enumerate(losses):
         seen = None if held_out is None else held_out.get(number)
         record = Record(number, float(loss), 0, 0, 0, 0, 0, 0, 4, 1, 0, 0, None, held_out=seen)
-        state = watch.after(State(number + 1, 0.0, 0.0, 0, {}, {}, drops=state.drops, since=state.since), record)
+        stage = max(given.stage_number(number / given.run.iterations), state.stage)  # as `Stages.enter` does
+        began = state.stage_began if stage == state.stage else number
+        kept = {"drops": state.drops, "since": state.since, "stage": stage, "stage_began": began}
+        state = watch.after(State(number + 1, 0.0, 0.0, 0, {}, {}, **kept), record)
         states.append(state)
         if state.stopped:
             break
@@ -86,8 +89,28 @@ def test_held_out_views_decide_if_there_are_any(tmp_path: Path) -> None:
 
 
 def test_a_run_in_stages_is_judged_in_the_last_stage(tmp_path: Path) -> None:
+    """The first window begins with the first iteration of the last stage."""
     given = config(tmp_path, STOP, "run.stages=[{until: 0.25, film: 0.5}]")
-    assert len(follow(given, np.ones(400))) == 161
+    assert len(follow(given, np.ones(400))) == 160
+    losses = np.concatenate([np.ones(100), 0.9 ** np.arange(300)])
+    assert len(follow(given, losses)) == 400
+
+
+@pytest.mark.parametrize("iterations", [200, 800])
+def test_a_resumed_run_keeps_the_start_of_its_last_stage(iterations: int, tmp_path: Path) -> None:
+    """With another number of iterations, the last stage would have begun elsewhere, after 50 or 200 iterations."""
+    stages = "run.stages=[{until: 0.25, film: 0.5}]"
+    *_, before = follow(config(tmp_path, STOP, stages), np.ones(130))
+    watch = Watch(config(tmp_path, STOP, stages, f"run.iterations={iterations}"))
+    for number in range(200):
+        record = Record(number, 1.0, 0, 0, 0, 0, 0, 0, 4, 1, 0, 0, None)
+        if number < before.iteration:
+            watch.add(record)
+            continue
+        before = watch.after(replace(before, iteration=number + 1), record)
+        if before.stopped:
+            break
+    assert before.iteration == 160
 
 
 def test_a_plateau_lowers_the_rate_before_a_run_stops(tmp_path: Path) -> None:
@@ -194,7 +217,7 @@ def test_iteration_counts_are_incompatible_with_a_time_limit(tmp_path: Path, mor
 
 def test_measuring_before_the_first_iteration_counts_in_the_time(tmp_path: Path) -> None:
     problem = make_problem(tmp_path, sets=["run.max_seconds=10"])
-    record = GuidedRecord(guided=True, measure_s=2.0, compile_s=1.5)
+    one, other = (Decision(setting=name, value="on", why="", seconds=2.0) for name in ("guiding", "paths"))
     assert problem.limit_s == 10
-    assert replace(problem, guided=record).limit_s == 6.5
-    assert replace(problem, guided=replace(record, cached=True)).limit_s == 10
+    assert replace(problem, decisions=[one, other]).limit_s == 6
+    assert replace(problem, decisions=[one, replace(other, cached=True)]).limit_s == 8

@@ -21,7 +21,7 @@ from reslrb_cli.config.run import check_name
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records.atomic import unfinished_folder
-from reslrb_cli.records.cache import MOST, PilotCache, cache_folder, key_of
+from reslrb_cli.records.decisions import CACHE_FILE, MOST, Decision, DecisionCache, cache_folder, key_of
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
 from reslrb_cli.records.run_folder import RunFolder, check_output
@@ -407,40 +407,40 @@ def test_the_last_status_of_an_exiting_process_stays(tmp_path, monkeypatch):
     assert stored(tmp_path)["status"] == "interrupted"
 
 
-# The cache of pilots' outcomes.
+# The cache of decisions.
+
+
+def made(value: object) -> Decision:
+    return Decision(setting="guiding", value=str(value), why="measured")
 
 
 def test_entries_are_kept(tmp_path: Path) -> None:
-    PilotCache(tmp_path / "new").put("a", {"x": 1})
-    PilotCache(tmp_path / "new").put("b", {"x": 2})
-    cache = PilotCache(tmp_path / "new")
-    assert cache.get("a") == {"x": 1}
-    assert cache.get("b") == {"x": 2}
-    assert cache.get("c") is None
+    DecisionCache(tmp_path / "new").put("a", made(1))
+    DecisionCache(tmp_path / "new").put("b", made(2))
+    cache = DecisionCache(tmp_path / "new")
+    assert [cache.get(key) for key in "abc"] == [made(1), made(2), None]
 
 
 def test_the_oldest_entries_are_dropped(tmp_path: Path) -> None:
-    cache = PilotCache(tmp_path)
-    (tmp_path / "pilot.json").write_text(json.dumps({str(k): {"x": k} for k in range(MOST)}))
-    cache.put("new", {"x": -1})
-    assert cache.get("0") is None
-    assert cache.get("1") == {"x": 1}
-    assert cache.get("new") == {"x": -1}
+    cache = DecisionCache(tmp_path)
+    (tmp_path / CACHE_FILE).write_text(json.dumps({str(k): made(k).to_json() for k in range(MOST)}))
+    cache.put("new", made("new"))
+    assert [cache.get(key) for key in ("0", "1", "new")] == [None, made(1), made("new")]
 
 
 @pytest.mark.parametrize("content", ["", "{", "[1]", '{"a": 3}', "\xff"])
 def test_a_broken_file_counts_as_empty_and_is_repaired(tmp_path: Path, content: str) -> None:
-    (tmp_path / "pilot.json").write_bytes(content.encode("latin-1"))
-    cache = PilotCache(tmp_path)
+    (tmp_path / CACHE_FILE).write_bytes(content.encode("latin-1"))
+    cache = DecisionCache(tmp_path)
     assert cache.get("a") is None
-    cache.put("a", {"x": 1})
-    assert cache.get("a") == {"x": 1}
+    cache.put("a", made(1))
+    assert cache.get("a") == made(1)
 
 
 def test_an_unwritable_place_is_no_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    PilotCache(tmp_path / "file" / "deeper").put("a", {})
-    assert PilotCache(tmp_path / "file" / "deeper").get("a") is None
+    DecisionCache(tmp_path / "file" / "deeper").put("a", made(1))
+    assert DecisionCache(tmp_path / "file" / "deeper").get("a") is None
 
 
 def test_location(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,7 @@ from report.measured import (
 )
 
 from reslrb_cli.records.clock import SharedTime, WorkerTime
-from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.images import read_layers
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
@@ -240,30 +240,22 @@ def test_times_of_workers_are_reported_by_part_and_worker(tmp_path):
 
 
 def test_paths_and_their_sampling_are_reported(tmp_path):
-    """Decisions that were left to measurement appear in the order in which they are made."""
-    paths = PathsRecord(paths="both", light_share=0.125, gain=1.5, low=1.2, high=1.9, measure_s=2.0, compile_s=3.0)
-    guided, sequence = GuidedRecord(guided=False, note="<b>"), SequenceRecord(low_discrepancy=False, note="alike")
-    decided = {"paths": paths, "guided": guided, "sequence": sequence}
-    records = {name: each.to_json() for name, each in decided.items()}
-    told = page_of(make_run(tmp_path / "all", iterations=0, **records)).sections["Choice of the samples"]
-    lines = [
-        "paths both, 12.5 % light paths: 1.5 times the efficiency here (1.2 to 1.9)"
-        " (measured in 2.0 s and 3.0 s of first steps)",
-        "guiding off: <b>",
-        "sequence independent: alike",
-    ]
+    """Decisions on `auto` settings appear in the order in which they are made."""
+    why = "camera paths have 1.5 times the efficiency here (1.2 to 1.9)"
+    decisions = [Decision(setting="paths", value="camera", why=why, gain=1.5, low=1.2, high=1.9, seconds=2.0)]
+    decisions += [Decision(setting="guiding", value="off", why="<b>")]
+    records = [each.to_json() for each in decisions]
+    told = page_of(make_run(tmp_path / "all", iterations=0, decisions=records)).sections["Choice of the samples"]
+    lines = [f"paths camera: {why} (measured in 2.0 s)", "guiding off: <b>"]
     assert [told.count(line) for line in lines] == [1] * len(lines)
     assert sorted(lines, key=told.index) == lines
 
 
-def test_paths_alone_are_reported(tmp_path):
-    """The run has a given estimator."""
-    camera = PathsRecord(paths="camera", light_share=0.0, note="all is diffuse").to_json()
+def test_without_decisions_none_are_reported(tmp_path):
     title = "Choice of the samples"
-    page = page_of(make_run(tmp_path / "camera", iterations=0, paths=camera))
-    assert page.sections[title].strip() == f"{title}paths camera: all is diffuse"
-    for number, unread in enumerate((None, {}, {"paths": "both", "of another": "version"})):
-        assert title not in page_of(make_run(tmp_path / f"{number}", iterations=0, paths=unread)).sections
+    assert title not in page_of(make_run(tmp_path / "none", iterations=0)).sections
+    damaged = page_of(make_run(tmp_path / "other", iterations=0, decisions=[{"of another": "version"}]))
+    assert "cannot be shown" in damaged.sections[title]
 
 
 def test_faults_come_first(tmp_path):

@@ -24,7 +24,7 @@ from report.measured import (
 from report.test_page import EVIL, Page, pixels
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.decisions import GuidedRecord
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.report.page import render
 from reslrb_cli.report.page.run import DAMAGED
@@ -73,8 +73,8 @@ def test_the_errors_of_runs_with_different_units_are_relative(tmp_path):
 
 
 def test_every_record_of_each_run_is_shown(tmp_path):
-    guided = GuidedRecord(guided=False, note="not measured").to_json()
-    records = {"guided": guided, "memory": MEMORY, "scaling": SCALING, "plan": PLAN}
+    guiding = Decision(setting="guiding", value="off", why="not measured").to_json()
+    records = {"decisions": [guiding], "memory": MEMORY, "scaling": SCALING, "plan": PLAN}
     page = page_of(
         make_run(tmp_path / "a", iterations=0, **records),
         make_run(tmp_path / "b", iterations=0, command_line=["reslrb", "optimize", "b"]),

@@ -137,7 +137,7 @@ def test_a_killed_run_resumes_to_the_same_end(case: str, experiment: Path, monke
     sets = [word for setting in CASES[case] for word in ("--set", setting)]
     at, newest = KILLED.get(case, (15, 12))
     whole, left = run_and_kill(monkeypatch, at, *ITERATIONS, *sets)
-    shutil.rmtree(experiment / "cache", ignore_errors=True)  # remove outcomes of earlier pilots
+    shutil.rmtree(experiment / "cache", ignore_errors=True)  # remove earlier decisions
     assert int(state_of(left)["iteration"]) == newest
     assert optimize("--resume", str(left), "--quiet") == 0
     assert differences(whole, left) == []

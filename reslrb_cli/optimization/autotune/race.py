@@ -1,10 +1,11 @@
-"""Comparisons of options before the first iteration: their cost, their evaluation, and their storage.
+"""Races between two ways to sample a gradient. A race takes steps of both ways before the first iteration.
 
-- `Tuner.decide` makes one decision. The method uses the result of an earlier run, or measures now if the run is long
-    enough.
 - `compare` compares two ways of sampling a gradient. The function returns the gain in efficiency, with its interval.
 - `Turns` decides whether another way of taking steps pays. Steps of both ways alternate, and their gradients have the
     same mean.
+- `StepTrial` takes the steps of a problem, with dL/dI fixed at one image.
+
+The module `sampling` says which settings are raced.
 
 The gain compares variance times time.
 
@@ -12,200 +13,50 @@ The gain compares variance times time.
 
 The variance is a sum over the parameters. Each parameter's variance is divided by the mean square of its gradient. The
 jackknife over the steps gives the interval for the logarithm of the variance ratio. The error of single times is added.
-Times include kernels and the run's other work. The other work counts equally for both options, and matters if
-iterations take milliseconds. If steps sample from a table, the table first learns from other paths. The table then
-stays fixed.
-
-A new option with two alternatives needs a record in `records/decisions.py` (a `PaidRecord`) and a row in `LATER`. The
-option also needs a `Turns` in `sampling.py` that makes the record (like `SequencePilot`). The option also needs a
-function like `_sequence` that calls `Tuner.decide`. `settle_sampling` calls this function. If an option has more than
-two values, each value competes with the best value so far.
+Times include kernels and the run's other work. The other work counts equally for both ways, and matters if iterations
+take milliseconds. If steps sample from a table, the table first learns from other paths. The table then stays fixed.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
-from reslrb_cli.guiding.tables import learnings
+from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.decisions import Allowance, Need
+from reslrb_cli.integrators.step import render_image
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
-from reslrb_cli.records.cache import PilotCache, key_of
+from reslrb_cli.optimization.sensitivity import finite, sample_gradient, take_gradient
+from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes
-from reslrb_cli.records.decisions import LEAST_IMAGE, Finding
-from reslrb_cli.records.manifest import versions
-from reslrb_cli.scene.files import file_digests, files_of
+from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
 
-#: Iterations of the run to which the cost of measuring is compared.
-ITERATIONS = 200
-#: Shares of a run of ITERATIONS without compilation: the limit for all measuring, and the plans for guiding, sequence
-#: and paths. If guiding is open after its plan, it may use the limit less the plan for the sequence.
-SHARE, GUIDING_SHARE, SEQUENCE_SHARE, PATHS_SHARE = 0.05, 0.025, 0.005, 0.015
-#: Minimum cost of useful measurements. Compilation is that of both kinds of steps and of walks for learning.
-GUIDING_NEEDS, SEQUENCE_NEEDS, PATHS_NEEDS = (2.5, 3.0), (2.5, 1.0), (1.5, 2.0)
-#: The same for camera paths only against half of each kind: the run uses the kernels of either outcome, and few steps
-#: with few samples suffice.
-CAMERA_NEEDS = (0.0, 3.0)
-#: The decisions by option: the reserved time for each, and its plan. The minimum would be too little if kernels are
-#: cached, because first steps take their time anyway.
-LATER = {
-    "paths": (PATHS_NEEDS[0], PATHS_SHARE * ITERATIONS),
-    "guiding": (GUIDING_NEEDS[0], GUIDING_SHARE * ITERATIONS),
-    "sequence": (SEQUENCE_NEEDS[0], SEQUENCE_SHARE * ITERATIONS),
-}
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
 CONFIDENCE = 0.95
+#: Minimum relative efficiency of the image for a sampling method that serves both image and gradient.
+LEAST_IMAGE = 0.95
 #: Rounding error of a sum that should vanish, as a share of it.
 ROUNDING = 1e-12
-Say = Callable[[str], None]
-Record = TypeVar("Record", bound=Finding)
+#: Views for the comparison, spread over the training views, and values of each image.
+MOST_VIEWS, MOST_VALUES = 4, 2**15
+#: Samples of the image at which dL/dI is fixed, as a share of a step's.
+IMAGE_SHARE = 0.25
 Gradients = dict[str, Array]
-#: A gain and the ends of its interval; NaN if unknown.
+#: A gain and the ends of its interval; None if unknown.
 Gain = tuple[float, float, float] | tuple[None, None, None]
 NOTHING: Gain = (None, None, None)
-logger = logging.getLogger(__name__)
-
-
-# --- one decision -----------------------------------------------------------------------------------------------------
-
-
-class Tuner:
-    """Decisions before a run. `problem` is the given problem, with the decisions so far.
-
-    `say` is called with the decisions, and once before a measurement. `cache` has measurements of earlier runs.
-    """
-
-    def __init__(self, problem: Problem, say: Say, cache: PilotCache | None = None) -> None:
-        self.problem, self.say, self._cache = problem, say, cache
-
-    def take(self, **decided: Any) -> None:
-        """Change fields of `problem` from now on."""
-        self.problem = replace(self.problem, **decided)
-
-    def set_aside(self, size: int) -> None:
-        """Add `size` bytes to the expected memory of all steps, if there is a memory budget."""
-        if (memory := self.problem.memory) is not None:
-            expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + size)
-            self.take(memory=replace(memory, expected_bytes=expected))
-
-    def tell(self) -> None:
-        """Print the decisions in one line, or each with its reason in verbose runs."""
-        decided = self.problem.sides, self.problem.guided, self.problem.sequence, self.problem.pixels
-        found = [each for each in decided if each is not None]
-        if logger.isEnabledFor(logging.DEBUG):
-            for each in found:
-                self.say(each.line(cost=True))
-        elif found:
-            measured = any(each.measure_s or each.cached for each in found)
-            chosen = ", ".join(each.decision() for each in found)
-            self.say(f"chosen {'by measurement' if measured else 'without measuring'}: {chosen} (-v gives the reasons)")
-
-    def decide(
-        self,
-        kind: type[Record],
-        of: dict[str, Any],
-        needs: Sequence[Need],
-        integrator: Tracer,
-        measure: Callable[[Allowance], Record],
-        unmeasured: Callable[[str], Record],
-        fits: Callable[[Record], bool] = lambda record: True,
-        later: Sequence[Need] = (),
-    ) -> Record:
-        """Return the decision of an earlier run if it `fits`. Without a stored decision that fits, measure now with
-        `measure`, and store the result.
-
-        `of` has the conditions of the decision that `situation` does not contain. `needs` are the minimum costs of
-        useful measurements with steps of `integrator` and of its alternatives (`Allowance.affords`). `unmeasured` takes
-        a note, and returns the decision without a measurement. Time for `later` measurements is reserved if the time
-        suffices for the present and the `later` measurements.
-        """
-        key = ""
-        if self._cache is not None:
-            key = key_of({**of, **situation(self.problem)})
-            try:
-                kept = replace(kind.from_json(self._cache.get(key)), cached=True)
-                if fits(kept):
-                    return kept
-            except TypeError:
-                pass  # absent, or written by another version
-        allowance = self.allowance(integrator)
-        if not allowance.affords(*needs):
-            return unmeasured(allowance.note())
-        if not allowance.spent_s:
-            self.say("measuring which sampling is most efficient")
-        with allowance.spending(later if allowance.affords(*needs, *later) else ()):
-            record = measure(allowance)
-        logger.debug(allowance.line())
-        if self._cache is not None:
-            self._cache.put(key, record.to_json())
-        return record
-
-    def allowance(self, integrator: Tracer) -> Allowance:
-        """Return the time limit of all measurements. If the time limit is not yet available, two first steps of
-        `integrator` with few samples determine the limit.
-        """
-        problem, run = self.problem, self.problem.config.run
-        if problem.allowance is not None:
-            return problem.allowance
-        unit = sets_of(problem.config)
-        own = integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
-        clock = StepClock()
-        first, second = (measured_step(problem, own, clock, 0, unit) for _ in range(2))
-        compile_ms = max(first.wall_ms + first.compile_ms - second.wall_ms, 0.0)
-        iteration_ms = second.beside_ms + second.kernel_ms * run.spp / unit
-        run_ms = compile_ms + run.iterations * iteration_ms
-        run_s = min(run_ms / 1e3, run.max_seconds or math.inf)
-        found = Allowance(run.measuring, run_s, compile_ms / 1e3, iteration_ms / 1e3)
-        self.take(allowance=found)
-        return found
-
-
-def is_auto(config: Config, option: str) -> bool:
-    """Whether this option of the integrator is decided by measurement."""
-    options = config.integrator.options()
-    if option == "paths":  # `both` measures its share in the same way
-        return options.get("paths") == "auto" or (options.get("paths"), options.get("light_share")) == ("both", "auto")
-    return bool(options.get(option) == "auto")
-
-
-def sets_of(config: Config) -> int:
-    """Return the number of sets in which a step's samples are traced. Each set has one dL/dI, or is one half."""
-    return (config.run.batches if config.adjoint == "batched" else 1) * config.halves * config.shares
-
-
-def situation(problem: Problem) -> dict[str, Any]:
-    """Return everything that a decision depends on as plain values, including settings and the contents of their
-    files.
-    """
-    config = problem.config
-    settings = config.model_dump(mode="json", include={"scene", "target", "views", "parameters", "integrator", "loss"})
-    for spec in settings["parameters"]:
-        del spec["learning_rate"]
-    return {
-        "settings": settings,
-        "files": file_digests(files_of(config)),
-        "sensors": problem.sensors,
-        "views": [[view.share, view.held_out, *(own.token for own in view.codes)] for view in problem.views],
-        "parameters": {key: list(problem.selection.array(key).shape) for key in problem.selection.keys},
-        "run": config.step_options() | {"memory_budget": config.run.memory_budget},
-        "versions": versions(),
-        "variant": mi.variant(),
-        "device": device_name(mi.variant()),
-    }
 
 
 # --- steps, and how they compare --------------------------------------------------------------------------------------
@@ -307,6 +158,8 @@ def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> 
 
 #: Fewer rounds give no result.
 LEAST_ROUNDS = 4
+#: Planned rounds for gradients with many entries, and with few, which tell less per round.
+ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
 #: Maximum number of checks whether the result is clear, one after each planned number of rounds.
 LOOKS = 3
 #: Confidence needed before the last check, higher than at the end: repeated checks must not let a useless option pass.
@@ -316,6 +169,11 @@ PLANNED = 3.4
 #: Samples of each walk for learning, as a share of a step's, and number of such walks before the trial if there is time
 #: for more than one.
 LEARNING_SHARE, LEARNINGS = 0.4, 2
+
+
+def sets_of(config: Config) -> int:
+    """Return the number of sets in which a step's samples are traced. Each set has one dL/dI, or is one half."""
+    return (config.run.batches if config.adjoint == "batched" else 1) * config.halves * config.shares
 
 
 def lessons(problem: Problem) -> float:
@@ -357,6 +215,17 @@ class Sizes:
         return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
 
 
+def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
+    """Return the sample counts of the run's steps and of the planned measured steps."""
+    run, adjoint = problem.config.run, problem.config.adjoint
+    call = run.spp // sets_of(problem.config)
+    part = min(problem.samples_per_pass or call, call)
+    entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
+    learned = lessons(problem) / (run.spp / call * len(problem.drawn(0)))
+    rounds = ROUNDS_OF_FEW if entries < FEW_ENTRIES else ROUNDS
+    return Sizes(run.spp, call, part, adjoint == "independent", rounds, learned, longer, planned)
+
+
 #: Take a plain step or one with the option, given a round and the samples per pixel, with the learned table, which
 #: stays unchanged. Equal rounds have equal seeds, different from those of any walk for learning.
 Take = Callable[[bool, int, int], Step]
@@ -364,42 +233,70 @@ Take = Callable[[bool, int, int], Step]
 Learn = Callable[[int, int], Step]
 
 
-class Turns(Generic[Record]):
-    """A decision based on steps that `take` returns. If a table must learn, `learn` provides the learning walks.
+@dataclass(frozen=True)
+class Finding:
+    """Result of a race. `other` tells whether the other way is better. `images` tells whether samples that serve only
+    an image use the other way, too.
 
-    `views` is the view count of an iteration divided by the view count of a measured step. The decision may cost
-    `share` times the time of ITERATIONS iterations. If `most` exceeds `share`, the minimum number of rounds may cost
-    `most` times the time of ITERATIONS iterations.
+    `gain` is the gain of the other way. `note` gives a reason if the gain alone does not decide. The race took `rounds`
+    rounds and `spent_s` seconds.
     """
 
-    LEAST, LOOKS = LEAST_ROUNDS, LOOKS
-    #: Whether the image, if it has its own samples, gets its own decision.
-    APART = False
+    other: bool
+    images: bool
+    gain: Gain
+    note: str
+    rounds: int
+    spent_s: float
+
+    def why(self) -> str:
+        """Return the gain in words, or the reason why there is none."""
+        gain, low, high = self.gain
+        if gain is None:
+            return self.note
+        found = f"{gain:.2g} times the efficiency here ({low:.2g} to {high:.2g})"
+        return f"{found}; {self.note}" if self.note else found
+
+
+class Turns:
+    """A race. `take` takes its steps. If a table must learn, `learn` provides the learning walks.
+
+    The race ends after `limit_s` seconds. With `sure`, it takes all planned rounds first, or as many as a step has
+    samples. Steps of milliseconds, whose time is that of Python code, are then measured, too. With `guides`, the other
+    way is guided. Its time then includes the learning of the run, and images with their own samples get their own
+    decision.
+    """
 
     def __init__(
-        self, take: Take, sizes: Sizes, views: float, share: float, most: float = 0.0, learn: Learn | None = None
+        self,
+        take: Take,
+        sizes: Sizes,
+        limit_s: float,
+        learn: Learn | None = None,
+        guides: bool = False,
+        sure: bool = False,
     ) -> None:
-        self._spent_ms = self._compile_ms = 0.0
-        self._take, self._learn, self._sizes, self._views = take, learn, sizes, views
-        self._share, self._most = share, max(share, most)
-        self._apart = self.APART and sizes.alone
+        self._spent_ms = 0.0
+        self._take, self._learn, self._sizes = take, learn, sizes
+        self._limit_ms, self._guides = 1e3 * limit_s, guides
+        self._sure = max(min(sizes.rounds, sizes.step), LEAST_ROUNDS) if sure else 0
+        self._apart = guides and sizes.alone
         self._plain: list[Step] = []  # all plain steps with valid times
         self._steps: tuple[list[Step], list[Step]] = ([], [])  # of both kinds
         self._walk = Step()
 
-    def run(self) -> Record:
+    def run(self) -> Finding:
         """Measure and decide."""
         spp, take = self._sizes.trial, self._take
-        self._spend(take(False, 0, spp), first=True)
+        self._spend(take(False, 0, spp))  # compiles kernels
         plain = self._spend(take(False, 0, spp))
         self._plain.append(plain)
         # Python's time is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            most = f"{self._most * ITERATIONS:.2g}"
-            return self._record(f"measuring it would take more than {most} iteration{'s' * (most != '1')}")
-        self._spend(take(True, 0, spp), first=True)
-        for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
+            return self._found(f"measuring it would take more than {self._limit_ms / 1e3:.2g} s")
+        self._spend(take(True, 0, spp))
+        for round in range(1, 1 + LOOKS * self._sizes.rounds):
             for other in (False, True):
                 self._steps[other].append(self._spend(take(other, round, spp)))
             self._plain.append(self._steps[False][-1])
@@ -414,26 +311,16 @@ class Turns(Generic[Record]):
         number of rounds of `round_ms` each.
         """
         if self._learn is None:
-            return self._affords(self.LEAST * round_ms)
-        walk = self._learn(0, self._sizes.learning)
-        if not self._affords(walk.wall_ms + self.LEAST * round_ms):
-            self._spend(walk, first=True)
+            return self._affords(LEAST_ROUNDS * round_ms)
+        self._walk = self._spend(self._learn(0, self._sizes.learning))
+        if not self._affords(LEAST_ROUNDS * round_ms):
             return False
-        self._walk = self._spend(walk)
         # One more walk gains little compared with the uncertainty of too few rounds.
-        rounds = max(self._sizes.rounds // 2, self.LEAST)
+        rounds = max(self._sizes.rounds // 2, LEAST_ROUNDS)
         for number in range(1, LEARNINGS):
             if self._affords(self._walk.wall_ms + rounds * round_ms):
                 self._walk = self._spend(self._learn(number, self._sizes.learning))
         return True
-
-    @property
-    def _iteration_ms(self) -> float:
-        """Time of an iteration of the run in milliseconds. The time includes the kernels for all samples, and the other
-        work for each set.
-        """
-        kernels = statistics.median(step.kernel_ms + step.image_ms for step in self._plain)
-        return self._views * (kernels + self._python_ms) * self._sizes.step / self._sizes.trial
 
     @property
     def _python_ms(self) -> float:
@@ -442,24 +329,19 @@ class Turns(Generic[Record]):
         return beside * self._sizes.trial / self._sizes.call
 
     def _affords(self, more_ms: float) -> bool:
-        share = self._share if len(self._steps[True]) >= self.LEAST else self._most
-        return self._spent_ms + more_ms <= share * ITERATIONS * self._iteration_ms
+        return len(self._steps[True]) < self._sure or self._spent_ms + more_ms <= self._limit_ms
 
-    def _more_ms(self) -> float:
-        """Return the additional time outside of kernels that a step with the option takes in a run. The time is for
-        `trial` samples.
-        """
-        return 0.0
-
-    def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> Record:
-        """Return the record of a decision. `found` has its common fields."""
-        raise NotImplementedError
+    def _learning_ms(self) -> float:
+        """Return the time that learning adds to a guided step of `trial` samples, as the mean over the run."""
+        sizes = self._sizes
+        kernel = self._walk.kernel_ms * sizes.part / sizes.learning
+        return (kernel + self._walk.beside_ms) * sizes.lessons * sizes.trial / sizes.call
 
     def _times(self, other: bool, images: bool) -> list[float]:
         """Return the times of steps of one kind. `images` is True if images with their own samples use the option as
         well.
         """
-        beside = self._python_ms + (self._more_ms() if other else 0.0)
+        beside = self._python_ms + (self._learning_ms() if other and self._guides else 0.0)
         if self._sizes.alone:
             beside += statistics.median(step.image_ms for step in self._steps[other and images])
         return [step.kernel_ms + beside for step in self._steps[other]]
@@ -492,35 +374,144 @@ class Turns(Generic[Record]):
             return gain[1] is not None and gain[1] > 1
         return gain[2] is None or gain[2] >= LEAST_IMAGE
 
-    def _decided(self) -> Record:
-        if len(self._steps[False]) < self.LEAST:
-            return self._record(f"{len(self._steps[False])} steps of both are too few to decide")
+    def _decided(self) -> Finding:
+        if len(self._steps[False]) < LEAST_ROUNDS:
+            return self._found(f"{len(self._steps[False])} steps of both are too few to decide")
         picture = self._image_gain()
         images = self._images(picture)
         gain = self._gain(images or not self._apart)
         if gain[1] is None:
-            return self._record("gradients have no noise")
+            return self._found("gradients have no noise")
         note = ""
         if gain[1] > 1 and not (images or self._apart):
             whose = "images have" if self._sizes.alone else "the image, of the same samples, has"
             note = f"{whose} {picture[0]:.2g} times the efficiency"
         on = gain[1] > 1 and not note
-        return self._record(note, gain, picture, on, on and images)
+        return self._found(note, gain, on, on and images)
 
-    def _record(
-        self, note: str, gain: Gain = NOTHING, picture: Gain = NOTHING, other: bool = False, images: bool = False
-    ) -> Record:
-        found = self._found(note) | dict(zip(("gain", "low", "high"), gain, strict=True))
-        found |= dict(zip(("image_gain", "image_low", "image_high"), picture, strict=True))
-        return self._decide(other, images, found | {"share": self._spent_ms / (ITERATIONS * self._iteration_ms)})
+    def _found(self, note: str, gain: Gain = NOTHING, other: bool = False, images: bool = False) -> Finding:
+        return Finding(other, images, gain, note, len(self._steps[True]), self._spent_ms / 1e3)
 
-    def _found(self, note: str) -> dict[str, Any]:
-        """Return the fields that are common to all records of `Turns` decisions."""
-        cost = {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
-        return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **cost}
-
-    def _spend(self, step: Step, first: bool = False) -> Step:
-        """Add the time of a step. A `first` step compiles kernels, so its whole time counts as compilation."""
-        self._spent_ms += 0.0 if first else step.wall_ms
-        self._compile_ms += step.compile_ms + (step.wall_ms if first else 0.0)
+    def _spend(self, step: Step) -> Step:
+        """Add the time of a step."""
+        self._spent_ms += step.wall_ms + step.compile_ms
         return step
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
+
+
+class StepTrial:
+    """Steps of a problem, taken by the integrator `plain` or by the integrator `other`. The steps leave no gradients,
+    and do not change the problem.
+
+    `views` are the used views. At most one of the integrators is guided. It samples from `table`, which `learn` fills.
+    The seeds depend on `what`, the name of the current decision.
+    """
+
+    def __init__(self, problem: Problem, what: str, plain: Tracer, other: Tracer) -> None:
+        self._problem, self._what, self._clock = problem, what, StepClock()
+        self._adjoint = problem.config.adjoint
+        # Separate integrators, because other sample counts would drop the tables and recordings of the run.
+        self._tracers = [one.with_options(samples_per_pass=None, freeze=one.freeze) for one in (plain, other)]
+        self._guided = next((one for one in self._tracers if one.preparation.guiding is not None), None)
+        self.table: Guiding | None = None if self._guided is None else self._guided.preparation.guiding
+        if self._guided is not None and self.table is not None:
+            self.table.held = True  # steps must not update it
+            self._guided.preparation.draw_from(self.table, problem.scene)
+        problem.apply()
+        trained = problem.trained
+        count = min(len(trained), MOST_VIEWS)
+        self.views: list[View] = [trained[k * len(trained) // count] for k in range(count)]
+        self._slopes = [self._slope(view) for view in self.views]
+        take_gradient(problem)  # recovered exposures have some of these entries
+
+    def race(self, sizes: Sizes, limit_s: float, guides: bool = False, sure: bool = False) -> Finding:
+        """Return the result of alternating steps (`Turns`)."""
+        learn = None if self.table is None else self.learn
+        return Turns(self.take, sizes, limit_s, learn, guides, sure).run()
+
+    def _slope(self, view: View) -> mi.TensorXf:
+        """Return the fixed dL/dI. Non-finite values become 0."""
+        spp = max(int(IMAGE_SHARE * self._problem.config.run.spp), 1)
+        image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
+        return to_tensor(finite(slope(view.objective, np.array(image))))
+
+    def learn(self, round: int, spp: int) -> Step:
+        """Let the table learn, and prepare it for sampling. It stays unchanged from then on.
+
+        The first call does all work twice, and drops the first result. The learning time then excludes compilation and
+        recording.
+        """
+        jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
+        compile_ms = 0.0
+        assert self.table is not None
+        if not self.table.learned:
+            compile_ms = self._teach(self.table, jobs).wall_ms
+            self.table.forget()
+        taken = timed(self._teach(self.table, jobs))
+        taken.compile_ms += compile_ms
+        return taken
+
+    def _teach(self, table: Guiding, jobs: list[Job]) -> StepTimes:
+        guided = self._guided
+        assert guided is not None
+        with self._clock.step() as times:
+            for view, job, gradient in zip(self.views, jobs, self._slopes, strict=True):
+                guided.learn_now(job, gradient)
+                for purpose in Purpose if self._adjoint == "independent" else (Purpose.BOTH, Purpose.IMAGE):
+                    table.table(view.sensor, purpose)
+        return times
+
+    def take(self, other: bool, round: int, spp: int) -> Step:
+        """Take one step of all views."""
+        problem, images = self._problem, {}
+        tracer, name = self._tracers[other], "on" if other else "off"
+        problem.apply()
+        with self._clock.step() as times:
+            for view, gradient in zip(self.views, self._slopes, strict=True):
+                job = self._job(view, self._seed(round, view, name), spp)
+                image = self._differentiate(tracer, view, job, gradient)
+                gradients = problem.gradients()
+                dr.eval(image, gradients)
+                images[str(view.sensor)] = image
+        taken = timed(times)
+        taken.gradients = take_gradient(problem)
+        if self._adjoint == "independent":
+            with self._clock.step() as times:
+                for view in self.views:
+                    job = self._job(view, self._seed(round, view, f"image, {name}"), spp)
+                    images[str(view.sensor)] = tracer.image(job)
+            apart = timed(times)
+            taken.image_ms = apart.kernel_ms
+            taken.wall_ms, taken.compile_ms = taken.wall_ms + apart.wall_ms, taken.compile_ms + apart.compile_ms
+        taken.images = {name: _few(image) for name, image in images.items()}
+        return taken
+
+    def _differentiate(self, tracer: Tracer, view: View, job: Job, gradient: mi.TensorXf) -> mi.TensorXf | None:
+        """Add the gradient of a job's samples as in a step of the run. Returns their image if there is one."""
+        on_samples = self._problem.on_samples(view)
+        if self._adjoint == "correlated":
+            image = tracer.correlated(job, lambda image: gradient)
+        elif self._adjoint == "independent" and on_samples is None:
+            tracer.backward(job, gradient)
+            return None
+        else:
+            image = tracer.known(job, gradient)
+        if on_samples is not None:
+            on_samples(image, gradient)
+        return image
+
+    def _job(self, view: View, number: int, spp: int) -> Job:
+        scene = self._problem.scene
+        opaque = dr.opaque(mi.UInt32, number)
+        return Job(scene, scene.sensors()[view.sensor], opaque, spp, self._problem.selection.params)
+
+    def _seed(self, round: int, view: View, what: str) -> int:
+        return seed(self._problem.config.run.seed, round, view.sensor, f"{self._what}, {what}")
+
+
+def _few(image: mi.TensorXf) -> Array:
+    """Return some values, distributed over an image. Non-finite values become 0."""
+    values = np.array(image, dtype=np.float32).ravel()
+    return finite(values[:: -(-values.size // MOST_VALUES)])

@@ -15,12 +15,7 @@ from pydantic import TypeAdapter
 from reslrb_cli.config.files import duration
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.clock import SharedTime
-from reslrb_cli.records.decisions import (
-    GuidedRecord,
-    PathsRecord,
-    PixelsRecord,
-    SequenceRecord,
-)
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.run_folder import FABRICATION_FILE, workshop_file
@@ -30,7 +25,7 @@ from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
 from reslrb_cli.report.page.workshop import CAPTIONS, VIEWS, workshop
-from reslrb_cli.report.run_summary import error_line, measured_line, warnings
+from reslrb_cli.report.run_summary import error_line, warnings
 from reslrb_cli.report.sources import ShownRun
 
 #: Number of first steps left out of medians, because they compile kernels.
@@ -152,11 +147,8 @@ def record_parts(run: ShownRun) -> dict[str, Markup]:
         "Regularizers": lambda: lay_out("run.regularized", results.get("regularized") or {}),
         "Run": lambda: lay_out("run.run", run, step_words(run.records), _wall(manifest)),
         "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
-        "Choice of the samples": lambda: (
-            soft(measured_line(PathsRecord, manifest.get("paths")))
-            + soft(measured_line(GuidedRecord, manifest.get("guided")))
-            + soft(measured_line(SequenceRecord, manifest.get("sequence")))
-            + soft(measured_line(PixelsRecord, manifest.get("pixels")))
+        "Choice of the samples": lambda: Markup().join(
+            soft(Decision.from_json(each).line(cost=True)) for each in manifest.get("decisions") or ()
         ),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
         "Memory budget": lambda: lay_out("run.memory", kept) if (kept := manifest.get("memory")) else Markup(),
