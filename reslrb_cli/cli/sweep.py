@@ -95,7 +95,7 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     "resumed",
     type=FOLDER,
     metavar="FOLDER",
-    help="Continue the sweep in this folder, in place of CONFIG; the same command again does this, too.",
+    help="Continue the sweep in this folder, in place of CONFIG.",
 )
 @click.option("--retry", is_flag=True, help="Repeat failed runs.")
 @allow_code_option
@@ -132,19 +132,19 @@ def command(
     Each run has a folder in FOLDER. The folder's name shows the run's settings. FOLDER/sweep.html has the table, curves
     and pictures. All combinations are checked before the first run starts. If a run fails, the run's table row shows
     the failure, and the other runs continue. Ctrl-C ends the sweep after the current iteration. To continue a sweep,
-    even after a kill, repeat the command or use --resume FOLDER.
+    even after a kill, use --resume FOLDER.
     """
-    from reslrb_cli.runs.sweep import make_plan, opened
+    from reslrb_cli.runs.sweep import make_plan, started
+    from reslrb_cli.runs.sweep import resumed as resumed_sweep
 
     if quiet or verbose:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)
-    plan = None
     if resumed is not None:
         given = [name for name in ("config_file", "overrides", "vary", "folder", "dry_run") if is_given(name)]
         if given:
             raise click.UsageError("--resume continues a sweep with its own settings; add only --seeds, --retry, "
                                    "--allow-code or --json")  # fmt: skip
-        folder = resumed
+        folder, place = resumed, resumed_sweep(resumed, seeds, retry, allow_code)
     elif config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
     else:
@@ -153,8 +153,9 @@ def command(
         folder = folder or run.output / f"{run.folder_name}-sweep"
         if dry_run:
             return _forecast(plan)
+        place = started(folder, plan)
     check_writable("--json", json_file)
-    with opened(folder, plan, seeds, retry, allow_code) as sweep:
+    with place as sweep:
         return _run(folder, sweep, json_file, quiet, verbose)
 
 

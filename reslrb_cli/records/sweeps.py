@@ -230,11 +230,9 @@ class SweepBestRecord(Line):
     """Combination with the lowest median of the quantity `of`, which is `loss` or `error`. The median is over the
     `seeds` seeds that all combinations have.
 
-    Combinations that differ only in learning rates are compared at their best rate. Wilcoxon's signed-rank test
-    compares pairs of runs with equal seeds. The best combination differs significantly from the combinations in
-    `beats`, but not from the combinations in `tied`. `second` has the next median. `ratio` is the best median divided
-    by the median of `second`. The 95 % interval of `ratio` comes from a bootstrap over the seeds. It is None for fewer
-    than 5 seeds. `line` is the record in words.
+    Combinations that differ only in learning rates are compared at their best rate. `second` has the next median.
+    `ratio` is the best median divided by the median of `second`. The 95 % interval of `ratio` comes from a bootstrap
+    over the seeds. It is None for fewer than 5 seeds. `line` is the record in words.
     """
 
     KIND: ClassVar[str] = "sweep_best"
@@ -242,8 +240,6 @@ class SweepBestRecord(Line):
     of: str
     best: str
     second: str
-    tied: Sequence[str]
-    beats: Sequence[str]
     seeds: int
     ratio: Range | None
     line: str
