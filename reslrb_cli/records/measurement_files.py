@@ -7,7 +7,6 @@ samples behind the figures, so that a measurement can be continued.
 
 from __future__ import annotations
 
-import gc
 import json
 import logging
 import math
@@ -15,13 +14,12 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, ClassVar
 
-from reslrb_cli.config.files import open_file
+from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records.atomic import remove_parts_of, write_atomically
 from reslrb_cli.records.manifest import now, versions
@@ -32,72 +30,31 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Lines between two reports of reading progress.
-_LINES = 4096
 
-#: Called with the progress of reading: the file, the bytes read, and the size in bytes.
-Tell = Callable[[Path, int, int], None]
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the objects in a file of JSON lines, oldest first. Numbers that are not finite become None.
 
-
-@dataclass(frozen=True)
-class Lines:
-    """Objects in a file, oldest first, and the numbers (from 1) of the damaged lines.
-
-    Non-finite numbers, which Python writes but JSON does not have, become None.
+    A last line without a line end is left out, because it is still being written or was interrupted. Raises a
+    ConfigError that names the file, and the line if it is damaged.
     """
-
-    objects: list[dict[str, Any]] = field(default_factory=list)
-    damaged: list[int] = field(default_factory=list)
-
-
-def read_lines(path: Path, tell: Tell | None = None) -> Lines:
-    """Read a file of JSON lines. Raises a ConfigError that names the file if the file cannot be read.
-
-    A last line without a line end is still being written or was interrupted. An incomplete last line is left out and
-    does not count as damaged.
-    """
-    found, done = Lines(), 0
     # Numbers that are not finite are replaced during parsing, because a second pass takes twice as long.
-    decoder = json.JSONDecoder(parse_float=_finite, parse_constant=lambda name: None)
-    with open_file(path) as file, _without_collecting():
-        size = os.fstat(file.fileno()).st_size
+    decoder, found = json.JSONDecoder(parse_float=_finite, parse_constant=lambda name: None), []
+    for number, line in enumerate(read_file(path).splitlines(keepends=True), 1):
+        if not line.strip() or not line.endswith(b"\n"):
+            continue
         try:
-            for number, line in enumerate(file, 1):
-                done += len(line)
-                if tell is not None and number % _LINES == 0:
-                    tell(path, done, max(done, size))
-                if not line.strip():
-                    continue
-                try:
-                    value = decoder.decode(line.decode("utf-8-sig" if number == 1 else "utf-8", "surrogatepass"))
-                except (ValueError, RecursionError):
-                    value = None
-                if isinstance(value, dict):
-                    found.objects.append(value)
-                elif line.endswith(b"\n"):
-                    found.damaged.append(number)
-        except OSError as error:
-            raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
+            value = decoder.decode(line.decode())
+        except (ValueError, RecursionError):
+            value = None
+        if not isinstance(value, dict):
+            raise ConfigError(path, f"line {number}", "is damaged, or no line that reslrb wrote")
+        found.append(value)
     return found
 
 
 def _finite(text: str) -> float | None:
     value = float(text)
     return value if math.isfinite(value) else None
-
-
-@contextmanager
-def _without_collecting() -> Iterator[None]:
-    """Disable garbage collection in the block, because the collector would repeatedly scan millions of objects without
-    cycles.
-    """
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
 
 
 class LineFile:
@@ -160,19 +117,6 @@ class Origin(Line):
     versions: Mapping[str, str] = field(default_factory=versions)
     platform: str = field(default_factory=platform.platform)
     written: str = field(default_factory=now)
-
-
-def read_origin(entry: Mapping[str, Any]) -> Origin | None:
-    """Return the origin in a line, or None if the line holds another record. Values of a wrong type become empty."""
-    if entry.get("kind") != Origin.KIND:
-        return None
-    words, named = entry.get("command"), entry.get("versions")
-    texts = {name: entry.get(name) for name in ("device", "variant", "platform", "written")}
-    return Origin(
-        command=[str(word) for word in words] if isinstance(words, list) else [],
-        versions={str(name): str(value) for name, value in named.items()} if isinstance(named, dict) else {},
-        **{name: value if isinstance(value, str) else "" for name, value in texts.items()},
-    )
 
 
 #: Maximum size of saved samples in bytes; larger ones are not saved.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from reslrb_cli.records.sweeps import (
 )
 from reslrb_cli.report.format import count, interval, number, shorten, table
 from reslrb_cli.report.run_summary import units_differ
-from reslrb_cli.report.sources import ShownRun, SweepRuns, is_number
+from reslrb_cli.report.sources import ShownRun, SweepRuns
 
 #: Settings that make losses, or errors, incomparable if they vary.
 OTHER_LOSS = ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out")
@@ -61,22 +60,18 @@ def _run_record(source: SweepRuns, combination: Combination, seed: int) -> Sweep
     status = str(run.manifest.get("status", ""))
     return SweepRunRecord(
         name, combination.settings, seed, status, len(run.records),
-        _number((results.get("image_loss") or {}).get("final")), _error(run, relative), relative,
-        _number(results.get("elapsed_s")), max((record["peak_mib"] for record in run.records), default=None),
+        (results.get("image_loss") or {}).get("final"), _error(run, relative), relative, results.get("elapsed_s"),
+        max((record["peak_mib"] for record in run.records), default=None),
         str(run.manifest.get("error") or ""),
     )  # fmt: skip
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if is_number(value) else None
 
 
 def _error(run: ShownRun, relative: bool) -> float | None:
     """Return the final error of all parameters. If `relative`, return the root mean square of their relative errors."""
     if not relative:
-        return _number((run.results.get("rmse") or {}).get("final"))
+        return (run.results.get("rmse") or {}).get("final")
     pairs = (run.results.get("relative_error") or {}).values()
-    known = [pair["final"] for pair in pairs if is_number(pair.get("final"))]
+    known = [pair["final"] for pair in pairs if pair.get("final") is not None]
     return math.sqrt(sum(error**2 for error in known) / len(known)) if known else None
 
 
@@ -256,7 +251,10 @@ def _outermost(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
             bests = [record.best for record in best_records(sweep, runs) if record.of == of]
         for key, each in ((key, each) for key in rates for each in sweep.combinations if each.name in bests):
             tried = [other.settings[key] for other in sweep.combinations]
-            if all(is_number(value) for value in tried) and each.settings[key] in (min(tried), max(tried)):
+            if all(isinstance(value, int | float) for value in tried) and each.settings[key] in (
+                min(tried),
+                max(tried),
+            ):
                 best = shorten(label(each.settings), LABEL_WIDTH)
                 found[f"{best}: this {key} is the best by {of}, and the outermost that was tried"] = None
     return list(found)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from cli.tiny import KEY, read_metrics, write_experiment
-from report.measured import make_run, write_bench, write_convergence, write_gradcheck, write_maps
+from report.measured import make_run, write_bench, write_convergence, write_gradcheck
 
 from reslrb_cli.cli import main
 from reslrb_cli.records import measurement_files
@@ -45,8 +45,7 @@ def test_one_page_for_everything(report, tmp_path):
     write_bench(tmp_path / "bench.jsonl")
     write_gradcheck(tmp_path / "check.jsonl")
     write_convergence(tmp_path / "convergence.jsonl")
-    write_maps(tmp_path / "maps")
-    names = ["a", "b", "bench.jsonl", "check.jsonl", "convergence.jsonl", "maps"]
+    names = ["a", "b", "bench.jsonl", "check.jsonl", "convergence.jsonl"]
     code, out, err = report(*names, "-o", "page.html")
     assert (code, out, err) == (0, "look at page.html\n", "")
     page = (tmp_path / "page.html").read_text()
@@ -69,7 +68,7 @@ def test_the_page_of_one_run_is_rewritten(report, tmp_path):
     ("args", "line"),
     [
         (["gone"], "gone: no such file"),
-        (["a", "note.txt"], "note.txt: line 1: holds no line that bench, gradcheck or convergence wrote"),
+        (["a", "note.txt"], "note.txt: line 1: is damaged, or no line that reslrb wrote"),
         (["empty"], "empty: is no run folder"),
         (["a", "a"], "--output: is missing"),
         (["bench.jsonl"], "--output: is missing"),

@@ -21,7 +21,6 @@ from report.measured import (
     write_bench,
     write_convergence,
     write_gradcheck,
-    write_maps,
 )
 
 from reslrb_cli.records.clock import SharedTime, WorkerTime
@@ -419,8 +418,7 @@ def pages(llvm, tmp_path_factory):
     write_bench(folder / "bench.jsonl", spps=(4, 16))
     write_gradcheck(folder / "check <script>.jsonl", LONG)
     write_convergence(folder / "convergence.jsonl")
-    write_maps(folder / "maps")
-    files = ("bench.jsonl", "check <script>.jsonl", "convergence.jsonl", "maps")
+    files = ("bench.jsonl", "check <script>.jsonl", "convergence.jsonl")
     some = [made for name, made in folders.items() if name not in ("three sensors", "no truth")]
     sources = read_sources([*some, *(folder / name for name in files)])
     written[EVERYTHING] = folder / "everything.html"

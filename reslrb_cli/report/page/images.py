@@ -13,9 +13,9 @@ import numpy as np
 from markupsafe import Markup
 
 from reslrb_cli.optimization.targets import WORDS
-from reslrb_cli.records.images import load_image, read_layers
+from reslrb_cli.records.images import load_image
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.layout import key, lay_out, soft
+from reslrb_cli.report.page.layout import lay_out
 from reslrb_cli.report.sources import ShownRun
 from reslrb_cli.report.tonemap import (
     as_png,
@@ -93,32 +93,6 @@ def fit(values: Array) -> Array:
 
     height, width = (max(round(size * MOST_PIXELS / longest), 1) for size in values.shape[:2])
     return resample(values, (width, height))
-
-
-#: z at the ends of the scale.
-MOST_Z = 5.0
-
-#: Maximum number of maps on a page; a page shows the first maps of a folder.
-MOST_MAPS = 40
-
-
-def gradient_maps(paths: Sequence[Path]) -> Markup:
-    """Return a row for each file of layers. Both gradients in a row are summed over channels and share one scale."""
-    rows = Markup()
-    for path in paths[:MOST_MAPS]:
-        try:
-            layers = read_layers(path)
-        except (OSError, ValueError):
-            rows += lay_out("gallery", [], key(path.stem), "This file is damaged.")
-            continue
-        sums = {name: np.nan_to_num(layers[name].astype(np.float64)).sum(-1, keepdims=True)
-                for name in ("gradient", "reference", "z")}  # fmt: skip
-        end = signed_end(np.stack([sums["gradient"], sums["reference"]]))
-        shown = [show_map(sums[name], end, name, lay_out("titled", name, ", sum over channels"), signed=True)
-                 for name in ("gradient", "reference")]  # fmt: skip
-        caption = lay_out("titled", "difference", " in standard errors")
-        rows += lay_out("gallery", [*shown, show_map(sums["z"], MOST_Z, "z", caption, signed=True)], key(path.stem))
-    return rows + soft(f"{len(paths) - MOST_MAPS} more maps are not shown." if len(paths) > MOST_MAPS else "")
 
 
 def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, Any]) -> Markup:

@@ -114,11 +114,8 @@ def header(run: ShownRun) -> Markup:
 
 
 def problems(run: ShownRun) -> Markup:
-    """Return the error and the warnings of a run, and a line about unreadable records."""
+    """Return the error and the warnings of a run."""
     lines, error = warnings(run.results, "±"), run.manifest.get("error")
-    if run.damaged:
-        where = f"{count(len(run.damaged), 'line')} of metrics.jsonl (the first is line {run.damaged[0]})"
-        lines.append(f"{where} could not be read.")
     return lay_out("note", [error] if error else [], "failed") + lay_out("note", lines)
 
 
