@@ -284,10 +284,9 @@ def optimize(
     written to `folder-2` and so on (see `Run.folder`). With `folder`, the setting `run.output` is ignored, with a
     warning. Without `folder`, only the caches of kernels and measurements are written.
 
-    `resume` is the folder of an earlier run. The run continues exactly where the earlier run stopped. New results go to
-    the earlier folder, or to `folder` if you give one. With `resume`, `experiment` is optional. If given, `experiment`
-    must agree with the earlier run. `overrides` may change iterations and learning rates. A finished run has no
-    iterations left and logs a warning.
+    `resume` is the folder of an earlier run, in place of `folder`. The run continues exactly where the earlier run
+    stopped. With `resume`, `experiment` is optional. If given, `experiment` must agree with the earlier run.
+    `overrides` may change iterations and learning rates. A finished run has no iterations left and logs a warning.
 
     `loss` is your own loss function, `loss(image, target)` or `loss(image, target, weights)`. The arguments are
     `mi.TensorXf` (height, width, channels). The image tracks derivatives. The loss function returns a `mi.Float` of
@@ -311,9 +310,11 @@ def optimize(
         ]
     with called():
         if resume is not None:
+            if folder is not None:
+                raise ConfigError("folder", "", "cannot be given with resume; copy the folder, and resume the copy")
             wanted = None if experiment is None else load(experiment)
             earlier = as_path(resume, "resume", "the folder of a run")
-            run = Run(*_reopened(earlier, wanted, [*put_in, *named], loss, allow_code))
+            run = Run(*_reopened(earlier, wanted, put_in, loss, allow_code))
             run._folder = earlier
             return run
         if experiment is None:

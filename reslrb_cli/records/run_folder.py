@@ -3,7 +3,7 @@
 - `read_value`: read a recovered parameter value of a run that is finished, interrupted or in progress.
 - `recovered`: make the experiment that starts from the recovered values.
 - `RunFolder`: create and replace folders.
-- `opened`, `copy_into`: lock the folder of a run to resume it, or copy its content into a new folder.
+- `opened`: lock the folder of a run to resume it.
 """
 
 from __future__ import annotations
@@ -360,29 +360,8 @@ def check_writable(folder: RunFolder) -> None:
     except OSError as error:
         if is_machine_fault(error):
             raise MachineError(f"{folder.path}: {error.strerror}; nothing of the run was changed") from None
-        reason = f"cannot be written to ({error.strerror}); to go on in another folder, add --set run.output=FOLDER"
+        reason = f"cannot be written to ({error.strerror}); copy it to another place, and resume the copy"
         raise ConfigError(folder.path, "", reason) from None
-
-
-def copy_into(folder: RunFolder, earlier: Path) -> None:
-    """Copy the files of a run from `earlier` into a new folder, except its report and its configuration.
-
-    Raises OSError.
-    """
-    for name in SUBFOLDERS:
-        for path in sorted((earlier / name).rglob("*")):
-            target = folder.path / name / path.relative_to(earlier / name)
-            if path.is_dir():
-                target.mkdir(exist_ok=True)
-            else:
-                _copy(path, target)
-    if (earlier / metrics.METRICS_FILE).is_file():
-        _copy(earlier / metrics.METRICS_FILE, folder.path / metrics.METRICS_FILE)
-
-
-def _copy(path: Path, target: Path) -> None:
-    with path.open("rb") as file:
-        write_atomically(target, lambda copy: shutil.copyfileobj(file, copy))
 
 
 def write_beginning(folder: RunFolder, config: str, manifest: Manifest) -> None:

@@ -158,8 +158,8 @@ class Recording:
                 if state.scaling is not None and state.scaling is not told:
                     self._tell_scaling(state.scaling)
                 told = state.scaling
+                metrics.write(record)  # first, because a checkpoint needs the lines of its iterations
                 self.course.add(state, record)
-                metrics.write(record)
                 yield record
                 self._note_memory(record.peak_mib)
                 if (fault := self.folder.fault) is not None:  # the folder may have been removed or replaced
@@ -169,7 +169,7 @@ class Recording:
                 if every and self.done % every == 0 and self.done < run.iterations:
                     self._write_images(f"iteration-{self.done:06d}")
                 if run.checkpoint_every.is_due(self.done - saved, time.monotonic() - saved_at):
-                    metrics.sync()  # first, because a checkpoint needs the lines of its iterations
+                    metrics.sync()
                     self._save_checkpoint()
                     saved, saved_at = self.done, time.monotonic()
                 self.page.refresh()

@@ -21,20 +21,13 @@ from reslrb_cli.optimization.stopping import OUT_OF_TIME
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, PREVIOUS_FILE_NAME, STATE_FILE
 from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
-from reslrb_cli.records.run_folder import (
-    RunFolder,
-    check_output,
-    check_writable,
-    copy_into,
-    opened,
-    write_beginning,
-)
+from reslrb_cli.records.run_folder import RunFolder, check_writable, opened, write_beginning
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.runs.prepare import (
+    PLACE,
     Change,
     PreparedRun,
     RunProgress,
-    SavedResults,
     changes,
     check_changes,
     digests,
@@ -48,9 +41,8 @@ Say = Callable[[str], None]
 class OpenedRun:
     """Run to be resumed: its locked folder, its manifest, its stored state and the new configuration.
 
-    `changed` holds the settings that differ from those at the start of the run. If `elsewhere` is true, the run
-    continues in a new folder, and the old folder stays unchanged. `records` are the records of the iterations, which
-    take `size` bytes. `said` collects warnings.
+    `changed` holds the settings that differ from those at the start of the run. `records` are the records of the
+    iterations, which take `size` bytes. `said` collects warnings.
     """
 
     folder: RunFolder
@@ -59,7 +51,6 @@ class OpenedRun:
     settled: Settled
     config: Config
     changed: dict[str, Change]
-    elsewhere: bool
     records: list[Record]
     size: int
     said: list[str] = field(default_factory=list)
@@ -140,26 +131,17 @@ class OpenedRun:
 
         Raises ConfigError and MachineError if the folder cannot be written to.
         """
-        text, run = dump(self.config), self.config.run
-        if self.elsewhere:
-            with RunFolder.create("--set", run.output, run.folder_name, False, text, manifest) as folder:
-                with _written(folder):
-                    copy_into(folder, self.folder.path)
-                    self._put_first(folder)
-                yield folder
-        else:
-            with _written(self.folder):
-                write_beginning(self.folder, text, manifest)
-                self._put_first(self.folder)
-            yield self.folder
-
-    def _put_first(self, folder: RunFolder) -> None:
-        """Cut the metrics back to the stored state. If the newest state is damaged, replace the damaged state by the
-        stored state.
-        """
-        cut_back(folder.path, self.records, self.size)
-        if self.stored.path.name == PREVIOUS_FILE_NAME:
-            (folder.checkpoint / PREVIOUS_FILE_NAME).replace(folder.checkpoint / STATE_FILE)
+        folder = self.folder
+        try:
+            write_beginning(folder, dump(self.config), manifest)
+            cut_back(folder.path, self.size)
+            if self.stored.path.name == PREVIOUS_FILE_NAME:  # the newest state is damaged
+                (folder.checkpoint / PREVIOUS_FILE_NAME).replace(folder.checkpoint / STATE_FILE)
+        except OSError as error:
+            if is_machine_fault(error):
+                raise MachineError(f"{folder.path}: {error.strerror}; the run was not continued") from None
+            raise
+        yield folder
 
 
 @contextlib.contextmanager
@@ -170,7 +152,7 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
     folder. Raises ConfigError if the folder holds no run, the run is in use, or the last two states are both damaged.
     Raises ConfigError also if a setting that must not change differs, or if `run.iterations` is below the number of
     finished iterations. Raises ConfigError also if an input file has changed, if records are missing or damaged, or if
-    the output folder cannot be used.
+    the folder cannot be written to.
     """
     with opened(run) as (folder, manifest):
         said: list[str] = []
@@ -178,22 +160,22 @@ def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[st
         settled, iteration = stored.read(Settled), stored.read(State).iteration
         began = loads(settled.config, stored.path)
         config, source = _read_config(run, wanted, overrides, settled.config)
-        elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
         found = changes(began, config)
         asked = changes(source, config)
         blamed = "--set" if all(isinstance(each, str) for each in overrides) else OVERRIDDEN
+        for key in PLACE:
+            if key in asked:
+                reason = f"cannot change now; to leave {run} as it is, copy it and resume the copy"
+                raise ConfigError(blamed, key, reason)
         differing = check_changes(found, lambda key: blamed if key in asked else config.source, run)
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
             raise ConfigError(config.source, "run.iterations", reason)
         _check_files(settled.files, config, run)
-        records, size = read_records(folder.path, iteration, stored.read(SavedResults).last)
-        earlier = OpenedRun(folder, manifest, stored, settled, config, differing, elsewhere, records, size, said)
+        records, size = read_records(folder.path, iteration)
+        earlier = OpenedRun(folder, manifest, stored, settled, config, differing, records, size, said)
         if not earlier.is_done:
-            if elsewhere:
-                check_output(config.source, config.run.output, config.run.folder_name, False)
-            else:
-                check_writable(folder)
+            check_writable(folder)
         yield earlier
 
 
@@ -257,13 +239,3 @@ def _check_files(before: Mapping[str, str], config: Config, run: Path) -> None:
         if here.get(key) != digest:
             what = "has changed" if key in here else "is missing"
             raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or start a new run")
-
-
-@contextlib.contextmanager
-def _written(folder: RunFolder) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if is_machine_fault(error):
-            raise MachineError(f"{folder.path}: {error.strerror}; the run was not continued") from None
-        raise
