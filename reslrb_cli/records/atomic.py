@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO
 
 from reslrb_cli.errors import ConfigError, is_machine_fault
-from reslrb_cli.records.lock import FolderLock, is_alive
+from reslrb_cli.records.lock import is_alive
 
 _PART = re.compile(r"\..+\.\d+\.part")
 
@@ -55,18 +55,13 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
 
 
 @contextmanager
-def unfinished_folder(parent: Path, lock: bool = True) -> Iterator[Path]:
-    """Yield a new folder in `parent`. Unless the block renames it, the folder is removed at the end.
-
-    The folder is locked, because other processes remove old unlocked folders. With `lock=False`, the block must lock
-    the folder itself.
-    """
+def unfinished_folder(parent: Path) -> Iterator[Path]:
+    """Yield a new folder in `parent`. Unless the block renames it, the folder is removed at the end."""
     path = parent / f"{FOLDER_PREFIX}{secrets.token_hex(8)}"
     unfinished.add(path)
     try:
         path.mkdir()
-        with FolderLock(path) if lock else contextlib.nullcontext():
-            yield path
+        yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
         unfinished.discard(path)

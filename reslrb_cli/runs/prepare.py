@@ -327,7 +327,7 @@ class RunProgress:
         """Save the state after the last complete iteration in `folder`, and return the iteration count. Raises
         OSError.
         """
-        save_checkpoint(folder, self.done, {}, *self._entries(self.state.on_file(self.stages.at(self.state.stage))))
+        save_checkpoint(folder, self.done, *self._entries(self.state.on_file(self.stages.at(self.state.stage))))
         return self.done
 
     def save_begun(self, folder: Path) -> None:
@@ -335,7 +335,7 @@ class RunProgress:
         begun = self.stages.begun
         assert begun is not None, "an iteration is at work"
         found = self._entries(begun.on_file(self.stages.now))
-        save_checkpoint(folder, begun.iteration, {}, *found, name=NONFINITE_FILE_NAME)
+        save_checkpoint(folder, begun.iteration, *found, name=NONFINITE_FILE_NAME)
 
     def _entries(self, state: State) -> tuple[Arrays, dict[str, Any]]:
         """Return the arrays and the other values that a checkpoint stores for `state`, in the form of

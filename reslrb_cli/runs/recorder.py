@@ -218,7 +218,7 @@ class Recording:
         if (fault := self.folder.fault) is not None:
             failure = failure or fault
             raise MachineError(describe(failure)) if isinstance(failure, OSError) else failure
-        parts = [self.folder.make_whole, self._save_last_checkpoint, self._write_parameters, self._note_results]
+        parts = [self._save_last_checkpoint, self._write_parameters, self._note_results]
         for part in parts if failure is not None else [*parts, self._write_final_images]:
             try:
                 part()

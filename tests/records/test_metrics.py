@@ -94,7 +94,9 @@ def test_a_checkpoint_can_be_read_by_numpy(tmp_path):
     import numpy as np
 
     for iteration in (5, 6):
-        save_checkpoint(tmp_path, iteration, {"a.data": np.full((2, 2, 3), 0.5)}, {"optimizer/a.data/0": np.array([6])})
+        save_checkpoint(
+            tmp_path, iteration, {"parameter/a.data": np.full((2, 2, 3), 0.5), "optimizer/a.data/0": np.array([6])}
+        )
     with np.load(tmp_path / "state.npz") as state:
         assert int(state["iteration"]) == 6
         assert state["parameter/a.data"].shape == (2, 2, 3)

@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import pytest
-from cli.tiny import reslrb
 from report.measured import (
     FLOOR,
     LAMP,
@@ -265,25 +264,6 @@ def test_a_damaged_manifest_leaves_the_rest(tmp_path, change):
     for page in (page_of(bad), page_of(good, bad)):
         assert "Convergence" in page.sections
     assert page_of(good, bad).row("Run good", "device")[1] == "a machine"
-
-
-@pytest.mark.parametrize(
-    ("change", "place"),
-    [
-        (lambda manifest: manifest.update(results=[1, 2]), "results"),
-        (lambda manifest: manifest["process"].update(pid="12"), "process.pid"),
-        (lambda manifest: manifest.update(process={"locked": False}), "process.host"),
-        (lambda manifest: manifest.update(status=["x"], versions=7, command_line=5, started=3), "status"),
-    ],
-)
-def test_a_manifest_of_other_types_is_one_located_line(tmp_path, change, place):
-    folder = make_run(tmp_path / "bad", iterations=0)
-    damage(folder, lambda manifest: manifest.update(status="running"))
-    damage(folder, change)
-    for command in (("report", folder), ("optimize", "--resume", folder)):
-        result = reslrb(*command)
-        assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1), result.output
-        assert f"{folder}/manifest.json: {place}: is damaged: " in result.stderr
 
 
 def test_damaged_metrics_are_one_located_line(tmp_path):

@@ -78,7 +78,7 @@ def test_an_unfitting_state_is_one_line(case: str, run: Path, capsys: pytest.Cap
     rewritten(run, arrays, values)
     if case == "no state":
         for iteration in (3, 4):
-            save_checkpoint(run / "checkpoint", iteration, {tiny.KEY: np.ones((4, 4, 3), np.float32)}, {})
+            save_checkpoint(run / "checkpoint", iteration, {f"parameter/{tiny.KEY}": np.ones((4, 4, 3), np.float32)})
         message = "holds values alone, not the state of a run"
     assert message in told(capsys, run)
 
