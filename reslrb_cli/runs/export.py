@@ -13,7 +13,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config, Fabrication
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens.solid import (
@@ -35,7 +34,7 @@ from reslrb_cli.optimization.moving import moves_anything
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
-from reslrb_cli.records.run_folder import FABRICATION_FILE, exposures, opened, workshop_file
+from reslrb_cli.records.run_folder import FABRICATION_FILE, exposures, workshop_file
 from reslrb_cli.runs.workshop import add_sheet, add_tolerances
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
@@ -54,7 +53,7 @@ DIRECTIONS = {
 }
 
 #: Unsupported formats of solids, which must not be taken for the name of a folder.
-_OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf")
+_OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf", ".obj")
 
 #: Called with a line about each thing written.
 Say = Callable[[str], None]
@@ -136,8 +135,6 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
             say(f"mean squared difference from the target is {loss['l2']:.4g}, also for the solid, by {how}")
         if f"{plan.kind}.3mf" not in beside:
             say(f"{plan.kind}.3mf is not written: lib3mf is missing; pip install 'reslrb[fabrication]'")
-    if off := numbers.get("tolerances"):
-        keep_tolerances(config, run, {"tolerances": off, "allowed_errors": numbers["allowed_errors"]}, pictures, say)
 
 
 def exposure_line(run: Path) -> str:
@@ -167,40 +164,10 @@ def keep_solid(
     pictures = add_sheet(
         numbers, config.fabrication, scene, sensor, sheets, luminance(image), luminance(target)
     ) | pictures_of(solid)
-    _write_pictures(run, pictures)
-    _write_numbers(run, numbers)
-
-
-def keep_tolerances(config: Config, run: Path, off: dict[str, Any], pictures: dict[str, Array], say: Say) -> None:
-    """Add measured tolerances and their pictures to the run folder and update its report.
-
-    If another process uses the folder, or the run has another solid, the function prints the reason and changes
-    nothing.
-    """
-    from reslrb_cli.report.page import write_report
-
-    try:
-        with opened(run):
-            if load(run / "config.yaml").fabrication != config.fabrication:
-                raise ValueError("`fabrication` differs from that of the run")
-            numbers = json.loads((run / FABRICATION_FILE).read_text())
-            _write_numbers(run, numbers | off)
-            _write_pictures(run, {name: image for name, image in pictures.items() if name in off["tolerances"]})
-            write_report(run)
-    except (ConfigError, OSError, ValueError) as error:
-        say(f"{run}: the page does not show the tolerances: {error}")
-    else:
-        say(f"{run / 'report.html'}: shows the tolerances")
-
-
-def _write_numbers(run: Path, numbers: dict[str, Any]) -> None:
-    content = json.dumps(finite(numbers), indent=2).encode() + b"\n"
-    write_atomically(run / FABRICATION_FILE, lambda file: file.write(content))
-
-
-def _write_pictures(run: Path, pictures: dict[str, Array]) -> None:
     for name, image in pictures.items():
         write_image(run / "images" / workshop_file(name), image)
+    content = json.dumps(finite(numbers), indent=2).encode() + b"\n"
+    write_atomically(run / FABRICATION_FILE, lambda file: file.write(content))
 
 
 def pictures_of(solid: Solid) -> dict[str, Array]:
@@ -248,7 +215,7 @@ def check_file(path: Path, config: Config) -> None:
         raise ConfigError("--output", "", f"{path} exists; give a new file")
     if path.suffix.lower() == ".3mf" and not _writes_3mf():
         raise ConfigError("--output", "", f"{path}: 3MF needs lib3mf, which is missing: "
-                          "pip install 'reslrb[fabrication]'; .stl, .obj and .ply work without")  # fmt: skip
+                          "pip install 'reslrb[fabrication]'; .stl and .ply work without")  # fmt: skip
 
 
 def _writes_3mf() -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -15,6 +16,8 @@ from reslrb_cli.cli.lens import command, read_luminance
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens import transport
+from reslrb_cli.lens.experiment import lamps
+from reslrb_cli.lens.surface import Setting, Surface
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import write_file
 from reslrb_cli.scene.images import read_image
@@ -216,3 +219,18 @@ def test_a_run_continues_with_its_momentum_and_measured_steepness(tmp_path: Path
     moved = np.abs(ends[1] - start).max()
     assert moved > 0
     assert np.abs(ends[0] - ends[1]).max() < 0.02 * moved
+
+
+def test_the_lamp_of_a_lens_in_oblique_light_is_beside_the_lens() -> None:
+    """No corner of the lamp is inside the lens, and its central ray is refracted to the centre of the face."""
+    setting = Setting(incidence=30.0, thickness=20.0)
+    surface = Surface(setting, np.zeros((8, 8)), np.ones((8, 8), bool), 0.0, 0.0, 0.0, None)  # type: ignore[arg-type]
+    found = re.search(r'matrix value="([^"]*)"', lamps(surface, 1.0, 0.0))
+    assert found is not None
+    matrix = np.array(found[1].split(), float).reshape(4, 4)
+    corners = matrix[:3, 3] + np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]) @ matrix[:3, :2].T
+    assert corners[:, 2].max() == pytest.approx(-20 - np.cos(np.radians(30)), abs=1e-6)  # by 1 mm along the beam
+    toward, middle = matrix[:3, 2], matrix[:3, 3]
+    entry = middle - toward * (middle[2] + 20) / toward[2]
+    sine = np.sin(np.radians(30)) / setting.ior
+    assert entry == pytest.approx([-20 * sine / np.sqrt(1 - sine**2), 0, -20], abs=1e-6)

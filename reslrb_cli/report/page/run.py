@@ -88,8 +88,7 @@ def fabrication(run: ShownRun) -> Markup:
     if not text:
         return Markup()
     numbers = json.loads(text)
-    names = [*CAPTIONS, *VIEWS, *(numbers.get("tolerances") or {})]
-    files = {name: run.path / "images" / f"{workshop_file(name)}.exr" for name in names}
+    files = {name: run.path / "images" / f"{workshop_file(name)}.exr" for name in (*CAPTIONS, *VIEWS)}
     pictures = {name: image for name, file in files.items() if (image := load_image(file)) is not None}
     return workshop(numbers, pictures)
 
