@@ -116,8 +116,8 @@ def command(
     """Write an experiment that shapes a lens, or a mirror, whose caustic shows PICTURE in parallel light.
 
     Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face of the lens or mirror already casts the picture.
-    Before any rendering, the command prints the depth of the face's relief. The command also prints the relief depth at
-    twice the distance.
+    Before any rendering, the command prints the depth of the face's relief. At twice the distance, the relief is about
+    half as deep.
     """
     import numpy as np
 

@@ -32,7 +32,6 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     load_packages()  # Mitsuba reads the images
     from reslrb_cli.records.sweeps import PAGE_FILE
     from reslrb_cli.report.page import write_page
-    from reslrb_cli.report.perceptual import with_seen_errors
     from reslrb_cli.report.sources import ShownRun, SweepRuns, read_sources
 
     if len(paths) > MOST_SOURCES:
@@ -46,6 +45,6 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
             raise ConfigError("--output", "", "is missing; give a file to write, e.g. -o page.html")
         output = sources[0].path / ("report.html" if isinstance(sources[0], ShownRun) else PAGE_FILE)
     check_writable("--output", output)
-    write_page([with_seen_errors(source) for source in sources], output)
+    write_page(sources, output)
     echo(f"look at {os.path.relpath(output)}")
     return ExitCode.DONE

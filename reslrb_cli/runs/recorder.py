@@ -43,10 +43,6 @@ from reslrb_cli.runs.prepare import RunProgress
 logger = logging.getLogger(__name__)
 
 
-#: Comparing images with more pixels takes some seconds and is announced.
-MANY_PIXELS = 5e5
-
-
 @dataclass
 class Recording:
     """Recording of one run. `course` holds its progress."""
@@ -226,7 +222,7 @@ class Recording:
                 failure = failure or error
         if failure is not None:
             status = Status.FAILED
-        elif status is Status.FINISHED:  # an interrupt must not wait; `reslrb report` finds the image errors, too
+        elif status is Status.FINISHED:  # an interrupt must not wait
             self._add("the certainty of the values was", self._measure_certainty)
             self._add("perceptual errors were", self._measure_seen_errors)
             if self.problem.config.fabrication is not None:
@@ -292,10 +288,7 @@ class Recording:
                 write_mask(self.folder.parameters, key, shown)
 
     def _measure_seen_errors(self) -> None:
-        pixels = sum(view.target.shape[0] * view.target.shape[1] for view in self.problem.views)
-        if pixels > MANY_PIXELS:
-            logger.info(f"measuring perceptual errors of {pixels / 1e6:.2g} million pixels")
-        self.seen = finite(seen_errors(self.folder.path, self.manifest.results, self.manifest.views))
+        self.seen = finite(seen_errors(self.folder.path, self.manifest.views))
 
     def _measure_solid(self) -> None:
         from reslrb_cli.runs.export import keep_solid

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 import time
@@ -51,9 +50,6 @@ def test_one_page_for_everything(report, tmp_path):
     page = (tmp_path / "page.html").read_text()
     assert page.endswith("</html>\n")
     assert 'http-equiv="refresh"' not in page
-    # These runs never recorded the errors, so the report computes them from the run folder
-    assert "Errors as people see them" in page
-    assert "CIEDE2000" in page
 
 
 def test_the_page_of_one_run_is_rewritten(report, tmp_path):
@@ -61,7 +57,6 @@ def test_the_page_of_one_run_is_rewritten(report, tmp_path):
     (folder / "report.html").write_text('<meta http-equiv="refresh" content="5">')
     assert report("a") == (0, f"look at {os.path.join('a', 'report.html')}\n", "")
     assert "refresh" not in (folder / "report.html").read_text()
-    assert "seen" not in json.loads((folder / "manifest.json").read_text())["results"]  # the run is left as it was
 
 
 @pytest.mark.parametrize(
@@ -233,9 +228,8 @@ def test_the_manifest_has_the_plan_and_perceptual_errors(optimize):
     rows = {row["feature"]: row["needed"] for row in plan["rows"]}
     assert (rows["derivatives of BSDFs"], rows["derivatives of emission"]) == (True, False)
     seen = manifest["results"]["seen"]
-    assert set(seen["images"][""]) == {"exposure", "initial", "final"}
-    assert seen["images"][""]["final"]["ssim"] is None  # 8x8 is too small
-    assert seen["colors"][KEY]["final"]["mean"] > 0
+    assert set(seen[""]) == {"exposure", "initial", "final"}
+    assert seen[""]["final"]["ssim"] is None  # 8x8 is too small
     page = PAGE.read_text()
     for title in ("Plan", "Errors as people see them"):
         assert f"<h2>{title}</h2>" in page

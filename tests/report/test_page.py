@@ -30,7 +30,6 @@ from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
-from reslrb_cli.report.perceptual import with_seen_errors
 from reslrb_cli.report.sources import ShownRun, read_sources
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
@@ -422,7 +421,7 @@ def pages(llvm, tmp_path_factory):
     some = [made for name, made in folders.items() if name not in ("three sensors", "no truth")]
     sources = read_sources([*some, *(folder / name for name in files)])
     written[EVERYTHING] = folder / "everything.html"
-    write_page([with_seen_errors(source) for source in sources], written[EVERYTHING])
+    write_page(sources, written[EVERYTHING])
     return written
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from report.measured import (
-    FLOOR,
     LAMP,
     MEMORY,
     ORIGIN,
@@ -98,8 +97,7 @@ def test_perceptual_errors(tmp_path):
     told = {"mean": 2.5, "max": 9.0}
     errors = {"psnr_db": 31.25, "ssim": 0.9, "ciede2000": told}
     same = errors | {"psnr_db": None, "ssim": None, "not_finite": 3}
-    colors = {FLOOR: {"initial": told, "final": told}}
-    seen = {"images": {"": {"exposure": 1.0, "initial": errors, "final": same}}, "colors": colors}
+    seen = {"": {"exposure": 1.0, "initial": errors, "final": same}}
     folder = make_run(tmp_path / "a", results={"seen": seen}, iterations=0)
     page = page_of(folder)
     title = "Errors as people see them"
@@ -107,7 +105,6 @@ def test_perceptual_errors(tmp_path):
     assert page.row(title, "start") == ["start", "31.25 dB", "0.9", "2.59"]
     assert page.row(title, "end")[1:3] == ["∞", "too small"]
     assert "3 pixels not finite" in page.row(title, "end")[0]
-    assert page.row(title, FLOOR)[1:] == ["2.59", "2.59"]
     both = page_of(make_run(tmp_path / "b", results={"seen": seen}, iterations=0), folder)
     assert [row[0] for row in both.cells[title][1:3]] == ["b start", "b end3 pixels not finite"]
 
@@ -252,7 +249,7 @@ def damage(folder, change):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda manifest: manifest.update(results={"parameters": {"a": 3}, "seen": {"images": {"": 7}}}),
+        lambda manifest: manifest.update(results={"parameters": {"a": 3}, "seen": {"": 7}}),
         lambda manifest: manifest.update(results={"parameters": 5, "rmse": 3}),
         lambda manifest: manifest.update(guided={"rows": 3}, memory={"budget": "x"}, scaling=[{}], plan={"rows": "no"}),
         lambda manifest: manifest.update(started="soon", views=[{"sensor": "x"}], versions={}),

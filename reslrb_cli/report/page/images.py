@@ -119,21 +119,19 @@ def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def seen_tables(runs: Sequence[ShownRun]) -> Markup:
-    """Return tables of perceptual errors at start and end, for the images and colours of all runs."""
-    images: list[dict[str, Any]] = []
-    colors: list[dict[str, Any]] = []
+def seen_table(runs: Sequence[ShownRun]) -> Markup:
+    """Return a table of the perceptual errors at start and end, for the images of all runs."""
+    rows: list[dict[str, Any]] = []
     for run in runs:
-        seen, name = run.results.get("seen") or {}, run.name if len(runs) > 1 else ""
-        for suffix, about in (seen.get("images") or {}).items():
+        name = run.name if len(runs) > 1 else ""
+        for suffix, about in (run.results.get("seen") or {}).items():
             sensor = f"sensor {suffix[1:]}, " if suffix else ""
-            images += [
+            rows += [
                 {"run": name, "name": sensor + title, "errors": about[moment]}
                 for title, moment in (("start", "initial"), ("end", "final"))
                 if moment in about
             ]
-        colors += [{"run": name, "name": key, "about": about} for key, about in (seen.get("colors") or {}).items()]
-    return lay_out("run.seen", images, colors) if images or colors else Markup()
+    return lay_out("run.seen", rows) if rows else Markup()
 
 
 #: Maximum number of images shown per sensor between the first and the last.

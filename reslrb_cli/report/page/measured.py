@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, SummaryRecord, Verdict, record_of
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.images import image_rows, seen_tables
+from reslrb_cli.report.page.images import image_rows, seen_table
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.page.run import guarded, problems, record_parts, step_ms
 from reslrb_cli.report.page.sweep import sweep_parts
@@ -158,7 +158,7 @@ def run_comparison(runs: Sequence[ShownRun]) -> Parts:
         "Runs": lambda: overview(runs),
         "Convergence": lambda: convergence_of_all(runs),
         "Images": lambda: _each(runs, image_rows),
-        "Errors as people see them": lambda: seen_tables(runs),
+        "Errors as people see them": lambda: seen_table(runs),
         "Parameters": lambda: _each(runs, lambda run: parameter_table(run.results)),
         "Textures": lambda: _each(runs, texture_pictures),
     }

@@ -25,12 +25,11 @@ from reslrb_cli.records.images import load_image
 from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.run_folder import FABRICATION_FILE, workshop_file
 from reslrb_cli.report.format import count, number
-from reslrb_cli.report.outcome import outcome_of
-from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
+from reslrb_cli.report.page.images import image_rows, seen_table, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
 from reslrb_cli.report.page.workshop import CAPTIONS, VIEWS, workshop
-from reslrb_cli.report.run_summary import error_line, measured_line, warnings
+from reslrb_cli.report.run_summary import error_line, measured_line, outcome_of, warnings
 from reslrb_cli.report.sources import ShownRun
 
 #: Number of first steps left out of medians, because they compile kernels.
@@ -130,7 +129,7 @@ def run_parts(run: ShownRun) -> dict[str, Markup]:
         ),
         "Fabrication": lambda: fabrication(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
-        "Errors as people see them": lambda: seen_tables([run]),
+        "Errors as people see them": lambda: seen_table([run]),
         "Textures": lambda: texture_pictures(run),
         "Convergence": lambda: convergence(run),
     }

@@ -14,7 +14,6 @@ from reslrb_cli.records.images import finite_range, in_range, read_mask, read_pa
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
-from reslrb_cli.report.perceptual import PLACES, is_color
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve, points_together
 from reslrb_cli.report.run_summary import MOMENTS, is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import ShownRun
@@ -24,6 +23,18 @@ Array = np.ndarray[Any, Any]
 
 #: Subfolders of `parameters/` with the initial, final and true values.
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
+
+
+#: Parameters of three numbers that are not visible colours.
+NO_COLORS = ("eta", "k")
+
+#: Quantities of geometry, which are neither light nor colour.
+PLACES = ("length", "degrees", "scale")
+
+
+def is_color(key: str, quantity: str) -> bool:
+    """Whether the three channels of a parameter are a colour."""
+    return quantity not in PLACES and not any(part in NO_COLORS for part in key.split(".")[-2:])
 
 
 def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = False) -> Markup:
