@@ -165,7 +165,7 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
     from reslrb_cli.config.loader import load
 
     load_packages()  # Mitsuba reads the images
-    from reslrb_cli.records.measurement_files import LineFile, LivePage
+    from reslrb_cli.records.measurement_files import LivePage, is_stream, write_lines
     from reslrb_cli.records.sweeps import PAGE_FILE, Failure, config_file, label, run_name
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.sources import read_sweep_runs
@@ -173,13 +173,11 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
     from reslrb_cli.runs.sweep import command as command_of
     from reslrb_cli.runs.sweep import is_left
 
-    file = None if json_file is None else LineFile(json_file)
-
     def refresh() -> None:
         source = read_sweep_runs(folder)
         write_page([source], folder / PAGE_FILE, live=True)
-        if file is not None and not file.is_stream:
-            file.write(_json_lines(source))
+        if json_file is not None and not is_stream(json_file):
+            write_lines(json_file, _json_lines(source))
 
     page = LivePage(refresh, "the sweep's page", PAGE_SHARE)
     runs, interrupted = list(sweep.runs), False
@@ -210,9 +208,8 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
         source = read_sweep_runs(folder)
         write_page([source], folder / PAGE_FILE)
     records = run_records(source)
-    if file is not None:
-        file.write(_json_lines(source))
-        file.close()
+    if json_file is not None:
+        write_lines(json_file, _json_lines(source))
     for line in lines(sweep, records):
         echo(line)
     done, failed = sum(run.is_done for run in records), sum(run.status == "failed" for run in records)

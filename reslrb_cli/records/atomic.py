@@ -7,7 +7,6 @@ A process that exits at once calls `remove_unfinished`. Files of killed processe
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
 import re
 import secrets
@@ -18,7 +17,6 @@ from pathlib import Path
 from typing import IO
 
 from reslrb_cli.errors import ConfigError, is_machine_fault
-from reslrb_cli.records.lock import is_alive
 
 _PART = re.compile(r"\..+\.\d+\.part")
 
@@ -84,14 +82,6 @@ def remove_parts(folder: Path) -> None:
             if _PART.fullmatch(name):
                 with contextlib.suppress(OSError):
                     os.unlink(os.path.join(parent, name))
-
-
-def remove_parts_of(path: Path) -> None:
-    """Remove unfinished versions of the file `path` whose processes have ended."""
-    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        if _PART.fullmatch(part.name) and not is_alive(int(part.name.split(".")[-2])):
-            with contextlib.suppress(OSError):
-                part.unlink()
 
 
 def _sync_folder(folder: Path) -> None:

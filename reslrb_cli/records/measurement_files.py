@@ -1,7 +1,7 @@
 """Files of measurements, JSON with one object per line.
 
-`LineFile` writes a file that is current and complete at every moment, no matter how the process ends. The first line is
-an `Origin`, which says where the file comes from. `read_lines` reads such files. The file `NAME.samples.npz` holds the
+`write_lines` writes a file that is complete at every moment, no matter how the process ends. The first line is an
+`Origin`, which says where the file comes from. `read_lines` reads such files. The file `NAME.samples.npz` holds the
 samples behind the figures, so that a measurement can be continued.
 """
 
@@ -17,11 +17,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError, printable
-from reslrb_cli.records.atomic import remove_parts_of, write_atomically
+from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.manifest import now, versions
 from reslrb_cli.records.metrics import Line
 
@@ -57,43 +57,18 @@ def _finite(text: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-class LineFile:
-    """JSON file with one object per line. Each write replaces the whole file. An existing file stays until the first
-    write.
+def is_stream(path: Path) -> bool:
+    """Whether `path` is a pipe or another file that is not regular."""
+    return os.path.lexists(path) and not path.is_file()
 
-    A pipe, or another file that is not regular, receives each final line once, as soon as the line is known.
-    """
 
-    def __init__(self, path: Path) -> None:
-        # Replaces the target of a link, not the link.
-        self._path = Path(os.path.realpath(path))
-        self.is_stream = os.path.lexists(path) and not self._path.is_file()
-        self._stream: IO[str] | None = None
-        self._sent: set[str] = set()
-        if not self.is_stream:
-            remove_parts_of(self._path)
-
-    def write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> None:
-        """Write all lines so far, final and provisional. Later calls must repeat the final lines.
-
-        Raises OSError if writing fails. The file is then unchanged.
-        """
-        if not self.is_stream:
-            text = "".join(line.to_json() + "\n" for line in [*final, *provisional])
-            write_atomically(self._path, lambda file: file.write(text.encode()))
-            return
-        if self._stream is None:
-            self._stream = self._path.open("w", encoding="utf-8")
-        for text in [line.to_json() for line in final]:
-            if text not in self._sent:
-                self._sent.add(text)
-                self._stream.write(text + "\n")
-        self._stream.flush()
-
-    def close(self) -> None:
-        """Close the stream, if there is one."""
-        if self._stream is not None:
-            self._stream.close()
+def write_lines(path: Path, lines: Sequence[Line]) -> None:
+    """Write a file with one object per line, atomically. A stream is written in place. Raises OSError."""
+    text = "".join(line.to_json() + "\n" for line in lines).encode()
+    if is_stream(path):
+        path.write_bytes(text)
+    else:  # the target of a link is replaced, not the link
+        write_atomically(Path(os.path.realpath(path)), lambda file: file.write(text))
 
 
 def _command() -> list[str]:

@@ -47,8 +47,7 @@ class ShownRun:
     @property
     def results(self) -> Mapping[str, Any]:
         """The results so far."""
-        results = self.manifest.get("results")
-        return results if isinstance(results, dict) else {}
+        return self.manifest.get("results") or {}
 
     def last(self, name: str) -> float | None:
         """Return the last known value of the metric `name`."""
@@ -67,10 +66,7 @@ class ShownRun:
     @property
     def scales(self) -> dict[str, float | None]:
         """The root mean square of each parameter's true value, by key, or None if unknown."""
-        about = self.results.get("parameters")
-        if not isinstance(about, dict):
-            return {}
-        return {key: entry.get("scale") for key, entry in about.items() if isinstance(entry, dict)}
+        return {key: entry.get("scale") for key, entry in (self.results.get("parameters") or {}).items()}
 
 
 @dataclass(frozen=True)

@@ -107,10 +107,8 @@ class Recording:
             else:
                 self._begin()
             (self.folder.path / FABRICATION_FILE).unlink(missing_ok=True)  # outdated once the run goes on
-            yield from self._iterate(stop)
-            left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
-            status = Status.INTERRUPTED if left else Status.FINISHED
-        except GeneratorExit:
+            with contextlib.suppress(GeneratorExit):
+                yield from self._iterate(stop)
             left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
             status = Status.INTERRUPTED if left else Status.FINISHED
         except KeyboardInterrupt:

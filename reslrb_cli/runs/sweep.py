@@ -23,12 +23,10 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import Location, format_location
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault, one_line
 from reslrb_cli.measure.methods import parse_cases
-from reslrb_cli.records.atomic import remove_parts_of
 from reslrb_cli.records.checkpoint import newest_checkpoint
 from reslrb_cli.records.lock import FolderLock, InUse
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.records.sweeps import (
-    SWEEP_FILE,
     Combination,
     SweepPlan,
     config_file,
@@ -247,7 +245,6 @@ def _locked(folder: Path) -> FolderLock:
 
 def _write(folder: Path, sweep: SweepPlan) -> None:
     try:
-        remove_parts_of(folder / SWEEP_FILE)
         sweep.write(folder)
     except OSError as error:
         raise _unwritable(folder, error) from None

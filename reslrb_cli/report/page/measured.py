@@ -178,8 +178,8 @@ def overview(runs: Sequence[ShownRun]) -> Markup:
 
 def _estimator(run: ShownRun) -> str:
     """Return the estimator or the integrator of the gradients, if the manifest names one."""
-    plan = run.manifest.get("plan")
-    return str(plan.get("estimator") or plan.get("integrator") or "") if isinstance(plan, dict) else ""
+    plan = run.manifest.get("plan") or {}
+    return str(plan.get("estimator") or plan.get("integrator") or "")
 
 
 def _final_error(run: ShownRun) -> str:
