@@ -20,7 +20,7 @@ Array = np.ndarray[Any, Any]
 
 #: Values of a record's fields that a line may lack.
 _DEFAULTS = {
-    each.name: each.default if each.default is not MISSING else each.default_factory()
+    each.name: each.default_factory() if each.default_factory is not MISSING else each.default
     for each in fields(Record)
     if each.default is not MISSING or each.default_factory is not MISSING
 }

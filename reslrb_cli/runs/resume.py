@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config.loader import OVERRIDDEN, Override, changed, dump, load, loads
+from reslrb_cli.config.loader import OVERRIDDEN, Override, dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
@@ -145,21 +145,20 @@ class OpenedRun:
 
 
 @contextlib.contextmanager
-def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override]) -> Iterator[OpenedRun]:
+def open_earlier(run: Path, overrides: Sequence[str | Override]) -> Iterator[OpenedRun]:
     """Open the run in the folder `run` to resume it, and lock it while the block runs.
 
-    `wanted` is a configuration that must agree with the run. The default for `wanted` is `config.yaml` in the run's
-    folder. Raises ConfigError if the folder holds no run, the run is in use, or the last two states are both damaged.
-    Raises ConfigError also if a setting that must not change differs, or if `run.iterations` is below the number of
-    finished iterations. Raises ConfigError also if an input file has changed, if records are missing or damaged, or if
-    the folder cannot be written to.
+    The configuration is `config.yaml` in the run's folder, with `overrides`. Raises ConfigError if the folder holds no
+    run, the run is in use, or the last two states are both damaged. Raises ConfigError also if a setting that must not
+    change differs, or if `run.iterations` is below the number of finished iterations. Raises ConfigError also if an
+    input file has changed, if records are missing or damaged, or if the folder cannot be written to.
     """
     with opened(run) as (folder, manifest):
         said: list[str] = []
         stored = _read_state(folder, said)
         settled, iteration = stored.read(Settled), stored.read(State).iteration
         began = loads(settled.config, stored.path)
-        config, source = _read_config(run, wanted, overrides, settled.config)
+        config, source = load(run / "config.yaml", overrides), load(run / "config.yaml")
         found = changes(began, config)
         asked = changes(source, config)
         blamed = "--set" if all(isinstance(each, str) for each in overrides) else OVERRIDDEN
@@ -216,21 +215,6 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
     if failures:
         raise failures[0]
     raise ConfigError(folder.path, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
-
-
-def _read_config(
-    run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override], text: str
-) -> tuple[Config, Config]:
-    """Return two configurations for resuming, one with and one without overrides. `text` is the configuration in the
-    state.
-    """
-    if isinstance(wanted, Config):
-        return changed(wanted, overrides), wanted
-    own = run / "config.yaml"
-    if wanted is not None or own.exists():
-        path = own if wanted is None else wanted
-        return load(path, overrides), load(path)
-    return loads(text, own, overrides), loads(text, own)
 
 
 def _check_files(before: Mapping[str, str], config: Config, run: Path) -> None:

@@ -213,7 +213,7 @@ def test_a_run_continues_from_its_folder(experiment: Path, caplog: pytest.LogCap
     assert values_equal(done.parameters, again.parameters)
     assert is_free(Path("mine"))
 
-    longer = rl.optimize(rl.load("mine/config.yaml"), resume="mine", overrides={"run.iterations": 7})
+    longer = rl.optimize(resume="mine", overrides={"run.iterations": 7})
     assert [record.iteration for record in longer] == [6]
 
 
@@ -261,6 +261,7 @@ def test_errors_are_located(experiment: Path) -> None:
         ),
         (lambda: rl.optimize("tiny.yaml", overrides={"variant": "cuda_ad_rgb"}), "variant: is cuda_ad_rgb, but llvm"),
         (lambda: rl.optimize(resume="."), ".: is no run's folder"),
+        (lambda: rl.optimize("tiny.yaml", resume="mine"), "experiment: cannot be given with resume"),
         (lambda: rl.optimize(resume="mine", folder="other"), "folder: cannot be given with resume; copy the folder"),
     ]
     for call, start in cases:
