@@ -26,6 +26,9 @@ from reslrb_cli.lens import transport
 
 Array = NDArray[np.float64]
 
+#: Upper bound of all lengths in mm.
+_FAR = 1e6
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -282,15 +285,16 @@ def _check(picture: Array, setting: Setting) -> None:
         raise ConfigError("", "picture", "has values that are negative or not finite")
     if is_even(picture):
         raise ConfigError("", "picture", "has only one colour; there is no picture to show")
-    for key in ("size", "picture_size"):
-        if min(getattr(s, key)) <= 0:
-            raise ConfigError("", key, "must be above 0 mm")
-    for key in ("distance", "thickness", "light_distance"):
-        if not getattr(s, key) > 0:
-            raise ConfigError("", key, f"is {getattr(s, key):g} mm; it must be above 0")
+    lengths = {"size": min(s.size), "picture_size": min(s.picture_size), "distance": s.distance,
+               "thickness": s.thickness}  # fmt: skip
+    if s.light_distance != np.inf:
+        lengths["light_distance"] = s.light_distance
+    for key, length in lengths.items():
+        if not 0 < length < _FAR:
+            raise ConfigError("", key, f"is {length:g} mm; it must be above 0, and below {_FAR:g}")
     if not -80 <= s.incidence <= 80:
         raise ConfigError("", "incidence", f"is {s.incidence:g} degrees; it must be between -80 and 80")
-    if max(map(abs, s.tilt)) > 80:
+    if not max(map(abs, s.tilt)) <= 80:
         raise ConfigError("", "tilt", f"is {s.tilt[0]:g} and {s.tilt[1]:g} degrees; both must be between -80 and 80")
     if s.kind == "lens" and not 1 < s.ior <= 5:
         raise ConfigError("", "ior", f"is {s.ior:g}; glass and plastics have 1.3 to 2.0, and the limit is 5")

@@ -69,8 +69,8 @@ def check_export(config: Config, output: Path, tolerances: bool) -> None:
     elif output.suffix.lower() in _OTHER_SOLIDS:
         raise ConfigError("--output", "", f"{output}: {output.suffix} is not supported; give a folder, or a file that "
                           f"ends in {', '.join(WRITERS)}")  # fmt: skip
-    else:
-        check_folder(output)
+    elif os.path.lexists(output) and not (output.is_dir() and not output.is_symlink() and not any(output.iterdir())):
+        raise ConfigError("--output", "", f"{output} exists; give a new or empty folder")
 
 
 def write_export(config: Config, run: Path, output: Path, tolerances: bool, say: Say) -> None:
@@ -106,7 +106,10 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
             image, numbers["loss"] = measure_loss(config, scene, sensors[0], integrator, target)
             pictures = add_sheet(numbers, plan, scene, sensors[0], sheets, luminance(image), luminance(target))
             if tolerances:
-                bench = bench_of(config, scene, selection.params, integrator, sensors[0])
+                try:
+                    bench = OpticalBench(scene, selection.params, plan, mi.load_dict(dict(integrator)), sensors[0])
+                except ConfigError as error:
+                    raise ConfigError(config.source, error.key, error.message) from None
                 pictures |= add_tolerances(
                     numbers, bench, sheets, luminance(image), luminance(target), config.run.final_spp, say
                 )
@@ -199,12 +202,6 @@ def pictures_of(solid: Solid) -> dict[str, Array]:
     return found
 
 
-def check_folder(path: Path) -> None:
-    """Raise ConfigError if `path` exists and is not an empty folder."""
-    if os.path.lexists(path) and not (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
-        raise ConfigError("--output", "", f"{path} exists; give a new or empty folder")
-
-
 def check_file(path: Path, config: Config) -> None:
     """Raise ConfigError if no solid can be written to the file `path`."""
     if config.fabrication is None:
@@ -257,20 +254,6 @@ def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None
     if needed:
         raise ConfigError("--tolerances", "", reason)
     return None
-
-
-def bench_of(
-    config: Config, scene: mi.Scene, params: mi.SceneParameters, integrator: dict[str, object], sensor: int
-) -> OpticalBench:
-    """Return the bench that moves the scene's parts to measure tolerances (`measure/tolerance.py`).
-
-    Raises ConfigError.
-    """
-    assert config.fabrication is not None
-    try:
-        return OpticalBench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
-    except ConfigError as error:
-        raise ConfigError(config.source, error.key, error.message) from None
 
 
 def measure_loss(
