@@ -100,16 +100,13 @@ def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, 
 
     The result is empty for a single view with default settings. All pixels of such a view have equal weights.
     """
-    if not views or (len(views) == 1 and not _is_special(views[0])):
+    special = [view for view in views or () if view["left_out"] or view["kinds"] or view["counted"]]
+    if not views or (len(views) == 1 and not special and views[0]["exposure"] == 1):
         return Markup()
     exposures = {view["exposure"]: _recovered(view["exposure"], results) for view in views}
     held_out = results.get("held_out") or {}
     losses = [held_out[moment] for moment in ("initial", "final") if moment in held_out]
     return lay_out("run.views", views, WORDS, exposures, losses)
-
-
-def _is_special(view: Mapping[str, Any]) -> bool:
-    return bool(view["left_out"] or view["kinds"] or view["counted"] or view["exposure"] != 1)
 
 
 def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:

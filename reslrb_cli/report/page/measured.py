@@ -29,7 +29,11 @@ SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixel
 
 def bench(objects: Sequence[Entry]) -> Markup:
     """Return diagrams and a table of a bench."""
-    entries = [_with_sizes(entry) for entry in objects if "integrator" in entry and "status" in entry]
+    entries = [
+        {"pixels": entry["width"] * entry["height"] if entry.get("width") else None, **entry}
+        for entry in objects
+        if "integrator" in entry and "status" in entry
+    ]
     labels = list(dict.fromkeys(map(label, entries)))
     values = {name: [entry[name] for entry in entries if entry.get(name)] for name in SWEPT}
     usual = {name: max(dict.fromkeys(found), key=found.count) for name, found in values.items() if found}
@@ -56,12 +60,6 @@ def label(entry: Entry) -> str:
     """
     parts = ":".join(str(entry[name]) for name in ("integrator", "estimator") if entry.get(name))
     return parts + (f", capacity {entry['capacity']}" if entry.get("capacity") not in (None, 1) else "")
-
-
-def _with_sizes(entry: Entry) -> dict[str, Any]:
-    width, height = entry.get("width"), entry.get("height")
-    pixels = width * height if isinstance(width, int) and isinstance(height, int) else None
-    return {"pixels": pixels, "texels": entry.get("texels")} | dict(entry)
 
 
 def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
