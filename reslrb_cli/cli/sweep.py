@@ -20,6 +20,7 @@ import tempfile
 import threading
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -203,7 +204,7 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
             if not quiet or code != ExitCode.DONE:
                 echo(f"  {line}")
             if code != ExitCode.DONE:
-                sweep = sweep.with_failure(name, Failure(code, one_line(line)))
+                sweep = replace(sweep, failures={**sweep.failures, name: Failure(code, one_line(line))})
                 sweep.write(folder)
         source = read_sweep_runs(folder)
         write_page([source], folder / PAGE_FILE)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -78,11 +78,6 @@ class SweepPlan:
     def runs(self) -> Iterator[tuple[Combination, int]]:
         """Combination and seed of each run, in order: all combinations with the first seed, then with the next."""
         return ((combination, seed) for seed in self.seeds for combination in self.combinations)
-
-    def with_failure(self, name: str, failure: Failure | None) -> SweepPlan:
-        """Return the sweep with `failure` for the run `name`. If `failure` is None, remove the run's failure."""
-        others = {other: each for other, each in self.failures.items() if other != name}
-        return replace(self, failures=others if failure is None else {**others, name: failure})
 
     def write(self, folder: Path) -> None:
         """Write `sweep.json` into `folder`, atomically. Raises OSError."""

@@ -49,6 +49,10 @@ class ShownRun:
         """The results so far."""
         return self.manifest.get("results") or {}
 
+    def column(self, name: str) -> list[float | None]:
+        """Return the metric `name` of every iteration."""
+        return [record[name] for record in self.records]
+
     def last(self, name: str) -> float | None:
         """Return the last known value of the metric `name`."""
         return next((record[name] for record in reversed(self.records) if record[name] is not None), None)

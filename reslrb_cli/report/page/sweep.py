@@ -106,7 +106,7 @@ def _by_iteration(runs: Sequence[ShownRun], name: str) -> tuple[Array, Array]:
     most = max(len(run.records) for run in runs)
     values = np.full((len(runs), most), np.nan)
     for row, run in zip(values, runs, strict=True):
-        row[: len(run.records)] = _column(run, name)
+        row[: len(run.records)] = run.column(name)
     return np.arange(most), values
 
 
@@ -116,18 +116,14 @@ def _by_time(runs: Sequence[ShownRun], name: str) -> tuple[Array, Array]:
     The first time is the earliest one at which all runs have completed an iteration. A run that has ended keeps its
     last value.
     """
-    ends = [np.array(_column(run, "elapsed_s"), dtype=np.float64) for run in runs]
+    ends = [np.array(run.column("elapsed_s"), dtype=np.float64) for run in runs]
     times = np.unique(np.concatenate(ends))
     times = times[times >= max(end[0] for end in ends)]
     times = times[:: -(-len(times) // MOST_POINTS)]
     values = np.full((len(runs), len(times)), np.nan)
     for row, run, end in zip(values, runs, ends, strict=True):
-        row[:] = np.array(_column(run, name), dtype=np.float64)[np.searchsorted(end, times, side="right") - 1]
+        row[:] = np.array(run.column(name), dtype=np.float64)[np.searchsorted(end, times, side="right") - 1]
     return times, values
-
-
-def _column(run: ShownRun, name: str) -> list[float | None]:
-    return [record[name] for record in run.records]
 
 
 def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
