@@ -288,7 +288,7 @@ def convergence(
         from reslrb_cli.measure.convergence.judgement import Judgement
         from reslrb_cli.measure.convergence.session import Session
         from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of
-        from reslrb_cli.report.convergence_tables import result_lines
+        from reslrb_cli.report.tables import result_lines
 
         if objective not in DEFAULTS:
             raise ConfigError("objective", "", f"is {objective!r}; there are {', '.join(DEFAULTS)}")

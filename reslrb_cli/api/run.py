@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from reslrb_cli.api.experiment import Experiment, called, held, load, load_with
+from reslrb_cli.api.experiment import Experiment, called, held, load_with
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config.files import as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override, overrides_of
@@ -105,7 +105,7 @@ class Run:
         if self._stopped and self._writes and self._folder is not None:
             with called():
                 self._stack, self._begun, self._writes = _reopened(
-                    self._folder, None, (), self.config.own_loss, self.config.allows_code
+                    self._folder, (), self.config.own_loss, self.config.allows_code
                 )
         self._stopped, self._status, self._failure = True, Status.RUNNING, None
         course = self._begun.course
@@ -284,10 +284,9 @@ def optimize(
     written to `folder-2` and so on (see `Run.folder`). With `folder`, the setting `run.output` is ignored, with a
     warning. Without `folder`, only the caches of kernels and measurements are written.
 
-    `resume` is the folder of an earlier run. The run continues exactly where the earlier run stopped. New results go to
-    the earlier folder, or to `folder` if you give one. With `resume`, `experiment` is optional. If given, `experiment`
-    must agree with the earlier run. `overrides` may change iterations and learning rates. A finished run has no
-    iterations left and logs a warning.
+    `resume` is the folder of an earlier run, in place of `experiment` and `folder`. The run continues exactly where the
+    earlier run stopped. `overrides` may change iterations and learning rates. A finished run has no iterations left and
+    logs a warning.
 
     `loss` is your own loss function, `loss(image, target)` or `loss(image, target, weights)`. The arguments are
     `mi.TensorXf` (height, width, channels). The image tracks derivatives. The loss function returns a `mi.Float` of
@@ -311,9 +310,12 @@ def optimize(
         ]
     with called():
         if resume is not None:
-            wanted = None if experiment is None else load(experiment)
+            if folder is not None:
+                raise ConfigError("folder", "", "cannot be given with resume; copy the folder, and resume the copy")
+            if experiment is not None:
+                raise ConfigError("experiment", "", "cannot be given with resume, which uses that of the run")
             earlier = as_path(resume, "resume", "the folder of a run")
-            run = Run(*_reopened(earlier, wanted, [*put_in, *named], loss, allow_code))
+            run = Run(*_reopened(earlier, put_in, loss, allow_code))
             run._folder = earlier
             return run
         if experiment is None:
@@ -342,17 +344,13 @@ def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
 
 
 def _reopened(
-    folder: Path,
-    wanted: Config | None,
-    put_in: Sequence[Override],
-    loss: Loss | None,
-    allow_code: bool,
+    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool
 ) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
     """Return the lock stack, the prepared run to resume, and True if iterations are left. The stack holds the lock of
     the run folder.
     """
     with contextlib.ExitStack() as stack:
-        earlier = stack.enter_context(open_earlier(folder, wanted, put_in))
+        earlier = stack.enter_context(open_earlier(folder, put_in))
         earlier.config = _with_own(earlier.config, loss, allow_code)
         variant = keep_variant(earlier.settled.variant, earlier.config.source)
         begun = earlier.begin(variant, logger.info, logger.warning)

@@ -106,7 +106,7 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role
-    from reslrb_cli.report.convergence_tables import (
+    from reslrb_cli.report.tables import (
         closing_sentence,
         method_cells,
         notes,
@@ -150,7 +150,7 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
 def _table(session: Session) -> Columns:
     """Return a table with columns that fit the finished and the expected results of the session."""
     from reslrb_cli.measure.convergence.setup import Role
-    from reslrb_cli.report.convergence_tables import method_columns
+    from reslrb_cli.report.tables import method_columns
 
     labels = [member.label for member in session.of(Role.CASE)]
     return method_columns(labels, [*session.facts.get("shapes", ()), "999 rounds"])

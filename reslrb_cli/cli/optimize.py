@@ -74,8 +74,7 @@ logger = logging.getLogger(__name__)
     "resumed",
     type=FOLDER,
     metavar="RUN",
-    help="Continue the run in this folder. CONFIG may be left out; otherwise it must be that of the run. --set "
-    "may change iterations, learning rates, and, with run.output or run.name, the folder.",
+    help="Continue the run in this folder, in place of CONFIG. --set may change iterations and learning rates.",
 )
 @allow_code_option
 @cluster_option("Distribute the shards of each step (run.shards) to workers", "the result is that of one process")
@@ -106,7 +105,9 @@ def command(
             raise click.UsageError("--force replaces a run, --resume continues one; give only one of them")
         if dry_run:
             raise click.UsageError("--dry-run is for a new run, --resume continues one; give only one of them")
-        return _resume(resumed, config_file, overrides, allow_code, workers, quiet)
+        if config_file is not None:
+            raise click.UsageError("--resume RUN uses the configuration of the run; leave out CONFIG")
+        return _resume(resumed, overrides, allow_code, workers, quiet)
     if dry_run and workers is not None:
         raise click.UsageError("--dry-run measures only this process; leave out --cluster")
     if config_file is None:
@@ -150,17 +151,10 @@ def _begin(
     return _run(begin(config, variant, force, logger.info, logger.warning), workers, quiet)
 
 
-def _resume(
-    run: Path,
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    allow_code: bool,
-    workers: Place | None,
-    quiet: bool,
-) -> int:
+def _resume(run: Path, overrides: tuple[str, ...], allow_code: bool, workers: Place | None, quiet: bool) -> int:
     from reslrb_cli.runs.resume import open_earlier
 
-    with open_earlier(run, config_file, overrides) as earlier:
+    with open_earlier(run, overrides) as earlier:
         if earlier.is_done:
             echo(earlier.done_line("--set", "="))
             return ExitCode.DONE

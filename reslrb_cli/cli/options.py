@@ -26,15 +26,15 @@ from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.records.atomic import remove_parts_of
 from reslrb_cli.records.measurement_files import (
     Kept,
     Line,
-    LineFile,
     LivePage,
     Origin,
     are_kept,
+    is_stream,
     samples_file,
+    write_lines,
     write_samples,
 )
 from reslrb_cli.records.measurements import BenchStatus
@@ -66,11 +66,8 @@ class Keeper:
         provisional: Callable[[], Sequence[Line]],
         kept: Callable[[], Kept | None],
     ) -> None:
-        self._file = None if json_file is None else LineFile(json_file)
-        self._samples = None
-        if json_file is not None and self._file is not None and not self._file.is_stream:
-            self._samples = samples_file(json_file)
-            remove_parts_of(self._samples)
+        self._file = json_file
+        self._samples = None if json_file is None or is_stream(json_file) else samples_file(json_file)
         self._origin, self._final, self._provisional, self._kept = origin, final, provisional, kept
         self._live = LivePage(lambda: self._write(self._final(), self._provisional()), "the file of --json")
 
@@ -78,19 +75,13 @@ class Keeper:
         """Write the files every few seconds. Writing takes only a small share of the time. Call this method between
         steps.
         """
-        if self._file is None:
-            return
-        if self._file.is_stream:  # a stream gets only final lines
-            self._file.write([self._origin, *self._final()])
-        else:
+        if self._samples is not None:  # a stream gets only the final lines
             self._live.refresh()
 
     def finish(self, lines: Sequence[Line]) -> None:
         """Write all `lines` in their final state. Raises OSError."""
-        if self._file is not None:
-            if not self._write(lines):
-                echo("the samples are too large to save: the same command will measure everything again")
-            self._file.close()
+        if self._file is not None and not self._write(lines):
+            echo("the samples are too large to save: the same command will measure everything again")
 
     def _write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
         """Write both files. Return True if the samples were small enough to save."""
@@ -102,7 +93,7 @@ class Keeper:
                 write_samples(self._samples, *kept)
             else:  # an existing file belongs to other lines
                 self._samples.unlink(missing_ok=True)
-        self._file.write([self._origin, *final], provisional)
+        write_lines(self._file, [self._origin, *final, *provisional])
         return fits
 
 

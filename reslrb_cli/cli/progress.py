@@ -1,20 +1,17 @@
-"""Progress of an optimisation and of reading long files: a bar on a terminal, plain lines otherwise."""
+"""Progress of an optimisation: a bar on a terminal, plain lines otherwise."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import click
 
-from reslrb_cli.config.files import in_words
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.records.metrics import Record
-from reslrb_cli.report.format import shorten
-from reslrb_cli.report.run_summary import BESIDE_A_BAR, descriptions
+from reslrb_cli.report.run_summary import descriptions
 
 #: Without a terminal, a line is written after each tenth of the iterations and after this many seconds.
 SECONDS_PER_LINE = 10.0
@@ -106,47 +103,3 @@ class Progress:
         if self._bar is not None:
             with contextlib.suppress(OSError):
                 self._bar.close()
-
-
-class Reading:
-    """Progress bar on standard error for reading long files. The bar can be called like `records.reading.Tell`.
-
-    As a context manager, it closes the bar. If reading took long, the end of the context prints `drawing`, because the
-    page is drawn next.
-    """
-
-    def __init__(self) -> None:
-        self._stream = sys.stderr
-        self._path: Path | None = None
-        self._bar: Any = None
-        self._began = self._said = time.monotonic()
-
-    def __call__(self, path: Path, done: int, size: int) -> None:
-        """Show that `done` of `size` bytes in the file `path` are read."""
-        now, name = time.monotonic(), shorten(str(path), BESIDE_A_BAR)
-        if not self._stream.isatty():
-            if now - self._said >= SECONDS_PER_LINE:
-                self._said = now
-                click.echo(f"reading {name}: {in_words(done)} of {in_words(size)}", file=self._stream)
-            return
-        if path != self._path:
-            from tqdm import tqdm
-
-            if self._bar is not None:
-                self._bar.close()
-            self._path = path
-            self._bar = tqdm(
-                total=size, file=self._stream, unit="B", unit_scale=True, unit_divisor=1024, dynamic_ncols=True,
-                desc=f"reading {name}", delay=LEAST_SECONDS, leave=False,
-            )  # fmt: skip
-        self._bar.total = size
-        self._bar.update(done - self._bar.n)
-
-    def __enter__(self) -> Reading:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-        if kind is None and time.monotonic() - self._began >= LEAST_SECONDS:
-            click.echo("drawing", file=self._stream)

@@ -23,31 +23,28 @@ MOST_SOURCES = 100
 def command(paths: tuple[Path, ...], output: Path | None) -> int:
     """Write one self-contained page about runs and measurements.
 
-    RUN is a run folder of `optimize`, a folder of a `sweep`, a file that `bench`, `gradcheck` or `convergence` wrote
-    with --json, or a folder of maps from `gradcheck --images`. The page shows losses and errors of several runs in one
-    picture. Images, times and memory of the runs appear side by side. Unfinished runs are shown up to their last
-    iteration.
+    RUN is a run folder of `optimize`, a folder of a `sweep`, or a file that `bench`, `gradcheck` or `convergence` wrote
+    with --json. The page shows losses and errors of several runs in one picture. Images, times and memory of the runs
+    appear side by side. Unfinished runs are shown up to their last iteration.
     """
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # Mitsuba reads the images
-    from reslrb_cli.cli.progress import Reading
     from reslrb_cli.records.sweeps import PAGE_FILE
     from reslrb_cli.report.page import write_page
-    from reslrb_cli.report.perceptual import with_seen_errors
     from reslrb_cli.report.sources import ShownRun, SweepRuns, read_sources
 
     if len(paths) > MOST_SOURCES:
         raise ConfigError("RUN", "", f"{len(paths)} are given; a page shows at most {MOST_SOURCES}")
-    gc.collect()  # so that unused objects, such as a scene, are not frozen below
-    with Reading() as tell:
-        sources = read_sources(paths, tell)
-    gc.freeze()  # otherwise Python searches millions of numbers for cycles during drawing
+    gc.disable()  # Python would search millions of numbers for cycles, again and again
+    sources = read_sources(paths)
+    gc.freeze()
+    gc.enable()
     if output is None:
         if len(sources) != 1 or not isinstance(sources[0], ShownRun | SweepRuns):
             raise ConfigError("--output", "", "is missing; give a file to write, e.g. -o page.html")
         output = sources[0].path / ("report.html" if isinstance(sources[0], ShownRun) else PAGE_FILE)
     check_writable("--output", output)
-    write_page([with_seen_errors(source) for source in sources], output)
+    write_page(sources, output)
     echo(f"look at {os.path.relpath(output)}")
     return ExitCode.DONE

@@ -20,6 +20,7 @@ import tempfile
 import threading
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,7 +96,7 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     "resumed",
     type=FOLDER,
     metavar="FOLDER",
-    help="Continue the sweep in this folder, in place of CONFIG; the same command again does this, too.",
+    help="Continue the sweep in this folder, in place of CONFIG.",
 )
 @click.option("--retry", is_flag=True, help="Repeat failed runs.")
 @allow_code_option
@@ -132,19 +133,19 @@ def command(
     Each run has a folder in FOLDER. The folder's name shows the run's settings. FOLDER/sweep.html has the table, curves
     and pictures. All combinations are checked before the first run starts. If a run fails, the run's table row shows
     the failure, and the other runs continue. Ctrl-C ends the sweep after the current iteration. To continue a sweep,
-    even after a kill, repeat the command or use --resume FOLDER.
+    even after a kill, use --resume FOLDER.
     """
-    from reslrb_cli.runs.sweep import make_plan, opened
+    from reslrb_cli.runs.sweep import make_plan, started
+    from reslrb_cli.runs.sweep import resumed as resumed_sweep
 
     if quiet or verbose:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)
-    plan = None
     if resumed is not None:
         given = [name for name in ("config_file", "overrides", "vary", "folder", "dry_run") if is_given(name)]
         if given:
             raise click.UsageError("--resume continues a sweep with its own settings; add only --seeds, --retry, "
                                    "--allow-code or --json")  # fmt: skip
-        folder = resumed
+        folder, place = resumed, resumed_sweep(resumed, seeds, retry, allow_code)
     elif config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
     else:
@@ -153,8 +154,9 @@ def command(
         folder = folder or run.output / f"{run.folder_name}-sweep"
         if dry_run:
             return _forecast(plan)
+        place = started(folder, plan)
     check_writable("--json", json_file)
-    with opened(folder, plan, seeds, retry, allow_code) as sweep:
+    with place as sweep:
         return _run(folder, sweep, json_file, quiet, verbose)
 
 
@@ -164,7 +166,7 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
     from reslrb_cli.config.loader import load
 
     load_packages()  # Mitsuba reads the images
-    from reslrb_cli.records.measurement_files import LineFile, LivePage
+    from reslrb_cli.records.measurement_files import LivePage, is_stream, write_lines
     from reslrb_cli.records.sweeps import PAGE_FILE, Failure, config_file, label, run_name
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.sources import read_sweep_runs
@@ -172,13 +174,11 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
     from reslrb_cli.runs.sweep import command as command_of
     from reslrb_cli.runs.sweep import is_left
 
-    file = None if json_file is None else LineFile(json_file)
-
     def refresh() -> None:
         source = read_sweep_runs(folder)
         write_page([source], folder / PAGE_FILE, live=True)
-        if file is not None and not file.is_stream:
-            file.write(_json_lines(source))
+        if json_file is not None and not is_stream(json_file):
+            write_lines(json_file, _json_lines(source))
 
     page = LivePage(refresh, "the sweep's page", PAGE_SHARE)
     runs, interrupted = list(sweep.runs), False
@@ -204,14 +204,13 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
             if not quiet or code != ExitCode.DONE:
                 echo(f"  {line}")
             if code != ExitCode.DONE:
-                sweep = sweep.with_failure(name, Failure(code, one_line(line)))
+                sweep = replace(sweep, failures={**sweep.failures, name: Failure(code, one_line(line))})
                 sweep.write(folder)
         source = read_sweep_runs(folder)
         write_page([source], folder / PAGE_FILE)
     records = run_records(source)
-    if file is not None:
-        file.write(_json_lines(source))
-        file.close()
+    if json_file is not None:
+        write_lines(json_file, _json_lines(source))
     for line in lines(sweep, records):
         echo(line)
     done, failed = sum(run.is_done for run in records), sum(run.status == "failed" for run in records)

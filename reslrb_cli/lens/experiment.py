@@ -149,7 +149,11 @@ def lamps(surface: Surface, power: float, sun: float) -> str:
         </transform>
     </emitter>"""
     wide, high = setting.size[0] * float(np.cos(np.radians(setting.incidence))), setting.size[1]
-    start = np.array([0.0, 0.0, -setting.thickness - _GAP]) if setting.kind == "lens" else -beam * setting.distance
+    start = -beam * setting.distance
+    if setting.kind == "lens":  # the central ray meets the face's centre, and no part of the lamp touches the lens
+        inside, _ = rays.incoming(*np.zeros((3, 1)))
+        tilt = float(np.tan(np.radians(abs(setting.incidence))))
+        start = -setting.thickness * inside[:, 0] / inside[2, 0] - beam * (_GAP + wide / 2 * tilt)
     if setting.kind == "mirror" and setting.outline == "rectangle":
         # oblique light meets parts beside it that stand out of the plane; light that passes the mirror is lost
         wide += 2 * surface.relief * abs(float(np.sin(np.radians(setting.incidence))))

@@ -485,14 +485,6 @@ def ply_file(vertices: NDArray[Any], triangles: NDArray[Any], comment: str = "")
     return head.encode() + vertices.astype("<f4").tobytes() + faces.tobytes()
 
 
-def obj(solid: Solid) -> bytes:
-    """Return OBJ, in mm."""
-    lines = ["# millimetres"]
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in solid.points.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (solid.triangles + 1).tolist()]
-    return "\n".join([*lines, ""]).encode()
-
-
 def three_mf(solid: Solid) -> bytes:
     """Return 3MF in mm, written by lib3mf. Raises ImportError if lib3mf is not installed."""
     import lib3mf
@@ -518,4 +510,4 @@ def three_mf(solid: Solid) -> bytes:
 
 
 #: Writers of a solid, by file suffix.
-WRITERS: dict[str, Callable[[Solid], bytes]] = {".stl": stl, ".3mf": three_mf, ".obj": obj, ".ply": ply}
+WRITERS: dict[str, Callable[[Solid], bytes]] = {".stl": stl, ".3mf": three_mf, ".ply": ply}

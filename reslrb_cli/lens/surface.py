@@ -26,6 +26,9 @@ from reslrb_cli.lens import transport
 
 Array = NDArray[np.float64]
 
+#: Upper bound of all lengths in mm.
+_FAR = 1e6
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -61,8 +64,7 @@ class Surface:
         outside of its outline, too.
     - `inside` (ny, nx) marks the cells inside the outline.
     - `floor` is a fraction of the picture's maximum. Darker parts of the picture were raised to this fraction.
-    - `relief` is the height between the lowest and the highest point. `relief_at_twice` is this height for a face at
-        twice the distance.
+    - `relief` is the height between the lowest and the highest point. At twice the distance, it is about half as much.
     """
 
     setting: Setting
@@ -70,13 +72,12 @@ class Surface:
     inside: NDArray[np.bool_]
     floor: float
     relief: float
-    relief_at_twice: float
     transport: transport.Transport
 
     def summary(self) -> str:
         """Return depth, floor and errors in one line."""
         return (
-            f"{self.relief:.3g} mm deep (at {2 * self.setting.distance:g} mm {self.relief_at_twice:.3g} mm); "
+            f"{self.relief:.3g} mm deep; "
             f"nothing darker than {100 * self.floor:g} % of the brightest; "
             f"{50 * self.transport.error:.2g} % of the light misplaced"
         )
@@ -238,30 +239,15 @@ def shape_surface(
         raise ConfigError("", "distance", f"no face was found for this picture at {setting.distance:g} mm; try a "
                                           "larger distance or a higher floor")  # fmt: skip
     inside = within(setting, *transport.grid(shape, setting.size))
-    relief = _depth(made.h, inside)
-    twice = _twice(setting, target, inside.shape)
-    low = float(made.h[inside].min())
+    low, high = float(made.h[inside].min()), float(made.h[inside].max())
+    relief = high - low
     if setting.kind == "lens" and setting.thickness + low <= 0:
         reason = (
             f"the relief is {relief:.3g} mm deep and goes {-low:.3g} mm into the glass; thickness must be above "
-            f"{-low:.3g} mm, or distance larger (at {2 * setting.distance:g} mm the relief is {twice:.3g} mm deep)"
+            f"{-low:.3g} mm, or distance larger (the relief is about half as deep at twice the distance)"
         )
         raise ConfigError("", "thickness", reason)
-    return Surface(setting, made.h, inside, floor, relief, twice, made)
-
-
-def _depth(h: Array, inside: NDArray[np.bool_]) -> float:
-    return float(h[inside].max() - h[inside].min())
-
-
-def _twice(setting: Setting, target: Array, shape: tuple[int, int]) -> float:
-    """Return the relief (mm) for twice the receiver's distance. The grid has at most 64 cells per side."""
-    far = replace(setting, distance=2 * setting.distance)
-    coarse = min(1.0, transport.TRIAL / max(shape))
-    small = (max(8, round(shape[0] * coarse)), max(8, round(shape[1] * coarse)))
-    rays = Rays(far)
-    made = transport.solve(rays, transport.resized(target, small), far.size, far.picture_size, small, _start(rays))
-    return _depth(made.h, within(far, *transport.grid(small, far.size)))
+    return Surface(setting, made.h, inside, floor, relief, made)
 
 
 def _start(rays: Rays) -> Array:
@@ -299,15 +285,16 @@ def _check(picture: Array, setting: Setting) -> None:
         raise ConfigError("", "picture", "has values that are negative or not finite")
     if is_even(picture):
         raise ConfigError("", "picture", "has only one colour; there is no picture to show")
-    for key in ("size", "picture_size"):
-        if min(getattr(s, key)) <= 0:
-            raise ConfigError("", key, "must be above 0 mm")
-    for key in ("distance", "thickness", "light_distance"):
-        if not getattr(s, key) > 0:
-            raise ConfigError("", key, f"is {getattr(s, key):g} mm; it must be above 0")
+    lengths = {"size": min(s.size), "picture_size": min(s.picture_size), "distance": s.distance,
+               "thickness": s.thickness}  # fmt: skip
+    if s.light_distance != np.inf:
+        lengths["light_distance"] = s.light_distance
+    for key, length in lengths.items():
+        if not 0 < length < _FAR:
+            raise ConfigError("", key, f"is {length:g} mm; it must be above 0, and below {_FAR:g}")
     if not -80 <= s.incidence <= 80:
         raise ConfigError("", "incidence", f"is {s.incidence:g} degrees; it must be between -80 and 80")
-    if max(map(abs, s.tilt)) > 80:
+    if not max(map(abs, s.tilt)) <= 80:
         raise ConfigError("", "tilt", f"is {s.tilt[0]:g} and {s.tilt[1]:g} degrees; both must be between -80 and 80")
     if s.kind == "lens" and not 1 < s.ior <= 5:
         raise ConfigError("", "ior", f"is {s.ior:g}; glass and plastics have 1.3 to 2.0, and the limit is 5")

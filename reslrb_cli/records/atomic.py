@@ -7,7 +7,6 @@ A process that exits at once calls `remove_unfinished`. Files of killed processe
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
 import re
 import secrets
@@ -18,7 +17,6 @@ from pathlib import Path
 from typing import IO
 
 from reslrb_cli.errors import ConfigError, is_machine_fault
-from reslrb_cli.records.lock import FolderLock, is_alive
 
 _PART = re.compile(r"\..+\.\d+\.part")
 
@@ -55,18 +53,13 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
 
 
 @contextmanager
-def unfinished_folder(parent: Path, lock: bool = True) -> Iterator[Path]:
-    """Yield a new folder in `parent`. Unless the block renames it, the folder is removed at the end.
-
-    The folder is locked, because other processes remove old unlocked folders. With `lock=False`, the block must lock
-    the folder itself.
-    """
+def unfinished_folder(parent: Path) -> Iterator[Path]:
+    """Yield a new folder in `parent`. Unless the block renames it, the folder is removed at the end."""
     path = parent / f"{FOLDER_PREFIX}{secrets.token_hex(8)}"
     unfinished.add(path)
     try:
         path.mkdir()
-        with FolderLock(path) if lock else contextlib.nullcontext():
-            yield path
+        yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
         unfinished.discard(path)
@@ -89,14 +82,6 @@ def remove_parts(folder: Path) -> None:
             if _PART.fullmatch(name):
                 with contextlib.suppress(OSError):
                     os.unlink(os.path.join(parent, name))
-
-
-def remove_parts_of(path: Path) -> None:
-    """Remove unfinished versions of the file `path` whose processes have ended."""
-    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        if _PART.fullmatch(part.name) and not is_alive(int(part.name.split(".")[-2])):
-            with contextlib.suppress(OSError):
-                part.unlink()
 
 
 def _sync_folder(folder: Path) -> None:

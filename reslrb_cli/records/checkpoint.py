@@ -63,20 +63,17 @@ FORMAT = 3
 def save_checkpoint(
     folder: Path,
     iteration: int,
-    parameters: Mapping[str, Array],
-    others: Mapping[str, Array],
+    arrays: Mapping[str, Array],
     values: Mapping[str, Any] | None = None,
     name: str = STATE_FILE,
 ) -> None:
     """Write the state after `iteration` updates into `folder`, atomically and durably.
 
-    The entries are `iteration`, `parameter/<key>`, the arrays in `others` under their names, and `values` as JSON. The
-    earlier state becomes `previous.npz`, unless `name` is another file name. Raises OSError if writing fails. Both
-    earlier states then still exist.
+    The entries are `iteration`, the `arrays` under their names, and `values` as JSON. The earlier state becomes
+    `previous.npz`, unless `name` is another file name. Raises OSError if writing fails. Both earlier states then still
+    exist.
     """
-    entries: dict[str, Array] = {"iteration": np.array(iteration)}
-    entries |= {f"parameter/{key}": value for key, value in parameters.items()}
-    entries |= others
+    entries: dict[str, Array] = {"iteration": np.array(iteration), **arrays}
     if values is not None:
         text = json.dumps({"format": FORMAT, "iteration": iteration, **values}, allow_nan=False)
         entries["state"] = np.frombuffer(text.encode(), np.uint8)

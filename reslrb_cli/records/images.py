@@ -172,19 +172,6 @@ def _place(letter: str) -> tuple[int, int, str]:
     return 1, int(letter) if letter.isdecimal() else 0, letter
 
 
-def read_layer_names(path: Path) -> set[str]:
-    """Return the layer names of an EXR, reading only its header. The result is empty if the file is missing or not an
-    EXR.
-    """
-    import OpenEXR
-
-    try:
-        head = OpenEXR.File(str(path), header_only=True).header()
-        return {channel.name.rpartition(".")[0] for channel in head["channels"]}
-    except Exception:  # damaged files raise many types
-        return set()
-
-
 #: File with the unchanged values of all parameters.
 PARAMETERS_FILE = "parameters.npz"
 

@@ -134,13 +134,13 @@ class Holder:
                 return False
             except OSError:
                 pass  # the folder cannot be opened, so there is no lock to test
-        return self.host == here.host and (self.boot != here.boot or not is_alive(self.pid))
+        return self.host == here.host and (self.boot != here.boot or not _is_alive(self.pid))
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
 
 
-def is_alive(process: int) -> bool:
+def _is_alive(process: int) -> bool:
     """True if a process with the number `process` exists."""
     try:
         os.kill(process, 0)

@@ -19,11 +19,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
 from reslrb_cli.backend.variant import package_version
 from reslrb_cli.config.files import read_file
-from reslrb_cli.config.yaml_text import format_location
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records import metrics
 from reslrb_cli.records.atomic import remove_parts, write_atomically
@@ -123,30 +120,14 @@ class Manifest:
 MANIFEST_FILE = "manifest.json"
 PROGRAM = "reslrb"
 
-#: Checks the types that `Manifest` declares.
-_CHECK = TypeAdapter(Manifest)
-
 
 def read_content(folder: Path) -> dict[str, Any] | None:
-    """Return the content of the manifest in `folder`, or None if there is none written by `reslrb`.
-
-    Manifests of earlier versions may lack fields. Raises a ConfigError that names the first field of a wrong type.
-    """
+    """Return the content of the manifest in `folder`, or None if there is none written by `reslrb`."""
     try:
-        text = read_file(folder / MANIFEST_FILE)
-        content = json.loads(text)
+        content = json.loads(read_file(folder / MANIFEST_FILE))
     except (ConfigError, ValueError, RecursionError):
         return None
-    if not isinstance(content, dict) or content.get("program") != PROGRAM:
-        return None
-    try:
-        _CHECK.validate_json(text, strict=True)
-    except ValidationError as error:
-        for wrong in error.errors(include_url=False):
-            if wrong["type"] != "missing" or len(wrong["loc"]) > 1:
-                reason = f"is damaged: {wrong['msg'].lower()}; restore the file, or begin a new run"
-                raise ConfigError(folder / MANIFEST_FILE, format_location(wrong["loc"]), reason) from None
-    return content
+    return content if isinstance(content, dict) and content.get("program") == PROGRAM else None
 
 
 def _write(folder: Path, content: Mapping[str, Any]) -> None:
@@ -162,7 +143,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     """Return the manifest in `folder`, or None if there is none written by `reslrb`.
 
     If the status is `running` but the process has certainly ended, the status becomes `interrupted`. If the folder is
-    writable, the correction is saved and unfinished files are removed. Raises ConfigError as `read_content`.
+    writable, the correction is saved and unfinished files are removed.
     """
     content = read_content(folder)
     if content is None or content.get("status") != Status.RUNNING:

@@ -1,13 +1,12 @@
 """Files of measurements, JSON with one object per line.
 
-`LineFile` writes a file that is current and complete at every moment, no matter how the process ends. The first line is
-an `Origin`, which says where the file comes from. `read_lines` reads such files. The file `NAME.samples.npz` holds the
+`write_lines` writes a file that is complete at every moment, no matter how the process ends. The first line is an
+`Origin`, which says where the file comes from. `read_lines` reads such files. The file `NAME.samples.npz` holds the
 samples behind the figures, so that a measurement can be continued.
 """
 
 from __future__ import annotations
 
-import gc
 import json
 import logging
 import math
@@ -15,15 +14,14 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from reslrb_cli.config.files import open_file
+from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError, printable
-from reslrb_cli.records.atomic import remove_parts_of, write_atomically
+from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.manifest import now, versions
 from reslrb_cli.records.metrics import Line
 
@@ -32,52 +30,25 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Lines between two reports of reading progress.
-_LINES = 4096
 
-#: Called with the progress of reading: the file, the bytes read, and the size in bytes.
-Tell = Callable[[Path, int, int], None]
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the objects in a file of JSON lines, oldest first. Numbers that are not finite become None.
 
-
-@dataclass(frozen=True)
-class Lines:
-    """Objects in a file, oldest first, and the numbers (from 1) of the damaged lines.
-
-    Non-finite numbers, which Python writes but JSON does not have, become None.
+    A last line without a line end is left out, because it is still being written or was interrupted. Raises a
+    ConfigError that names the file, and the line if it is damaged.
     """
-
-    objects: list[dict[str, Any]] = field(default_factory=list)
-    damaged: list[int] = field(default_factory=list)
-
-
-def read_lines(path: Path, tell: Tell | None = None) -> Lines:
-    """Read a file of JSON lines. Raises a ConfigError that names the file if the file cannot be read.
-
-    A last line without a line end is still being written or was interrupted. An incomplete last line is left out and
-    does not count as damaged.
-    """
-    found, done = Lines(), 0
     # Numbers that are not finite are replaced during parsing, because a second pass takes twice as long.
-    decoder = json.JSONDecoder(parse_float=_finite, parse_constant=lambda name: None)
-    with open_file(path) as file, _without_collecting():
-        size = os.fstat(file.fileno()).st_size
+    decoder, found = json.JSONDecoder(parse_float=_finite, parse_constant=lambda name: None), []
+    for number, line in enumerate(read_file(path).splitlines(keepends=True), 1):
+        if not line.strip() or not line.endswith(b"\n"):
+            continue
         try:
-            for number, line in enumerate(file, 1):
-                done += len(line)
-                if tell is not None and number % _LINES == 0:
-                    tell(path, done, max(done, size))
-                if not line.strip():
-                    continue
-                try:
-                    value = decoder.decode(line.decode("utf-8-sig" if number == 1 else "utf-8", "surrogatepass"))
-                except (ValueError, RecursionError):
-                    value = None
-                if isinstance(value, dict):
-                    found.objects.append(value)
-                elif line.endswith(b"\n"):
-                    found.damaged.append(number)
-        except OSError as error:
-            raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
+            value = decoder.decode(line.decode())
+        except (ValueError, RecursionError):
+            value = None
+        if not isinstance(value, dict):
+            raise ConfigError(path, f"line {number}", "is damaged, or no line that reslrb wrote")
+        found.append(value)
     return found
 
 
@@ -86,57 +57,18 @@ def _finite(text: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-@contextmanager
-def _without_collecting() -> Iterator[None]:
-    """Disable garbage collection in the block, because the collector would repeatedly scan millions of objects without
-    cycles.
-    """
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
+def is_stream(path: Path) -> bool:
+    """Whether `path` is a pipe or another file that is not regular."""
+    return os.path.lexists(path) and not path.is_file()
 
 
-class LineFile:
-    """JSON file with one object per line. Each write replaces the whole file. An existing file stays until the first
-    write.
-
-    A pipe, or another file that is not regular, receives each final line once, as soon as the line is known.
-    """
-
-    def __init__(self, path: Path) -> None:
-        # Replaces the target of a link, not the link.
-        self._path = Path(os.path.realpath(path))
-        self.is_stream = os.path.lexists(path) and not self._path.is_file()
-        self._stream: IO[str] | None = None
-        self._sent: set[str] = set()
-        if not self.is_stream:
-            remove_parts_of(self._path)
-
-    def write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> None:
-        """Write all lines so far, final and provisional. Later calls must repeat the final lines.
-
-        Raises OSError if writing fails. The file is then unchanged.
-        """
-        if not self.is_stream:
-            text = "".join(line.to_json() + "\n" for line in [*final, *provisional])
-            write_atomically(self._path, lambda file: file.write(text.encode()))
-            return
-        if self._stream is None:
-            self._stream = self._path.open("w", encoding="utf-8")
-        for text in [line.to_json() for line in final]:
-            if text not in self._sent:
-                self._sent.add(text)
-                self._stream.write(text + "\n")
-        self._stream.flush()
-
-    def close(self) -> None:
-        """Close the stream, if there is one."""
-        if self._stream is not None:
-            self._stream.close()
+def write_lines(path: Path, lines: Sequence[Line]) -> None:
+    """Write a file with one object per line, atomically. A stream is written in place. Raises OSError."""
+    text = "".join(line.to_json() + "\n" for line in lines).encode()
+    if is_stream(path):
+        path.write_bytes(text)
+    else:  # the target of a link is replaced, not the link
+        write_atomically(Path(os.path.realpath(path)), lambda file: file.write(text))
 
 
 def _command() -> list[str]:
@@ -160,19 +92,6 @@ class Origin(Line):
     versions: Mapping[str, str] = field(default_factory=versions)
     platform: str = field(default_factory=platform.platform)
     written: str = field(default_factory=now)
-
-
-def read_origin(entry: Mapping[str, Any]) -> Origin | None:
-    """Return the origin in a line, or None if the line holds another record. Values of a wrong type become empty."""
-    if entry.get("kind") != Origin.KIND:
-        return None
-    words, named = entry.get("command"), entry.get("versions")
-    texts = {name: entry.get(name) for name in ("device", "variant", "platform", "written")}
-    return Origin(
-        command=[str(word) for word in words] if isinstance(words, list) else [],
-        versions={str(name): str(value) for name, value in named.items()} if isinstance(named, dict) else {},
-        **{name: value if isinstance(value, str) else "" for name, value in texts.items()},
-    )
 
 
 #: Maximum size of saved samples in bytes; larger ones are not saved.

@@ -184,37 +184,29 @@ def mend(folder: Path) -> None:
         pass
 
 
-def read_records(folder: Path, count: int, last: Record | None) -> tuple[list[Record], int]:
+def read_records(folder: Path, count: int) -> tuple[list[Record], int]:
     """Return the first `count` records in `folder`, and their size in bytes. A checkpoint contains the iterations of
     the returned records.
 
-    `last` is the last record as stored in the checkpoint. It replaces a line lost to a full disk. Raises a ConfigError
-    that names the file if other records are missing, or file and line if a complete line is damaged.
+    Raises a ConfigError that names the file if records are missing, or file and line if a complete line is damaged.
     """
     path = folder / METRICS_FILE
     content = read_file(path) if count and os.path.lexists(path) else b""
     whole = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
     records = [_record(line, number, path) for number, line in enumerate(whole)]
-    if len(records) == count - 1 and last is not None and last.iteration == count - 1:
-        records.append(last)
     if len(records) < count:
         held = f"holds {len(records)} of the {count} iterations of the checkpoint"
         raise ConfigError(path, "", f"{held}; put it back, or begin anew from `initial: {{run: ...}}`")
     return records, sum(map(len, whole))
 
 
-def cut_back(folder: Path, records: list[Record], size: int) -> None:
-    """Cut the metrics file in `folder` back to `records`. The file's first `size` bytes hold all records, or all except
-    the last.
-    """
+def cut_back(folder: Path, size: int) -> None:
+    """Cut the metrics file in `folder` back to its first `size` bytes."""
     path = folder / METRICS_FILE
-    if not records:
+    if size:
+        os.truncate(path, size)
+    else:
         path.unlink(missing_ok=True)
-        return
-    content = read_file(path)[:size] if size else b""
-    if content.count(b"\n") < len(records):
-        content += records[-1].to_json().encode() + b"\n"
-    write_atomically(path, lambda file: file.write(content), durable=True)
 
 
 _RECORD: TypeAdapter[Record] = TypeAdapter(Record)

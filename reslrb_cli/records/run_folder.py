@@ -3,7 +3,7 @@
 - `read_value`: read a recovered parameter value of a run that is finished, interrupted or in progress.
 - `recovered`: make the experiment that starts from the recovered values.
 - `RunFolder`: create and replace folders.
-- `opened`, `copy_into`: lock the folder of a run to resume it, or copy its content into a new folder.
+- `opened`: lock the folder of a run to resume it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import os
 import re
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,7 +29,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records import metrics
-from reslrb_cli.records.atomic import FOLDER_PREFIX, remove_parts, unfinished_folder, write_atomically
+from reslrb_cli.records.atomic import remove_parts, unfinished_folder, write_atomically
 from reslrb_cli.records.checkpoint import STATE_FILE, newest_checkpoint, open_archive
 from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
 from reslrb_cli.records.manifest import Manifest, Status, read_manifest
@@ -116,9 +115,6 @@ OWN_ENTRIES = (
     "config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", FABRICATION_FILE, *SUBFOLDERS
 )  # fmt: skip
 
-#: Minimum age in seconds of an unlocked unfinished folder to be removed; a newer one may be about to be locked.
-LEFT_SECONDS = 60.0
-
 
 def check_output(source: object, output: Path, name: str, force: bool) -> None:
     """Raise a ConfigError (key `run.output` or `run.name`) if a run folder cannot be made in `output`.
@@ -132,7 +128,6 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
     try:
         with unfinished_folder(ancestor) as folder:
             (folder / "file").write_text("is there room?")
-            _try_name(source, folder, name)
     except OSError as error:
         raise _output_error(source, ancestor, error) from None
     if force:
@@ -165,8 +160,7 @@ class RunFolder:
         """
         try:
             output.mkdir(parents=True, exist_ok=True)
-            _remove_left(output)
-            with unfinished_folder(output, lock=False) as part, contextlib.ExitStack() as stack:
+            with unfinished_folder(output) as part, contextlib.ExitStack() as stack:
                 lock = stack.enter_context(FolderLock(part))
                 for entry in SUBFOLDERS:
                     (part / entry).mkdir()
@@ -174,7 +168,7 @@ class RunFolder:
                 manifest.process = Holder.here(locked=lock.real)
                 manifest.write(part)
                 own = cls(part, lock)
-                folder = own._replace(source, output / name, manifest) if force else own._place(output / name)
+                folder = own._replace(source, output / name) if force else own._place(output / name)
                 if folder.lock is lock:
                     stack.pop_all()
                 return folder
@@ -198,7 +192,7 @@ class RunFolder:
             return False
         return True
 
-    def _replace(self, source: object, path: Path, manifest: Manifest) -> RunFolder:
+    def _replace(self, source: object, path: Path) -> RunFolder:
         """Move the folder's content over the run folder at `path`, which is locked meanwhile."""
         while not self._take_name(path):
             _check_replaceable(source, path)
@@ -214,28 +208,20 @@ class RunFolder:
             try:
                 # The manifest comes first, so that it names the right run even if the process ends here.
                 os.replace(self.path / manifests.MANIFEST_FILE, path / manifests.MANIFEST_FILE)
-                self._replace_others(path, manifest)
+                remove_parts(path)
+                for name in OWN_ENTRIES:
+                    entry = path / name
+                    if entry.is_dir() and not entry.is_symlink():
+                        shutil.rmtree(entry)
+                    elif name != manifests.MANIFEST_FILE:
+                        entry.unlink(missing_ok=True)
+                for name in ("config.yaml", *SUBFOLDERS):
+                    os.replace(self.path / name, path / name)
             except BaseException:
                 lock.release()
                 raise
             return RunFolder(path, lock)
         return replace(self, path=path)
-
-    def _replace_others(self, path: Path, manifest: Manifest) -> None:
-        try:
-            remove_parts(path)
-            for name in OWN_ENTRIES:
-                entry = path / name
-                if entry.is_dir() and not entry.is_symlink():
-                    shutil.rmtree(entry)
-                elif name != manifests.MANIFEST_FILE:
-                    entry.unlink(missing_ok=True)
-            for name in ("config.yaml", *SUBFOLDERS):
-                os.replace(self.path / name, path / name)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                manifest.end(path, Status.FAILED, str(error))
-            raise
 
     @property
     def is_there(self) -> bool:
@@ -252,11 +238,6 @@ class RunFolder:
         if self.is_there:
             return None
         return FileNotFoundError(errno.ENOENT, "has gone while the run went on", str(self.path))
-
-    def make_whole(self) -> None:
-        """Recreate removed subfolders. Raises OSError."""
-        for name in SUBFOLDERS:
-            (self.path / name).mkdir(exist_ok=True)
 
     @property
     def images(self) -> Path:
@@ -276,16 +257,6 @@ class RunFolder:
     def __exit__(self, *_: object) -> None:
         if self.lock is not None:
             self.lock.release()
-
-
-def _try_name(source: object, folder: Path, name: str) -> None:
-    try:
-        (folder / f"{name}-2").mkdir()  # the name of a second run
-    except OSError as error:
-        if is_machine_fault(error):
-            raise
-        reason = f"{name[:40]!r}{'...' * (len(name) > 40)} cannot name a folder ({error.strerror}); give another name"
-        raise ConfigError(source, "run.name", reason) from None
 
 
 def _check_replaceable(source: object, path: Path) -> None:
@@ -313,16 +284,6 @@ def _output_error(source: object, folder: Path, error: OSError) -> ConfigError |
         return MachineError(f"{folder}: {error.strerror}; no run folder was made")
     reason = f"cannot write to {folder} ({error.strerror}); give a folder that can be written to"
     return ConfigError(source, "run.output", reason)
-
-
-def _remove_left(output: Path) -> None:
-    """Remove unfinished folders of killed processes."""
-    for path in output.glob(f"{FOLDER_PREFIX}*"):
-        with contextlib.suppress(OSError, InUse):
-            if time.time() - path.stat().st_mtime > LEFT_SECONDS:
-                with FolderLock(path, wait_s=0) as lock:
-                    if lock.real:
-                        shutil.rmtree(path, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -360,29 +321,8 @@ def check_writable(folder: RunFolder) -> None:
     except OSError as error:
         if is_machine_fault(error):
             raise MachineError(f"{folder.path}: {error.strerror}; nothing of the run was changed") from None
-        reason = f"cannot be written to ({error.strerror}); to go on in another folder, add --set run.output=FOLDER"
+        reason = f"cannot be written to ({error.strerror}); copy it to another place, and resume the copy"
         raise ConfigError(folder.path, "", reason) from None
-
-
-def copy_into(folder: RunFolder, earlier: Path) -> None:
-    """Copy the files of a run from `earlier` into a new folder, except its report and its configuration.
-
-    Raises OSError.
-    """
-    for name in SUBFOLDERS:
-        for path in sorted((earlier / name).rglob("*")):
-            target = folder.path / name / path.relative_to(earlier / name)
-            if path.is_dir():
-                target.mkdir(exist_ok=True)
-            else:
-                _copy(path, target)
-    if (earlier / metrics.METRICS_FILE).is_file():
-        _copy(earlier / metrics.METRICS_FILE, folder.path / metrics.METRICS_FILE)
-
-
-def _copy(path: Path, target: Path) -> None:
-    with path.open("rb") as file:
-        write_atomically(target, lambda copy: shutil.copyfileobj(file, copy))
 
 
 def write_beginning(folder: RunFolder, config: str, manifest: Manifest) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -78,11 +78,6 @@ class SweepPlan:
     def runs(self) -> Iterator[tuple[Combination, int]]:
         """Combination and seed of each run, in order: all combinations with the first seed, then with the next."""
         return ((combination, seed) for seed in self.seeds for combination in self.combinations)
-
-    def with_failure(self, name: str, failure: Failure | None) -> SweepPlan:
-        """Return the sweep with `failure` for the run `name`. If `failure` is None, remove the run's failure."""
-        others = {other: each for other, each in self.failures.items() if other != name}
-        return replace(self, failures=others if failure is None else {**others, name: failure})
 
     def write(self, folder: Path) -> None:
         """Write `sweep.json` into `folder`, atomically. Raises OSError."""
@@ -230,11 +225,9 @@ class SweepBestRecord(Line):
     """Combination with the lowest median of the quantity `of`, which is `loss` or `error`. The median is over the
     `seeds` seeds that all combinations have.
 
-    Combinations that differ only in learning rates are compared at their best rate. Wilcoxon's signed-rank test
-    compares pairs of runs with equal seeds. The best combination differs significantly from the combinations in
-    `beats`, but not from the combinations in `tied`. `second` has the next median. `ratio` is the best median divided
-    by the median of `second`. The 95 % interval of `ratio` comes from a bootstrap over the seeds. It is None for fewer
-    than 5 seeds. `line` is the record in words.
+    Combinations that differ only in learning rates are compared at their best rate. `second` has the next median.
+    `ratio` is the best median divided by the median of `second`. The 95 % interval of `ratio` comes from a bootstrap
+    over the seeds. It is None for fewer than 5 seeds. `line` is the record in words.
     """
 
     KIND: ClassVar[str] = "sweep_best"
@@ -242,8 +235,6 @@ class SweepBestRecord(Line):
     of: str
     best: str
     second: str
-    tied: Sequence[str]
-    beats: Sequence[str]
     seeds: int
     ratio: Range | None
     line: str

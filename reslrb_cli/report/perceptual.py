@@ -1,4 +1,4 @@
-"""Perceptual errors: PSNR, SSIM and CIEDE2000 between images and targets, and CIEDE2000 of recovered colours.
+"""Perceptual errors: PSNR, SSIM and CIEDE2000 between images and targets.
 
 Colours are linear sRGB (BT.709 primaries, D65), as in Mitsuba's RGB variants. Arrays are (..., 3).
 """
@@ -8,15 +8,12 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reslrb_cli.optimization.errors import comparison_grid, nearest, on_grid
-from reslrb_cli.records.images import load_image, read_mask, read_parameters
-from reslrb_cli.report.sources import ShownRun, Source
+from reslrb_cli.records.images import load_image
 from reslrb_cli.report.tonemap import encode, exposure_for, shown_exposures
 
 Array = np.ndarray[Any, Any]
@@ -52,54 +49,6 @@ def _colour() -> Any:
         warnings.simplefilter("ignore")
         import colour
     return colour
-
-
-#: Parameters of three numbers that are not visible colours.
-NO_COLORS = ("eta", "k")
-
-#: Quantities of geometry, which are neither light nor colour.
-PLACES = ("length", "degrees", "scale")
-
-
-def is_color(key: str, quantity: str) -> bool:
-    """Whether the three channels of a parameter are a colour."""
-    return quantity not in PLACES and not any(part in NO_COLORS for part in key.split(".")[-2:])
-
-
-def color_errors(moments: Mapping[str, Array], true: Array, mask: Array | None) -> dict[str, Any]:
-    """Return the CIEDE2000 differences between a surface's colours and the true colours, for each of `moments`. Only
-    entries in `mask` count.
-
-    Arrays are colours (3,) or textures (H, W, 3). If the resolutions differ, the finer grid is used. The result is
-    empty if the arrays hold no colours or the mask is empty.
-    """
-    found: dict[str, Any] = {}
-    target = _texture(true)
-    if target is None:
-        return {}
-    for moment, value in moments.items():
-        texture = _texture(value)
-        if texture is not None and value.ndim == true.ndim:
-            pair = _entries(texture, target, mask)
-            if pair[0].size:
-                found[moment] = _mean_and_max(ciede2000(*pair))
-    return found
-
-
-def _texture(array: Array) -> Array | None:
-    """Return colours (3,) or (H, W, 3) as (H, W, 3), or None for other shapes."""
-    array = array.reshape(1, 1, 3) if array.shape == (3,) else array
-    return array if array.ndim == 3 and array.shape[2] == 3 else None
-
-
-def _entries(value: Array, true: Array, mask: Array | None) -> tuple[Array, Array]:
-    """Return the compared colours (N, 3) of both arrays."""
-    grid = comparison_grid(value.shape, true.shape)
-    if mask is None or mask.shape != value.shape[:2]:
-        mask = np.ones(value.shape[:2], dtype=bool)
-    if grid is not None:
-        value, true, mask = on_grid(value, grid), on_grid(true, grid), nearest(mask, grid)
-    return np.nan_to_num(value[mask]), np.nan_to_num(true[mask])
 
 
 #: Standard deviation and side length of the SSIM window in pixels, as in Wang et al. 2004.
@@ -146,18 +95,13 @@ def ssim(first: Array, second: Array) -> float | None:
 
 
 _TARGET = re.compile(r"target(-\d+)?\.exr")
-MOMENTS = ("initial", "final")
 
 
-def seen_errors(
-    folder: Path, results: Mapping[str, Any], views: Sequence[Mapping[str, Any]] | None = None
-) -> dict[str, Any]:
-    """Return the perceptual errors of the run in `folder`, for `results.seen` in its manifest. The result is empty if
-    nothing can be compared.
+def seen_errors(folder: Path, views: Sequence[Mapping[str, Any]] | None = None) -> dict[str, Any]:
+    """Return the perceptual errors of the images of the run in `folder`, for `results.seen` in its manifest.
 
-    For each sensor (`""`, `"-0"`, ...), `images` holds the `exposure` for viewing the target. `images` also holds the
-    `image_errors` of the `initial` and the `final` image. `colors` holds, by key, the `color_errors` of surface colours
-    with known true values. `results` and `views` come from the run's manifest. Missing and damaged files are left out.
+    Each sensor (`""`, `"-0"`, ...) has the `exposure` for viewing the target, and the `image_errors` of the `initial`
+    and the `final` image. `views` comes from the run's manifest. Missing and damaged files are left out.
     """
     images, exposures = {}, shown_exposures(views)
     for path in sorted((folder / "images").glob("target*.exr")):
@@ -167,35 +111,10 @@ def seen_errors(
         suffix = match[1] or ""
         exposure = exposures.get(suffix) or exposure_for(target)
         found: dict[str, Any] = {}
-        for moment in MOMENTS:
+        for moment in ("initial", "final"):
             image = load_image(folder / "images" / f"{moment}{suffix}.exr")
             if image is not None and image.shape[:2] == target.shape[:2]:
                 found[moment] = image_errors(image, target, exposure)
         if found:
             images[suffix] = {"exposure": exposure} | found
-    colors = _colors(folder / "parameters", results)
-    return {"images": images, "colors": colors} if images or colors else {}
-
-
-def _colors(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
-    true = read_parameters(folder / "true")
-    found: dict[str, Any] = {}
-    moments = {"initial": read_parameters(folder / "initial"), "final": read_parameters(folder)}
-    for key, about in (results.get("parameters") or {}).items():
-        if key in true and not about.get("quantity") and is_color(key, ""):
-            values = {moment: arrays[key] for moment, arrays in moments.items() if key in arrays}
-            errors = color_errors(values, true[key], read_mask(folder, key))
-            found |= {key: errors} if errors else {}
-    return found
-
-
-def with_seen_errors(source: Source) -> Source:
-    """Return `source`, with perceptual errors added to the results of a run that lacks them."""
-    if not isinstance(source, ShownRun) or "seen" in source.results:
-        return source
-    try:
-        found = seen_errors(source.path, source.results, source.manifest.get("views"))
-    except Exception:  # damaged files must not prevent the page
-        return source
-    results = {**source.results, "seen": found}
-    return replace(source, manifest={**source.manifest, "results": results}) if found else source
+    return images

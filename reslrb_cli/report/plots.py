@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from reslrb_cli.records.images import bounded, file_stem, write_layers
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.report.tables import integrator_name, reference_name
 from reslrb_cli.report.tonemap import color_map
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Array = np.ndarray[Any, Any]
 
@@ -111,16 +108,6 @@ def _thinned(points: Array, together: int) -> tuple[Any, Any]:
     return xs, ys
 
 
-def _figure(inches: tuple[float, float]) -> Figure:
-    """Return a figure with its own canvas, because pyplot would choose a backend for the whole process."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=inches, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 #: z at the ends of the scale.
 _MOST_Z = 5.0
 
@@ -132,10 +119,14 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
     Both gradients share one scale, which 1 % of the texels exceed. An EXR of the same name holds the unchanged values
     as the layers `gradient`, `reference`, `difference` and `z`.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     colors = color_map(signed=True)
     sums = gradient.sum(-1), reference.sum(-1)
     end = float(np.quantile(np.abs(np.stack(sums)), 0.99)) or 1.0
-    figure = _figure((13, 4.2))
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)  # without pyplot, which would choose a backend for the whole process
     axes = figure.subplots(1, 3)
     titles = (integrator_name(record), reference_name(record), "difference in standard errors, z")
     for axis, image, limit, title in zip(axes, (*sums, z), (end, end, _MOST_Z), titles, strict=True):

@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from reslrb_cli.config.files import duration
 from reslrb_cli.records.measurements import Band, Range
@@ -28,7 +25,7 @@ from reslrb_cli.records.sweeps import (
 )
 from reslrb_cli.report.format import count, interval, number, shorten, table
 from reslrb_cli.report.run_summary import units_differ
-from reslrb_cli.report.sources import ShownRun, SweepRuns, is_number
+from reslrb_cli.report.sources import ShownRun, SweepRuns
 
 #: Settings that make losses, or errors, incomparable if they vary.
 OTHER_LOSS = ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out")
@@ -63,22 +60,18 @@ def _run_record(source: SweepRuns, combination: Combination, seed: int) -> Sweep
     status = str(run.manifest.get("status", ""))
     return SweepRunRecord(
         name, combination.settings, seed, status, len(run.records),
-        _number((results.get("image_loss") or {}).get("final")), _error(run, relative), relative,
-        _number(results.get("elapsed_s")), max((record["peak_mib"] for record in run.records), default=None),
+        (results.get("image_loss") or {}).get("final"), _error(run, relative), relative, results.get("elapsed_s"),
+        max((record["peak_mib"] for record in run.records), default=None),
         str(run.manifest.get("error") or ""),
     )  # fmt: skip
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if is_number(value) else None
 
 
 def _error(run: ShownRun, relative: bool) -> float | None:
     """Return the final error of all parameters. If `relative`, return the root mean square of their relative errors."""
     if not relative:
-        return _number((run.results.get("rmse") or {}).get("final"))
+        return (run.results.get("rmse") or {}).get("final")
     pairs = (run.results.get("relative_error") or {}).values()
-    known = [pair["final"] for pair in pairs if is_number(pair.get("final"))]
+    known = [pair["final"] for pair in pairs if pair.get("final") is not None]
     return math.sqrt(sum(error**2 for error in known) / len(known)) if known else None
 
 
@@ -119,9 +112,8 @@ def best_records(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[Sweep
     found = []
     for of in OTHERS:
         groups = _groups(sweep, _paired(sweep, runs, of))
-        verdict = find_best({name: rows[0] for name, rows in groups.items()}) if len(groups) > 1 else None
-        if verdict is not None:
-            found.append(_best(of, verdict, groups, {each.name: label(each.settings) for each in sweep.combinations}))
+        if len(groups) > 1:
+            found.append(_best(of, groups, {each.name: label(each.settings) for each in sweep.combinations}))
     return found
 
 
@@ -180,29 +172,18 @@ def _ratios(sweep: SweepPlan, runs: Sequence[SweepRunRecord], of: str) -> dict[s
     return {name: each for name, each in found.items() if each is not None}
 
 
-def _best(
-    of: str, verdict: Ranking, groups: Mapping[str, list[list[float]]], labels: dict[str, str]
-) -> SweepBestRecord:
-    values = {name: rows[0] for name, rows in groups.items()}
-    second = min((name for name in values if name != verdict.best), key=lambda name: float(np.median(values[name])))
-    seeds = len(values[verdict.best])
-    apart = ratio(groups[verdict.best], groups[second])
-    what = f"lowest median {FIGURES[of]}: {shorten(labels[verdict.best], LABEL_WIDTH)}"
-    pairs = f"in pairs of {count(seeds, 'seed')}"
-    tied = ", ".join(shorten(labels[name], LABEL_WIDTH) for name in verdict.tied[:MOST_NAMED])
-    more = len(verdict.tied) - MOST_NAMED
-    tied += f" and {more} more" if more > 0 else ""
-    if verdict.too_few:
-        says = f"not told from the others: {pairs} no test could do that, with --seeds {verdict.enough} it could"
-    elif verdict.tied:
-        says = f"not told from {tied} ({pairs}, by Wilcoxon's signed ranks, 5 % over all)"
-    else:
-        says = f"surely lower than all others ({pairs}, by Wilcoxon's signed ranks, 5 % over all)"
-    lower = sum(one < other for one, other in zip(values[verdict.best], values[second], strict=True))
-    says += f"; lower than the next, {shorten(labels[second], LABEL_WIDTH)}, with {lower} of {count(seeds, 'seed')}"
+def _best(of: str, groups: Mapping[str, list[list[float]]], labels: dict[str, str]) -> SweepBestRecord:
+    best, second = sorted(groups, key=lambda name: float(np.median(groups[name][0])))[:2]
+    one, other = groups[best][0], groups[second][0]
+    apart, seeds = ratio(groups[best], groups[second]), count(len(one), "seed")
+    lower = sum(a < b for a, b in zip(one, other, strict=True))
+    line = f"lowest median {FIGURES[of]}: {shorten(labels[best], LABEL_WIDTH)}; lower than the next, "
+    line += f"{shorten(labels[second], LABEL_WIDTH)}, with {lower} of {seeds}"
     if apart is not None:
-        says += f", {interval(apart.value, apart.low, apart.high, 3)} times that (95 %, bootstrap over the seeds)"
-    return SweepBestRecord(of, verdict.best, second, verdict.tied, verdict.beats, seeds, apart, f"{what}; {says}")
+        line += f", {interval(apart.value, apart.low, apart.high, 3)} times that (95 %, bootstrap over the seeds)"
+    elif len(one) < LEAST_SEEDS:
+        line += f" (--seeds {LEAST_SEEDS} or more give an interval of the ratio)"
+    return SweepBestRecord(of, best, second, len(one), apart, line)
 
 
 #: Minimum number of seeds for an interval of a median.
@@ -241,59 +222,6 @@ def ratio(own: Sequence[Sequence[float]], base: Sequence[Sequence[float]]) -> Ra
     return Range(found[0] / found[1], float(low), float(high))
 
 
-#: Probability that, among equal combinations, the test finds any difference from the best.
-ALPHA = 0.05
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """Best combination (lowest median), the combinations `tied` with the best, and the combinations that the best
-    `beats`. `tied` and `beats` are in order of medians.
-
-    `too_few` is true if the number of seeds is too small for the test to find any difference. `enough` is a sufficient
-    number.
-    """
-
-    best: str
-    tied: list[str]
-    beats: list[str]
-    too_few: bool
-    enough: int
-
-
-def find_best(values: Mapping[str, Sequence[float]]) -> Ranking | None:
-    """Find the combination with the lowest median, and the combinations tied with the best. Return None if there are no
-    values.
-
-    Values at the same index have the same seed. Wilcoxon's signed-rank test uses the differences from the best
-    combination. A combination is tied if the test finds no difference. The test is two-sided, at level `ALPHA` divided
-    by the number of other combinations.
-    """
-    if not values:
-        return None
-    order = sorted(values, key=lambda name: float(np.median(values[name])))
-    best, others = order[0], order[1:]
-    level = ALPHA / max(len(others), 1)
-    apart = [name for name in others if _signed_ranks(values[best], values[name]) < level]
-    enough = next(count for count in range(2, 1000) if _least_p(count) < level)
-    can_tell = _least_p(len(values[best])) < level
-    tied = [name for name in others if name not in apart]
-    return Ranking(best, tied, apart, bool(others) and not can_tell, enough)
-
-
-def _signed_ranks(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return the two-sided p-value of Wilcoxon's signed-rank test, or 1 if the pairs favour `other`."""
-    differences = np.subtract(one, other, dtype=np.float64)
-    if not differences.any():
-        return 1.0
-    return min(2.0 * float(stats.wilcoxon(differences, alternative="less").pvalue), 1.0)
-
-
-def _least_p(pairs: int) -> float:
-    """Return the smallest p-value that the test can reach with `pairs` pairs."""
-    return 2.0 ** (1 - pairs)
-
-
 def notes(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
     """Return remarks on the table: what is not compared, and what failed."""
     lines = []
@@ -323,7 +251,10 @@ def _outermost(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
             bests = [record.best for record in best_records(sweep, runs) if record.of == of]
         for key, each in ((key, each) for key in rates for each in sweep.combinations if each.name in bests):
             tried = [other.settings[key] for other in sweep.combinations]
-            if all(is_number(value) for value in tried) and each.settings[key] in (min(tried), max(tried)):
+            if all(isinstance(value, int | float) for value in tried) and each.settings[key] in (
+                min(tried),
+                max(tried),
+            ):
                 best = shorten(label(each.settings), LABEL_WIDTH)
                 found[f"{best}: this {key} is the best by {of}, and the outermost that was tried"] = None
     return list(found)

@@ -13,7 +13,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config, Fabrication
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens.solid import (
@@ -35,7 +34,7 @@ from reslrb_cli.optimization.moving import moves_anything
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
-from reslrb_cli.records.run_folder import FABRICATION_FILE, exposures, opened, workshop_file
+from reslrb_cli.records.run_folder import FABRICATION_FILE, exposures, workshop_file
 from reslrb_cli.runs.workshop import add_sheet, add_tolerances
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
@@ -54,7 +53,7 @@ DIRECTIONS = {
 }
 
 #: Unsupported formats of solids, which must not be taken for the name of a folder.
-_OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf")
+_OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf", ".obj")
 
 #: Called with a line about each thing written.
 Say = Callable[[str], None]
@@ -70,8 +69,8 @@ def check_export(config: Config, output: Path, tolerances: bool) -> None:
     elif output.suffix.lower() in _OTHER_SOLIDS:
         raise ConfigError("--output", "", f"{output}: {output.suffix} is not supported; give a folder, or a file that "
                           f"ends in {', '.join(WRITERS)}")  # fmt: skip
-    else:
-        check_folder(output)
+    elif os.path.lexists(output) and not (output.is_dir() and not output.is_symlink() and not any(output.iterdir())):
+        raise ConfigError("--output", "", f"{output} exists; give a new or empty folder")
 
 
 def write_export(config: Config, run: Path, output: Path, tolerances: bool, say: Say) -> None:
@@ -107,7 +106,10 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
             image, numbers["loss"] = measure_loss(config, scene, sensors[0], integrator, target)
             pictures = add_sheet(numbers, plan, scene, sensors[0], sheets, luminance(image), luminance(target))
             if tolerances:
-                bench = bench_of(config, scene, selection.params, integrator, sensors[0])
+                try:
+                    bench = OpticalBench(scene, selection.params, plan, mi.load_dict(dict(integrator)), sensors[0])
+                except ConfigError as error:
+                    raise ConfigError(config.source, error.key, error.message) from None
                 pictures |= add_tolerances(
                     numbers, bench, sheets, luminance(image), luminance(target), config.run.final_spp, say
                 )
@@ -136,8 +138,6 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
             say(f"mean squared difference from the target is {loss['l2']:.4g}, also for the solid, by {how}")
         if f"{plan.kind}.3mf" not in beside:
             say(f"{plan.kind}.3mf is not written: lib3mf is missing; pip install 'reslrb[fabrication]'")
-    if off := numbers.get("tolerances"):
-        keep_tolerances(config, run, {"tolerances": off, "allowed_errors": numbers["allowed_errors"]}, pictures, say)
 
 
 def exposure_line(run: Path) -> str:
@@ -167,40 +167,10 @@ def keep_solid(
     pictures = add_sheet(
         numbers, config.fabrication, scene, sensor, sheets, luminance(image), luminance(target)
     ) | pictures_of(solid)
-    _write_pictures(run, pictures)
-    _write_numbers(run, numbers)
-
-
-def keep_tolerances(config: Config, run: Path, off: dict[str, Any], pictures: dict[str, Array], say: Say) -> None:
-    """Add measured tolerances and their pictures to the run folder and update its report.
-
-    If another process uses the folder, or the run has another solid, the function prints the reason and changes
-    nothing.
-    """
-    from reslrb_cli.report.page import write_report
-
-    try:
-        with opened(run):
-            if load(run / "config.yaml").fabrication != config.fabrication:
-                raise ValueError("`fabrication` differs from that of the run")
-            numbers = json.loads((run / FABRICATION_FILE).read_text())
-            _write_numbers(run, numbers | off)
-            _write_pictures(run, {name: image for name, image in pictures.items() if name in off["tolerances"]})
-            write_report(run)
-    except (ConfigError, OSError, ValueError) as error:
-        say(f"{run}: the page does not show the tolerances: {error}")
-    else:
-        say(f"{run / 'report.html'}: shows the tolerances")
-
-
-def _write_numbers(run: Path, numbers: dict[str, Any]) -> None:
-    content = json.dumps(finite(numbers), indent=2).encode() + b"\n"
-    write_atomically(run / FABRICATION_FILE, lambda file: file.write(content))
-
-
-def _write_pictures(run: Path, pictures: dict[str, Array]) -> None:
     for name, image in pictures.items():
         write_image(run / "images" / workshop_file(name), image)
+    content = json.dumps(finite(numbers), indent=2).encode() + b"\n"
+    write_atomically(run / FABRICATION_FILE, lambda file: file.write(content))
 
 
 def pictures_of(solid: Solid) -> dict[str, Array]:
@@ -232,12 +202,6 @@ def pictures_of(solid: Solid) -> dict[str, Array]:
     return found
 
 
-def check_folder(path: Path) -> None:
-    """Raise ConfigError if `path` exists and is not an empty folder."""
-    if os.path.lexists(path) and not (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
-        raise ConfigError("--output", "", f"{path} exists; give a new or empty folder")
-
-
 def check_file(path: Path, config: Config) -> None:
     """Raise ConfigError if no solid can be written to the file `path`."""
     if config.fabrication is None:
@@ -248,7 +212,7 @@ def check_file(path: Path, config: Config) -> None:
         raise ConfigError("--output", "", f"{path} exists; give a new file")
     if path.suffix.lower() == ".3mf" and not _writes_3mf():
         raise ConfigError("--output", "", f"{path}: 3MF needs lib3mf, which is missing: "
-                          "pip install 'reslrb[fabrication]'; .stl, .obj and .ply work without")  # fmt: skip
+                          "pip install 'reslrb[fabrication]'; .stl and .ply work without")  # fmt: skip
 
 
 def _writes_3mf() -> bool:
@@ -290,20 +254,6 @@ def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None
     if needed:
         raise ConfigError("--tolerances", "", reason)
     return None
-
-
-def bench_of(
-    config: Config, scene: mi.Scene, params: mi.SceneParameters, integrator: dict[str, object], sensor: int
-) -> OpticalBench:
-    """Return the bench that moves the scene's parts to measure tolerances (`measure/tolerance.py`).
-
-    Raises ConfigError.
-    """
-    assert config.fabrication is not None
-    try:
-        return OpticalBench(scene, params, config.fabrication, mi.load_dict(dict(integrator)), sensor)
-    except ConfigError as error:
-        raise ConfigError(config.source, error.key, error.message) from None
 
 
 def measure_loss(

@@ -71,8 +71,8 @@ MAY_CHANGE = re.compile(
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 
-#: Settings for the place of a run, which its folder shows already.
-_PLACE = ("run.name", "run.output")
+#: Settings for the place of a new run.
+PLACE = ("run.name", "run.output")
 
 #: Maximum number of changed settings that an error names.
 _SHOWN = 3
@@ -106,7 +106,7 @@ def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], r
             wrong[0],
             f"is {first}{also}; {run} may change only iterations and learning rates",
         )
-    return {key: change for key, change in found.items() if key not in _PLACE}
+    return {key: change for key, change in found.items() if key not in PLACE}
 
 
 def flat(config: Config) -> dict[str, Any]:
@@ -192,12 +192,11 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class SavedResults:
-    """Results in a checkpoint, in addition to the records of the iterations. `last` is the newest record."""
+    """Results in a checkpoint, in addition to the records of the iterations."""
 
     images: Images
     certainty: Noted
     best: Least | None = None
-    last: Record | None = None
     shared: SharedTime | None = None
     best_values: Arrays = field(default_factory=dict, metadata=entry("best"))
     squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
@@ -320,7 +319,7 @@ class RunProgress:
         """Save the state after the last complete iteration in `folder`, and return the iteration count. Raises
         OSError.
         """
-        save_checkpoint(folder, self.done, {}, *self._entries(self.state.on_file(self.stages.at(self.state.stage))))
+        save_checkpoint(folder, self.done, *self._entries(self.state.on_file(self.stages.at(self.state.stage))))
         return self.done
 
     def save_begun(self, folder: Path) -> None:
@@ -328,14 +327,14 @@ class RunProgress:
         begun = self.stages.begun
         assert begun is not None, "an iteration is at work"
         found = self._entries(begun.on_file(self.stages.now))
-        save_checkpoint(folder, begun.iteration, {}, *found, name=NONFINITE_FILE_NAME)
+        save_checkpoint(folder, begun.iteration, *found, name=NONFINITE_FILE_NAME)
 
     def _entries(self, state: State) -> tuple[Arrays, dict[str, Any]]:
         """Return the arrays and the other values that a checkpoint stores for `state`, in the form of
         `tree.entries`.
         """
         met = SavedResults(
-            self.results.images["initial"], self.certainty.noted, self.best.least, self.last, self.shared,
+            self.results.images["initial"], self.certainty.noted, self.best.least, self.shared,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
         )  # fmt: skip
         return entries(self._settled, state, met)

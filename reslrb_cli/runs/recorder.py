@@ -43,10 +43,6 @@ from reslrb_cli.runs.prepare import RunProgress
 logger = logging.getLogger(__name__)
 
 
-#: Comparing images with more pixels takes some seconds and is announced.
-MANY_PIXELS = 5e5
-
-
 @dataclass
 class Recording:
     """Recording of one run. `course` holds its progress."""
@@ -111,10 +107,8 @@ class Recording:
             else:
                 self._begin()
             (self.folder.path / FABRICATION_FILE).unlink(missing_ok=True)  # outdated once the run goes on
-            yield from self._iterate(stop)
-            left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
-            status = Status.INTERRUPTED if left else Status.FINISHED
-        except GeneratorExit:
+            with contextlib.suppress(GeneratorExit):
+                yield from self._iterate(stop)
             left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
             status = Status.INTERRUPTED if left else Status.FINISHED
         except KeyboardInterrupt:
@@ -158,8 +152,8 @@ class Recording:
                 if state.scaling is not None and state.scaling is not told:
                     self._tell_scaling(state.scaling)
                 told = state.scaling
+                metrics.write(record)  # first, because a checkpoint needs the lines of its iterations
                 self.course.add(state, record)
-                metrics.write(record)
                 yield record
                 self._note_memory(record.peak_mib)
                 if (fault := self.folder.fault) is not None:  # the folder may have been removed or replaced
@@ -169,7 +163,7 @@ class Recording:
                 if every and self.done % every == 0 and self.done < run.iterations:
                     self._write_images(f"iteration-{self.done:06d}")
                 if run.checkpoint_every.is_due(self.done - saved, time.monotonic() - saved_at):
-                    metrics.sync()  # first, because a checkpoint needs the lines of its iterations
+                    metrics.sync()
                     self._save_checkpoint()
                     saved, saved_at = self.done, time.monotonic()
                 self.page.refresh()
@@ -218,7 +212,7 @@ class Recording:
         if (fault := self.folder.fault) is not None:
             failure = failure or fault
             raise MachineError(describe(failure)) if isinstance(failure, OSError) else failure
-        parts = [self.folder.make_whole, self._save_last_checkpoint, self._write_parameters, self._note_results]
+        parts = [self._save_last_checkpoint, self._write_parameters, self._note_results]
         for part in parts if failure is not None else [*parts, self._write_final_images]:
             try:
                 part()
@@ -226,7 +220,7 @@ class Recording:
                 failure = failure or error
         if failure is not None:
             status = Status.FAILED
-        elif status is Status.FINISHED:  # an interrupt must not wait; `reslrb report` finds the image errors, too
+        elif status is Status.FINISHED:  # an interrupt must not wait
             self._add("the certainty of the values was", self._measure_certainty)
             self._add("perceptual errors were", self._measure_seen_errors)
             if self.problem.config.fabrication is not None:
@@ -292,10 +286,7 @@ class Recording:
                 write_mask(self.folder.parameters, key, shown)
 
     def _measure_seen_errors(self) -> None:
-        pixels = sum(view.target.shape[0] * view.target.shape[1] for view in self.problem.views)
-        if pixels > MANY_PIXELS:
-            logger.info(f"measuring perceptual errors of {pixels / 1e6:.2g} million pixels")
-        self.seen = finite(seen_errors(self.folder.path, self.manifest.results, self.manifest.views))
+        self.seen = finite(seen_errors(self.folder.path, self.manifest.views))
 
     def _measure_solid(self) -> None:
         from reslrb_cli.runs.export import keep_solid

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config.loader import OVERRIDDEN, Override, changed, dump, load, loads
+from reslrb_cli.config.loader import OVERRIDDEN, Override, dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
@@ -21,20 +21,13 @@ from reslrb_cli.optimization.stopping import OUT_OF_TIME
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, PREVIOUS_FILE_NAME, STATE_FILE
 from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
-from reslrb_cli.records.run_folder import (
-    RunFolder,
-    check_output,
-    check_writable,
-    copy_into,
-    opened,
-    write_beginning,
-)
+from reslrb_cli.records.run_folder import RunFolder, check_writable, opened, write_beginning
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.runs.prepare import (
+    PLACE,
     Change,
     PreparedRun,
     RunProgress,
-    SavedResults,
     changes,
     check_changes,
     digests,
@@ -48,9 +41,8 @@ Say = Callable[[str], None]
 class OpenedRun:
     """Run to be resumed: its locked folder, its manifest, its stored state and the new configuration.
 
-    `changed` holds the settings that differ from those at the start of the run. If `elsewhere` is true, the run
-    continues in a new folder, and the old folder stays unchanged. `records` are the records of the iterations, which
-    take `size` bytes. `said` collects warnings.
+    `changed` holds the settings that differ from those at the start of the run. `records` are the records of the
+    iterations, which take `size` bytes. `said` collects warnings.
     """
 
     folder: RunFolder
@@ -59,7 +51,6 @@ class OpenedRun:
     settled: Settled
     config: Config
     changed: dict[str, Change]
-    elsewhere: bool
     records: list[Record]
     size: int
     said: list[str] = field(default_factory=list)
@@ -140,60 +131,50 @@ class OpenedRun:
 
         Raises ConfigError and MachineError if the folder cannot be written to.
         """
-        text, run = dump(self.config), self.config.run
-        if self.elsewhere:
-            with RunFolder.create("--set", run.output, run.folder_name, False, text, manifest) as folder:
-                with _written(folder):
-                    copy_into(folder, self.folder.path)
-                    self._put_first(folder)
-                yield folder
-        else:
-            with _written(self.folder):
-                write_beginning(self.folder, text, manifest)
-                self._put_first(self.folder)
-            yield self.folder
-
-    def _put_first(self, folder: RunFolder) -> None:
-        """Cut the metrics back to the stored state. If the newest state is damaged, replace the damaged state by the
-        stored state.
-        """
-        cut_back(folder.path, self.records, self.size)
-        if self.stored.path.name == PREVIOUS_FILE_NAME:
-            (folder.checkpoint / PREVIOUS_FILE_NAME).replace(folder.checkpoint / STATE_FILE)
+        folder = self.folder
+        try:
+            write_beginning(folder, dump(self.config), manifest)
+            cut_back(folder.path, self.size)
+            if self.stored.path.name == PREVIOUS_FILE_NAME:  # the newest state is damaged
+                (folder.checkpoint / PREVIOUS_FILE_NAME).replace(folder.checkpoint / STATE_FILE)
+        except OSError as error:
+            if is_machine_fault(error):
+                raise MachineError(f"{folder.path}: {error.strerror}; the run was not continued") from None
+            raise
+        yield folder
 
 
 @contextlib.contextmanager
-def open_earlier(run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override]) -> Iterator[OpenedRun]:
+def open_earlier(run: Path, overrides: Sequence[str | Override]) -> Iterator[OpenedRun]:
     """Open the run in the folder `run` to resume it, and lock it while the block runs.
 
-    `wanted` is a configuration that must agree with the run. The default for `wanted` is `config.yaml` in the run's
-    folder. Raises ConfigError if the folder holds no run, the run is in use, or the last two states are both damaged.
-    Raises ConfigError also if a setting that must not change differs, or if `run.iterations` is below the number of
-    finished iterations. Raises ConfigError also if an input file has changed, if records are missing or damaged, or if
-    the output folder cannot be used.
+    The configuration is `config.yaml` in the run's folder, with `overrides`. Raises ConfigError if the folder holds no
+    run, the run is in use, or the last two states are both damaged. Raises ConfigError also if a setting that must not
+    change differs, or if `run.iterations` is below the number of finished iterations. Raises ConfigError also if an
+    input file has changed, if records are missing or damaged, or if the folder cannot be written to.
     """
     with opened(run) as (folder, manifest):
         said: list[str] = []
         stored = _read_state(folder, said)
         settled, iteration = stored.read(Settled), stored.read(State).iteration
         began = loads(settled.config, stored.path)
-        config, source = _read_config(run, wanted, overrides, settled.config)
-        elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
+        config, source = load(run / "config.yaml", overrides), load(run / "config.yaml")
         found = changes(began, config)
         asked = changes(source, config)
         blamed = "--set" if all(isinstance(each, str) for each in overrides) else OVERRIDDEN
+        for key in PLACE:
+            if key in asked:
+                reason = f"cannot change now; to leave {run} as it is, copy it and resume the copy"
+                raise ConfigError(blamed, key, reason)
         differing = check_changes(found, lambda key: blamed if key in asked else config.source, run)
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
             raise ConfigError(config.source, "run.iterations", reason)
         _check_files(settled.files, config, run)
-        records, size = read_records(folder.path, iteration, stored.read(SavedResults).last)
-        earlier = OpenedRun(folder, manifest, stored, settled, config, differing, elsewhere, records, size, said)
+        records, size = read_records(folder.path, iteration)
+        earlier = OpenedRun(folder, manifest, stored, settled, config, differing, records, size, said)
         if not earlier.is_done:
-            if elsewhere:
-                check_output(config.source, config.run.output, config.run.folder_name, False)
-            else:
-                check_writable(folder)
+            check_writable(folder)
         yield earlier
 
 
@@ -236,34 +217,9 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
     raise ConfigError(folder.path, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
 
 
-def _read_config(
-    run: Path, wanted: Path | Config | None, overrides: Sequence[str | Override], text: str
-) -> tuple[Config, Config]:
-    """Return two configurations for resuming, one with and one without overrides. `text` is the configuration in the
-    state.
-    """
-    if isinstance(wanted, Config):
-        return changed(wanted, overrides), wanted
-    own = run / "config.yaml"
-    if wanted is not None or own.exists():
-        path = own if wanted is None else wanted
-        return load(path, overrides), load(path)
-    return loads(text, own, overrides), loads(text, own)
-
-
 def _check_files(before: Mapping[str, str], config: Config, run: Path) -> None:
     here = digests(config)
     for key, digest in before.items():
         if here.get(key) != digest:
             what = "has changed" if key in here else "is missing"
             raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or start a new run")
-
-
-@contextlib.contextmanager
-def _written(folder: RunFolder) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if is_machine_fault(error):
-            raise MachineError(f"{folder.path}: {error.strerror}; the run was not continued") from None
-        raise

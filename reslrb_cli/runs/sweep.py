@@ -12,9 +12,8 @@ import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.files import NAME_BYTES, open_file
@@ -24,12 +23,10 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import Location, format_location
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault, one_line
 from reslrb_cli.measure.methods import parse_cases
-from reslrb_cli.records.atomic import remove_parts_of, write_atomically
 from reslrb_cli.records.checkpoint import newest_checkpoint
 from reslrb_cli.records.lock import FolderLock, InUse
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.records.sweeps import (
-    SWEEP_FILE,
     Combination,
     SweepPlan,
     config_file,
@@ -39,7 +36,6 @@ from reslrb_cli.records.sweeps import (
     run_name,
     short_keys,
 )
-from reslrb_cli.runs.prepare import changes
 from reslrb_cli.scene.files import digest_of, file_digests, files_of
 
 #: Maximum number of runs of a sweep. Each has a folder and a line on the page.
@@ -194,53 +190,62 @@ def _bounded(name: str) -> str:
 
 
 @contextlib.contextmanager
-def opened(
-    folder: Path, plan: Plan | None, seeds: int | None = None, retry: bool = False, allow_code: bool = False
-) -> Iterator[SweepPlan]:
-    """Open the sweep in `folder`, and lock it while the block runs.
+def started(folder: Path, plan: Plan) -> Iterator[SweepPlan]:
+    """Start the sweep of `plan` in `folder`, and lock the folder while the block runs.
 
-    With a `plan`, the function opens the plan's sweep. If the folder holds no sweep yet, the function starts the sweep.
-    Without a plan, the function opens the sweep that the folder holds. `seeds` may add more seeds to it. With `retry`,
-    runs that failed count as not yet done.
-
-    Raises ConfigError if the folder holds another sweep or anything else. Raises ConfigError also if user code is not
-    allowed to run, or has changed since the start of the sweep.
+    Raises ConfigError if the folder holds a sweep or anything else.
     """
-    if plan is not None:
-        _make(folder)
-    elif not folder.is_dir():
-        raise ConfigError(folder, "", "no such folder; start a sweep by `reslrb sweep CONFIG --vary ...`")
-    try:
-        lock = FolderLock(folder.resolve())
-    except InUse:
-        raise ConfigError(folder, "", "is in use by another `reslrb sweep`; end that first") from None
-    except OSError as error:
-        raise ConfigError(folder, "", f"cannot be opened: {error.strerror}") from None
-    with lock:
-        if is_sweep(folder) or plan is None:
-            kept = read_sweep(folder)
-            if plan is not None:
-                _check_same(folder, kept, plan)
-            _check_files(folder, kept, allow_code or plan is not None)
-            sweep = _grown(kept, plan.sweep.seeds if plan else None, seeds)
-        else:
-            _begin(folder, plan)
-            sweep = plan.sweep
-        if retry:
-            sweep = replace(sweep, failures={})
-        try:
-            remove_parts_of(folder / SWEEP_FILE)
-            sweep.write(folder)
-        except OSError as error:
-            raise _unwritable(folder, error) from None
-        yield sweep
-
-
-def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
         raise ConfigError("-o", "", f"{folder} is a file, not the folder of a sweep") from None
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    with _locked(folder):
+        if is_sweep(folder):
+            reason = f"{folder} has a sweep already; `reslrb sweep --resume {folder}` continues it; give another folder"
+            raise ConfigError("-o", "", reason)
+        _write_configs(folder, plan)
+        _write(folder, plan.sweep)
+        yield plan.sweep
+
+
+@contextlib.contextmanager
+def resumed(
+    folder: Path, seeds: int | None = None, retry: bool = False, allow_code: bool = False
+) -> Iterator[SweepPlan]:
+    """Open the sweep in `folder`, and lock it while the block runs.
+
+    `seeds` may add more seeds to the sweep. With `retry`, runs that failed count as not yet done.
+
+    Raises ConfigError if the folder holds no sweep, or if user code is not allowed to run, or has changed since the
+    start of the sweep.
+    """
+    if not folder.is_dir():
+        raise ConfigError(folder, "", "no such folder; start a sweep by `reslrb sweep CONFIG --vary ...`")
+    with _locked(folder):
+        kept = read_sweep(folder)
+        _check_files(folder, kept, allow_code)
+        sweep = _grown(kept, seeds)
+        if retry:
+            sweep = replace(sweep, failures={})
+        _write(folder, sweep)
+        yield sweep
+
+
+def _locked(folder: Path) -> FolderLock:
+    """Return the lock of the folder of a sweep. Raises ConfigError."""
+    try:
+        return FolderLock(folder.resolve())
+    except InUse:
+        raise ConfigError(folder, "", "is in use by another `reslrb sweep`; end that first") from None
+    except OSError as error:
+        raise ConfigError(folder, "", f"cannot be opened: {error.strerror}") from None
+
+
+def _write(folder: Path, sweep: SweepPlan) -> None:
+    try:
+        sweep.write(folder)
     except OSError as error:
         raise _unwritable(folder, error) from None
 
@@ -251,49 +256,19 @@ def _unwritable(folder: Path, error: OSError) -> ConfigError | MachineError:
     return ConfigError("-o", "", f"cannot write to {folder} ({error.strerror}); give another folder")
 
 
-def _begin(folder: Path, plan: Plan) -> None:
-    """Write the configurations, then the plan. If the plan is written, all configurations therefore exist."""
+def _write_configs(folder: Path, plan: Plan) -> None:
+    """Write the configurations of a new sweep, before its plan. Raises ConfigError if the folder holds other files."""
     # a sweep that was killed at its start has written only configurations
     if others := sorted(path.name for path in folder.iterdir() if path.name != "configs"):
         reason = f"{folder} contains {one_line(others[0], 60)!r}, but no sweep; give a new or empty folder"
         raise ConfigError("-o", "", reason)
     try:
         for combination in plan.sweep.combinations:
-            path, text = config_file(folder, combination), dump(plan.configs[combination.name]).encode()
+            path = config_file(folder, combination)
             path.parent.mkdir(exist_ok=True)
-            write_atomically(path, partial(_put, text))
+            path.write_text(dump(plan.configs[combination.name]), encoding="utf-8")
     except OSError as error:
         raise _unwritable(folder, error) from None
-
-
-def _put(text: bytes, file: IO[bytes]) -> None:
-    file.write(text)
-
-
-def _check_same(folder: Path, kept: SweepPlan, plan: Plan) -> None:
-    """Raise ConfigError if the sweep in `folder` differs from the plan. The error names the first difference."""
-    advice = "give another folder with -o, or continue that sweep with --resume"
-    there = [(each.name, each.settings) for each in kept.combinations]
-    here = [(each.name, each.settings) for each in plan.sweep.combinations]
-    if there != here:
-        what = ", ".join(dict.fromkeys([*kept.keys, *plan.sweep.keys])) or "nothing"
-        raise ConfigError(folder, "", f"has a sweep with other settings or values ({what}); {advice}")
-    if kept.seeds[0] != plan.sweep.seeds[0]:
-        reason = f"is {plan.sweep.seeds[0]}, and {kept.seeds[0]} in the sweep in {folder}; {advice}"
-        raise ConfigError(plan.sweep.config, "run.seed", reason)
-    for combination in kept.combinations:
-        path = config_file(folder, combination)
-        then = loads(read_text(path, str(path)), path)
-        found = {
-            key: change
-            for key, change in changes(then, plan.configs[combination.name]).items()
-            if key not in ("run.name", "run.output")
-        }
-        if found:
-            key, (was, is_) = next(iter(found.items()))
-            shown = [one_line("not set" if value is None else value, 60) for value in (is_, was)]
-            reason = f"is {shown[0]}, and {shown[1]} in the sweep in {folder}; {advice}"
-            raise ConfigError(plan.sweep.config, key, reason)
 
 
 def _check_files(folder: Path, kept: SweepPlan, allowed: bool) -> None:
@@ -307,19 +282,16 @@ def _check_files(folder: Path, kept: SweepPlan, allowed: bool) -> None:
             raise ConfigError(file, "", reason)
 
 
-def _grown(kept: SweepPlan, planned: Sequence[int] | None, seeds: int | None) -> SweepPlan:
-    """Return the sweep extended to more seeds if requested. Raises ConfigError if fewer seeds are requested than the
-    sweep has.
-    """
-    wanted = len(planned) if planned is not None else seeds
-    if wanted is None or wanted == len(kept.seeds):
+def _grown(kept: SweepPlan, seeds: int | None) -> SweepPlan:
+    """Return the sweep extended to `seeds` seeds, if given. Raises ConfigError if the sweep has more seeds already."""
+    if seeds is None or seeds == len(kept.seeds):
         return kept
-    if wanted < len(kept.seeds):
-        raise ConfigError("--seeds", "", f"is {wanted}; the sweep has {len(kept.seeds)} seeds already")
-    if wanted * len(kept.combinations) > MOST_RUNS or kept.seeds[0] + wanted > SEED_END:
-        reason = f"{len(kept.combinations)} x {wanted} seeds: a sweep has at most {MOST_RUNS} runs"
+    if seeds < len(kept.seeds):
+        raise ConfigError("--seeds", "", f"is {seeds}; the sweep has {len(kept.seeds)} seeds already")
+    if seeds * len(kept.combinations) > MOST_RUNS or kept.seeds[0] + seeds > SEED_END:
+        reason = f"{len(kept.combinations)} x {seeds} seeds: a sweep has at most {MOST_RUNS} runs"
         raise ConfigError("--seeds", "", reason)
-    return replace(kept, seeds=list(range(kept.seeds[0], kept.seeds[0] + wanted)))
+    return replace(kept, seeds=list(range(kept.seeds[0], kept.seeds[0] + seeds)))
 
 
 # --- runs still to be done --------------------------------------------------------------------------------------------

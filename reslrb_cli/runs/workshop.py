@@ -1,4 +1,8 @@
-"""Figures and pictures of the sheet for the workshop that makes a lens or a mirror (`report/page/workshop.py`)."""
+"""Figures and pictures of the sheet for the workshop that makes a lens or a mirror (`report/page/workshop.py`).
+
+`setup_of` measures the set-up in its scene: distances, direction of the light, orientation of the picture. Lengths are
+in mm. Directions are unit vectors in the axes of the scene.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,6 @@ from reslrb_cli.measure.tolerance import (
     where_light_goes,
 )
 from reslrb_cli.records.images import luminance
-from reslrb_cli.runs.setup import setup_of
 from reslrb_cli.scene.images import read_image
 
 Array = np.ndarray[Any, Any]
@@ -103,3 +106,132 @@ def as_picture(image: Array, original: Array, inside: tuple[slice, slice]) -> Ar
     seen, wanted = image[inside], original[inside]
     scaled = seen / max(float(seen.mean()), 1e-30) * (wanted.mean() / max(float(wanted.max()), 1e-30))
     return np.asarray(scaled, dtype=np.float32)[:, :, None]
+
+
+# --- the set-up -------------------------------------------------------------------------------------------------------
+
+#: Rays from the lamps. A lamp farther away than this multiple of the face's size counts as parallel light.
+RAYS, FAR = 2**14, 500.0
+
+
+def setup_of(
+    scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, sheet: Sheet, target: Array
+) -> dict[str, Any] | None:
+    """Return the set-up of the solid in `scene`, or None if no light reaches the solid, or `sensor` sees no receiver.
+
+    `sheet` is the front face. `target` (H, W) is the luminance that `sensor` should see. The result has these entries.
+
+    - `kind` is `lens` or `mirror`. `face_size` and `picture_size` are widths and heights.
+    - `receiver_distance` is the distance from the centre of the face (x = y = z = 0) to the centre of the receiver.
+    - `light_distance` is the distance of a point lamp from the side that faces the lamp. For parallel light, the entry
+        is `parallel`.
+    - `lit_side` is `front` or `back`, the side of the solid that faces the lamp.
+    - `light_direction` is the direction in which the light travels. `receiver` is the receiver's centre.
+        `receiver_normal` is the receiver's normal towards the solid. `picture_up` and `picture_right` are directions on
+        the receiver.
+    - `through` tells whether the picture reads correctly for a viewer behind the receiver.
+    """
+    shapes = {shape.id(): shape for shape in scene.shapes()}
+    if plan.receiver not in shapes:
+        return None
+    center = np.ravel(shapes[plan.receiver].bbox().center()).astype(float)
+    normal = _normal(scene, sensor, shapes[plan.receiver])
+    light = _light(scene, [shapes[name] for name in (*plan.faces, "back") if name in shapes])
+    if normal is None or light is None:
+        return None
+    points, directions = light
+    toward, lamp = beam(points, directions, max(sheet.half) * 2)
+    front = toward[2] < 0
+    entrance = np.array([0.0, 0.0, 0.0 if front else -plan.thickness])
+    normal = normal if normal @ center < 0 else -normal
+    camera = np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4)
+    mirrored, behind = np.linalg.det(camera[:3, :3]) < 0, (camera[:3, 3] - center) @ normal < 0
+    left, top, right, bottom = _middles(sensor, target, center, normal)
+    return {
+        "kind": plan.kind,
+        "face_size": [2 * half for half in sheet.half],
+        "picture_size": [float(np.linalg.norm(right - left)), float(np.linalg.norm(top - bottom))],
+        "receiver_distance": float(np.linalg.norm(center)),
+        "light_distance": "parallel" if lamp is None else float(np.linalg.norm(lamp - entrance)),
+        "lit_side": "front" if front else "back",
+        "light_direction": _unit(toward),
+        "receiver": [float(value) for value in center],
+        "receiver_normal": _unit(normal),
+        "picture_up": _unit(top - bottom),
+        "picture_right": _unit(right - left),
+        "through": bool(mirrored != behind),
+    }
+
+
+def _unit(vector: Array) -> list[float]:
+    return [round(float(value), 9) + 0.0 for value in vector / np.linalg.norm(vector)]  # no -0
+
+
+def _normal(scene: mi.Scene, sensor: mi.Sensor, receiver: mi.Shape) -> Array | None:
+    """Return the normal (3,) of the receiver in the middle of the film, or None if `sensor` sees another object
+    there.
+    """
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+    si = scene.ray_intersect(mi.Ray3f(ray))
+    if not bool(np.all(np.array(si.is_valid() & (si.shape == mi.ShapePtr(receiver))))):
+        return None
+    return np.ravel(np.array(si.n)).astype(float)
+
+
+def _middles(sensor: mi.Sensor, target: Array, center: Array, normal: Array) -> list[Array]:
+    """Return the points (3,) on the receiver's plane that appear at the middles of the picture's four edges.
+
+    The order is left, top, right, bottom, as on the film. The picture consists of the nonzero pixels of `target` (H,
+    W).
+    """
+    rows, columns = picture_within(target)
+    height, width = target.shape
+    u, v = [columns.start / width, columns.stop / width], [rows.start / height, rows.stop / height]
+    places = []
+    for x, y in ((u[0], sum(v) / 2), (sum(u) / 2, v[0]), (u[1], sum(v) / 2), (sum(u) / 2, v[1])):
+        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
+        origin, direction = (np.ravel(np.array(each)).astype(float) for each in (ray.o, ray.d))
+        places.append(origin + (center - origin) @ normal / (direction @ normal) * direction)
+    return places
+
+
+def _light(scene: mi.Scene, solid: list[mi.Shape]) -> tuple[Array, Array] | None:
+    """Return the points (n, 3) where light from the lamps first meets the solid's shapes. Also return the light's
+    directions (n, 3).
+
+    Returns None if no ray meets them.
+    """
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, RAYS)
+    ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
+    active = (mi.luminance(weight) if mi.is_rgb else weight.x) > 0
+    si = scene.ray_intersect(ray, active)
+    met = mi.Bool(False)
+    for shape in solid:
+        met = met | (si.shape == mi.ShapePtr(shape))
+    kept = np.ravel(np.array(active & si.is_valid() & met)).astype(bool)
+    points, directions = (np.array(each, dtype=float).reshape(3, -1).T[kept] for each in (si.p, ray.d))
+    return (points, directions) if len(points) > 8 else None
+
+
+def beam(points: Array, directions: Array, size: float) -> tuple[Array, Array | None]:
+    """Return the mean direction (3,) of the rays, and the position (3,) of their lamp. For parallel light, the position
+    is None.
+
+    Rays go through `points` (n, 3) along unit `directions` (n, 3). `size` (mm) is the size of the face. The light of a
+    wide and distant lamp, such as the sun, counts as parallel, because the mean direction is the same all over the
+    face.
+    """
+    toward = directions.mean(axis=0)
+    toward /= np.linalg.norm(toward)
+    along = directions @ toward
+    slopes = directions / along[:, None] - toward
+    across = points - points.mean(axis=0)
+    across -= (across @ toward)[:, None] * toward
+    spread = float(np.sum(across**2))
+    growth = float(np.sum(across * slopes)) / max(spread, 1e-30)  # 1 / distance of a point lamp
+    if growth * size < 1 / FAR:
+        return toward, None
+    # The point nearest to all rays.
+    cut = np.eye(3)[None] - directions[:, :, None] * directions[:, None, :]
+    return toward, np.linalg.solve(cut.sum(axis=0), np.einsum("nij,nj->i", cut, points))

@@ -213,10 +213,8 @@ def test_a_run_continues_from_its_folder(experiment: Path, caplog: pytest.LogCap
     assert values_equal(done.parameters, again.parameters)
     assert is_free(Path("mine"))
 
-    beside = rl.optimize(rl.load("mine/config.yaml"), folder="beside", resume="mine", overrides={"run.iterations": 7})
-    assert [record.iteration for record in beside] == [6]
-    assert beside.folder == experiment / "beside"
-    assert len(records_of(Path("mine"))) == 6
+    longer = rl.optimize(resume="mine", overrides={"run.iterations": 7})
+    assert [record.iteration for record in longer] == [6]
 
 
 def test_a_replaced_folder_is_reported(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -263,6 +261,8 @@ def test_errors_are_located(experiment: Path) -> None:
         ),
         (lambda: rl.optimize("tiny.yaml", overrides={"variant": "cuda_ad_rgb"}), "variant: is cuda_ad_rgb, but llvm"),
         (lambda: rl.optimize(resume="."), ".: is no run's folder"),
+        (lambda: rl.optimize("tiny.yaml", resume="mine"), "experiment: cannot be given with resume"),
+        (lambda: rl.optimize(resume="mine", folder="other"), "folder: cannot be given with resume; copy the folder"),
     ]
     for call, start in cases:
         with pytest.raises(rl.ConfigError) as error:

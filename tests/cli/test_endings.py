@@ -426,32 +426,6 @@ def test_removing_the_folder_ends_the_run(optimize, during):
     assert os.listdir("runs") == []
 
 
-def test_removing_the_contents_of_a_folder_keeps_what_it_can(optimize, during):
-    """The test imitates an `rm -rf` that has not yet removed the folder itself. The last line names the files that the
-    run writes afterwards.
-    """
-
-    def remove(record):
-        if record.iteration == 1:
-            for path in RUN.iterdir():
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-    during(remove)
-    code, out, err = optimize("--set", "run.iterations=50")
-    assert (code, faults(RUN, code, err), out) == (6, [], "")
-    [line] = lines(err)
-    assert "runs/tiny/metrics.jsonl: has been removed while the run went on; " in line
-    assert "; saved: the state after 3 of 3 iterations, in " in line
-    assert line.endswith("runs/tiny/checkpoint")
-    content = read_content(RUN)
-    assert (content["status"], content["error"], content["results"]["iterations"]) == ("failed", line, 3)
-    with np.load(RUN / "checkpoint" / "state.npz") as state:
-        assert int(state["iteration"]) == 3
-        kept = state[f"parameter/{KEY}"]
-    with np.load(RUN / "parameters" / "parameters.npz") as values:
-        assert np.array_equal(values[KEY], kept)
-
-
 def test_another_run_with_the_same_name_is_left_alone(optimize, during):
     seen = []
 

@@ -191,14 +191,18 @@ def test_missing_or_bad_values_of_a_run_are_refused_in_one_line(folder: Path, tm
 
     assert "has no checkpoint/state.npz" in refusal()
     values = {tiny.KEY: np.full((4, 4, 3), 0.5, np.float32), LAMP: np.ones(3, np.float32)}
-    save_checkpoint(run / "checkpoint", 1, values, {})
+
+    def save(**changes: np.ndarray) -> None:
+        save_checkpoint(run / "checkpoint", 1, {f"parameter/{key}": value for key, value in (values | changes).items()})
+
+    save()
     assert "did not recover `wall.translation`; it has" in refusal()
     values |= {"wall.translation": np.zeros(3, np.float32), "wall.scale": np.array(1, np.float32)}
-    save_checkpoint(run / "checkpoint", 1, values | {LAMP: np.ones(2, np.float32)}, {})
+    save(**{LAMP: np.ones(2, np.float32)})
     assert f"`{LAMP}` of shape 2, but in the scene of shape 3" in refusal()
-    save_checkpoint(run / "checkpoint", 1, values | {LAMP: np.full(3, np.nan, np.float32)}, {})
+    save(**{LAMP: np.full(3, np.nan, np.float32)})
     assert "all values must be finite" in refusal()
-    save_checkpoint(run / "checkpoint", 1, values | {tiny.KEY: np.full((4, 4, 3), 2, np.float32)}, {})
+    save(**{tiny.KEY: np.full((4, 4, 3), 2, np.float32)})
     assert "exclude the initial value" in refusal()
     (run / "checkpoint" / STATE_FILE).write_bytes(b"PK\x03\x04 and then nothing")
     assert "is damaged, cut off, or not written by reslrb" in refusal()

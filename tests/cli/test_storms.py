@@ -27,7 +27,7 @@ from reslrb_cli.cli.terminal import SIGNALS
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records import measurement_files
 from reslrb_cli.records.manifest import read_content, read_manifest
-from reslrb_cli.records.measurement_files import LineFile
+from reslrb_cli.records.measurement_files import write_lines
 from reslrb_cli.records.measurements import SummaryRecord
 from reslrb_cli.runs import recorder
 
@@ -265,7 +265,6 @@ def test_both_files_are_current_and_old_ones_are_removed(tmp_path: Path, monkeyp
     file.write_text("old\n")
     samples = measurement_files.samples_file(file)
     measurement_files.write_samples(samples, {"rows": 9}, {})
-    (tmp_path / ".c.samples.npz.999999999.part").write_bytes(b"what a killed process left")
     measured = Measurement(file)
     # The old files stay until there is a new result.
     assert (file.read_text(), measurement_files.read_samples(samples)[0]) == ("old\n", {"rows": 9})
@@ -327,22 +326,20 @@ def test_too_large_samples_are_not_saved_and_reported(
     assert not measurement_files.samples_file(tmp_path / "c.jsonl").exists()
 
 
-def test_a_pipe_gets_each_line_once_at_once(tmp_path: Path) -> None:
+def test_a_pipe_gets_all_lines_at_the_end(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
-    file = LineFile(tmp_path / "pipe")
-    file.write(lines("a"), lines("not yet"))
-    assert os.read(reader, 1000) == b'{"kind": "summary", "line": "a"}\n'
-    file.write(lines("a", "b"))
-    assert os.read(reader, 1000) == b'{"kind": "summary", "line": "b"}\n'
-    file.close()
+    measured = Measurement(tmp_path / "pipe")
+    measured.keeper.refresh()
+    measured.keeper.finish(lines("a"))
+    assert os.read(reader, 1000).splitlines()[1:] == [b'{"kind": "summary", "line": "a"}']
     os.close(reader)
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
 
 
 def test_the_target_of_a_link_is_written(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "c.jsonl")
-    LineFile(tmp_path / "link").write(lines("here", "a"))
+    write_lines(tmp_path / "link", lines("here", "a"))
     assert (tmp_path / "link").is_symlink()
     assert read(tmp_path / "c.jsonl") == ["a"]
 

@@ -11,7 +11,6 @@ import json
 import logging
 import os
 import re
-import select
 import struct
 import sys
 import termios
@@ -23,11 +22,9 @@ from cli.test_nonfinite import CONFIG, SCENE
 from cli.test_nonfinite import reslrb_nonfinite as reslrb
 from records.test_metrics import make_record
 
-from reslrb_cli.cli import progress as module
-from reslrb_cli.cli.progress import Progress, Reading, descriptions
+from reslrb_cli.cli.progress import Progress, descriptions
 from reslrb_cli.cli.terminal import LogLines
 from reslrb_cli.optimization.errors import ErrorMeter
-from reslrb_cli.records.measurement_files import read_lines
 
 # Names from scenes, files and arguments reach the terminal and the log as text, never as commands.
 
@@ -282,38 +279,3 @@ def test_keys_are_shortened_and_cannot_control_the_terminal():
     assert "\x1b" not in text
     assert re.search(r"\(\\x1b\S+\.\.\.\S+\.value\)$", text)
     assert len(text) < 90
-
-
-def write_metrics(folder, lines=20_000):
-    file = folder / "metrics.jsonl"
-    file.write_text('{"iteration": 1, "loss": 0.25}\n' * lines)
-    return file
-
-
-def test_reading_a_long_file_has_a_bar(monkeypatch, tmp_path):
-    monkeypatch.setattr(module, "LEAST_SECONDS", 0.0)
-    master, slave = os.openpty()
-    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
-    with os.fdopen(slave, "w") as terminal:
-        monkeypatch.setattr(sys, "stderr", terminal)
-        with Reading() as tell:
-            assert len(read_lines(write_metrics(tmp_path), tell).objects) == 20_000
-        text = ""
-        while not text.endswith("\n") and select.select([master], [], [], 5)[0]:  # the written text arrives in pieces
-            text += os.read(master, 1 << 16).decode()
-    os.close(master)
-    assert re.search(r"reading .*metrics.jsonl: +\d+%\|.*/605k ", text)
-    assert text.endswith("drawing\r\n")
-
-
-def test_without_a_terminal_lines_are_written_from_time_to_time(monkeypatch, tmp_path, capsys):
-    file = write_metrics(tmp_path)
-    with Reading() as tell:
-        read_lines(file, tell)
-    assert capsys.readouterr().err == ""  # reading took no time
-    monkeypatch.setattr(module, "SECONDS_PER_LINE", 0.0)
-    with Reading() as tell:
-        read_lines(file, tell)
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 4
-    assert re.fullmatch(r"reading .*metrics.jsonl: 124 KiB of 605.5 KiB", lines[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -15,6 +16,8 @@ from reslrb_cli.cli.lens import command, read_luminance
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens import transport
+from reslrb_cli.lens.experiment import lamps
+from reslrb_cli.lens.surface import Setting, Surface
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import write_file
 from reslrb_cli.scene.images import read_image
@@ -113,7 +116,7 @@ def test_the_start_casts_the_picture_upright_with_the_right_brightness(kind: str
     args = [str(tmp_path / "p.exr"), "-o", str(folder), "--pixels", "32", "--floor", "0.2", *OPTIONS[kind]]
     result = CliRunner().invoke(command, args, catch_exceptions=False)
     assert result.exit_code == 0
-    assert "mm deep (at 400 mm" in result.output
+    assert " mm deep; nothing darker" in result.output
     heights = read_image(folder / "start.exr", "linear", signed=True)[:, :, 0]
     image = np.array(mi.render(flattened(heights, folder), spp=256, seed=1))[:, :, 1]
     target = read_image(folder / "target.exr")[:, :, 1]
@@ -135,7 +138,7 @@ BAD = {
     ),
     "index": (["--ior", "1"], "--ior: is 1; glass and plastics"),
     "incidence": (["--mirror", "--incidence", "0"], "--incidence: at 0 degrees the receiver blocks the mirror's"),
-    "size": (["--size", "nan"], "--size: is nan; it must be above 0"),
+    "size": (["--size", "nan"], "--size: is nan mm; it must be above 0"),
     "thickness": (["--thickness", "0.5"], "--thickness: the relief is"),
     "light": (["--light-distance", "20"], "--light-distance: is 20 mm, at which no lens was found"),
     "sun": (["--sun", "40"], "--sun: is 40 degrees; it must be from 0 to below 10"),
@@ -150,11 +153,11 @@ BAD = {
     "no image": ([], "p.exr: is not a readable image"),
     "too large": ([], "p.exr: is 40000x30000 pixels; the limit is 134217728 pixels"),
     "not finite": ([], "p.exr: pixel ("),
-    "no distance": (["--distance", "0"], "--distance: is 0; it must be above 0"),
-    "behind": (["--distance", "-5"], "--distance: is -5; it must be above 0"),
-    "not a number": (["--distance", "nan"], "--distance: is nan; it must be above 0"),
-    "far too large": (["--size", "1e7"], "--size: is 1e+07; it must be above 0"),
-    "no picture size": (["--picture-size", "0"], "--picture-size: is 0; it must be above 0"),
+    "no distance": (["--distance", "0"], "--distance: is 0 mm; it must be above 0"),
+    "behind": (["--distance", "-5"], "--distance: is -5 mm; it must be above 0"),
+    "not a number": (["--distance", "nan"], "--distance: is nan mm; it must be above 0"),
+    "far too large": (["--size", "1e7"], "--size: is 1e+07 mm; it must be above 0"),
+    "no picture size": (["--picture-size", "0"], "--picture-size: is 0 mm; it must be above 0"),
     "no glass": (["--ior", "9"], "--ior: is 9; glass and plastics"),
     "floor": (["--floor", "1"], "--floor: is 1; it must be from 0 to below 1"),
     "tilt": (["--tilt", "0", "85"], "--tilt: is 0 and 85 degrees; both must be between"),
@@ -216,3 +219,18 @@ def test_a_run_continues_with_its_momentum_and_measured_steepness(tmp_path: Path
     moved = np.abs(ends[1] - start).max()
     assert moved > 0
     assert np.abs(ends[0] - ends[1]).max() < 0.02 * moved
+
+
+def test_the_lamp_of_a_lens_in_oblique_light_is_beside_the_lens() -> None:
+    """No corner of the lamp is inside the lens, and its central ray is refracted to the centre of the face."""
+    setting = Setting(incidence=30.0, thickness=20.0)
+    surface = Surface(setting, np.zeros((8, 8)), np.ones((8, 8), bool), 0.0, 0.0, None)  # type: ignore[arg-type]
+    found = re.search(r'matrix value="([^"]*)"', lamps(surface, 1.0, 0.0))
+    assert found is not None
+    matrix = np.array(found[1].split(), float).reshape(4, 4)
+    corners = matrix[:3, 3] + np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]) @ matrix[:3, :2].T
+    assert corners[:, 2].max() == pytest.approx(-20 - np.cos(np.radians(30)), abs=1e-6)  # by 1 mm along the beam
+    toward, middle = matrix[:3, 2], matrix[:3, 3]
+    entry = middle - toward * (middle[2] + 20) / toward[2]
+    sine = np.sin(np.radians(30)) / setting.ior
+    assert entry == pytest.approx([-20 * sine / np.sqrt(1 - sine**2), 0, -20], abs=1e-6)

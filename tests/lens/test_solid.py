@@ -103,7 +103,7 @@ def test_a_solid_is_closed_oriented_outward_and_has_the_volume_of_its_heights(na
     back = edge_heights(under(ripples), wanted.outline).max() + 0.1 if both else -8.0
     volume += beside * (front - back)
     assert solid.volume == pytest.approx(volume, rel=1e-3)
-    for kind, written in (("stl", solids.stl), ("ply", solids.ply), ("obj", solids.obj)):
+    for kind, written in (("stl", solids.stl), ("ply", solids.ply)):
         read = trimesh.load(io.BytesIO(written(solid)), file_type=kind)
         assert read.is_watertight  # each edge belongs to two triangles
         assert read.is_winding_consistent  # in opposite directions
@@ -388,5 +388,5 @@ def test_invalid_files_are_refused_in_one_line(run: Path, tmp_path: Path, monkey
     # A folder gets all files that can be written, and a line says which one is missing.
     said = done("export", run, "-o", tmp_path / "out").output
     assert "lens.3mf is not written: lib3mf is missing" in said
-    assert {"lens.stl", "lens.obj", "lens.ply"} < {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"lens.stl", "lens.ply"} < {path.name for path in (tmp_path / "out").iterdir()}
     assert not (tmp_path / "out/lens.3mf").exists()

@@ -22,10 +22,9 @@ from reslrb_cli.lens.workshop import (
 )
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import luminance, write_file
-from reslrb_cli.report.page.workshop import material, setup_facts
-from reslrb_cli.report.sketch import sketch
+from reslrb_cli.report.page.workshop import material, setup_facts, sketch
 from reslrb_cli.runs.export import read_solid
-from reslrb_cli.runs.setup import setup_of
+from reslrb_cli.runs.workshop import setup_of
 
 
 def test_the_step_of_a_ball_leaves_scallops_of_the_given_height() -> None:

@@ -29,7 +29,7 @@ from reslrb_cli.measure.sampling import settings as sampled_as
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune.sampling import situation
 from reslrb_cli.records.decisions import DecisionCache, key_of
-from reslrb_cli.runs.sweep import make_plan, opened
+from reslrb_cli.runs.sweep import make_plan, resumed, started
 from reslrb_cli.scene.files import files_of
 
 #: Each text contains a number that tests change from 0.25 to 0.75, so that the size stays the same.
@@ -203,19 +203,15 @@ def test_a_run_continues_with_its_original_files(folder: Path) -> None:
 
 
 def test_a_sweep_continues_with_its_original_files(folder: Path) -> None:
-    def plan() -> Any:
-        return make_plan(Path("photo.yaml"), ["run.spp=[4, 8]"], 1, [], allow_code=True)
-
-    with opened(Path("s"), plan()):
+    with started(Path("s"), make_plan(Path("photo.yaml"), ["run.spp=[4, 8]"], 1, [], allow_code=True)):
         pass
     for file in OF_PHOTO:
         restore = change(folder / file)
-        for again in (plan(), None):
-            with pytest.raises(ConfigError, match="has changed since the sweep in s began") as caught:
-                opened(Path("s"), again, allow_code=True).__enter__()
-            assert caught.value.source == str(folder / file)
+        with pytest.raises(ConfigError, match="has changed since the sweep in s began") as caught:
+            resumed(Path("s"), allow_code=True).__enter__()
+        assert caught.value.source == str(folder / file)
         restore()
-    with opened(Path("s"), None, allow_code=True) as kept:
+    with resumed(Path("s"), allow_code=True) as kept:
         assert list(kept.codes) == [str(folder / "own.py")]
 
 

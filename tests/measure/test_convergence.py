@@ -22,7 +22,7 @@ from reslrb_cli.measure.convergence.statistics import GROUPS, MethodSamples, Ref
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import BenchStatus
-from reslrb_cli.report.convergence_tables import closing_sentence, notes
+from reslrb_cli.report.tables import closing_sentence, notes
 
 # What `convergence` reports about methods of known cost, noise and bias. The processes only pretend to measure.
 

@@ -20,7 +20,7 @@ from reslrb_cli.measure.methods import Plan
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus
-from reslrb_cli.report.convergence_tables import closing_sentence, notes
+from reslrb_cli.report.tables import closing_sentence, notes
 
 
 def test_steps_continue_after_compilation_with_distinct_seeds(tmp_path: Path) -> None:

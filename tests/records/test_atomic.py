@@ -99,7 +99,7 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
 
 
 def save(folder: Path, iteration: int, size: int = 64) -> None:
-    save_checkpoint(folder, iteration, {"a": np.full(size, iteration, np.float32)}, {}, {"elapsed_s": 1.0})
+    save_checkpoint(folder, iteration, {"parameter/a": np.full(size, iteration, np.float32)}, {"elapsed_s": 1.0})
 
 
 def iteration_of(path: Path) -> int:

@@ -83,10 +83,10 @@ def test_an_incomplete_checkpoint_keeps_the_previous_one(tmp_path, file_size_lim
 
     said = []  # errors of discarded archives
     monkeypatch.setattr(sys, "unraisablehook", said.append)
-    save_checkpoint(tmp_path, 1, {"a": np.zeros(3)}, {})
+    save_checkpoint(tmp_path, 1, {"a": np.zeros(3)})
     for size in (100, 2000, 9000):  # in the headers, in the first array, in the last array
         with file_size_limit(size), pytest.raises(OSError, match=r"state\.npz"):
-            save_checkpoint(tmp_path, 2, {"a": np.zeros(999), "b": np.zeros(999)}, {})
+            save_checkpoint(tmp_path, 2, {"a": np.zeros(999), "b": np.zeros(999)})
     with np.load(tmp_path / "state.npz") as state:
         assert int(state["iteration"]) == 1
     gc.collect()

@@ -5,12 +5,9 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
-import shutil
 import subprocess
 import sys
 import threading
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -20,7 +17,6 @@ from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.run import check_name
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.records import manifest as manifests
-from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.decisions import CACHE_FILE, MOST, Decision, DecisionCache, cache_folder, key_of
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
@@ -145,14 +141,6 @@ def test_a_failed_start_leaves_no_files(tmp_path, monkeypatch):
     assert names(tmp_path / "runs") == []
 
 
-@pytest.mark.parametrize("name", ["x" * 300, "ü" * 130, "x" * 254])
-def test_impossible_file_names_are_refused_at_once(tmp_path, name):
-    with pytest.raises(ConfigError, match=r"^c\.yaml: run\.name: ") as error:
-        check_output("c.yaml", tmp_path, name, False)
-    assert len(str(error.value)) < 200
-    assert names(tmp_path) == []
-
-
 def test_a_full_disk_is_not_blamed_on_the_configuration(tmp_path, monkeypatch):
     def fail(*args, **options):
         raise OSError(28, "No space left on device")
@@ -198,47 +186,6 @@ def test_without_locks_runs_still_work(tmp_path, monkeypatch):
         with RunFolder.create("c.yaml", tmp_path, "run", force, "", make_manifest()) as folder:
             content = read_manifest(folder.path)
             assert (content["status"], content["process"]["locked"]) == ("running", False)
-
-
-def test_an_unfinished_folder_of_a_killed_process_is_removed_later(tmp_path):
-    old, new, locked = (tmp_path / f".reslrb-{name}" for name in ("old", "new", "locked"))
-    for folder in (old, new, locked):
-        (folder / "images").mkdir(parents=True)
-    for folder in (old, locked):
-        os.utime(folder, (1e9, 1e9))
-    with FolderLock(locked):
-        create(tmp_path)
-        assert names(tmp_path) == [".reslrb-locked", ".reslrb-new", "run"]
-
-
-def test_a_slowly_written_folder_is_not_removed(tmp_path):
-    """An export into a folder of runs takes minutes. A run that starts there meanwhile leaves the export alone."""
-    with unfinished_folder(tmp_path) as part:
-        (part / "scene.xml").write_text("half")
-        os.utime(part, (1e9, 1e9))
-        create(tmp_path)
-        assert (part / "scene.xml").read_text() == "half"
-        part.rename(tmp_path / "exported")
-    assert names(tmp_path) == ["exported", "run"]
-    with FolderLock(tmp_path / "exported", wait_s=0):
-        pass
-
-
-def test_a_half_failed_replacement_is_reported(tmp_path, monkeypatch):
-    create(tmp_path)
-    rmtree = shutil.rmtree
-
-    def fail(path, ignore_errors=False):
-        if not ignore_errors:
-            raise OSError(5, "Input/output error", str(path))
-        rmtree(path, ignore_errors=True)
-
-    monkeypatch.setattr(shutil, "rmtree", fail)
-    with pytest.raises(MachineError, match="Input/output error"):
-        create(tmp_path, force=True, seed=8)
-    content = read_manifest(tmp_path / "run")
-    assert (content["status"], content["seed"]) == ("failed", 8)
-    assert names(tmp_path) == ["run"]
 
 
 CONTEND = """
@@ -338,43 +285,6 @@ def test_a_reader_without_write_permission_sees_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr(manifests, "write_atomically", fail)
     assert read_manifest(tmp_path)["status"] == "interrupted"
     assert stored(tmp_path)["status"] == "running"
-
-
-def damaged(content):
-    """Yield the keys to each field of a manifest, and the manifest with a value of another type in that field."""
-    for key, value in content.items():
-        for wrong in (None, "text", 5, False, [1], {"a": 1}):
-            if type(wrong) is not type(value):
-                yield (key,), content | {key: wrong}
-        if key == "process":
-            yield from (((key, *keys), content | {key: changed}) for keys, changed in damaged(value))
-
-
-def refusal(folder):
-    """Return the error of reading the manifest in `folder`, or an empty string if reading succeeds."""
-    try:
-        read_manifest(folder)
-    except ConfigError as error:
-        return str(error)
-    return ""
-
-
-def test_a_damaged_manifest_is_one_located_line(tmp_path):
-    abandoned(tmp_path)
-    whole, counts = stored(tmp_path), Counter()
-    for keys, content in damaged(whole):
-        (tmp_path / MANIFEST_FILE).write_text(json.dumps(content))
-        told = refusal(tmp_path)
-        place = re.escape(f"{tmp_path / MANIFEST_FILE}: {'.'.join(keys)}")
-        assert re.fullmatch(rf"({place}([.\[]\S*)?: is damaged: .+)?", told)
-        counts[keys] += bool(told)
-    del counts["program",]
-    assert min(counts.values()) == 4  # an optional field is None or of one other type
-    assert counts["process", "pid"] == counts["process", "locked"] == counts["results",] == 5
-    of_an_earlier_version = {key: whole[key] for key in ("program", "status")}
-    (tmp_path / MANIFEST_FILE).write_text(json.dumps(of_an_earlier_version))
-    assert refusal(tmp_path) == ""
-    assert read_manifest(tmp_path)["status"] == "interrupted"
 
 
 @pytest.mark.parametrize("status", [Status.FINISHED, Status.INTERRUPTED, Status.FAILED])

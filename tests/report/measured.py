@@ -9,7 +9,7 @@ import numpy as np
 from records.test_metrics import make_record
 
 from reslrb_cli.optimization.results import summary
-from reslrb_cli.records.images import write_image, write_layers, write_mask, write_parameters
+from reslrb_cli.records.images import write_image, write_mask, write_parameters
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.measurement_files import Origin
 from reslrb_cli.records.measurements import (
@@ -83,14 +83,6 @@ def convergence_lines(parameter="all"):
 
 def write_convergence(path, parameter="all"):
     path.write_text("".join(json.dumps(line) + "\n" for line in convergence_lines(parameter)))
-
-
-def write_maps(folder, name="floor-stack"):
-    """Write a map of a gradient as `gradcheck --images` does."""
-    folder.mkdir()
-    gradient = np.random.default_rng(1).normal(size=(8, 12, 3)).astype(np.float32)
-    layers = {"gradient": gradient, "reference": 1.1 * gradient, "difference": -0.1 * gradient, "z": gradient[:, :, 0]}
-    write_layers(folder / f"{name}.exr", layers)
 
 
 # A run folder as `reslrb optimize` leaves it, made without rendering.

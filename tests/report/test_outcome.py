@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from reslrb_cli.report.outcome import Outcome, outcome_of
+from reslrb_cli.report.run_summary import Outcome, outcome_of
 
 FELL = {"change": "fell", "late": "flat"}
 

@@ -21,7 +21,6 @@ from report.measured import (
     write_bench,
     write_convergence,
     write_gradcheck,
-    write_maps,
 )
 
 from reslrb_cli.records.clock import SharedTime, WorkerTime
@@ -31,7 +30,6 @@ from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
-from reslrb_cli.report.perceptual import with_seen_errors
 from reslrb_cli.report.sources import ShownRun, read_sources
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
@@ -411,12 +409,11 @@ def pages(llvm, tmp_path_factory):
     write_bench(folder / "bench.jsonl", spps=(4, 16))
     write_gradcheck(folder / "check <script>.jsonl", LONG)
     write_convergence(folder / "convergence.jsonl")
-    write_maps(folder / "maps")
-    files = ("bench.jsonl", "check <script>.jsonl", "convergence.jsonl", "maps")
+    files = ("bench.jsonl", "check <script>.jsonl", "convergence.jsonl")
     some = [made for name, made in folders.items() if name not in ("three sensors", "no truth")]
     sources = read_sources([*some, *(folder / name for name in files)])
     written[EVERYTHING] = folder / "everything.html"
-    write_page([with_seen_errors(source) for source in sources], written[EVERYTHING])
+    write_page(sources, written[EVERYTHING])
     return written
 
 

@@ -92,7 +92,7 @@ def begin_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
     monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
-    monkeypatch.setattr(recording, "seen_errors", lambda folder, results, views: {})
+    monkeypatch.setattr(recording, "seen_errors", lambda folder, views: {})
 
 
 def optimize(*args: str) -> int:

@@ -13,9 +13,9 @@ import numpy as np
 from markupsafe import Markup
 
 from reslrb_cli.optimization.targets import WORDS
-from reslrb_cli.records.images import load_image, read_layers
+from reslrb_cli.records.images import load_image
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.layout import key, lay_out, soft
+from reslrb_cli.report.page.layout import lay_out
 from reslrb_cli.report.sources import ShownRun
 from reslrb_cli.report.tonemap import (
     as_png,
@@ -95,47 +95,18 @@ def fit(values: Array) -> Array:
     return resample(values, (width, height))
 
 
-#: z at the ends of the scale.
-MOST_Z = 5.0
-
-#: Maximum number of maps on a page; a page shows the first maps of a folder.
-MOST_MAPS = 40
-
-
-def gradient_maps(paths: Sequence[Path]) -> Markup:
-    """Return a row for each file of layers. Both gradients in a row are summed over channels and share one scale."""
-    rows = Markup()
-    for path in paths[:MOST_MAPS]:
-        try:
-            layers = read_layers(path)
-        except (OSError, ValueError):
-            rows += lay_out("gallery", [], key(path.stem), "This file is damaged.")
-            continue
-        sums = {name: np.nan_to_num(layers[name].astype(np.float64)).sum(-1, keepdims=True)
-                for name in ("gradient", "reference", "z")}  # fmt: skip
-        end = signed_end(np.stack([sums["gradient"], sums["reference"]]))
-        shown = [show_map(sums[name], end, name, lay_out("titled", name, ", sum over channels"), signed=True)
-                 for name in ("gradient", "reference")]  # fmt: skip
-        caption = lay_out("titled", "difference", " in standard errors")
-        rows += lay_out("gallery", [*shown, show_map(sums["z"], MOST_Z, "z", caption, signed=True)], key(path.stem))
-    return rows + soft(f"{len(paths) - MOST_MAPS} more maps are not shown." if len(paths) > MOST_MAPS else "")
-
-
 def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, Any]) -> Markup:
     """Return a table of the views, and the loss of the held-out views.
 
     The result is empty for a single view with default settings. All pixels of such a view have equal weights.
     """
-    if not views or (len(views) == 1 and not _is_special(views[0])):
+    special = [view for view in views or () if view["left_out"] or view["kinds"] or view["counted"]]
+    if not views or (len(views) == 1 and not special and views[0]["exposure"] == 1):
         return Markup()
     exposures = {view["exposure"]: _recovered(view["exposure"], results) for view in views}
     held_out = results.get("held_out") or {}
     losses = [held_out[moment] for moment in ("initial", "final") if moment in held_out]
     return lay_out("run.views", views, WORDS, exposures, losses)
-
-
-def _is_special(view: Mapping[str, Any]) -> bool:
-    return bool(view["left_out"] or view["kinds"] or view["counted"] or view["exposure"] != 1)
 
 
 def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
@@ -145,21 +116,19 @@ def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def seen_tables(runs: Sequence[ShownRun]) -> Markup:
-    """Return tables of perceptual errors at start and end, for the images and colours of all runs."""
-    images: list[dict[str, Any]] = []
-    colors: list[dict[str, Any]] = []
+def seen_table(runs: Sequence[ShownRun]) -> Markup:
+    """Return a table of the perceptual errors at start and end, for the images of all runs."""
+    rows: list[dict[str, Any]] = []
     for run in runs:
-        seen, name = run.results.get("seen") or {}, run.name if len(runs) > 1 else ""
-        for suffix, about in (seen.get("images") or {}).items():
+        name = run.name if len(runs) > 1 else ""
+        for suffix, about in (run.results.get("seen") or {}).items():
             sensor = f"sensor {suffix[1:]}, " if suffix else ""
-            images += [
+            rows += [
                 {"run": name, "name": sensor + title, "errors": about[moment]}
                 for title, moment in (("start", "initial"), ("end", "final"))
                 if moment in about
             ]
-        colors += [{"run": name, "name": key, "about": about} for key, about in (seen.get("colors") or {}).items()]
-    return lay_out("run.seen", images, colors) if images or colors else Markup()
+    return lay_out("run.seen", rows) if rows else Markup()
 
 
 #: Maximum number of images shown per sensor between the first and the last.

@@ -1,4 +1,4 @@
-"""Parts of a page about files of measurements, folders of maps, and several runs."""
+"""Parts of a page about files of measurements, and about several runs."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Any
 
 from markupsafe import Markup
 
-from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict, record_of
-from reslrb_cli.report.format import count, number
-from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
+from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, SummaryRecord, Verdict, record_of
+from reslrb_cli.report.format import number
+from reslrb_cli.report.page.images import image_rows, seen_table
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.page.run import guarded, problems, record_parts, step_ms
 from reslrb_cli.report.page.sweep import sweep_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.plots import Curve
 from reslrb_cli.report.run_summary import worst
-from reslrb_cli.report.sources import Maps, Measurements, ShownRun, Source, SweepRuns, is_number
+from reslrb_cli.report.sources import Measurements, ShownRun, Source, SweepRuns
 from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 
 Entry = Mapping[str, Any]
@@ -27,9 +27,13 @@ Naming = Callable[[Entry], str]
 SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixels of the film", "texels": "texels"}
 
 
-def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
-    """Return diagrams and a table of a bench. Also return the number of lines that are not results of a bench."""
-    entries = [_with_sizes(entry) for entry in objects if "integrator" in entry and "status" in entry]
+def bench(objects: Sequence[Entry]) -> Markup:
+    """Return diagrams and a table of a bench."""
+    entries = [
+        {"pixels": entry["width"] * entry["height"] if entry.get("width") else None, **entry}
+        for entry in objects
+        if "integrator" in entry and "status" in entry
+    ]
     labels = list(dict.fromkeys(map(label, entries)))
     values = {name: [entry[name] for entry in entries if entry.get(name)] for name in SWEPT}
     usual = {name: max(dict.fromkeys(found), key=found.count) for name, found in values.items() if found}
@@ -47,8 +51,7 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
     fixed = [f"{SWEPT[name]} {number(value)}" for name, value in usual.items() if name not in varied]
     entries.sort(key=lambda entry: [entry.get(name) or 0 for name in varied])
     rows = [{"label": label(entry), "entry": entry} for entry in entries]
-    parts += lay_out("measured.bench", rows, {name: SWEPT[name] for name in varied}, fixed)
-    return parts, len(objects) - len(entries)
+    return parts + lay_out("measured.bench", rows, {name: SWEPT[name] for name in varied}, fixed)
 
 
 def label(entry: Entry) -> str:
@@ -57,12 +60,6 @@ def label(entry: Entry) -> str:
     """
     parts = ":".join(str(entry[name]) for name in ("integrator", "estimator") if entry.get(name))
     return parts + (f", capacity {entry['capacity']}" if entry.get("capacity") not in (None, 1) else "")
-
-
-def _with_sizes(entry: Entry) -> dict[str, Any]:
-    width, height = entry.get("width"), entry.get("height")
-    pixels = width * height if isinstance(width, int) and isinstance(height, int) else None
-    return {"pixels": pixels, "texels": entry.get("texels")} | dict(entry)
 
 
 def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
@@ -84,23 +81,12 @@ def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x
 MOST_DRAWN = 8
 
 
-def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
-    """Return the summary, diagrams and a table of a convergence. Also return the number of other lines."""
-    kinds = {
-        kind: [entry for entry in objects if entry.get("kind") == kind] for kind in ("point", "method", "reference")
-    }
-    said = [entry for entry in objects if entry.get("kind") not in kinds and isinstance(entry.get("line"), str)]
-    known = [entry for entries in kinds.values() for entry in entries]
-    spps = len({entry.get("spp") for entry in known if entry.get("status", "ok") == "ok"})
+def convergence(objects: Sequence[Entry]) -> Markup:
+    """Return the summary of a convergence, a diagram for each quantity, and a table of the methods."""
+    points, methods = ([entry for entry in objects if entry.get("kind") == kind] for kind in ("point", "method"))
+    spps = len({entry.get("spp") for entry in [*points, *methods] if entry.get("status", "ok") == "ok"})
     name = partial(method_label, with_spp=spps > 1)
-    markup = Markup().join(lay_out("paragraph", entry["line"]) for entry in said)
-    if kinds["point"] or kinds["method"]:
-        markup += _steps(kinds["point"], kinds["method"], name)
-    return markup, len(objects) - len(known) - len(said)
-
-
-def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> Markup:
-    """Return a diagram for each quantity, and a table of the methods."""
+    said = [lay_out("paragraph", entry["line"]) for entry in objects if entry.get("kind") == SummaryRecord.KIND]
     labels = list(dict.fromkeys(map(name, [*methods, *points])))
     quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
     quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
@@ -113,7 +99,7 @@ def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> M
         for entry in methods
         if (what := quantity(entry)) in quantities
     ]
-    return lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out(
+    return Markup().join(said) + lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out(
         "measured.methods", rows, bool(points), len(quantities), MOST_DRAWN)  # fmt: skip
 
 
@@ -132,7 +118,7 @@ def method_label(entry: Entry, with_spp: bool = False) -> str:
 
 
 def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> tuple[str, Markup]:
-    floors = sorted(value for entry in points if is_number(value := entry.get("reference_rmse")) and value > 0)
+    floors = sorted(value for entry in points if (value := entry.get("reference_rmse") or 0) > 0)
     curves = curves_of(points, labels, naming, "elapsed_s", "relative_rmse")
     drawing = diagram(curves, "time (s)", "relative error", 10, floors[len(floors) // 2 :][:1])
     return {"all": "all parameters", "image": "the image"}.get(what, key(what)), drawing
@@ -170,7 +156,7 @@ def run_comparison(runs: Sequence[ShownRun]) -> Parts:
         "Runs": lambda: overview(runs),
         "Convergence": lambda: convergence_of_all(runs),
         "Images": lambda: _each(runs, image_rows),
-        "Errors as people see them": lambda: seen_tables(runs),
+        "Errors as people see them": lambda: seen_table(runs),
         "Parameters": lambda: _each(runs, lambda run: parameter_table(run.results)),
         "Textures": lambda: _each(runs, texture_pictures),
     }
@@ -190,8 +176,8 @@ def overview(runs: Sequence[ShownRun]) -> Markup:
 
 def _estimator(run: ShownRun) -> str:
     """Return the estimator or the integrator of the gradients, if the manifest names one."""
-    plan = run.manifest.get("plan")
-    return str(plan.get("estimator") or plan.get("integrator") or "") if isinstance(plan, dict) else ""
+    plan = run.manifest.get("plan") or {}
+    return str(plan.get("estimator") or plan.get("integrator") or "")
 
 
 def _final_error(run: ShownRun) -> str:
@@ -214,28 +200,17 @@ def _each(runs: Sequence[ShownRun], make: Callable[[ShownRun], Markup]) -> Marku
 
 #: Heading of a source, before its name.
 HEADINGS = {"bench": "Cost of a step", "gradcheck": "Gradients against references",
-            "convergence": "Error against run time", "maps": "Maps of gradients"}  # fmt: skip
+            "convergence": "Error against run time"}  # fmt: skip
 
 
-def measured(source: Measurements | Maps) -> Markup:
-    """Return the whole content of a file of measurements or a folder of maps."""
-    if isinstance(source, Maps):
-        return gradient_maps(source.files)
+def measured(source: Measurements) -> Markup:
+    """Return the whole content of a file of measurements."""
     make = {"bench": bench, "gradcheck": gradcheck, "convergence": convergence}[source.kind]
-    markup, unknown = make(source.objects)
-    if source.damaged:
-        markup += soft(
-            f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."
-        )
-    if unknown:
-        markup += soft(f"{count(unknown, 'line')} of other kinds, or damaged, left out.")
-    return markup + Markup().join(lay_out("run.origin", origin) for origin in source.origins)
+    return make(source.objects) + Markup().join(lay_out("run.origin", origin) for origin in source.origins)
 
 
-def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
-    """Return a table of the comparisons and the number of other lines. Failures come first. Incomplete derivatives are
-    listed, too.
-    """
+def gradcheck(objects: Sequence[Entry]) -> Markup:
+    """Return a table of the comparisons. Failures come first. Incomplete derivatives are listed, too."""
     records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
     missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
     failed = [failure_line(record) for record in records if record.verdict is Verdict.FAILS]
@@ -244,5 +219,4 @@ def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
     lines += [found.line() for found in missing]
     several = len({record.case for record in records}) > 1
     rows = [{"case": record.case, "cells": cells(record)} for record in ordered]
-    markup = lay_out("measured.gradcheck", failed, lines, list(HEAD), several, rows)
-    return markup, len(objects) - len(records) - len(missing)
+    return lay_out("measured.gradcheck", failed, lines, list(HEAD), several, rows)

@@ -20,12 +20,11 @@ from reslrb_cli.records.images import load_image
 from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.run_folder import FABRICATION_FILE, workshop_file
 from reslrb_cli.report.format import count, number
-from reslrb_cli.report.outcome import outcome_of
-from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
+from reslrb_cli.report.page.images import image_rows, seen_table, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
 from reslrb_cli.report.page.workshop import CAPTIONS, VIEWS, workshop
-from reslrb_cli.report.run_summary import error_line, warnings
+from reslrb_cli.report.run_summary import error_line, outcome_of, warnings
 from reslrb_cli.report.sources import ShownRun
 
 #: Number of first steps left out of medians, because they compile kernels.
@@ -83,8 +82,7 @@ def fabrication(run: ShownRun) -> Markup:
     if not text:
         return Markup()
     numbers = json.loads(text)
-    names = [*CAPTIONS, *VIEWS, *(numbers.get("tolerances") or {})]
-    files = {name: run.path / "images" / f"{workshop_file(name)}.exr" for name in names}
+    files = {name: run.path / "images" / f"{workshop_file(name)}.exr" for name in (*CAPTIONS, *VIEWS)}
     pictures = {name: image for name, file in files.items() if (image := load_image(file)) is not None}
     return workshop(numbers, pictures)
 
@@ -109,11 +107,8 @@ def header(run: ShownRun) -> Markup:
 
 
 def problems(run: ShownRun) -> Markup:
-    """Return the error and the warnings of a run, and a line about unreadable records."""
+    """Return the error and the warnings of a run."""
     lines, error = warnings(run.results, "±"), run.manifest.get("error")
-    if run.damaged:
-        where = f"{count(len(run.damaged), 'line')} of metrics.jsonl (the first is line {run.damaged[0]})"
-        lines.append(f"{where} could not be read.")
     return lay_out("note", [error] if error else [], "failed") + lay_out("note", lines)
 
 
@@ -129,7 +124,7 @@ def run_parts(run: ShownRun) -> dict[str, Markup]:
         ),
         "Fabrication": lambda: fabrication(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
-        "Errors as people see them": lambda: seen_tables([run]),
+        "Errors as people see them": lambda: seen_table([run]),
         "Textures": lambda: texture_pictures(run),
         "Convergence": lambda: convergence(run),
     }

@@ -1,22 +1,20 @@
-"""Parts of a page about a sweep: its table, curves of medians with bands, and recovered images side by side."""
+"""Parts of a page about a sweep: its table, curves of medians with bands, and final images side by side."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from reslrb_cli.records.images import load_image, read_parameters
+from reslrb_cli.records.images import load_image
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.sweeps import Combination, in_words, label, run_name, short_keys
 from reslrb_cli.report.format import count, number, shorten
-from reslrb_cli.report.page.images import Picture, show
-from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
+from reslrb_cli.report.page.images import show
+from reslrb_cli.report.page.layout import diagram, lay_out, soft
 from reslrb_cli.report.page.run import guarded
-from reslrb_cli.report.page.values import visible
-from reslrb_cli.report.perceptual import PLACES
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve
 from reslrb_cli.report.run_summary import units_differ
 from reslrb_cli.report.sources import ShownRun, SweepRuns
@@ -34,8 +32,8 @@ from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposu
 
 Array = np.ndarray[Any, Any]
 
-#: Maximum numbers of combinations with curves, of combinations with pictures, and of parameters with pictures.
-MOST_CURVES, MOST_PICTURES, MOST_TEXTURES = 2 * len(COLORS), 24, 6
+#: Maximum numbers of combinations with curves, and of combinations with pictures.
+MOST_CURVES, MOST_PICTURES = 2 * len(COLORS), 24
 
 #: Maximum width of a combination below a picture, and of a setting's value in the table.
 CAPTION_WIDTH, VALUE_WIDTH = 80, 60
@@ -67,7 +65,6 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
         "Settings": settings,
         "Convergence": lambda: _curves(source, drawn),
         "Images": lambda: _images(source),
-        "Textures": lambda: _textures(source),
         "Runs of the sweep": lambda: lay_out("sweep.runs", runs, figures),
     }
     return {title: guarded(make) for title, make in parts.items()}
@@ -109,7 +106,7 @@ def _by_iteration(runs: Sequence[ShownRun], name: str) -> tuple[Array, Array]:
     most = max(len(run.records) for run in runs)
     values = np.full((len(runs), most), np.nan)
     for row, run in zip(values, runs, strict=True):
-        row[: len(run.records)] = _column(run, name)
+        row[: len(run.records)] = run.column(name)
     return np.arange(most), values
 
 
@@ -119,18 +116,14 @@ def _by_time(runs: Sequence[ShownRun], name: str) -> tuple[Array, Array]:
     The first time is the earliest one at which all runs have completed an iteration. A run that has ended keeps its
     last value.
     """
-    ends = [np.array(_column(run, "elapsed_s"), dtype=np.float64) for run in runs]
+    ends = [np.array(run.column("elapsed_s"), dtype=np.float64) for run in runs]
     times = np.unique(np.concatenate(ends))
     times = times[times >= max(end[0] for end in ends)]
     times = times[:: -(-len(times) // MOST_POINTS)]
     values = np.full((len(runs), len(times)), np.nan)
     for row, run, end in zip(values, runs, ends, strict=True):
-        row[:] = np.array(_column(run, name), dtype=np.float64)[np.searchsorted(end, times, side="right") - 1]
+        row[:] = np.array(run.column(name), dtype=np.float64)[np.searchsorted(end, times, side="right") - 1]
     return times, values
-
-
-def _column(run: ShownRun, name: str) -> list[float | None]:
-    return [record[name] for record in run.records]
 
 
 def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
@@ -146,70 +139,28 @@ def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def _shown(source: SweepRuns) -> tuple[list[tuple[Combination, ShownRun]], Markup]:
-    """Return the first finished run of each combination, and a line of text that explains this selection."""
-    found = []
+def _images(source: SweepRuns) -> Markup:
+    """Return the target, and the final image of the first sensor of each combination's first finished run. All images
+    have one exposure.
+    """
+    shown = []
     for combination in source.sweep.combinations:
         done = [run for run in _runs(source, combination) if run.manifest.get("status") == Status.FINISHED]
-        found += [(combination, done[0])] if done else []
-    more = len(found) - MOST_PICTURES
-    line = "Of each combination the first seed that is finished." if found else ""
-    return found[:MOST_PICTURES], soft(line + (f" {more} more combinations are not shown." if more > 0 else ""))
-
-
-def _images(source: SweepRuns) -> Markup:
-    """Return the target and each combination's final image of the first sensor, all with one exposure."""
-    shown, line = _shown(source)
-    names = ("", "-0")  # the first of several sensors has the suffix -0
-    first = next((run for _, run in shown), None)
-    if first is None:
+        shown += [(combination, done[0])] if done else []
+    if not shown:
         return Markup()
+    first, more = shown[0][1], len(shown) - MOST_PICTURES
+    names = ("", "-0")  # the first of several sensors has the suffix -0
     suffix = next((end for end in names if (first.path / "images" / f"target{end}.exr").exists()), "")
     target = load_image(first.path / "images" / f"target{suffix}.exr")
     exposure = shown_exposures(first.manifest.get("views")).get(suffix) or exposure_for(target)
     pictures = [] if target is None else [show(target * exposure, "target", lay_out("titled", "target", ""))]
-    for combination, run in shown:
+    for combination, run in shown[:MOST_PICTURES]:
         image, loss = load_image(run.path / "images" / f"final{suffix}.exr"), run.results.get("image_loss") or {}
         if image is not None:
+            title = shorten(label(combination.settings), CAPTION_WIDTH)
             said = "" if loss.get("final") is None else f"loss {number(loss['final'])}"
-            pictures.append(_picture(image * exposure, combination, said))
-    return line + lay_out("gallery", pictures, "", exposure_words(exposure, target))
-
-
-def _textures(source: SweepRuns) -> Markup:
-    """Return each true texture, if known, and the texture that each combination recovered."""
-    shown, line = _shown(source)
-    if not shown:
-        return Markup()
-    archives = [read_parameters(run.path / "parameters") for _, run in shown]
-    true = read_parameters(shown[0][1].path / "parameters" / "true")
-    parts = Markup()
-    for name in [name for name, array in archives[0].items() if array.ndim == 3 and array.size][:MOST_TEXTURES]:
-        about = (shown[0][1].results.get("parameters") or {}).get(name) or {}
-        found: dict[str, Array] = {"true": true[name]} if name in true else {}
-        places = [place for place, each in enumerate(archives) if name in each]
-        found |= {_moment(place): archives[place][name] for place in places}
-        arrays, words = visible(found, about.get("quantity") in PLACES)
-        pictures = [show(arrays["true"], f"true: {name}", lay_out("titled", "true", ""))] if name in true else []
-        pictures += [
-            _picture(arrays[_moment(place)], shown[place][0], _error(shown[place][1], name)) for place in places
-        ]
-        parts += lay_out("gallery", pictures, key(name), words)
-    return line + parts if parts else parts
-
-
-def _moment(place: int) -> str:
-    """Return the key that `visible` uses for a combination's texture. The first combination's key is `final`. Its
-    texture sets the exposure if the true texture is unknown.
-    """
-    return f"final {place}" if place else "final"
-
-
-def _picture(values: Array, combination: Combination, said: str) -> Picture:
-    title = shorten(label(combination.settings), CAPTION_WIDTH)
-    return show(values, title, lay_out("titled", title, ""), said)
-
-
-def _error(run: ShownRun, name: str) -> str:
-    pair: Mapping[str, Any] = (run.results.get("parameter_rmse") or {}).get(name) or {}
-    return "" if pair.get("final") is None else f"RMSE {number(pair['final'], 3)}"
+            pictures.append(show(image * exposure, title, lay_out("titled", title, ""), said))
+    line = "Of each combination the first seed that is finished."
+    line += f" {more} more combinations are not shown." if more > 0 else ""
+    return soft(line) + lay_out("gallery", pictures, "", exposure_words(exposure, target))

@@ -14,7 +14,6 @@ from reslrb_cli.records.images import finite_range, in_range, read_mask, read_pa
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
-from reslrb_cli.report.perceptual import PLACES, is_color
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve, points_together
 from reslrb_cli.report.run_summary import MOMENTS, is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import ShownRun
@@ -24,6 +23,18 @@ Array = np.ndarray[Any, Any]
 
 #: Subfolders of `parameters/` with the initial, final and true values.
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
+
+
+#: Parameters of three numbers that are not visible colours.
+NO_COLORS = ("eta", "k")
+
+#: Quantities of geometry, which are neither light nor colour.
+PLACES = ("length", "degrees", "scale")
+
+
+def is_color(key: str, quantity: str) -> bool:
+    """Whether the three channels of a parameter are a colour."""
+    return quantity not in PLACES and not any(part in NO_COLORS for part in key.split(".")[-2:])
 
 
 def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = False) -> Markup:
@@ -133,7 +144,7 @@ def convergence(run: ShownRun) -> Markup:
     names = sorted(known, key=lambda name: -known[name])
     drawn = names[:MOST_CURVES]
     what = "relative error" if relative else "RMSE"
-    curves = _both("loss", [(run, "loss", 0, _column(run, "loss"))])
+    curves = _both("loss", [(run, "loss", 0, run.column("loss"))])
     curves += _both(f"{what} by parameter", [(run, name, k, errors[name]) for k, name in enumerate(drawn)])
     curves += lay_out("legend", drawn)
     more, words = len(names) - len(drawn), f"The {MOST_CURVES} parameters that are the farthest off at the end; "
@@ -148,11 +159,11 @@ def convergence_of_all(runs: Sequence[ShownRun]) -> Markup:
     if not begun:
         return lay_out("paragraph", "No iteration was completed.")
     parts = lay_out("legend", [run.name if run.records else "" for run in runs])
-    parts += _both("loss", [(run, run.name, place, _column(run, "loss")) for place, run in begun])
+    parts += _both("loss", [(run, run.name, place, run.column("loss")) for place, run in begun])
     if any(units_differ(run.results) for run in runs):
         totals, label = [_total_relative(run) for _, run in begun], "relative error"
     else:
-        totals, label = [_column(run, "parameter_rmse") for _, run in begun], "parameter RMSE"
+        totals, label = [run.column("parameter_rmse") for _, run in begun], "parameter RMSE"
     curves = [(run, run.name, place, total) for (place, run), total in zip(begun, totals, strict=True)]
     parts += _both(f"{label}, all parameters", curves)
     counts = Counter(name for _, run in begun for name in run.records[-1]["parameter_errors"])
@@ -170,7 +181,7 @@ def convergence_of_all(runs: Sequence[ShownRun]) -> Markup:
 def _both(label: str, curves: Sequence[tuple[ShownRun, str, int, Figures]]) -> Markup:
     """Return the same curves in two diagrams side by side, over iterations and over time."""
     drawn = [
-        ("", diagram([Curve(title, _column(run, name), ys, k) for run, title, k, ys in curves], caption, label))
+        ("", diagram([Curve(title, run.column(name), ys, k) for run, title, k, ys in curves], caption, label))
         for name, caption in ABSCISSAE
     ]
     return lay_out("diagrams", drawn)
@@ -183,10 +194,6 @@ def _thinning(runs: Sequence[ShownRun]) -> Markup:
     if len(runs) == 1:
         return soft(f"Each point is the mean of {most} iterations.")
     return soft(f"Of runs with more than {MOST_POINTS} iterations each point is the mean of some, at most {most}.")
-
-
-def _column(run: ShownRun, name: str) -> Figures:
-    return [record[name] for record in run.records]
 
 
 def _errors(run: ShownRun, name: str, scale: float | None) -> Figures:
