@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,7 +24,6 @@ from click.shell_completion import CompletionItem
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.loader import load, loads
-from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.records.atomic import remove_parts_of
@@ -228,26 +228,47 @@ class Counts(click.ParamType):
         return tuple(counts)
 
 
-class Size(click.ParamType):
-    """A number of bytes such as `2GiB`."""
-
-    name = "size"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        try:
-            return memory_bytes(str(value))
-        except ValueError:
-            self.fail(f"`{value}` is not a size; write 2GiB or 500MB", param, ctx)
-
-
-#: Replacements of removed options.
+#: Advice for removed options, by command and option.
 REMOVED = {
-    "--runs": "was removed; compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
+    "convergence --runs": "compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
     "--vary 'integrator=[prb, reslrb:stack]'`",
-    "--markdown": "was removed; `reslrb report FILE -o page.html` shows the table of results of --json FILE",
-    "--plot": "was removed; `reslrb report FILE -o page.html` plots results of --json FILE",
-    "--resume": "was removed here; --json FILE continues from the results in FILE",
-    "--rates": "was removed; compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
+    "convergence --rates": "compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
+    **dict.fromkeys(
+        (f"{command} --markdown" for command in ("bench", "gradcheck", "convergence")),
+        "`reslrb report FILE -o page.html` shows the table of results of --json FILE",
+    ),
+    **dict.fromkeys(
+        (f"{command} --plot" for command in ("bench", "gradcheck", "convergence")),
+        "`reslrb report FILE -o page.html` plots results of --json FILE",
+    ),
+    **dict.fromkeys(
+        (f"{command} --resume" for command in ("bench", "gradcheck", "convergence")),
+        "--json FILE continues from the results in FILE",
+    ),
+    **dict.fromkeys(
+        ("bench --memory-limit", "convergence --memory-limit"),
+        "the shell's `ulimit -v KIB` limits every process of the command",
+    ),
+    **dict.fromkeys(
+        ("optimize --verbose", "optimize -v", "sweep --verbose", "sweep -v"),
+        "`reslrb --debug COMMAND` prints the details",
+    ),
+    **dict.fromkeys(("init --force", "lens --force"), "remove or rename the files that exist"),
+    "gradcheck --estimators": "name them by --integrators, such as reslrb:stack,reslrb:gather",
+    "gradcheck --case": "name the case after the suite, as in --suite extreme:furnace",
+    "gradcheck --directions": "each parameter has three directions",
+    "render --run": "name the folder of the run in place of CONFIG, as in `reslrb render RUN -o IMAGE`",
+    "render --spp": "use --set run.spp=N",
+    "sweep --retry": "a sweep that continues repeats its failed runs",
+    "sweep --json": "results.jsonl in the folder of the sweep has the results",
+    "sweep --dry-run": "`reslrb optimize CONFIG --dry-run` measures one of the runs",
+    "sweep --quiet": "redirect the output, as in > sweep.log",
+    "init --recover": "all other parameters are comments of the file; remove the # of those that you want",
+    "inspect --samples": "--conditioning takes 8 gradients",
+    "doctor --json": "the lines of `reslrb doctor` have the same content",
+    "lens --margin": "the film sees an eighth of the picture's longer side around it",
+    "lens --incidence": "--mirror DEGREES gives the angle",
+    "lens --through": "exchange left and right of the picture, for a view from behind",
 }
 
 budget_option = click.option(
@@ -255,11 +276,6 @@ budget_option = click.option(
     help=
         "Time limit, including loading and compiling. Measurements without time are named, with the time that "
         "they need.",
-)  # fmt: skip
-
-memory_limit_option = click.option(
-    "--memory-limit", type=Size(),
-    help="Address space of each process, e.g. 2GiB (CPU only). Default: the machine's memory.",
 )  # fmt: skip
 
 
@@ -326,6 +342,39 @@ def experiment_arguments(function: Callable[..., Any], required: bool = True) ->
 def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add CONFIG and `--set` to a command in which CONFIG is optional. Without CONFIG, `config_file` is None."""
     return experiment_arguments(function, required=False)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The options of commands that run an experiment, by the names of their parameters."""
+
+    config_file: Path | None
+    overrides: tuple[str, ...]
+    allow_code: bool
+
+    def config(self) -> Config:
+        """Load the configuration, or that of the built-in Cornell box if no file is given. Raises ConfigError."""
+        return read_or_box(self.config_file, self.overrides).with_code(self.allow_code)
+
+
+@dataclass(frozen=True)
+class Comparison(Experiment):
+    """The options of commands that compare integrators by measurements (`comparison_options`)."""
+
+    integrators: str | None
+    budget: float
+    rounds: int | None
+    json_file: Path | None
+
+
+def comparison_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of `Comparison` to a command, except CONFIG, `--set` and `--integrators`."""
+    rounds = click.option(
+        "--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
+        help="Number of steps of each integrator, including those in the file of --json, for any time: the same steps "
+        "on every machine.",
+    )  # fmt: skip
+    return allow_code_option(budget_option(rounds(json_option(function))))
 
 
 def is_given(name: str) -> bool:

@@ -194,14 +194,12 @@ def _bounded(name: str) -> str:
 
 
 @contextlib.contextmanager
-def opened(
-    folder: Path, plan: Plan | None, seeds: int | None = None, retry: bool = False, allow_code: bool = False
-) -> Iterator[SweepPlan]:
+def opened(folder: Path, plan: Plan | None, seeds: int | None = None, allow_code: bool = False) -> Iterator[SweepPlan]:
     """Open the sweep in `folder`, and lock it while the block runs.
 
     With a `plan`, the function opens the plan's sweep. If the folder holds no sweep yet, the function starts the sweep.
-    Without a plan, the function opens the sweep that the folder holds. `seeds` may add more seeds to it. With `retry`,
-    runs that failed count as not yet done.
+    Without a plan, the function opens the sweep that the folder holds. `seeds` may add more seeds to it. Runs
+    that failed count as not yet done.
 
     Raises ConfigError if the folder holds another sweep or anything else. Raises ConfigError also if user code is not
     allowed to run, or has changed since the start of the sweep.
@@ -222,12 +220,10 @@ def opened(
             if plan is not None:
                 _check_same(folder, kept, plan)
             _check_files(folder, kept, allow_code or plan is not None)
-            sweep = _grown(kept, plan.sweep.seeds if plan else None, seeds)
+            sweep = replace(_grown(kept, plan.sweep.seeds if plan else None, seeds), failures={})
         else:
             _begin(folder, plan)
             sweep = plan.sweep
-        if retry:
-            sweep = replace(sweep, failures={})
         try:
             remove_parts_of(folder / SWEEP_FILE)
             sweep.write(folder)

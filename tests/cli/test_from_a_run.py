@@ -100,10 +100,10 @@ def test_rendering_a_run_renders_its_recovered_values(folder: Path) -> None:
         f"{{key: {LAMP}, initial: {left[LAMP].tolist()}}}, {{motion: {{of: wall, free: [translation, scale]}}, "
         f"initial: {{translation: {left['wall.translation'].tolist()}, scale: {left['wall.scale']}}}}}]"
     )
-    common = ("--spp", 16, "--sensor", 0, "--set", "run.seed=3", "-o")
+    common = ("--set", "run.spp=16", "--sensor", 0, "--set", "run.seed=3", "-o")
     expected = reslrb("render", folder / "tiny.yaml", "--set", f"parameters={by_hand}", *common, folder / "a.exr")
     assert expected.exit_code == 0, expected.output
-    assert reslrb("render", "--run", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
+    assert reslrb("render", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
     # The samples are equal, but a CPU adds them in any order.
     assert np.allclose(load_image(folder / "a.exr"), load_image(folder / "b.exr"), rtol=1e-5)
     initial = reslrb("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
@@ -124,15 +124,15 @@ def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
     assert np.all(np.abs(factor - 1) > 0.01)
     words = " ".join(f"{value:.4g}" for value in np.ravel(factor))
     for suffix in (".exr", ".png"):
-        result = reslrb("render", "--run", run, "--spp", 4, "-o", tmp_path / f"with{suffix}")
+        result = reslrb("render", run, "--set", "run.spp=4", "-o", tmp_path / f"with{suffix}")
         assert f"times {words}, the run's exposure (--exposure 1 ignores it)" in result.output
-        plain = reslrb("render", "--run", run, "--spp", 4, "--exposure", 1, "-o", tmp_path / f"without{suffix}")
+        plain = reslrb("render", run, "--set", "run.spp=4", "--exposure", 1, "-o", tmp_path / f"without{suffix}")
         assert plain.exit_code == 0
         assert "times" not in plain.output
     light, shown = (load_image(tmp_path / f"{name}.exr") for name in ("without", "with"))
     assert np.allclose(shown, light * factor, rtol=1e-5)
     assert load_image(tmp_path / "with.png").mean() != load_image(tmp_path / "without.png").mean()
-    assert "--exposure is for PNG" in reslrb("render", "--run", run, "--exposure", 2, "-o", tmp_path / "a.exr").output
+    assert "--exposure is for PNG" in reslrb("render", run, "--exposure", 2, "-o", tmp_path / "a.exr").output
     result = reslrb("export", run, "-o", tmp_path / "exported")
     line = f"multiply renderings by the exposure, {words}, to match the photographs"
     assert line in result.output.splitlines()
@@ -159,12 +159,12 @@ def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "Missing argument 'CONFIG'"),
-        (("tiny.yaml", "--run", "runs/tiny"), "not both"),
-        (("--run", "runs/tiny", "--scene"), "remove --initial or --scene"),
-        (("--run", "runs/none"), "no such folder"),
-        (("--run", "tiny.yaml"), "is a file, not the folder of a run"),
-        (("--run", "runs"), "has no manifest.json"),
+        ((), "Missing argument 'CONFIG|RUN'"),
+        (("--run", "runs/tiny"), "--run was removed; name the folder of the run in place of CONFIG"),
+        (("tiny.yaml", "--spp", "4"), "--spp was removed; use --set run.spp=N"),
+        (("runs/tiny", "--scene"), "remove --initial or --scene"),
+        (("runs/none",), "no such file"),
+        (("runs",), "has no manifest.json"),
     ],
 )
 def test_other_folders_are_refused(
@@ -184,7 +184,7 @@ def test_missing_or_bad_values_of_a_run_are_refused_in_one_line(folder: Path, tm
         (run / name).write_bytes((folder / "runs/tiny" / name).read_bytes())
 
     def refusal() -> str:
-        result = reslrb("render", "--run", run, "-o", tmp_path / "x.exr")
+        result = reslrb("render", run, "-o", tmp_path / "x.exr")
         assert result.exit_code == 2, result.output
         assert "Traceback" not in result.output
         return result.output
@@ -297,8 +297,8 @@ def test_each_camera_is_rendered_with_the_relief(run: Path, tmp_path: Path, sens
     heights = read_value(run, "sheet.heightmap")
     assert np.abs(heights).max() > 0.05, "it never rose, so this would show nothing"
     file = tmp_path / "image.exr"
-    common = ("--spp", 256, "--exposure", 1, "--set", "run.seed=3")
-    done = reslrb("render", "--run", run, "--sensor", sensor, *common, "-o", file)
+    common = ("--set", "run.spp=256", "--exposure", 1, "--set", "run.seed=3")
+    done = reslrb("render", run, "--sensor", sensor, *common, "-o", file)
     assert done.exit_code == 0, done.output
     image = load_image(file)
     assert image.shape == (SIZE, SIZE, 3)

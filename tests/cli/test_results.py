@@ -272,8 +272,8 @@ def test_a_png_is_tone_mapped_on_request(capsys):
     Path("scene.xml").write_text(dim)
     printed = {}
     for name, options in (("a.exr", ()), ("as_is.png", ()), ("auto.png", ("auto",)), ("ten.png", ("10",))):
-        more = ("--exposure", *options) if options else ()
-        code, printed[name], err = reslrb(capsys, "render", "box.yaml", "--scene", "--spp", "64", "-o", name, *more)
+        more = ("--set", "run.spp=64", *(("--exposure", *options) if options else ()))
+        code, printed[name], err = reslrb(capsys, "render", "box.yaml", "--scene", "-o", name, *more)
         assert code == 0, err
     assert "exposure" not in printed["a.exr"] + printed["auto.png"]
     factor = re.search(r"; --exposure auto: shown (\S+) times brighter$", printed["as_is.png"].strip())

@@ -239,7 +239,7 @@ def test_decisions_of_another_experiment_are_not_used(folder: Path, files: tuple
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", [
-    ("gradcheck", "--seeds", "3", "--estimators", "stack"),
+    ("gradcheck", "--seeds", "3", "--integrators", "reslrb:stack"),
     ("bench", "--max-depth", "2", "--rounds", "3", "--integrators", "reslrb:stack"),
     ("convergence", "--rounds", "3", "--integrators", "reslrb:stack"),
 ])  # fmt: skip

@@ -153,10 +153,10 @@ def test_commands_accept_it_like_prb(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return int(end.value.code or 0)
 
     own, passes = ["--set", f"integrator.type={kind}"], (0, ExitCode.CHECK_FAILED)
-    assert call("render", *own, "-o", "a.exr", "--spp", "4") == 0
+    assert call("render", *own, "-o", "a.exr", "--set", "run.spp=4") == 0
     assert call("bench", "--max-depth", "2", "--integrators", f"{kind}(sppi=2),prb", "--json", "b.json") == 0
     words = ["--rounds", "4", "--integrators", f"{kind},prb", "--json", "c.jsonl"]
     assert call("convergence", *words) in passes
     lines = [json.loads(line) for line in Path("c.jsonl").read_text().splitlines()]
     assert kind in [line.get("label") for line in lines if line["kind"] == "method"]
-    assert call("gradcheck", *own, "--estimators", "stack", "--seeds", "3", "--spp", "16") in passes
+    assert call("gradcheck", *own, "--integrators", "reslrb:stack", "--seeds", "3", "--spp", "16") in passes
