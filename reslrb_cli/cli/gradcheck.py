@@ -29,7 +29,6 @@ from reslrb_cli.cli.options import (
     cluster_option,
     is_given,
     json_option,
-    look_at,
     optional_experiment_arguments,
     origin_of,
     read_earlier,
@@ -326,7 +325,7 @@ def _run(
             drawn = drawn or result.maps is not None
         keeper.finish(records)
     if folder is not None and drawn:
-        look_at(folder)
+        echo(f"look at {os.path.relpath(folder)}")
     return records, interrupts.requested
 
 

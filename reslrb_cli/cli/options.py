@@ -146,11 +146,6 @@ def read_earlier(kind: str, json_file: Path | None, now: Mapping[str, Any] | Non
     return earlier
 
 
-def look_at(path: Path) -> None:
-    """Print the path of an image, or of a folder of images."""
-    echo(f"look at {os.path.relpath(path)}")
-
-
 def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCode:
     """Return the exit code of a comparison. The code is INTERRUPTED if `interrupted`, whatever was measured.
 
@@ -161,13 +156,6 @@ def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCo
         return ExitCode.INTERRUPTED
     memory = states == {BenchStatus.OUT_OF_MEMORY}
     return ExitCode.DONE if done else ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
-
-
-def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
-    """Return the experiment of a run with its recovered values (`records.run_folder.recovered`). Raises ConfigError."""
-    from reslrb_cli.records.run_folder import recovered
-
-    return recovered(run, overrides)
 
 
 class FolderPath(click.Path):
@@ -250,9 +238,9 @@ REMOVED = {
         "the shell's `ulimit -v KIB` limits every process of the command",
     ),
     **dict.fromkeys(
-        ("optimize --verbose", "optimize -v", "sweep --verbose", "sweep -v"),
-        "`reslrb --debug COMMAND` prints the details",
+        ("optimize --verbose", "optimize -v"), "`reslrb --debug optimize` prints details of the measurements"
     ),
+    **dict.fromkeys(("sweep --verbose", "sweep -v"), "the folder of each run has its warnings"),
     **dict.fromkeys(("init --force", "lens --force"), "remove or rename the files that exist"),
     "gradcheck --estimators": "name them by --integrators, such as reslrb:stack,reslrb:gather",
     "gradcheck --case": "name the case after the suite, as in --suite extreme:furnace",
@@ -279,28 +267,25 @@ budget_option = click.option(
 )  # fmt: skip
 
 
-def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--set` (`overrides`) to a command."""
-    return click.option(
-        "--set",
-        "overrides",
-        multiple=True,
-        metavar="KEY=VALUE",
-        shell_complete=complete_setting,
-        help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
-    )(function)
+#: `--set` (`overrides`).
+overrides_option = click.option(
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE", shell_complete=complete_setting,
+    help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
+)  # fmt: skip
 
-
-def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--json` (`json_file`) to a command that measures."""
-    return click.option(
-        "--json",
-        "json_file",
-        type=click.Path(path_type=Path, dir_okay=False),
-        metavar="FILE",
-        help="Write one JSON object per line as results come, and the samples beside the file. Results of the same "
+#: `--json` (`json_file`) of a command that measures.
+json_option = click.option(
+    "--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help=
+        "Write one JSON object per line as results come, and the samples beside the file. Results of the same "
         "measurement in FILE are kept and not measured again.",
-    )(function)
+)  # fmt: skip
+
+#: `--allow-code` (`allow_code`) of a command that runs users' own code.
+allow_code_option = click.option(
+    "--allow-code", is_flag=True,
+    help="Run the files of Python code that CONFIG or a list names (type: custom, FILE.py:NAME), with all your rights.",
+)  # fmt: skip
 
 
 def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -311,16 +296,6 @@ def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Cal
     return click.option(
         "--cluster", metavar="WHERE", help=f"{what}: {where}; {result}. Needs `pip install reslrb[cluster]`."
     )
-
-
-def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--allow-code` (`allow_code`) to a command that runs users' own code."""
-    return click.option(
-        "--allow-code",
-        is_flag=True,
-        help="Run the files of Python code that CONFIG or a list names (type: custom, FILE.py:NAME), with all your "
-        "rights.",
-    )(function)
 
 
 def allowance(budget_s: float, number: int | None, of: str) -> str:
@@ -382,17 +357,12 @@ def is_given(name: str) -> bool:
     return click.get_current_context().get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
 
 
-def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:
-    """Load and check the configuration. Raises ConfigError."""
-    return load(config_file, list(overrides))
-
-
 def read_or_box(config_file: Path | None, overrides: tuple[str, ...]) -> Config:
     """Load the configuration. If no file is given, load the configuration of the built-in Cornell box. Raises
     ConfigError.
     """
     if config_file is not None:
-        return read_config(config_file, overrides)
+        return load(config_file, overrides)
     from reslrb_cli.measure.scenes import small
 
     return loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)

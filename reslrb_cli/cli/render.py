@@ -15,11 +15,10 @@ from reslrb_cli.cli.options import (
     check_writable,
     is_given,
     overrides_option,
-    read_config,
-    read_recovered,
     start_variant,
 )
 from reslrb_cli.cli.terminal import echo
+from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import ViewSpec
 from reslrb_cli.errors import ConfigError
@@ -97,7 +96,13 @@ def command(
     linear = output.suffix.lower() in FLOAT_FORMATS
     if linear and is_given("exposure") and (run is None or exposure != 1):
         raise click.UsageError(f"{output.suffix} is linear; --exposure is for PNG and JPG")
-    config = (read_config if run is None else read_recovered)(path, overrides).with_code(allow_code)
+    if run is None:
+        config = load(path, overrides)
+    else:
+        from reslrb_cli.records.run_folder import recovered
+
+        config = recovered(run, overrides)
+    config = config.with_code(allow_code)
     check_image_path(output)
     start_variant(config)
 

@@ -149,7 +149,7 @@ def _run(folder: Path, sweep: SweepPlan) -> int:
         LineFile(folder / RESULTS_FILE).write(_results(source))
         return source
 
-    page, verbose = LivePage(write, "the sweep's page", PAGE_SHARE), logger.isEnabledFor(logging.DEBUG)
+    page = LivePage(write, "the sweep's page", PAGE_SHARE)
     runs, interrupted = list(sweep.runs), False
     again = f"`reslrb sweep --resume {os.path.relpath(folder)}`"
     go_on = f"{again} continues"
@@ -163,7 +163,7 @@ def _run(folder: Path, sweep: SweepPlan) -> int:
                 break
             echo(f"run {number} of {len(runs)}: {label(combination.settings)}, seed {seed}")
             timed = load(config_file(folder, combination)).run.max_seconds is not None
-            code, line = call(command_of(folder, sweep, combination, seed), interrupts, verbose, fresh=timed)
+            code, line = call(command_of(folder, sweep, combination, seed), interrupts, fresh=timed)
             if interrupted := code == ExitCode.INTERRUPTED or (interrupts.requested and code != ExitCode.DONE):
                 break
             if code == ExitCode.MACHINE:
@@ -203,26 +203,21 @@ def _results(source: SweepRuns) -> list[Line]:
 # --- one run, in a process of its own ---------------------------------------------------------------------------------
 
 
-def call(
-    arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False, fresh: bool = False
-) -> tuple[int, str]:
+def call(arguments: Sequence[str], interrupts: Interrupts, fresh: bool = False) -> tuple[int, str]:
     """Run `reslrb` with these arguments in its own process. Returns its exit code and its last line.
 
     The first signal in `interrupts` is passed on to the process. A second signal ends the run's process together with
-    this process. `verbose` shows the output of the process. Otherwise, the run folder contains the warnings of the
-    process. A `fresh` process has no cached kernels or decisions. Runs with equal time limits therefore start under
-    equal conditions.
+    this process. The run folder contains the warnings of the process. A `fresh` process has no cached kernels or
+    decisions. Runs with equal time limits therefore start under equal conditions.
     """
     if fresh:
         with tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder:
             caches = dict.fromkeys(("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE"), folder)
-            return _call(arguments, interrupts, verbose, {**os.environ, **caches, "CUDA_CACHE_DISABLE": "1"})
-    return _call(arguments, interrupts, verbose, None)
+            return _call(arguments, interrupts, {**os.environ, **caches, "CUDA_CACHE_DISABLE": "1"})
+    return _call(arguments, interrupts, None)
 
 
-def _call(
-    arguments: Sequence[str], interrupts: Interrupts, verbose: bool, environment: dict[str, str] | None
-) -> tuple[int, str]:
+def _call(arguments: Sequence[str], interrupts: Interrupts, environment: dict[str, str] | None) -> tuple[int, str]:
     program = [*python_command(_PROGRAM), str(os.getpid()), *arguments]
     process = subprocess.Popen(
         program,
@@ -251,9 +246,7 @@ def _call(
                 *lines, rest = (rest + chunk).split(b"\n")
                 for line in (line.decode(errors="replace") for line in lines if line.strip()):
                     said.append(line)
-                    if verbose:
-                        echo(f"  {line}")
-                    elif _PROGRESS.match(line):
+                    if _PROGRESS.match(line):
                         _show(line)
         code = process.wait()
     finally:

@@ -317,8 +317,7 @@ run:
   certainty: false  # of a design there is no true value
 fabrication:  # mm; what `reslrb export` makes a solid of
   {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},{also}
-   picture: picture.exr,  # as it was, without a floor
-   size: [{s.size[0]:.9g}, {s.size[1]:.9g}]}}
+   picture: picture.exr}}  # as it was, without a floor
 """
 
 

@@ -131,8 +131,7 @@ def test_a_texture_is_recovered_with_a_transform(experiment, capsys, transform):
 
 
 def test_saved_files_of_a_run_agree(experiment, capsys):
-    assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=3", "--set", "run.images_every=2")[0] == 0
-    assert "iteration-000002.exr" in names("runs/box/images")
+    assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=3")[0] == 0
     with np.load("runs/box/checkpoint/state.npz") as state, np.load("runs/box/parameters/parameters.npz") as values:
         np.testing.assert_array_equal(state[f"parameter/{KEY}"], values[KEY])
         assert int(state["iteration"]) == 3

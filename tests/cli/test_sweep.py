@@ -52,7 +52,7 @@ def folder(llvm, tmp_path, monkeypatch):
     return tmp_path
 
 
-def call(arguments, interrupts, verbose=False, fresh=False):
+def call(arguments, interrupts, fresh=False):
     """Call the command in this process, in place of `sweep.call`."""
     result = CliRunner().invoke(main, list(arguments))
     return result.exit_code, result.output.strip().splitlines()[-1]
@@ -225,7 +225,7 @@ def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
             copy("over-final-images")
         end(self)
 
-    def calling(arguments, interrupts, verbose=False, fresh=False):
+    def calling(arguments, interrupts, fresh=False):
         calls.append(arguments)
         if len(calls) == 4:
             copy("between-runs")
@@ -266,7 +266,7 @@ def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
     ends = {"learning_rate=0.02-seed=1": (5, "the loss is not finite"), "learning_rate=0.2-seed=0": (-9, "killed")}
     called = []
 
-    def failing(arguments, interrupts, verbose=False, fresh=False):
+    def failing(arguments, interrupts, fresh=False):
         called.append(arguments)
         name = next(word for word in ends if any(word in each for each in arguments)) if any(
             word in each for word in ends for each in arguments) else None  # fmt: skip
@@ -322,7 +322,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_complete_folders(folder, monkey
 def test_a_sweep_locks_its_folder(folder, monkeypatch):
     said = []
 
-    def another(arguments, interrupts, verbose=False, fresh=False):
+    def another(arguments, interrupts, fresh=False):
         said.append(reslrb("sweep", "--resume", "s").output)
         return 130, ""
 
@@ -385,7 +385,7 @@ def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
 def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
     asked = []
 
-    def noting(arguments, interrupts, verbose=False, fresh=False):
+    def noting(arguments, interrupts, fresh=False):
         asked.append(fresh)
         return call(arguments, interrupts)
 
