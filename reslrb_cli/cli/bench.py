@@ -12,7 +12,7 @@ import click
 
 from reslrb_cli.cli.options import (
     COUNT,
-    Comparison,
+    ComparisonOptions,
     Counts,
     Keeper,
     check_writable,
@@ -38,7 +38,7 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
 
 
 @dataclass(frozen=True)
-class Options(Comparison):
+class BenchOptions(ComparisonOptions):
     """The options of the command, by the names of its parameters."""
 
     swept: str
@@ -79,7 +79,7 @@ def command(**given: Any) -> int:
     integrators continues. Ctrl-C keeps finished results. To continue after any interruption, repeat the command with
     the same --json file.
     """
-    began, options = time.monotonic(), Options(**given)
+    began, options = time.monotonic(), BenchOptions(**given)
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # before the imports below need them

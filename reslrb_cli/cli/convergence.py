@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.options import (
-    Comparison,
+    ComparisonOptions,
     Counts,
     Keeper,
     check_writable,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Options(Comparison):
+class ConvergenceOptions(ComparisonOptions):
     """The options of the command, by the names of its parameters."""
 
     objective: str
@@ -70,7 +70,7 @@ def command(**given: Any) -> int:
     (relative variance * seconds). Ctrl-C keeps finished results. To continue after any interruption, repeat the command
     with the same --json file. docs/convergence.md explains the columns.
     """
-    began, options = time.monotonic(), Options(**given)
+    began, options = time.monotonic(), ConvergenceOptions(**given)
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.config.loader import check_code
 

@@ -21,7 +21,7 @@ from reslrb_cli.backend.installation import load_packages
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cli.options import (
     COUNT,
-    Experiment,
+    ExperimentOptions,
     Keeper,
     allow_code_option,
     allowance,
@@ -56,7 +56,7 @@ CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget
 
 
 @dataclass(frozen=True)
-class Options(Experiment):
+class GradcheckOptions(ExperimentOptions):
     """The options of the command, by the names of its parameters."""
 
     suite: str | None
@@ -88,7 +88,7 @@ def _given(options: dict[str, str]) -> str | None:
     return next((option for name, option in options.items() if is_given(name)), None)
 
 
-def run_missing(options: Options, config: Config, variant: str) -> int:
+def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
     """Measure, print and write; return the exit code. `variant` must be set."""
     from reslrb_cli.measure.missing import KIND, MissingCheck
 
@@ -109,7 +109,7 @@ def run_missing(options: Options, config: Config, variant: str) -> int:
         return ExitCode.INTERRUPTED if interrupts.requested else ExitCode.DONE
 
 
-def run_suite(options: Options, place: Place | None) -> int:
+def run_suite(options: GradcheckOptions, place: Place | None) -> int:
     """Run the named cases, or all cases without names. Print a line for each case and write the file.
 
     Cases in the file are not run again. If `place` is given, the workers at this place run the cases.
@@ -141,7 +141,11 @@ def run_suite(options: Options, place: Place | None) -> int:
     keeper = Keeper(json_file, origin_of(variant), lines, lambda: [], lambda: suite.kept(to_keep, done))
     work = [(name, chosen, seeds) for name in to_do]
     with contextlib.ExitStack() as stack:
-        run = serially if place is None else stack.enter_context(_cases_at(place, variant))
+        run: Callable[..., Any] = serially
+        if place is not None:
+            from reslrb_cli.cluster.checks import cases_at
+
+            run = stack.enter_context(cases_at(place, variant))
         interrupts = stack.enter_context(Interrupts())
         found = in_order(run(lambda: interrupts.requested, case_records, work))
         for name, rows in zip(to_do, found, strict=True):
@@ -155,12 +159,6 @@ def run_suite(options: Options, place: Place | None) -> int:
     for line in summary_lines(lines()):
         echo(line)
     return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
-
-
-def _cases_at(place: Place, variant: str) -> contextlib.AbstractContextManager[Callable[..., Any]]:
-    from reslrb_cli.cluster.checks import cases_at
-
-    return cases_at(place, variant)
 
 
 def _listed(text: str) -> list[Case]:
@@ -241,7 +239,7 @@ def command(**given: Any) -> int:
     is a Cornell box (--set scene.options.size=64, ...). The exit code is 1 if a comparison fails; the last lines
     describe the failures. docs/gradcheck.md explains the columns.
     """
-    began, options = time.monotonic(), Options(**given)
+    began, options = time.monotonic(), GradcheckOptions(**given)
     load_packages()  # before the imports below need them
     from reslrb_cli.measure.gradcheck import Gradcheck
     from reslrb_cli.measure.methods import all_estimators
@@ -304,7 +302,7 @@ def _exit_code(records: Iterable[GradcheckRecord]) -> int:
 
 
 def _run(
-    check: Gradcheck, variant: str, to_keep: dict[str, Any], options: Options
+    check: Gradcheck, variant: str, to_keep: dict[str, Any], options: GradcheckOptions
 ) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write. Return all records, and True if the user interrupted."""
     from reslrb_cli.report.tables import cells, gradcheck_columns

@@ -47,7 +47,7 @@ def read_luminance(path: Path) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Options:
+class LensOptions:
     """The options of the command, by the names of its parameters."""
 
     picture: Path
@@ -147,7 +147,7 @@ def command(**given: Any) -> None:
     from reslrb_cli.lens.surface import Setting, is_even, shape_surface
     from reslrb_cli.lens.transport import resized
 
-    options = Options(**given)
+    options = LensOptions(**given)
     options.check()
     picture, output, pixels, size, sun, both = (
         options.picture, options.output, options.pixels, options.size, options.sun, options.both

@@ -15,7 +15,7 @@ import click
 
 from reslrb_cli.cli.options import (
     FOLDER,
-    Experiment,
+    ExperimentOptions,
     allow_code_option,
     cluster_option,
     optional_experiment_arguments,
@@ -63,7 +63,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Options(Experiment):
+class OptimizeOptions(ExperimentOptions):
     """The options of the command, by the names of its parameters."""
 
     force: bool
@@ -99,7 +99,7 @@ def command(**given: Any) -> int:
     current iteration, with a complete folder. A second signal ends the run at once. --resume RUN continues any run that
     has ended.
     """
-    options = Options(**given)
+    options = OptimizeOptions(**given)
     if options.quiet:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING)
     workers = None if options.cluster is None else Place.parse(options.cluster)
@@ -125,7 +125,7 @@ def _check_shards(config: Config, workers: Place | None) -> None:
         raise ConfigError(config.source, "run.stages", "cannot be combined with --cluster yet; remove one of them")
 
 
-def _begin(config_file: Path, options: Options, workers: Place | None) -> int:
+def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -> int:
     from reslrb_cli.records.run_folder import check_output
 
     config = options.config()
@@ -144,7 +144,7 @@ def _begin(config_file: Path, options: Options, workers: Place | None) -> int:
     return _run(begin(config, variant, options.force, logger.info, logger.warning), workers, options.quiet)
 
 
-def _resume(run: Path, options: Options, workers: Place | None) -> int:
+def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
     from reslrb_cli.runs.resume import open_earlier
 
     with open_earlier(run, options.config_file, options.overrides) as earlier:

@@ -218,46 +218,40 @@ class Counts(click.ParamType):
 
 #: Advice for removed options, by command and option.
 REMOVED = {
-    "convergence --runs": "compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
-    "--vary 'integrator=[prb, reslrb:stack]'`",
-    "convergence --rates": "compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
-    **dict.fromkeys(
-        (f"{command} --markdown" for command in ("bench", "gradcheck", "convergence")),
-        "`reslrb report FILE -o page.html` shows the table of results of --json FILE",
-    ),
-    **dict.fromkeys(
-        (f"{command} --plot" for command in ("bench", "gradcheck", "convergence")),
-        "`reslrb report FILE -o page.html` plots results of --json FILE",
-    ),
-    **dict.fromkeys(
-        (f"{command} --resume" for command in ("bench", "gradcheck", "convergence")),
-        "--json FILE continues from the results in FILE",
-    ),
-    **dict.fromkeys(
-        ("bench --memory-limit", "convergence --memory-limit"),
-        "the shell's `ulimit -v KIB` limits every process of the command",
-    ),
-    **dict.fromkeys(
-        ("optimize --verbose", "optimize -v"), "`reslrb --debug optimize` prints details of the measurements"
-    ),
-    **dict.fromkeys(("sweep --verbose", "sweep -v"), "the folder of each run has its warnings"),
-    **dict.fromkeys(("init --force", "lens --force"), "remove or rename the files that exist"),
-    "gradcheck --estimators": "name them by --integrators, such as reslrb:stack,reslrb:gather",
-    "gradcheck --case": "name the case after the suite, as in --suite extreme:furnace",
-    "gradcheck --directions": "each parameter has three directions",
-    "render --run": "name the folder of the run in place of CONFIG, as in `reslrb render RUN -o IMAGE`",
-    "render --spp": "use --set run.spp=N",
-    "sweep --retry": "a sweep that continues repeats its failed runs",
-    "sweep --json": "results.jsonl in the folder of the sweep has the results",
-    "sweep --dry-run": "`reslrb optimize CONFIG --dry-run` measures one of the runs",
-    "sweep --quiet": "redirect the output, as in > sweep.log",
-    "init --recover": "all other parameters are comments of the file; remove the # of those that you want",
-    "inspect --samples": "--conditioning takes 8 gradients",
-    "doctor --json": "the lines of `reslrb doctor` have the same content",
-    "lens --margin": "the film sees an eighth of the picture's longer side around it",
-    "lens --incidence": "--mirror DEGREES gives the angle",
-    "lens --through": "exchange left and right of the picture, for a view from behind",
-}
+    f"{command} {option}": advice
+    for commands, option, advice in (
+        ("convergence", "--runs", "compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
+         "--vary 'integrator=[prb, reslrb:stack]'`"),
+        ("convergence", "--rates", "compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, "
+         "0.1]'`"),
+        ("bench gradcheck convergence", "--markdown",
+         "`reslrb report FILE -o page.html` shows the table of results of --json FILE"),
+        ("bench gradcheck convergence", "--plot", "`reslrb report FILE -o page.html` plots results of --json FILE"),
+        ("bench gradcheck convergence", "--resume", "--json FILE continues from the results in FILE"),
+        ("bench convergence", "--memory-limit", "the shell's `ulimit -v KIB` limits every process of the command"),
+        ("optimize", "--verbose", "`reslrb --debug optimize` prints details of the measurements"),
+        ("optimize", "-v", "`reslrb --debug optimize` prints details of the measurements"),
+        ("sweep", "--verbose", "the folder of each run has its warnings"),
+        ("sweep", "-v", "the folder of each run has its warnings"),
+        ("sweep", "--retry", "a sweep that continues repeats its failed runs"),
+        ("sweep", "--json", "results.jsonl in the folder of the sweep has the results"),
+        ("sweep", "--dry-run", "`reslrb optimize CONFIG --dry-run` measures one of the runs"),
+        ("sweep", "--quiet", "redirect the output, as in > sweep.log"),
+        ("gradcheck", "--estimators", "name them by --integrators, such as reslrb:stack,reslrb:gather"),
+        ("gradcheck", "--case", "name the case after the suite, as in --suite extreme:furnace"),
+        ("gradcheck", "--directions", "each parameter has three directions"),
+        ("render", "--run", "name the folder of the run in place of CONFIG, as in `reslrb render RUN -o IMAGE`"),
+        ("render", "--spp", "use --set run.spp=N"),
+        ("init lens", "--force", "remove or rename the files that exist"),
+        ("init", "--recover", "all other parameters are comments of the file; remove the # of those that you want"),
+        ("inspect", "--samples", "--conditioning takes 8 gradients"),
+        ("doctor", "--json", "the lines of `reslrb doctor` have the same content"),
+        ("lens", "--margin", "the film sees an eighth of the picture's longer side around it"),
+        ("lens", "--incidence", "--mirror DEGREES gives the angle"),
+        ("lens", "--through", "exchange left and right of the picture, for a view from behind"),
+    )
+    for command in commands.split()
+}  # fmt: skip
 
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
@@ -320,7 +314,7 @@ def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[...,
 
 
 @dataclass(frozen=True)
-class Experiment:
+class ExperimentOptions:
     """The options of commands that run an experiment, by the names of their parameters."""
 
     config_file: Path | None
@@ -333,7 +327,7 @@ class Experiment:
 
 
 @dataclass(frozen=True)
-class Comparison(Experiment):
+class ComparisonOptions(ExperimentOptions):
     """The options of commands that compare integrators by measurements (`comparison_options`)."""
 
     integrators: str | None
@@ -343,7 +337,7 @@ class Comparison(Experiment):
 
 
 def comparison_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `Comparison` to a command, except CONFIG, `--set` and `--integrators`."""
+    """Add the options of `ComparisonOptions` to a command, except CONFIG, `--set` and `--integrators`."""
     rounds = click.option(
         "--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
         help="Number of steps of each integrator, including those in the file of --json, for any time: the same steps "

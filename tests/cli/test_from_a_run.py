@@ -12,14 +12,13 @@ from agreement import compare
 from cli import tiny
 from cli.tiny import reslrb
 
-from reslrb_cli.cli.options import read_recovered
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.parameters import ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
 from reslrb_cli.records.images import load_image, read_parameters
-from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.records.run_folder import read_value, recovered
 from reslrb_cli.runs.export import choose_integrator
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
@@ -145,7 +144,7 @@ def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "rendered by ptracer" in result.output
     theirs = mi.load_file(str(folder / "exported/scene.xml"))
-    problem = assemble_scene(read_recovered(folder / "runs/tiny", ("integrator.rr_depth=9",)))
+    problem = assemble_scene(recovered(folder / "runs/tiny", ("integrator.rr_depth=9",)))
     found = np.stack([np.array(mi.render(theirs, spp=64, seed=seed)) for seed in range(16)])
     result = compare(np.stack([problem.render(0, 64, seed, "test") for seed in range(16)]), found)
     assert result, result
@@ -219,7 +218,7 @@ def test_an_exported_scene_names_path_if_ptracer_is_wrong(tmp_path: Path) -> Non
     assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")
 
 
-# Continuing from runs whose cameras come from a file, and which recovered a relief: `render --run` and `export`.
+# Continuing from runs whose cameras come from a file, and which recovered a relief: `render` and `export`.
 
 SIZE = 12
 #: A sheet of 5x5 vertices that is lit by a lamp. The cameras of the file replace this sensor.
@@ -302,8 +301,8 @@ def test_each_camera_is_rendered_with_the_relief(run: Path, tmp_path: Path, sens
     assert done.exit_code == 0, done.output
     image = load_image(file)
     assert image.shape == (SIZE, SIZE, 3)
-    recovered, begun = (assemble_scene(config) for config in (read_recovered(run, ()), load(run / "config.yaml")))
-    own, first = (np.stack([one.render(sensor, 16, k, "test").mean() for k in range(16)]) for one in (recovered, begun))
+    ended, begun = (assemble_scene(config) for config in (recovered(run, ()), load(run / "config.yaml")))
+    own, first = (np.stack([one.render(sensor, 16, k, "test").mean() for k in range(16)]) for one in (ended, begun))
     error = own.std(ddof=1) * np.sqrt(2 / len(own))  # the image has as many samples as all these renderings
     far = np.abs(np.array([own.mean(), first.mean()]) - image.mean()) / error
     assert far[0] < 3 < far[1], (image.mean(), own, first)
@@ -316,8 +315,8 @@ def test_mitsuba_sees_the_relief_from_each_camera(run: Path, tmp_path: Path, sen
     assert done.exit_code == 0, done.output
     theirs = mi.load_file(str(tmp_path / "exported/scene.xml"))
     assert len(theirs.sensors()) == 2
-    recovered, begun = (assemble_scene(config) for config in (read_recovered(run, ()), load(run / "config.yaml")))
-    own, first = (np.stack([one.render(sensor, 64, k, "test") for k in range(16)]) for one in (recovered, begun))
+    ended, begun = (assemble_scene(config) for config in (recovered(run, ()), load(run / "config.yaml")))
+    own, first = (np.stack([one.render(sensor, 64, k, "test") for k in range(16)]) for one in (ended, begun))
     found = np.stack([np.array(mi.render(theirs, sensor=sensor, spp=64, seed=seed)) for seed in range(16)])
     result = compare(own, found)
     assert result, result

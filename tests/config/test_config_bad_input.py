@@ -296,7 +296,6 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "name from a home": (GOOD + "run: {name: ~root/x}\n", "run.name: must be a name and not a path"),
     "name of the folder": (GOOD + "run: {name: '..'}\n", "run.name: must be a name and not a path"),
     "name of a drive": (GOOD + "run: {name: 'C:\\x'}\n", "run.name: must be a name and not a path"),
-    "name of a device": (GOOD + "run: {name: Aux.1}\n", "run.name: must be another name: Aux.1"),
     "empty key of a target": (
         target("{render: {parameters: {'': 1}}}"),
         "target.render.parameters: must have keys that are not empty",
