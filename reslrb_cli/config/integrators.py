@@ -29,7 +29,7 @@ from reslrb_cli.config.base import (
     mark,
     must,
 )  # fmt: skip
-from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
+from reslrb_cli.config.files import CAPACITY, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
 
 _DEPTH = must(
     lambda depth: depth <= PATH_LENGTH,
@@ -247,13 +247,8 @@ class TrajectoryConfig(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
 
     @model_validator(mode="after")
     def _check_record(self) -> Self:
-        """Raise an error if the record of a path, which has room for `max_depth` vertices, would be too long."""
-        if not 0 <= self.max_depth < LOCAL_ENTRIES:
-            raise located(
-                "max_depth",
-                f"must be at least 0 and less than {LOCAL_ENTRIES}, not {self.max_depth}: the record of a path has one "
-                "entry for each vertex, and thread-local memory is limited; use reslrb, which needs no record",
-            )
+        if self.max_depth < 0:
+            raise located("max_depth", "must be at least 0: the record of a path has one entry for each vertex")
         return self
 
 

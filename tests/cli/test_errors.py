@@ -208,7 +208,7 @@ REFUSED = {
     ),
     "record": (
         [f"integrator={TRAJECTORY}"],
-        "integrator.max_depth: must be at least 0 and less than 65536, not 70000: the record of a path has one entry",
+        "integrator.max_depth: must be at most 65535 segments, or -1 for no limit, not 70000",
     ),
 }
 
