@@ -220,7 +220,7 @@ def gradcheck(
     Returns one record per comparison, with the fields that `--json` writes. `record.holds` is False if the comparison
     fails.
 
-    - `estimators`: a list as for `--estimators` (default: all four).
+    - `estimators`: a list of estimators, such as `stack,reservoir(capacity=4)` (default: all four).
     - `budget`: total time in seconds.
     - `seeds`: number of seeds, at least 3, regardless of `budget`.
     - `spp`: samples per pixel of one gradient.

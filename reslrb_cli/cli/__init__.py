@@ -102,8 +102,8 @@ def _explained(error: BaseException) -> BaseException:
     if isinstance(error, click.NoSuchOption):
         from reslrb_cli.cli.options import REMOVED
 
-        if error.option_name in REMOVED:
-            return click.UsageError(f"{error.option_name} {REMOVED[error.option_name]}", error.ctx)
+        if advice := REMOVED.get(f"{error.ctx and error.ctx.info_name} {error.option_name}"):
+            return click.UsageError(f"{error.option_name} was removed; {advice}", error.ctx)
     return error
 
 
@@ -117,14 +117,17 @@ def _set_debug(ctx: click.Context, _parameter: click.Parameter, value: bool) -> 
 )
 @click.version_option(__version__, prog_name="reslrb")
 @click.option(
-    "--debug", is_flag=True, expose_value=False, callback=_set_debug, help="Also show the traceback of an error."
-)
+    "--debug", is_flag=True, expose_value=False, callback=_set_debug,
+    help="Also show the traceback of an error, and details of the measurements before a run.",
+)  # fmt: skip
 def main() -> None:
     """Recover scene parameters from images by gradients through light paths, with Mitsuba 3."""
     logger = logging.getLogger("reslrb_cli")
     if not logger.handlers:
         logger.addHandler(LogLines())
         logger.setLevel(logging.INFO)
+    if main.debug:
+        logger.setLevel(logging.DEBUG)
     try:
         os.getcwd()
     except OSError as error:  # it was removed, and Mitsuba does not load without it

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from reslrb_cli.cli.options import (
     COUNT,
+    ComparisonOptions,
     Counts,
     Keeper,
-    allow_code_option,
-    budget_option,
     check_writable,
+    comparison_options,
     exit_code,
     is_given,
-    json_option,
     measuring,
-    memory_limit_option,
     optional_experiment_arguments,
     origin_of,
-    read_or_box,
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
@@ -37,6 +35,16 @@ if TYPE_CHECKING:
 
 #: Integrators that are compared by default.
 INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
+
+
+@dataclass(frozen=True)
+class BenchOptions(ComparisonOptions):
+    """The options of the command, by the names of its parameters."""
+
+    swept: str
+    values: tuple[int, ...] | None
+    max_depth: int
+    objective: str
 
 
 @click.command("bench")
@@ -61,18 +69,8 @@ INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,
 @click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,
               help="fixed: dL/dI is known before the image; l2: it comes from the image, as "
                    "run.adjoint says.")  # fmt: skip
-@allow_code_option
-@memory_limit_option
-@budget_option
-@click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of steps of each integrator, including those in the file of --json, for "
-                   "any time.")  # fmt: skip
-@json_option
-def command(
-    config_file: Path | None, overrides: tuple[str, ...], swept: str, values: tuple[int, ...] | None, max_depth: int,
-    integrators: str | None, objective: str, allow_code: bool, memory_limit: int | None,
-    budget: float, rounds: int | None, json_file: Path | None,
-) -> int:  # fmt: skip
+@comparison_options
+def command(**given: Any) -> int:
     """Measure time and peak memory of gradient steps against path depth, or another quantity (--sweep).
 
     A step computes the image of CONFIG's first sensor, the loss, and the gradient of every parameter. Without CONFIG,
@@ -81,28 +79,28 @@ def command(
     integrators continues. Ctrl-C keeps finished results. To continue after any interruption, repeat the command with
     the same --json file.
     """
-    began = time.monotonic()
+    began, options = time.monotonic(), BenchOptions(**given)
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # before the imports below need them
     from reslrb_cli.measure.methods import Sweep, depths, machine_of, parse_cases, usual_values
     from reslrb_cli.records.measurements import BenchStatus
 
-    config = read_or_box(config_file, overrides).with_code(allow_code)
+    config, swept, values, json_file = options.config(), options.swept, options.values, options.json_file
     if (swept != "depth" or values is not None) and is_given("max_depth"):
         reason = "needs --sweep depth" if values is None else "has no effect with --values"
-        raise ConfigError("--max-depth", "", f"{reason}; use --set integrator.max_depth={max_depth}")
-    cases = parse_cases(integrators or INTEGRATORS, deep=swept == "depth")
+        raise ConfigError("--max-depth", "", f"{reason}; use --set integrator.max_depth={options.max_depth}")
+    usual = depths(options.max_depth) if swept == "depth" else usual_values(swept, config)
     check_writable("--json", json_file)
     sweep = Sweep(
-        **machine_of(config, memory_limit),
+        **machine_of(config, None),
         config=config,
-        cases=cases,
-        values=sorted(values or (depths(max_depth) if swept == "depth" else usual_values(swept, config))),
-        objective=objective,
-        budget_s=budget,
-        rounds=rounds,
-        default=integrators is None,
+        cases=parse_cases(options.integrators or INTEGRATORS, deep=swept == "depth"),
+        values=sorted(values or usual),
+        objective=options.objective,
+        budget_s=options.budget,
+        rounds=options.rounds,
+        default=options.integrators is None,
         swept=swept,
     )
     sweep.check()

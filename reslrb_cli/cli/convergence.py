@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from reslrb_cli.cli.options import (
-    COUNT,
+    ComparisonOptions,
     Counts,
     Keeper,
-    allow_code_option,
-    budget_option,
     check_writable,
+    comparison_options,
     exit_code,
     experiment_arguments,
-    json_option,
     measuring,
-    memory_limit_option,
     origin_of,
 )
 from reslrb_cli.cli.terminal import echo
@@ -32,6 +30,15 @@ if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.methods import Plan
     from reslrb_cli.records.measurements import MethodRecord
+
+
+@dataclass(frozen=True)
+class ConvergenceOptions(ComparisonOptions):
+    """The options of the command, by the names of its parameters."""
+
+    objective: str
+    spps: tuple[int, ...] | None
+    reference: str | None
 
 
 @click.command("convergence")
@@ -46,11 +53,6 @@ if TYPE_CHECKING:
               help=
         "fixed: the gradient with dL/dI of a reference image; loss: the gradient of CONFIG's loss, as "
         "run.adjoint says; image: the image.")  # fmt: skip
-@budget_option
-@click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help=
-        "Number of turns of each method, including those in the file of --json, for any time: the same steps "
-        "on every machine.")  # fmt: skip
 @click.option("--spp", "spps", type=Counts(), metavar="LIST",
               help="Samples per pixel of a step; several values are compared, e.g. 4,16,64. Default: "
                    "run.spp.")  # fmt: skip
@@ -58,14 +60,8 @@ if TYPE_CHECKING:
               help=
         "Method whose mean over many steps is the reference for errors. Default: reslrb:stack with half light "
         "paths and half camera paths, if CONFIG allows it.")  # fmt: skip
-@allow_code_option
-@memory_limit_option
-@json_option
-def command(
-    config_file: Path, overrides: tuple[str, ...], integrators: str | None, objective: str, budget: float,
-    rounds: int | None, spps: tuple[int, ...] | None, reference: str | None, allow_code: bool,
-    memory_limit: int | None, json_file: Path | None,
-) -> int:  # fmt: skip
+@comparison_options
+def command(**given: Any) -> int:
     """Measure how fast each method's error falls for CONFIG. The parameters have initial values, and the first sensor
     is used.
 
@@ -74,26 +70,26 @@ def command(
     (relative variance * seconds). Ctrl-C keeps finished results. To continue after any interruption, repeat the command
     with the same --json file. docs/convergence.md explains the columns.
     """
-    began = time.monotonic()
+    began, options = time.monotonic(), ConvergenceOptions(**given)
     from reslrb_cli.backend.installation import load_packages
-    from reslrb_cli.config.loader import check_code, load
+    from reslrb_cli.config.loader import check_code
 
     load_packages()  # before the imports below need them
     from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of
 
-    config = load(config_file, overrides).with_code(allow_code)
+    config, objective, json_file = options.config(), options.objective, options.json_file
     if objective == "loss":
         check_code(config)
-    named = compared(integrators, reference, DEFAULTS[objective])
+    named = compared(options.integrators, options.reference, DEFAULTS[objective])
     check_writable("--json", json_file)
     plan = Plan(
-        **machine_of(config, memory_limit),
+        **machine_of(config, None),
         **named,
         config=config,
         objective=objective,
-        budget_s=budget,
-        rounds=rounds,
-        spps=spps or (),
+        budget_s=options.budget,
+        rounds=options.rounds,
+        spps=options.spps or (),
     )
     plan.check()
     results, interrupted = _run(plan, json_file, began)

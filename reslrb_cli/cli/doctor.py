@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-
 import click
 
 from reslrb_cli.backend.doctor import Backend, Report, examine
@@ -13,18 +10,14 @@ from reslrb_cli.errors import BackendError
 
 
 @click.command("doctor")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of lines.")
-def command(as_json: bool) -> None:
+def command() -> None:
     """Show the variant, device, libLLVM and versions in use, and test them.
 
     Each backend compiles and runs one kernel and traces one ray. The exit code is 3 if no backend works.
     """
     report = examine()
-    if as_json:
-        click.echo(json.dumps(dataclasses.asdict(report), indent=2))
-    else:
-        for name, value in _lines(report):
-            echo(f"{name:14} {value}")
+    for name, value in _lines(report):
+        echo(f"{name:14} {value}")
     missing = [name for name, version in report.packages.items() if version is None and name != "reslrb"]
     if missing:
         raise BackendError(f"missing packages; install them with `pip install {' '.join(missing)}`")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from reslrb_cli.cli.options import FOLDER, overrides_option, read_recovered, start_variant
+from reslrb_cli.cli.options import FOLDER, overrides_option, start_variant
 from reslrb_cli.cli.terminal import echo
 
 
@@ -31,9 +31,10 @@ def command(run: Path, overrides: tuple[str, ...], output: Path, tolerances: boo
     solid in millimetres (lens.stl, .3mf, .ply). FOLDER then also contains the solid's heights (heights.png, .exr)
     and fabrication.json.
     """
+    from reslrb_cli.records.run_folder import recovered
     from reslrb_cli.runs.export import check_export, write_export
 
-    config = read_recovered(run, overrides)
+    config = recovered(run, overrides)
     check_export(config, output, tolerances)
     start_variant(config)
     write_export(config, run, output, tolerances, echo)

@@ -10,6 +10,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from reslrb_cli.backend.installation import load_packages
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cli.options import (
     COUNT,
+    ExperimentOptions,
     Keeper,
     allow_code_option,
     allowance,
@@ -27,7 +29,6 @@ from reslrb_cli.cli.options import (
     cluster_option,
     is_given,
     json_option,
-    look_at,
     optional_experiment_arguments,
     origin_of,
     read_earlier,
@@ -37,22 +38,49 @@ from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_estimators
+from reslrb_cli.measure.methods import PATHS_OPTIONS, Case, parse_cases
 from reslrb_cli.measure.resume_store import settings
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
 
 if TYPE_CHECKING:
-    from reslrb_cli.config.schema import Config
     from reslrb_cli.measure.gradcheck import CheckResult, Gradcheck
 
 
 #: Options of comparisons; `--missing` makes none.
-COMPARING = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "integrators": "--integrators",
-             "folder": "--images"}  # fmt: skip
+COMPARING = {"suite": "--suite", "integrators": "--integrators", "images": "--images"}
 
 #: Options of a configuration; a suite has none.
-CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
+CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "images": "--images"}
+
+
+@dataclass(frozen=True)
+class GradcheckOptions(ExperimentOptions):
+    """The options of the command, by the names of its parameters."""
+
+    suite: str | None
+    integrators: str | None
+    budget: float
+    seeds: int | None
+    cluster: str | None
+    json_file: Path | None
+    spp: int | None
+    missing: bool
+    images: Path | None
+
+    def check(self) -> None:
+        """Raise ConfigError if an option has no effect beside another."""
+        if self.missing and (option := _given(COMPARING)):
+            raise ConfigError(option, "", "has no effect with --missing, which compares nothing; remove one of them")
+        if self.missing and self.config_file is None:
+            raise ConfigError("--missing", "", "needs a CONFIG with parameters and a loss")
+        if self.missing and self.cluster is not None:
+            raise ConfigError("--cluster", "", "has no effect with --missing, which distributes nothing; remove one")
+        if self.suite is not None and (option := _given(CONFIGURED)):
+            raise ConfigError("--suite", "", f"{option} has no effect on a suite; remove it")
+        if self.suite is not None and self.suite.partition(":")[0] != "extreme":
+            raise ConfigError("--suite", "", f"there is no suite `{self.suite}`; write extreme, or extreme:CASE")
 
 
 def _given(options: dict[str, str]) -> str | None:
@@ -60,15 +88,13 @@ def _given(options: dict[str, str]) -> str | None:
     return next((option for name, option in options.items() if is_given(name)), None)
 
 
-def run_missing(
-    config: Config, variant: str, budget: float, seeds: int | None, spp: int | None, along: int | None,
-    json_file: Path | None,
-) -> int:  # fmt: skip
+def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
     """Measure, print and write; return the exit code. `variant` must be set."""
     from reslrb_cli.measure.missing import KIND, MissingCheck
 
-    to_keep = settings(config, {}, variant, device_name(variant), spp=spp, directions=along)
-    check = MissingCheck(config, budget, seeds, spp, along, read_earlier(KIND, json_file, to_keep))
+    json_file, seeds, spp = options.json_file, options.seeds, options.spp
+    to_keep = settings(config, {}, variant, device_name(variant), spp=spp, directions=None)
+    check = MissingCheck(config, options.budget, seeds, spp, None, read_earlier(KIND, json_file, to_keep))
     echo(check.conditions())
     records: list[MissingRecord] = []
     keeper = Keeper(
@@ -83,24 +109,24 @@ def run_missing(
         return ExitCode.INTERRUPTED if interrupts.requested else ExitCode.DONE
 
 
-def run_suite_command(
-    names: tuple[str, ...], estimators: str | None, seeds: int | None, json_file: Path | None, place: Place | None
-) -> int:
+def run_suite(options: GradcheckOptions, place: Place | None) -> int:
     """Run the named cases, or all cases without names. Print a line for each case and write the file.
 
     Cases in the file are not run again. If `place` is given, the workers at this place run the cases.
     """
-    chosen = _estimators(estimators)
+    chosen = None if options.integrators is None else _estimators(options.integrators)
     variant = set_variant("auto")
 
     from reslrb_cli.measure.extreme import CASES, case_records, suite
     from reslrb_cli.optimization.shards import in_order, serially
     from reslrb_cli.report.tables import summary_lines
 
+    seeds, json_file, listed = options.seeds, options.json_file, str(options.suite).partition(":")[2]
+    names = [name.strip() for name in listed.split(",")] if listed else []
     for name in names:
         if name not in CASES:
-            near = difflib.get_close_matches(name, list(CASES), n=1, cutoff=0)
-            raise ConfigError("--case", "", f"there is no case `{name}`; did you mean {near[0]}?")
+            near = difflib.get_close_matches(name, CASES, n=1) or ["furnace"]
+            raise ConfigError("--suite", "", f"there is no case `{name}`; did you mean {near[0]}?")
     to_keep = suite.settings(chosen, seeds, variant, device_name(variant))
     earlier = read_earlier(suite.KIND, json_file, to_keep)
     done = {} if earlier is None else suite.restore(earlier)
@@ -115,7 +141,11 @@ def run_suite_command(
     keeper = Keeper(json_file, origin_of(variant), lines, lambda: [], lambda: suite.kept(to_keep, done))
     work = [(name, chosen, seeds) for name in to_do]
     with contextlib.ExitStack() as stack:
-        run = serially if place is None else stack.enter_context(_cases_at(place, variant))
+        run: Callable[..., Any] = serially
+        if place is not None:
+            from reslrb_cli.cluster.checks import cases_at
+
+            run = stack.enter_context(cases_at(place, variant))
         interrupts = stack.enter_context(Interrupts())
         found = in_order(run(lambda: interrupts.requested, case_records, work))
         for name, rows in zip(to_do, found, strict=True):
@@ -131,26 +161,28 @@ def run_suite_command(
     return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
 
 
-def _cases_at(place: Place, variant: str) -> contextlib.AbstractContextManager[Callable[..., Any]]:
-    from reslrb_cli.cluster.checks import cases_at
+def _listed(text: str) -> list[Case]:
+    """Parse `--integrators`: estimators of `reslrb`, and the user's own integrators. Raises ConfigError."""
+    cases = parse_cases(text, deep=False)
+    for case in cases:
+        if case.type != "custom" and "estimator" not in case.options:
+            reason = f"`{case.label}` is neither an estimator, reslrb:ESTIMATOR, nor your own integrator, FILE.py:CLASS"
+            raise ConfigError("--integrators", "", reason)
+    return cases
 
-    return cases_at(place, variant)
 
-
-def _estimators(text: str | None) -> list[str] | None:
+def _estimators(text: str) -> list[str]:
     """Parse the estimators for a suite. Estimators accept no option except `paths`, because the cases set their own
     options.
     """
-    if text is None:
-        return None
     written = []
-    for case in parse_estimators(text):
-        name, label = case.options["estimator"], case.label.partition(":")[2]
+    for case in _listed(text):
+        name, label = case.options.get("estimator"), case.label.partition(":")[2]
         if not case.options.keys() <= {"estimator", *PATHS_OPTIONS}:
-            raise ConfigError("--estimators", label, "a suite allows no option except paths")
+            raise ConfigError("--integrators", label, "a suite allows estimators of reslrb, and no option except paths")
         if name not in ESTIMATOR_OPTIONS or name == "auto":
             known = ", ".join(other for other in ESTIMATOR_OPTIONS if other != "auto")
-            raise ConfigError("--estimators", "", f"`{name}` is no estimator; there are {known}")
+            raise ConfigError("--integrators", "", f"`{name}` is no estimator; there are {known}")
         case.at(read_or_box(None, ()), 4, known=True)
         written.append(label)
     return written
@@ -171,21 +203,15 @@ logger = logging.getLogger(__name__)
 
 @click.command("gradcheck")
 @optional_experiment_arguments
-@click.option("--suite", type=click.Choice(["extreme"]),
-              help="Run the scenes of a suite in place of CONFIG. extreme: scenes in which gradients "
-                   "often fail.")  # fmt: skip
-@click.option(
-    "--case", "cases", multiple=True, metavar="NAME", help="Run only this case of the suite. May be repeated."
-)
-@click.option("--estimators", metavar="LIST",
-              help=
-        "Estimators to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
-        "options of CONFIG, and stack(paths=both) if CONFIG leaves the paths open and the scene "
-             "allows both.")  # fmt: skip
+@click.option("--suite", metavar="extreme[:CASE,...]",
+              help="Run the scenes of a suite in place of CONFIG, or only the named cases. extreme: scenes in which "
+                   "gradients often fail.")  # fmt: skip
 @click.option("--integrators", metavar="LIST",
               help=
-        "Check your own Mitsuba integrators, FILE.py:CLASS[(OPTION=VALUE,...)], separated by commas, and say "
-        "where to look if one is wrong. Needs --allow-code.")  # fmt: skip
+        "Check these, separated by commas: estimators, reslrb:ESTIMATOR[(OPTION=VALUE,...)], or your own Mitsuba "
+        "integrators, FILE.py:CLASS[(OPTION=VALUE,...)], which need --allow-code; the last lines say where to look "
+        "if one of these is wrong. Default: all four estimators, with the options of CONFIG, and "
+        "reslrb:stack(paths=both) if CONFIG leaves the paths open and the scene allows both.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
               help=
         "Time limit, including loading and compiling; it determines the number of seeds. Comparisons without "
@@ -201,18 +227,11 @@ logger = logging.getLogger(__name__)
               help=
         "Instead, measure the share of each parameter's derivative that silhouettes, shadow edges and light "
         "that leaves the film make up, which no gradient here includes.")  # fmt: skip
-@click.option("--directions", type=click.IntRange(min=1, max=64), metavar="N",
-              help="With --missing: number of directions of each parameter. Default: 3.")  # fmt: skip
-@click.option("--images", "folder", type=click.Path(path_type=Path, file_okay=False),
+@click.option("--images", type=click.Path(path_type=Path, file_okay=False),
               help=
         "Write maps of the gradients of textures, their references and z to this folder, as PNG and as layers "
         "of EXR files.")  # fmt: skip
-def command(
-    config_file: Path | None, overrides: tuple[str, ...], suite: str | None, cases: tuple[str, ...],
-    estimators: str | None, integrators: str | None, budget: float, seeds: int | None, allow_code: bool,
-    cluster: str | None, json_file: Path | None, spp: int | None, missing: bool, directions: int | None,
-    folder: Path | None,
-) -> int:  # fmt: skip
+def command(**given: Any) -> int:
     """Compare the gradients of every parameter of CONFIG with references. The parameters have their initial values.
 
     Each estimator is compared with naive AD of the same paths (walk_ad), with a valid stock integrator (ptracer, else
@@ -220,39 +239,33 @@ def command(
     is a Cornell box (--set scene.options.size=64, ...). The exit code is 1 if a comparison fails; the last lines
     describe the failures. docs/gradcheck.md explains the columns.
     """
-    began = time.monotonic()
+    began, options = time.monotonic(), GradcheckOptions(**given)
     load_packages()  # before the imports below need them
     from reslrb_cli.measure.gradcheck import Gradcheck
-    from reslrb_cli.measure.participants import settings_of
+    from reslrb_cli.measure.methods import all_estimators
+    from reslrb_cli.measure.participants import CheckSettings
     from reslrb_cli.measure.sampling import KIND
     from reslrb_cli.measure.sampling import settings as settings_to_keep
     from reslrb_cli.report.tables import summary_lines
 
-    if missing and (option := _given(COMPARING)):
-        raise ConfigError(option, "", "has no effect with --missing, which compares nothing; remove one of them")
-    if missing and config_file is None:
-        raise ConfigError("--missing", "", "needs a CONFIG with parameters and a loss")
-    if directions is not None and not missing:
-        raise ConfigError("--directions", "", "needs --missing")
-    place = None if cluster is None else Place.parse(cluster)
-    if missing and place is not None:
-        raise ConfigError("--cluster", "", "has no effect with --missing, which distributes nothing; remove one")
-    check_writable("--json", json_file)
-    if suite is not None:
-        if option := _given(CONFIGURED):
-            reason = f"{option} has no effect on a suite; remove it"
-            raise ConfigError("--suite", "", reason)
-        return run_suite_command(cases, estimators, seeds, json_file, place)
-    if cases:
-        raise ConfigError("--case", "", "names a case of a suite; add --suite extreme")
-    config = read_or_box(config_file, overrides).with_code(allow_code)
-    if missing:
+    options.check()
+    place = None if options.cluster is None else Place.parse(options.cluster)
+    check_writable("--json", options.json_file)
+    if options.suite is not None:
+        return run_suite(options, place)
+    config = options.config()
+    if options.missing:
         check_code(config)
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
-        return run_missing(config, variant, budget, seeds, spp, directions, json_file)
-    _check_folder(folder)
-    checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
+        return run_missing(options, config, variant)
+    _check_folder(options.images)
+    listed = None if options.integrators is None else _listed(options.integrators)
+    checked = CheckSettings(
+        config, listed or all_estimators(config), options.budget, options.seeds, options.spp, listed is not None,
+        time.monotonic() - began,
+    )  # fmt: skip
+    checked.configs()  # before anything is loaded
     if place is not None:
         from reslrb_cli.cluster.checks import check_shareable
 
@@ -260,19 +273,19 @@ def command(
         place.check()
     variant = set_variant(config.variant)
     to_keep = settings_to_keep(checked, variant, device_name(variant))
-    check = Gradcheck(checked, earlier=read_earlier(KIND, json_file, to_keep))
-    echo(f"{device_name(variant)}, {variant}; {allowance(budget, seeds, 'seed')}")
+    check = Gradcheck(checked, earlier=read_earlier(KIND, options.json_file, to_keep))
+    echo(f"{device_name(variant)}, {variant}; {allowance(options.budget, options.seeds, 'seed')}")
     echo(check.conditions())
     with contextlib.ExitStack() as stack:
         if place is not None:
             from reslrb_cli.cluster.checks import samples_at
 
             check.sample_with(stack.enter_context(samples_at(checked, check.participants, place, variant)))
-        records, interrupted = _run(check, variant, to_keep, json_file, folder)
+        records, interrupted = _run(check, variant, to_keep, options)
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
         echo(line)
-    if integrators is not None and records and not interrupted:
+    if records and not interrupted and any(case.type == "custom" for case in checked.integrators):
         from reslrb_cli.measure.own import look_into
 
         with Interrupts() as interrupts:
@@ -289,14 +302,15 @@ def _exit_code(records: Iterable[GradcheckRecord]) -> int:
 
 
 def _run(
-    check: Gradcheck, variant: str, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
+    check: Gradcheck, variant: str, to_keep: dict[str, Any], options: GradcheckOptions
 ) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write. Return all records, and True if the user interrupted."""
     from reslrb_cli.report.tables import cells, gradcheck_columns
 
     records: list[GradcheckRecord] = []
     drawn = False
-    keeper = Keeper(json_file, origin_of(variant), lambda: records, lambda: [], lambda: check.kept(to_keep))
+    folder, origin = options.images, origin_of(variant)
+    keeper = Keeper(options.json_file, origin, lambda: records, lambda: [], lambda: check.kept(to_keep))
     with Interrupts() as interrupts:
         table = gradcheck_columns(check.expected())
         echo(table.head())
@@ -309,7 +323,7 @@ def _run(
             drawn = drawn or result.maps is not None
         keeper.finish(records)
     if folder is not None and drawn:
-        look_at(folder)
+        echo(f"look at {os.path.relpath(folder)}")
     return records, interrupts.requested
 
 

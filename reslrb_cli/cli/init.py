@@ -167,30 +167,19 @@ _RATIO = 0.01
     metavar="scene.options.NAME=VALUE",
     help="Value of a $NAME of the scene file; also written to the configuration. May be repeated.",
 )
-@click.option(
-    "--recover",
-    "wanted",
-    multiple=True,
-    metavar="KEY",
-    help="Parameter to recover, in place of the default choice: a key of `reslrb inspect`, or a glob such as "
-    "'*.radiance.value'. May be repeated.",
-)
-@click.option("--force", is_flag=True, help="Replace existing files.")
 def command(
     scene_file: Path,
     target: Path | None,
     output: Path | None,
     index: int,
     overrides: tuple[str, ...],
-    wanted: tuple[str, ...],
-    force: bool,
 ) -> None:
     """Write a commented configuration for the scene in the file SCENE, to use with `reslrb optimize`.
 
     The configuration recovers the colours of the materials that are largest in view, the roughness of metals, and the
     brightness of visible lamps. Lamps are left out if the photograph has 8 or 16 bits, because such a photograph clips
-    the lamps. All other recoverable parameters are listed as comments with bounds and current values. --recover selects
-    other parameters.
+    the lamps. All other recoverable parameters are listed as comments with bounds and current values. Remove the # of
+    those that you want.
 
     With --target, the film gets the photograph's aspect ratio. The film's size is such that a run takes minutes. If the
     photograph has another size than the film, the command writes a resized copy beside the configuration. If there are
@@ -204,7 +193,7 @@ def command(
     path = output or Path(f"{named}.yaml")
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ConfigError("--output", "", f"{path} must end in .yaml or .yml")
-    _check_free(path, force)
+    _check_free(path)
     check_writable("--output", path)
     options = _read_options(scene_file, overrides)
     set_variant("auto")
@@ -229,11 +218,11 @@ def command(
     size = choose_size(own, photo, fixed=own != whole)
     reason = _why_camera(scene, sensor, description.hides_emitters, scene_file)
     is_integer = photo is not None and photo.is_integer
-    proposals = _propose(scene_file, scene, index, wanted, lamps=not is_integer and not description.hides_emitters)
+    proposals = _propose(scene_file, scene, index, lamps=not is_integer and not description.hides_emitters)
     image, copied = target, photo is not None and photo.size != size
     if photo is not None and copied:
         image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
-        _check_free(image, force)
+        _check_free(image)
     text = _first_config(
         path, options, description.variables, sensors, index, proposals, scene=scene_file, target=image,
         is_integer=is_integer, size=size, film=own, reason=reason,
@@ -301,15 +290,11 @@ def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
         echo(f"sensor {named[index]}; --sensor selects another: {', '.join(others[:LISTED_SENSORS])}{more}")
 
 
-def _propose(scene_file: Path, scene: mi.Scene, index: int, wanted: tuple[str, ...], lamps: bool) -> list[Proposal]:
+def _propose(scene_file: Path, scene: mi.Scene, index: int, lamps: bool) -> list[Proposal]:
     """Return the parameters that can be recovered. Raises ConfigError if there are none."""
     from reslrb_cli.scene.proposal import propose
 
-    try:
-        proposals = propose(scene, index, lamps, wanted)
-    except LookupError as error:
-        more = f"reslrb inspect {scene_file} lists the keys"
-        raise ConfigError("--recover", "", f"`{error.args[0]}` matches no recoverable parameter; {more}") from None
+    proposals = propose(scene, index, lamps)
     if not proposals:
         raise ConfigError(scene_file, "", "has no recoverable parameter; reslrb inspect --all says why")
     return proposals
@@ -333,6 +318,6 @@ def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: 
     return None
 
 
-def _check_free(path: Path, force: bool) -> None:
-    if os.path.lexists(path) and not (force and path.is_file()):
-        raise ConfigError(path, "", "exists" + ("; --force replaces it" if path.is_file() else " and is not a file"))
+def _check_free(path: Path) -> None:
+    if os.path.lexists(path):
+        raise ConfigError(path, "", "exists; remove or rename it")

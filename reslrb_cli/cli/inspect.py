@@ -193,7 +193,7 @@ def _flags(info: ParameterInfo) -> str:
     return ("" if info.differentiable else "not ") + "differentiable" + ", discontinuous" * info.discontinuous
 
 
-#: Default number of gradients for `--conditioning`.
+#: Number of gradients for `--conditioning`, each of run.spp samples per pixel.
 SAMPLES = 8
 
 
@@ -210,11 +210,6 @@ SAMPLES = 8
 @click.option(
     "--conditioning", is_flag=True, help="Measure the sensitivity of image and loss to each parameter (renders)."
 )
-@click.option(
-    "--samples",
-    type=click.IntRange(min=2),
-    help=f"Gradients that --conditioning takes, each of run.spp samples per pixel.  [default: {SAMPLES}]",
-)
 def command(
     path: Path,
     overrides: tuple[str, ...],
@@ -222,7 +217,6 @@ def command(
     as_json: bool,
     nonfinite: bool,
     conditioning: bool,
-    samples: int | None,
 ) -> int | None:
     """List the parameters of a scene that can be recovered, with their current values, and the contents of the scene.
 
@@ -236,8 +230,6 @@ def command(
     of the image and the curvature of the loss per unit, and the length by which it would have to change to explain the
     image. `optimizer.scale: auto` compensates for the parameters' different sensitivities.
     """
-    if samples is not None and not conditioning:
-        raise click.UsageError("--samples has no effect without --conditioning")
     subject = read_subject(path, overrides)
     config = subject.config
     if conditioning and subject.missing:
@@ -257,7 +249,7 @@ def command(
     selection = None if "parameters" in subject.missing else select(config, scene)
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
     plan = None if selection is None else make_plan(subject, scene, selection)
-    measured = measure(subject, overrides, samples or SAMPLES) if conditioning else None
+    measured = measure(subject, overrides) if conditioning else None
     if as_json:
         known = {"run": subject.run, **vars(summary)}
         known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan and {"rows": plan}, "edges": edges}
@@ -318,7 +310,7 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
     return f"`reslrb optimize {subject.config.source}`" + (" runs it again" if subject.run else " runs it")
 
 
-def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Conditioning:
+def measure(subject: Subject, overrides: tuple[str, ...]) -> Conditioning:
     """Measure the conditioning of the experiment. The conditioning does not depend on the estimator, so the estimator
     `auto` becomes `stack`.
     """
@@ -328,7 +320,7 @@ def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Condi
     config = subject.config
     if config.integrator.options().get("estimator") == "auto":
         config = read_subject(subject.path, (*overrides, "integrator.estimator=stack")).config
-    return measure_conditioning(assemble(config, logging.getLogger(__name__).info), samples)
+    return measure_conditioning(assemble(config, logging.getLogger(__name__).info), SAMPLES)
 
 
 def select(config: Config, scene: Any) -> Selection | str:

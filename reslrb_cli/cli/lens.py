@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -14,15 +15,13 @@ from reslrb_cli.records.atomic import write_atomically, writing
 if TYPE_CHECKING:
     import numpy as np
 
-#: Margin around the picture on the film, as a fraction of its longer side; light in it counts as lost.
-MARGIN = 0.125
 #: Texels and pixels along the longer side.
 PIXELS = 256
 ITERATIONS = 100
 #: Vertices of the face per cell of the initial face, along each side, and the maximum along one side.
 FINER, MOST_VERTICES = 3, 1024
 #: Options whose names differ from those of the face's settings.
-_OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distance"}
+_OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distance", "incidence": "--mirror"}
 
 
 def read_luminance(path: Path) -> np.ndarray:
@@ -47,6 +46,44 @@ def read_luminance(path: Path) -> np.ndarray:
     return image
 
 
+@dataclass(frozen=True)
+class LensOptions:
+    """The options of the command, by the names of its parameters."""
+
+    picture: Path
+    output: Path
+    size: float
+    distance: float
+    picture_size: float | None
+    ior: float
+    thickness: float | None
+    mirror: float | None
+    outline: Literal["rectangle", "round"]
+    tilt: tuple[float, float]
+    light_distance: float | None
+    sun: float
+    both: bool
+    floor: float | None
+    pixels: int
+
+    def check(self) -> None:
+        """Raise ConfigError if an option is out of range, contradicts another, or names files that exist."""
+        if self.floor is not None and not 0 <= self.floor < 1:
+            raise ConfigError("--floor", "", f"is {self.floor:g}; it must be from 0 to below 1")
+        if not 0 <= self.sun < 10:
+            raise ConfigError("--sun", "", f"is {self.sun:g} degrees; it must be from 0 to below 10 (the sun: 0.53)")
+        if self.sun and self.light_distance is not None:
+            raise ConfigError("--sun", "", "needs parallel light, --light-distance a point light; remove one")
+        if self.both and self.mirror is not None:
+            raise ConfigError("--both", "", "needs a lens: a mirror has one face")
+        if self.output.exists() and not self.output.is_dir():
+            raise ConfigError("--output", "", f"{self.output} is a file; name a folder")
+        names = ("lens.yaml", "scene.xml", "face.ply", "back.ply", "target.exr", "picture.exr", "start.exr")
+        taken = next((path for name in names if (path := self.output / name).exists()), None)
+        if taken is not None:
+            raise ConfigError("--output", "", f"{taken} exists; give another folder, or remove it")
+
+
 @click.command("lens")
 @click.argument("picture", metavar="PICTURE", type=click.Path(path_type=Path))
 @click.option(
@@ -61,10 +98,9 @@ def read_luminance(path: Path) -> np.ndarray:
 @click.option(
     "--thickness", type=float, help="Thickness of the lens at its flat face, in mm. Default: a quarter of --size."
 )
-@click.option("--mirror", is_flag=True, help="Make a mirror instead of a lens.")
-@click.option(
-    "--incidence", type=float, help="Angle between the light and a mirror's normal, in degrees.  [default: 30]"
-)
+@click.option("--mirror", type=float, metavar="DEGREES",
+              help="Make a mirror instead of a lens, with this angle between the light and the mirror's normal, "
+                   "e.g. 30.")  # fmt: skip
 @click.option("--outline", type=click.Choice(["rectangle", "round"]), default="rectangle", show_default=True,
               help="Outline of the face; round is the ellipse inside the rectangle.")  # fmt: skip
 @click.option("--tilt", type=float, nargs=2, default=(0.0, 0.0), metavar="NOD TURN",
@@ -80,10 +116,6 @@ def read_luminance(path: Path) -> np.ndarray:
     help="Angular diameter of parallel light; that of the sun is 0.53.",
 )
 @click.option("--both", is_flag=True, help="Make both faces of a lens free; the second one starts flat.")
-@click.option("--margin", type=float, default=MARGIN, show_default=True,
-              help="Margin around the picture on the film, as a fraction of its longer side; light "
-                   "in it counts as lost.")  # fmt: skip
-@click.option("--through", is_flag=True, help="View the picture through the receiver, from behind.")
 @click.option(
     "--floor",
     type=float,
@@ -91,28 +123,7 @@ def read_luminance(path: Path) -> np.ndarray:
 )
 @click.option("--pixels", type=click.IntRange(16, 1024), default=PIXELS, show_default=True,
               help="Pixels of the picture's longer side, and texels of the face's longer side.")  # fmt: skip
-@click.option("--force", is_flag=True, help="Replace existing files.")
-def command(
-    picture: Path,
-    output: Path,
-    size: float,
-    distance: float,
-    picture_size: float | None,
-    ior: float,
-    thickness: float | None,
-    mirror: bool,
-    incidence: float | None,
-    outline: Literal["rectangle", "round"],
-    tilt: tuple[float, float],
-    light_distance: float | None,
-    sun: float,
-    both: bool,
-    margin: float,
-    through: bool,
-    floor: float | None,
-    pixels: int,
-    force: bool,
-) -> None:
+def command(**given: Any) -> None:
     """Write an experiment that shapes a lens, or a mirror, whose caustic shows PICTURE in parallel light.
 
     Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face of the lens or mirror already casts the picture.
@@ -126,24 +137,11 @@ def command(
     from reslrb_cli.lens.surface import Setting, is_even, shape_surface
     from reslrb_cli.lens.transport import resized
 
-    if floor is not None and not 0 <= floor < 1:
-        raise ConfigError("--floor", "", f"is {floor:g}; it must be from 0 to below 1")
-    if not 0 <= sun < 10:
-        raise ConfigError("--sun", "", f"is {sun:g} degrees; it must be from 0 to below 10 (the sun: 0.53)")
-    if not 0 <= margin <= 1:
-        raise ConfigError("--margin", "", f"is {margin:g}; it must be from 0 to 1, the extent of the receiver")
-    if sun and light_distance is not None:
-        raise ConfigError("--sun", "", "needs parallel light, --light-distance a point light; remove one")
-    if both and mirror:
-        raise ConfigError("--both", "", "needs a lens: a mirror has one face")
-    if incidence is not None and not mirror:
-        raise ConfigError("--incidence", "", "needs --mirror: a lens is lit along its axis")
-    if output.exists() and not output.is_dir():
-        raise ConfigError("--output", "", f"{output} is a file; name a folder")
-    names = ("lens.yaml", "scene.xml", "face.ply", "back.ply", "target.exr", "picture.exr", "start.exr")
-    taken = next((path for name in names if (path := output / name).exists()), None)
-    if taken is not None and not force:
-        raise ConfigError("--output", "", f"{taken} exists; --force replaces it")
+    options = LensOptions(**given)
+    options.check()
+    picture, output, pixels, size, sun, both = (
+        options.picture, options.output, options.pixels, options.size, options.sun, options.both
+    )  # fmt: skip
     set_variant("auto")
 
     from reslrb_cli.records.images import write_file
@@ -157,31 +155,31 @@ def command(
         raise ConfigError("--pixels", "", f"is {pixels}, too few for the fine pattern of {picture}, which has "
                           f"{longer} pixels")  # fmt: skip
     rows, columns = image.shape
-    if outline == "round" and light_distance is not None and (mirror or rows != columns):
+    at, is_mirror = options.light_distance, options.mirror is not None
+    if options.outline == "round" and at is not None and (is_mirror or rows != columns):
         raise ConfigError("--outline", "", "round needs parallel light, or a point light, a lens and a square picture: "
                           "the cone of a point light fits no other face")  # fmt: skip
     share = np.array([columns, rows]) / max(rows, columns)
     setting = Setting(
-        kind="mirror" if mirror else "lens",
+        kind="mirror" if is_mirror else "lens",
         size=tuple(size * share),
-        distance=distance,
-        picture_size=tuple((size if picture_size is None else picture_size) * share),
-        ior=ior,
-        thickness=size / 4 if thickness is None else thickness,
-        outline=outline,
-        light_distance=np.inf if light_distance is None else light_distance,
-        tilt=tilt,
-        incidence=30.0 if mirror and incidence is None else incidence or 0.0,
-        through=through,
+        distance=options.distance,
+        picture_size=tuple((options.picture_size or size) * share),
+        ior=options.ior,
+        thickness=size / 4 if options.thickness is None else options.thickness,
+        outline=options.outline,
+        light_distance=np.inf if at is None else at,
+        tilt=options.tilt,
+        incidence=options.mirror or 0.0,
     )
     try:
-        surface = shape_surface(image, setting, pixels, "auto" if floor is None else floor)
+        surface = shape_surface(image, setting, pixels, "auto" if options.floor is None else options.floor)
     except ConfigError as error:
         key = error.key
         source = picture if key == "picture" else _OPTIONS.get(key, f"--{key}")
         raise ConfigError(source, "", error.message) from None
     echo(surface.summary())
-    target, power = experiment.target_image(image, surface, margin)
+    target, power = experiment.target_image(image, surface)
     film = target.shape[1], target.shape[0]
     with writing("--output", output):
         output.mkdir(parents=True, exist_ok=True)
@@ -189,7 +187,7 @@ def command(
         ny, nx = (finer * cells for cells in surface.heights.shape)
         heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)
         write_file(output / "start.exr", heights[:, :, None], linear=True)
-        for name, seen in (("target.exr", target), ("picture.exr", experiment.on_film(image, surface, margin))):
+        for name, seen in (("target.exr", target), ("picture.exr", experiment.on_film(image))):
             write_file(output / name, np.repeat(seen.astype(np.float32)[:, :, None], 3, 2), linear=True)
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),

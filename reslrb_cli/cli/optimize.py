@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from reslrb_cli.cli.options import (
     FOLDER,
+    ExperimentOptions,
     allow_code_option,
     cluster_option,
     optional_experiment_arguments,
-    read_config,
     start_variant,
 )
 from reslrb_cli.cli.terminal import echo, fill
@@ -61,6 +62,17 @@ NOTICE = "stopping after this iteration; a second signal stops at once"
 logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class OptimizeOptions(ExperimentOptions):
+    """The options of the command, by the names of its parameters."""
+
+    force: bool
+    dry_run: bool
+    resumed: Path | None
+    cluster: str | None
+    quiet: bool
+
+
 @click.command("optimize")
 @optional_experiment_arguments
 @click.option("--force", is_flag=True, help="Replace the run folder of this name instead of creating a numbered one.")
@@ -79,40 +91,30 @@ logger = logging.getLogger(__name__)
 @allow_code_option
 @cluster_option("Distribute the shards of each step (run.shards) to workers", "the result is that of one process")
 @click.option("--quiet", is_flag=True, help="Print only the last line.")
-@click.option("-v", "--verbose", is_flag=True, help="Print details of the measurements before the first iteration.")
-def command(
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    force: bool,
-    dry_run: bool,
-    resumed: Path | None,
-    allow_code: bool,
-    cluster: str | None,
-    quiet: bool,
-    verbose: bool,
-) -> int:
+def command(**given: Any) -> int:
     """Recover the parameters of CONFIG from its target images.
 
     Writes a run folder. The last line of the output names the folder. Ctrl-C, SIGTERM and SIGHUP end the run after the
     current iteration, with a complete folder. A second signal ends the run at once. --resume RUN continues any run that
     has ended.
     """
-    if quiet or verbose:
-        logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)
-    workers = None if cluster is None else Place.parse(cluster)
-    if resumed is not None:
-        if force:
+    options = OptimizeOptions(**given)
+    if options.quiet:
+        logging.getLogger("reslrb_cli").setLevel(logging.WARNING)
+    workers = None if options.cluster is None else Place.parse(options.cluster)
+    if options.resumed is not None:
+        if options.force:
             raise click.UsageError("--force replaces a run, --resume continues one; give only one of them")
-        if dry_run:
+        if options.dry_run:
             raise click.UsageError("--dry-run is for a new run, --resume continues one; give only one of them")
-        if config_file is not None:
+        if options.config_file is not None:
             raise click.UsageError("--resume RUN uses the configuration of the run; leave out CONFIG")
-        return _resume(resumed, overrides, allow_code, workers, quiet)
-    if dry_run and workers is not None:
+        return _resume(options.resumed, options, workers)
+    if options.dry_run and workers is not None:
         raise click.UsageError("--dry-run measures only this process; leave out --cluster")
-    if config_file is None:
+    if options.config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
-    return _begin(config_file, overrides, force, dry_run, allow_code, workers, quiet)
+    return _begin(options.config_file, options, workers)
 
 
 def _check_shards(config: Config, workers: Place | None) -> None:
@@ -124,48 +126,40 @@ def _check_shards(config: Config, workers: Place | None) -> None:
         raise ConfigError(config.source, "run.stages", "cannot be combined with --cluster yet; remove one of them")
 
 
-def _begin(
-    config_file: Path,
-    overrides: tuple[str, ...],
-    force: bool,
-    dry_run: bool,
-    allow_code: bool,
-    workers: Place | None,
-    quiet: bool,
-) -> int:
+def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -> int:
     from reslrb_cli.records.run_folder import check_output
 
-    config = read_config(config_file, overrides).with_code(allow_code)
+    config = options.config()
     run = config.run
     _check_shards(config, workers)
-    check_output(config_file, run.output, run.folder_name, force)
+    check_output(config_file, run.output, run.folder_name, options.force)
     if workers is not None:
         workers.check()
     variant = start_variant(config)
-    if dry_run:
+    if options.dry_run:
         show_forecast(config)
         return ExitCode.DONE
 
     from reslrb_cli.runs.prepare import begin
 
-    return _run(begin(config, variant, force, logger.info, logger.warning), workers, quiet)
+    return _run(begin(config, variant, options.force, logger.info, logger.warning), workers, options.quiet)
 
 
-def _resume(run: Path, overrides: tuple[str, ...], allow_code: bool, workers: Place | None, quiet: bool) -> int:
+def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
     from reslrb_cli.runs.resume import open_earlier
 
-    with open_earlier(run, overrides) as earlier:
+    with open_earlier(run, options.overrides) as earlier:
         if earlier.is_done:
             echo(earlier.done_line("--set", "="))
             return ExitCode.DONE
-        earlier.config = config = earlier.config.with_code(allow_code)
+        earlier.config = config = earlier.config.with_code(options.allow_code)
         _check_shards(config, workers)
         if workers is not None:
             workers.check()
         variant = start_variant(config.model_copy(update={"variant": earlier.settled.variant}))
         begun = earlier.begin(variant, logger.info, logger.warning)
         logger.info(f"continuing {run} after {earlier.iteration} of {config.run.iterations} iterations")
-        return _run(begun, workers, quiet)
+        return _run(begun, workers, options.quiet)
 
 
 def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:

@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,7 +24,6 @@ from click.shell_completion import CompletionItem
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.loader import load, loads
-from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.records.measurement_files import (
@@ -137,11 +137,6 @@ def read_earlier(kind: str, json_file: Path | None, now: Mapping[str, Any] | Non
     return earlier
 
 
-def look_at(path: Path) -> None:
-    """Print the path of an image, or of a folder of images."""
-    echo(f"look at {os.path.relpath(path)}")
-
-
 def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCode:
     """Return the exit code of a comparison. The code is INTERRUPTED if `interrupted`, whatever was measured.
 
@@ -152,13 +147,6 @@ def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCo
         return ExitCode.INTERRUPTED
     memory = states == {BenchStatus.OUT_OF_MEMORY}
     return ExitCode.DONE if done else ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
-
-
-def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
-    """Return the experiment of a run with its recovered values (`records.run_folder.recovered`). Raises ConfigError."""
-    from reslrb_cli.records.run_folder import recovered
-
-    return recovered(run, overrides)
 
 
 class FolderPath(click.Path):
@@ -219,27 +207,42 @@ class Counts(click.ParamType):
         return tuple(counts)
 
 
-class Size(click.ParamType):
-    """A number of bytes such as `2GiB`."""
-
-    name = "size"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        try:
-            return memory_bytes(str(value))
-        except ValueError:
-            self.fail(f"`{value}` is not a size; write 2GiB or 500MB", param, ctx)
-
-
-#: Replacements of removed options.
+#: Advice for removed options, by command and option.
 REMOVED = {
-    "--runs": "was removed; compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
-    "--vary 'integrator=[prb, reslrb:stack]'`",
-    "--markdown": "was removed; `reslrb report FILE -o page.html` shows the table of results of --json FILE",
-    "--plot": "was removed; `reslrb report FILE -o page.html` plots results of --json FILE",
-    "--resume": "was removed here; --json FILE continues from the results in FILE",
-    "--rates": "was removed; compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, 0.1]'`",
-}
+    f"{command} {option}": advice
+    for commands, option, advice in (
+        ("convergence", "--runs", "compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
+         "--vary 'integrator=[prb, reslrb:stack]'`"),
+        ("convergence", "--rates", "compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, "
+         "0.1]'`"),
+        ("bench gradcheck convergence", "--markdown",
+         "`reslrb report FILE -o page.html` shows the table of results of --json FILE"),
+        ("bench gradcheck convergence", "--plot", "`reslrb report FILE -o page.html` plots results of --json FILE"),
+        ("bench gradcheck convergence", "--resume", "--json FILE continues from the results in FILE"),
+        ("bench convergence", "--memory-limit", "the shell's `ulimit -v KIB` limits every process of the command"),
+        ("optimize", "--verbose", "`reslrb --debug optimize` prints details of the measurements"),
+        ("optimize", "-v", "`reslrb --debug optimize` prints details of the measurements"),
+        ("sweep", "--verbose", "the folder of each run has its warnings"),
+        ("sweep", "-v", "the folder of each run has its warnings"),
+        ("sweep", "--retry", "a sweep that continues repeats its failed runs"),
+        ("sweep", "--json", "results.jsonl in the folder of the sweep has the results"),
+        ("sweep", "--dry-run", "`reslrb optimize CONFIG --dry-run` measures one of the runs"),
+        ("sweep", "--quiet", "redirect the output, as in > sweep.log"),
+        ("gradcheck", "--estimators", "name them by --integrators, such as reslrb:stack,reslrb:gather"),
+        ("gradcheck", "--case", "name the case after the suite, as in --suite extreme:furnace"),
+        ("gradcheck", "--directions", "each parameter has three directions"),
+        ("render", "--run", "name the folder of the run in place of CONFIG, as in `reslrb render RUN -o IMAGE`"),
+        ("render", "--spp", "use --set run.spp=N"),
+        ("init lens", "--force", "remove or rename the files that exist"),
+        ("init", "--recover", "all other parameters are comments of the file; remove the # of those that you want"),
+        ("inspect", "--samples", "--conditioning takes 8 gradients"),
+        ("doctor", "--json", "the lines of `reslrb doctor` have the same content"),
+        ("lens", "--margin", "the film sees an eighth of the picture's longer side around it"),
+        ("lens", "--incidence", "--mirror DEGREES gives the angle"),
+        ("lens", "--through", "exchange left and right of the picture, for a view from behind"),
+    )
+    for command in commands.split()
+}  # fmt: skip
 
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
@@ -248,34 +251,26 @@ budget_option = click.option(
         "they need.",
 )  # fmt: skip
 
-memory_limit_option = click.option(
-    "--memory-limit", type=Size(),
-    help="Address space of each process, e.g. 2GiB (CPU only). Default: the machine's memory.",
+
+#: `--set` (`overrides`).
+overrides_option = click.option(
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE", shell_complete=complete_setting,
+    help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
 )  # fmt: skip
 
-
-def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--set` (`overrides`) to a command."""
-    return click.option(
-        "--set",
-        "overrides",
-        multiple=True,
-        metavar="KEY=VALUE",
-        shell_complete=complete_setting,
-        help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
-    )(function)
-
-
-def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--json` (`json_file`) to a command that measures."""
-    return click.option(
-        "--json",
-        "json_file",
-        type=click.Path(path_type=Path, dir_okay=False),
-        metavar="FILE",
-        help="Write one JSON object per line as results come, and the samples beside the file. Results of the same "
+#: `--json` (`json_file`) of a command that measures.
+json_option = click.option(
+    "--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help=
+        "Write one JSON object per line as results come, and the samples beside the file. Results of the same "
         "measurement in FILE are kept and not measured again.",
-    )(function)
+)  # fmt: skip
+
+#: `--allow-code` (`allow_code`) of a command that runs users' own code.
+allow_code_option = click.option(
+    "--allow-code", is_flag=True,
+    help="Run the files of Python code that CONFIG or a list names (type: custom, FILE.py:NAME), with all your rights.",
+)  # fmt: skip
 
 
 def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -286,16 +281,6 @@ def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Cal
     return click.option(
         "--cluster", metavar="WHERE", help=f"{what}: {where}; {result}. Needs `pip install reslrb[cluster]`."
     )
-
-
-def allow_code_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--allow-code` (`allow_code`) to a command that runs users' own code."""
-    return click.option(
-        "--allow-code",
-        is_flag=True,
-        help="Run the files of Python code that CONFIG or a list names (type: custom, FILE.py:NAME), with all your "
-        "rights.",
-    )(function)
 
 
 def allowance(budget_s: float, number: int | None, of: str) -> str:
@@ -319,14 +304,42 @@ def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[...,
     return experiment_arguments(function, required=False)
 
 
+@dataclass(frozen=True)
+class ExperimentOptions:
+    """The options of commands that run an experiment, by the names of their parameters."""
+
+    config_file: Path | None
+    overrides: tuple[str, ...]
+    allow_code: bool
+
+    def config(self) -> Config:
+        """Load the configuration, or that of the built-in Cornell box if no file is given. Raises ConfigError."""
+        return read_or_box(self.config_file, self.overrides).with_code(self.allow_code)
+
+
+@dataclass(frozen=True)
+class ComparisonOptions(ExperimentOptions):
+    """The options of commands that compare integrators by measurements (`comparison_options`)."""
+
+    integrators: str | None
+    budget: float
+    rounds: int | None
+    json_file: Path | None
+
+
+def comparison_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of `ComparisonOptions` to a command, except CONFIG, `--set` and `--integrators`."""
+    rounds = click.option(
+        "--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
+        help="Number of steps of each integrator, including those in the file of --json, for any time: the same steps "
+        "on every machine.",
+    )  # fmt: skip
+    return allow_code_option(budget_option(rounds(json_option(function))))
+
+
 def is_given(name: str) -> bool:
     """True if the user gave the option with the parameter name `name` to the current command."""
     return click.get_current_context().get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
-
-
-def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:
-    """Load and check the configuration. Raises ConfigError."""
-    return load(config_file, list(overrides))
 
 
 def read_or_box(config_file: Path | None, overrides: tuple[str, ...]) -> Config:
@@ -334,7 +347,7 @@ def read_or_box(config_file: Path | None, overrides: tuple[str, ...]) -> Config:
     ConfigError.
     """
     if config_file is not None:
-        return read_config(config_file, overrides)
+        return load(config_file, overrides)
     from reslrb_cli.measure.scenes import small
 
     return loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)

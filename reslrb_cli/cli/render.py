@@ -11,17 +11,14 @@ from typing import Any
 import click
 
 from reslrb_cli.cli.options import (
-    COUNT,
-    FOLDER,
     allow_code_option,
     check_writable,
     is_given,
-    optional_experiment_arguments,
-    read_config,
-    read_recovered,
+    overrides_option,
     start_variant,
 )
 from reslrb_cli.cli.terminal import echo
+from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import ViewSpec
 from reslrb_cli.errors import ConfigError
@@ -53,7 +50,8 @@ class ExposureType(click.ParamType):
 
 
 @click.command("render")
-@optional_experiment_arguments
+@click.argument("path", metavar="CONFIG|RUN", type=click.Path(path_type=Path))
+@overrides_option
 @click.option(
     "-o",
     "--output",
@@ -61,14 +59,7 @@ class ExposureType(click.ParamType):
     type=click.Path(path_type=Path),
     help="Image file to write. EXR, HDR and PFM are linear, PNG and JPG are 8-bit sRGB.",
 )
-@click.option(
-    "--run",
-    metavar="RUN",
-    type=FOLDER,
-    help="Render the scene of the run in this folder with its recovered values, in place of CONFIG.",
-)
 @allow_code_option
-@click.option("--spp", type=COUNT, help="Samples per pixel. Default: run.spp.")
 @click.option(
     "--sensor", type=click.IntRange(min=0), help="Index of the sensor. Default: the first one of the experiment."
 )
@@ -78,7 +69,7 @@ class ExposureType(click.ParamType):
     default="1",
     show_default=True,
     help="Factor of the image in a PNG or JPG: a number, or auto, which suits everything in view except lamps. "
-    "With --run, the default is the run's exposure, also in EXR, HDR and PFM; 1 ignores it.",
+    "For a RUN, the default is the run's exposure, also in EXR, HDR and PFM; 1 ignores it.",
 )
 @click.option(
     "--initial/--scene",
@@ -87,29 +78,37 @@ class ExposureType(click.ParamType):
     help="Use the initial values of the parameters (default), or those of the scene file.",
 )
 def command(
-    config_file: Path | None,
+    path: Path,
     overrides: tuple[str, ...],
     output: Path,
-    run: Path | None,
     allow_code: bool,
-    spp: int | None,
     sensor: int | None,
     exposure: float | None,
     initial: bool,
 ) -> None:
-    """Render the scene of CONFIG, or of a run (--run RUN), with its integrator."""
+    """Render the scene of CONFIG with its integrator, or that of the run in the folder RUN with its recovered values.
+
+    The image has run.spp samples per pixel; --set run.spp=N changes their number.
+    """
+    run = path if path.is_dir() else None
     if run is not None and is_given("initial"):
-        raise click.UsageError("--run renders the recovered values; remove --initial or --scene")
+        raise click.UsageError("a run is rendered with its recovered values; remove --initial or --scene")
     linear = output.suffix.lower() in FLOAT_FORMATS
     if linear and is_given("exposure") and (run is None or exposure != 1):
         raise click.UsageError(f"{output.suffix} is linear; --exposure is for PNG and JPG")
-    config = _read(config_file, run, overrides).with_code(allow_code)
+    if run is None:
+        config = load(path, overrides)
+    else:
+        from reslrb_cli.records.run_folder import recovered
+
+        config = recovered(run, overrides)
+    config = config.with_code(allow_code)
     check_image_path(output)
     start_variant(config)
 
     import numpy as np
 
-    from reslrb_cli.optimization.assemble import check_passes, load_for_rendering
+    from reslrb_cli.optimization.assemble import load_for_rendering
     from reslrb_cli.optimization.loading import render_in_passes
     from reslrb_cli.records.images import write_file
     from reslrb_cli.records.run_folder import exposures
@@ -118,9 +117,7 @@ def command(
     if sensor is not None:
         config = _of_sensor(config, sensor)
     scene, sensors, integrator, multiple = load_for_rendering(config, initial)
-    samples = spp or config.run.spp
-    if spp is not None:
-        check_passes("--spp", spp, multiple)
+    samples = config.run.spp
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
     own = {} if run is None or is_given("exposure") else exposures(run)
     applied = own.get(sensors[0], np.float32(1))
@@ -145,17 +142,6 @@ def _suiting(image: Any, scene: Any, sensor: Any) -> float:
     from reslrb_cli.scene.visibility import sees_lamps
 
     return exposure_for(image, None if unsupported_part(scene, sensor) else sees_lamps(scene, sensor))
-
-
-def _read(config_file: Path | None, run: Path | None, overrides: tuple[str, ...]) -> Config:
-    """Return the configuration to render, from a file or from a run with its recovered values."""
-    if config_file is not None and run is not None:
-        raise click.UsageError("give CONFIG or --run RUN, not both")
-    if run is not None:
-        return read_recovered(run, overrides)
-    if config_file is None:
-        raise click.UsageError("Missing argument 'CONFIG' (or --run RUN)")
-    return read_config(config_file, overrides)
 
 
 def _of_sensor(config: Config, sensor: int) -> Config:

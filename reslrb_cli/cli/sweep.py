@@ -31,23 +31,19 @@ from reslrb_cli.cli.options import (
     COUNT,
     FOLDER,
     allow_code_option,
-    check_writable,
     complete_setting,
     is_given,
     optional_experiment_arguments,
-    start_variant,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
-from reslrb_cli.errors import BackendError, ConfigError, ExitCode, MachineError, UnsupportedScene, one_line
+from reslrb_cli.errors import BackendError, ExitCode, MachineError, one_line
 from reslrb_cli.measure.processes import last_words
 from reslrb_cli.report.format import shorten
 
 if TYPE_CHECKING:
-    from reslrb_cli.config.schema import Config
     from reslrb_cli.records.metrics import Line
     from reslrb_cli.records.sweeps import SweepPlan
     from reslrb_cli.report.sources import SweepRuns
-    from reslrb_cli.runs.sweep import Plan
 
 logger = logging.getLogger(__name__)
 NOTICE = "stopping after this iteration of the current run; a second signal stops at once"
@@ -98,22 +94,7 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     metavar="FOLDER",
     help="Continue the sweep in this folder, in place of CONFIG.",
 )
-@click.option("--retry", is_flag=True, help="Repeat failed runs.")
 @allow_code_option
-@click.option(
-    "--dry-run",
-    is_flag=True,
-    help="Measure a few small steps of each combination, and print the number of runs and their time and memory.",
-)
-@click.option(
-    "--json",
-    "json_file",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Write the results of every run and combination, one object per line.",
-)
-@click.option("--quiet", is_flag=True, help="Print only the table and the last line.")
-@click.option("-v", "--verbose", is_flag=True, help="Show the output of each run.")
 def command(
     config_file: Path | None,
     overrides: tuple[str, ...],
@@ -121,69 +102,60 @@ def command(
     seeds: int | None,
     folder: Path | None,
     resumed: Path | None,
-    retry: bool,
     allow_code: bool,
-    dry_run: bool,
-    json_file: Path | None,
-    quiet: bool,
-    verbose: bool,
 ) -> int:
     """Run the experiment of CONFIG with several seeds for every combination of settings, one run after the other.
 
     Each run has a folder in FOLDER. The folder's name shows the run's settings. FOLDER/sweep.html has the table, curves
-    and pictures. All combinations are checked before the first run starts. If a run fails, the run's table row shows
-    the failure, and the other runs continue. Ctrl-C ends the sweep after the current iteration. To continue a sweep,
-    even after a kill, use --resume FOLDER.
+    and pictures, and FOLDER/results.jsonl the results of every run and combination. All combinations are checked before
+    the first run starts. If a run fails, the run's table row shows the failure, and the other runs continue. Ctrl-C
+    ends the sweep after the current iteration. To continue a sweep, even after a kill, use --resume FOLDER. This also
+    repeats failed runs.
     """
     from reslrb_cli.runs.sweep import make_plan, started
     from reslrb_cli.runs.sweep import resumed as resumed_sweep
 
-    if quiet or verbose:
-        logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)
     if resumed is not None:
-        given = [name for name in ("config_file", "overrides", "vary", "folder", "dry_run") if is_given(name)]
+        given = [name for name in ("config_file", "overrides", "vary", "folder") if is_given(name)]
         if given:
-            raise click.UsageError("--resume continues a sweep with its own settings; add only --seeds, --retry, "
-                                   "--allow-code or --json")  # fmt: skip
-        folder, place = resumed, resumed_sweep(resumed, seeds, retry, allow_code)
+            raise click.UsageError("--resume continues a sweep with its own settings; add only --seeds or --allow-code")
+        folder, place = resumed, resumed_sweep(resumed, seeds, allow_code)
     elif config_file is None:
         raise click.UsageError("Missing argument 'CONFIG'")
     else:
         plan = make_plan(config_file, vary, seeds or 1, overrides, allow_code)
         run = next(iter(plan.configs.values())).run
         folder = folder or run.output / f"{run.folder_name}-sweep"
-        if dry_run:
-            return _forecast(plan)
         place = started(folder, plan)
-    check_writable("--json", json_file)
     with place as sweep:
-        return _run(folder, sweep, json_file, quiet, verbose)
+        return _run(folder, sweep)
 
 
-def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, verbose: bool) -> int:
-    """Run the remaining runs of the sweep, update its page, and print the results."""
+def _run(folder: Path, sweep: SweepPlan) -> int:
+    """Run the remaining runs of the sweep, update its page and its results, and print the results."""
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.config.loader import load
 
     load_packages()  # Mitsuba reads the images
-    from reslrb_cli.records.measurement_files import LivePage, is_stream, write_lines
-    from reslrb_cli.records.sweeps import PAGE_FILE, Failure, config_file, label, run_name
+    from reslrb_cli.records.measurement_files import LivePage, write_lines
+    from reslrb_cli.records.sweeps import PAGE_FILE, RESULTS_FILE, Failure, config_file, label, run_name
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.sources import read_sweep_runs
     from reslrb_cli.report.sweep import lines, run_records
     from reslrb_cli.runs.sweep import command as command_of
     from reslrb_cli.runs.sweep import is_left
 
-    def refresh() -> None:
+    def write(live: bool = True) -> SweepRuns:
         source = read_sweep_runs(folder)
-        write_page([source], folder / PAGE_FILE, live=True)
-        if json_file is not None and not is_stream(json_file):
-            write_lines(json_file, _json_lines(source))
+        write_page([source], folder / PAGE_FILE, live=live)
+        write_lines(folder / RESULTS_FILE, _results(source))
+        return source
 
-    page = LivePage(refresh, "the sweep's page", PAGE_SHARE)
+    page = LivePage(write, "the sweep's page", PAGE_SHARE)
     runs, interrupted = list(sweep.runs), False
-    go_on = f"`reslrb sweep --resume {os.path.relpath(folder)}` continues"
-    with Interrupts(notice=None if quiet else NOTICE) as interrupts:
+    again = f"`reslrb sweep --resume {os.path.relpath(folder)}`"
+    go_on = f"{again} continues"
+    with Interrupts(notice=NOTICE) as interrupts:
         for number, (combination, seed) in enumerate(runs, 1):
             name = run_name(combination, seed)
             if not is_left(folder, sweep, name):
@@ -191,31 +163,25 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
             page.refresh()
             if interrupted := interrupts.requested:
                 break
-            if not quiet:
-                echo(f"run {number} of {len(runs)}: {label(combination.settings)}, seed {seed}")
+            echo(f"run {number} of {len(runs)}: {label(combination.settings)}, seed {seed}")
             timed = load(config_file(folder, combination)).run.max_seconds is not None
-            code, line = call(command_of(folder, sweep, combination, seed), interrupts, verbose, fresh=timed)
+            code, line = call(command_of(folder, sweep, combination, seed), interrupts, fresh=timed)
             if interrupted := code == ExitCode.INTERRUPTED or (interrupts.requested and code != ExitCode.DONE):
                 break
             if code == ExitCode.MACHINE:
                 raise MachineError(f"{line}; {go_on}")
             if code == ExitCode.BACKEND:
                 raise BackendError(line)
-            if not quiet or code != ExitCode.DONE:
-                echo(f"  {line}")
+            echo(f"  {line}")
             if code != ExitCode.DONE:
                 sweep = replace(sweep, failures={**sweep.failures, name: Failure(code, one_line(line))})
                 sweep.write(folder)
-        source = read_sweep_runs(folder)
-        write_page([source], folder / PAGE_FILE)
-    records = run_records(source)
-    if json_file is not None:
-        write_lines(json_file, _json_lines(source))
+        records = run_records(write(live=False))
     for line in lines(sweep, records):
         echo(line)
     done, failed = sum(run.is_done for run in records), sum(run.status == "failed" for run in records)
     ended = "interrupted" if interrupted else "finished"
-    more = f"; {go_on}" if interrupted else "; --retry repeats failed runs" if failed else ""
+    more = f"; {go_on}" if interrupted else f"; {again} repeats the failed runs" if failed else ""
     which = f"{done} of {len(records)} runs done" + (f", {failed} failed" if failed else "")
     echo(f"{ended}, {which}; look at {os.path.relpath(folder / PAGE_FILE)}{more}")
     if interrupted:
@@ -223,8 +189,8 @@ def _run(folder: Path, sweep: SweepPlan, json_file: Path | None, quiet: bool, ve
     return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
 
 
-def _json_lines(source: SweepRuns) -> list[Line]:
-    """Return the lines of the JSON file: the device, the results of runs and combinations, and the best
+def _results(source: SweepRuns) -> list[Line]:
+    """Return the lines of `results.jsonl`: the device, the results of runs and combinations, and the best
     combinations.
     """
     from reslrb_cli.records.measurement_files import Origin
@@ -239,26 +205,21 @@ def _json_lines(source: SweepRuns) -> list[Line]:
 # --- one run, in a process of its own ---------------------------------------------------------------------------------
 
 
-def call(
-    arguments: Sequence[str], interrupts: Interrupts, verbose: bool = False, fresh: bool = False
-) -> tuple[int, str]:
+def call(arguments: Sequence[str], interrupts: Interrupts, fresh: bool = False) -> tuple[int, str]:
     """Run `reslrb` with these arguments in its own process. Returns its exit code and its last line.
 
     The first signal in `interrupts` is passed on to the process. A second signal ends the run's process together with
-    this process. `verbose` shows the output of the process. Otherwise, the run folder contains the warnings of the
-    process. A `fresh` process has no cached kernels or decisions. Runs with equal time limits therefore start under
-    equal conditions.
+    this process. The run folder contains the warnings of the process. A `fresh` process has no cached kernels or
+    decisions. Runs with equal time limits therefore start under equal conditions.
     """
     if fresh:
         with tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder:
             caches = dict.fromkeys(("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE"), folder)
-            return _call(arguments, interrupts, verbose, {**os.environ, **caches, "CUDA_CACHE_DISABLE": "1"})
-    return _call(arguments, interrupts, verbose, None)
+            return _call(arguments, interrupts, {**os.environ, **caches, "CUDA_CACHE_DISABLE": "1"})
+    return _call(arguments, interrupts, None)
 
 
-def _call(
-    arguments: Sequence[str], interrupts: Interrupts, verbose: bool, environment: dict[str, str] | None
-) -> tuple[int, str]:
+def _call(arguments: Sequence[str], interrupts: Interrupts, environment: dict[str, str] | None) -> tuple[int, str]:
     program = [*python_command(_PROGRAM), str(os.getpid()), *arguments]
     process = subprocess.Popen(
         program,
@@ -287,9 +248,7 @@ def _call(
                 *lines, rest = (rest + chunk).split(b"\n")
                 for line in (line.decode(errors="replace") for line in lines if line.strip()):
                     said.append(line)
-                    if verbose:
-                        echo(f"  {line}")
-                    elif _PROGRESS.match(line):
+                    if _PROGRESS.match(line):
                         _show(line)
         code = process.wait()
     finally:
@@ -344,42 +303,3 @@ def _end_with_input() -> None:
     """
     os.read(0, 1)
     os._exit(ExitCode.INTERRUPTED)
-
-
-# --- what it will take ------------------------------------------------------------------------------------------------
-
-
-def _forecast(plan: Plan) -> int:
-    """Print the number of runs, and the time and memory for each combination; write nothing."""
-    from reslrb_cli.config.files import duration, in_words
-    from reslrb_cli.optimization.forecast import make_forecast
-    from reslrb_cli.records.decisions import DecisionCache
-    from reslrb_cli.records.sweeps import label
-    from reslrb_cli.report.format import count, table
-
-    sweep, seeds = plan.sweep, len(plan.sweep.seeds)
-    whole = f"{count(len(sweep.combinations), 'combination')} with {count(seeds, 'seed')}"
-    echo(f"{whole}: {count(len(sweep.combinations) * seeds, 'run')}, one after the other; nothing was written")
-    rows: list[tuple[str, ...]] = [("settings", "memory", "an iteration", "a run", f"{seeds} of them")]
-    total_s = 0.0
-    with Interrupts() as interrupts:
-        for combination in sweep.combinations:
-            if interrupts.requested:
-                raise KeyboardInterrupt
-            config: Config = plan.configs[combination.name]
-            start_variant(config)
-            try:
-                forecast = make_forecast(config, logger.info, DecisionCache())
-            except (ConfigError, UnsupportedScene) as error:
-                rows.append((shorten(label(combination.settings), 60), f"will fail: {error}"))
-                continue
-            total_s += seeds * forecast.whole_s
-            rows.append((
-                shorten(label(combination.settings), 60), in_words(forecast.peak),
-                f"{1e3 * forecast.iteration_s:.3g} ms", duration(forecast.whole_s),
-                duration(seeds * forecast.whole_s),
-            ))  # fmt: skip
-    for line in table(rows):
-        echo(line)
-    echo(f"time of the whole sweep: about {duration(total_s)}")
-    return ExitCode.DONE

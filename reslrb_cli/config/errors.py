@@ -38,6 +38,17 @@ _EXPECTED = {
 
 #: Advice for removed settings, by the last two names of the key, with the value if other values remain.
 REMOVED = {
+    "fabrication.min_thickness": "`reslrb export` prints the smallest thickness of the solid; remove it",
+    "fabrication.receiver": "give the receiver the id `screen` in the scene file, and remove it",
+    "fabrication.size": "it is the size of the mesh; remove it",
+    "integrator.sppc": "each part has as many samples as the step; remove it",
+    "integrator.sppp": "each part has as many samples as the step; remove it",
+    "integrator.sppi": "each part has as many samples as the step; remove it",
+    "mask.specular": "list the kinds of pixels to leave out, such as mask: {kinds: [border, clipped, alpha]}",
+    "mask.border": "list the kinds of pixels to leave out, such as mask: {kinds: [specular, clipped, alpha]}",
+    "mask.clipped": "list the kinds of pixels to leave out, such as mask: {kinds: [specular, border, alpha]}",
+    "mask.alpha": "list the kinds of pixels to leave out, such as mask: {kinds: [specular, border, clipped]}",
+    "run.images_every": "a run saves its first and its last image; in Python, `Run.images` renders those between",
     "scene.sensors": "list them in `views`, such as views: [{sensor: 0}, {sensor: 1}]; all of scene.cameras are used",
     "views.loss": "all views have the loss that `loss` says",
     "render.seed": "the target always has the same samples; remove it",

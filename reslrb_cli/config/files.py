@@ -13,11 +13,9 @@ from reslrb_cli.errors import ConfigError, one_line
 NAME_BYTES = 200
 
 #: Largest path length of a limit; -1 means no limit. Roulette lets at most 95 % of the paths continue at each vertex,
-#: so none of 10^20 paths is a thousand vertices longer than `rr_depth`.
+#: so none of 10^20 paths is a thousand vertices longer than `rr_depth`. Dr.Jit's largest array in thread-local memory,
+#: which holds the record of a path of `trajectory`, has one entry more.
 PATH_LENGTH = 2**16 - 1
-
-#: Largest array in a kernel's thread-local memory: Dr.Jit's limit.
-LOCAL_ENTRIES = 2**16
 
 #: Maximum number of kept connections or events per path. Each has its own code in the kernel, and the compile time
 #: grows faster than their number: on two cores, 64 took seconds and 256 most of a minute.

@@ -6,7 +6,7 @@ The limits on samples, passes and paths are checked here, before a scene is load
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     Discriminator,
@@ -29,21 +29,13 @@ from reslrb_cli.config.base import (
     mark,
     must,
 )  # fmt: skip
-from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
+from reslrb_cli.config.files import CAPACITY, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
 
 _DEPTH = must(
     lambda depth: depth <= PATH_LENGTH,
     lambda depth: (
         f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {depth}: Russian roulette ends "
         "paths long before"
-    ),
-)
-
-_RECORD = must(
-    lambda depth: depth < LOCAL_ENTRIES,
-    lambda depth: (
-        f"must be less than {LOCAL_ENTRIES}, not {depth}: the record of a path has one entry for each "
-        "vertex, and thread-local memory is limited; use reslrb, which needs no record"
     ),
 )
 
@@ -55,9 +47,6 @@ _CAPACITY = must(
     ),
 )
 
-#: Samples per pixel for one part of a derivative.
-Samples = Annotated[int, Field(ge=0, le=PASS_SAMPLES)]
-
 
 class Integrator(Choice):
     """Options of all integrators."""
@@ -65,7 +54,8 @@ class Integrator(Choice):
     type: str
     max_depth: Annotated[int, _DEPTH] = Field(default=8, ge=-1, json_schema_extra={"maximum": PATH_LENGTH})
     """Length of the longest path in segments, from the emitter to the sensor. 1: only emitters that the sensor sees
-    directly. 2: also direct light. -1: no limit; only Russian roulette ends paths."""
+    directly. 2: also direct light. -1: no limit; only Russian roulette ends paths. `trajectory` needs a limit, because
+    its record of a path has room for this many vertices."""
     rr_depth: Count = Field(default=5, description="Path depth at which Russian roulette starts.")
     hide_emitters: bool = False
     """Whether the image leaves out emitters that the sensor sees directly."""
@@ -232,17 +222,10 @@ class Prb(Integrator, json_schema_extra=NEEDS_TYPE):
 
 class PrbProjective(Integrator, json_schema_extra=NEEDS_TYPE):
     """Mitsuba's path replay backpropagation, with the derivatives of outlines and shadow edges. A derivative has three
-    parts, each with its own samples."""
+    parts, each with as many samples as the step."""
 
     type: Literal["prb_projective"] = "prb_projective"
     """Mitsuba's projective path replay, from the sensor."""
-    sppc: Samples | None = None
-    """Samples per pixel of the part that changes smoothly. 0 leaves this part out. null: as many as the step has."""
-    sppp: Samples | None = None
-    """Samples per pixel of the outlines that the sensor sees. 0 leaves this part out. null: as many as the step has."""
-    sppi: Samples | None = None
-    """Samples per pixel of shadow edges and of everything else behind the first surface. 0 leaves this part out. null:
-    as many as the step has."""
 
 
 class WalkAdConfig(AttachingTracer, json_schema_extra=NEEDS_TYPE):
@@ -251,22 +234,20 @@ class WalkAdConfig(AttachingTracer, json_schema_extra=NEEDS_TYPE):
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
     paths: Literal["light", "camera", "both"] = "light"
     """Where paths start, as for `reslrb`."""
-    light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.5
-    """Fraction of the samples that are light paths, with `paths: both`."""
-
-    @model_validator(mode="after")
-    def _check_options(self) -> Self:
-        _check_share(self.paths, self.light_share)
-        return self
+    #: Fraction of the samples that are light paths, with `paths: both`.
+    light_share: ClassVar[float] = 0.5
 
 
 class TrajectoryConfig(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
     """The light paths of `reslrb`, reversed by Dr.Jit. Dr.Jit records each path's loop state in thread-local memory."""
 
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
-    max_depth: Annotated[int, _RECORD] = Field(default=8, ge=0, json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES})
-    """Length of the longest path in segments, as above. The record has room for this many vertices, so a limit is
-    required."""
+
+    @model_validator(mode="after")
+    def _check_record(self) -> Self:
+        if self.max_depth < 0:
+            raise located("max_depth", "must be at least 0: the record of a path has one entry for each vertex")
+        return self
 
 
 class Own(Integrator, json_schema_extra=NEEDS_TYPE):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 from pydantic import BeforeValidator, Discriminator, Field, WithJsonSchema, model_validator
 from typing_extensions import Self
@@ -48,12 +48,22 @@ HEIGHTMAP = "heightmap"
 # --- settings of a motion, by part ------------------------------------------------------------------------------------
 
 
-class ByWord(Section):
+Part = TypeVar("Part")
+
+
+class ByWord(Section, Generic[Part]):
     """Settings of a motion for each of its parts."""
 
     TAG: ClassVar[str] = "words"
 
-    def words(self) -> dict[str, Any]:
+    translation: Part | None = Field(default=None, description="Of the translation, in scene units.")
+    x: Part | None = Field(default=None, description="Of the translation along x, in scene units.")
+    y: Part | None = Field(default=None, description="Of the translation along y, in scene units.")
+    z: Part | None = Field(default=None, description="Of the translation along z, in scene units.")
+    rotation: Part | None = Field(default=None, description="Of each angle, in degrees.")
+    scale: Part | None = Field(default=None, description="Of the scale factor.")
+
+    def words(self) -> dict[str, Part]:
         """Return the given settings as a mapping from part to setting."""
         return {word: value for word in WORDS if (value := getattr(self, word)) is not None}
 
@@ -74,48 +84,20 @@ Bounds = Annotated[tuple[_Bound, _Bound], Field(strict=False)]
 TransformName = Literal["none", "sigmoid", "log", "softplus"]
 
 
-class MotionInitial(ByWord):
+class MotionInitial(ByWord[_NumberOrList]):
     """Initial values of a motion."""
 
-    translation: _NumberOrList | None = Field(default=None, description="Initial translation, in scene units.")
-    x: float | None = Field(default=None, description="Initial translation along x, in scene units.")
-    y: float | None = Field(default=None, description="Initial translation along y, in scene units.")
-    z: float | None = Field(default=None, description="Initial translation along z, in scene units.")
-    rotation: _NumberOrList | None = Field(default=None, description="Initial angles, in degrees.")
-    scale: _NumberOrList | None = Field(default=None, description="Initial scale factor.")
+
+class MotionBounds(ByWord[Bounds]):
+    """Bounds [low, high] of a motion."""
 
 
-class MotionBounds(ByWord):
-    """Bounds of a motion."""
-
-    translation: Bounds | None = Field(default=None, description="[low, high] of each number, in scene units.")
-    x: Bounds | None = Field(default=None, description="[low, high], in scene units.")
-    y: Bounds | None = Field(default=None, description="[low, high], in scene units.")
-    z: Bounds | None = Field(default=None, description="[low, high], in scene units.")
-    rotation: Bounds | None = Field(default=None, description="[low, high] of each angle, in degrees.")
-    scale: Bounds | None = Field(default=None, description="[low, high] of the scale factor.")
-
-
-class MotionTransform(ByWord):
+class MotionTransform(ByWord[TransformName]):
     """Transforms of a motion."""
 
-    translation: TransformName | None = Field(default=None, description="As `transform`.")
-    x: TransformName | None = Field(default=None, description="As `transform`.")
-    y: TransformName | None = Field(default=None, description="As `transform`.")
-    z: TransformName | None = Field(default=None, description="As `transform`.")
-    rotation: TransformName | None = Field(default=None, description="As `transform`.")
-    scale: TransformName | None = Field(default=None, description="As `transform`.")
 
-
-class MotionRates(ByWord):
+class MotionRates(ByWord[Positive]):
     """Learning rates of a motion."""
-
-    translation: Positive | None = Field(default=None, description="Learning rate, in scene units.")
-    x: Positive | None = Field(default=None, description="Learning rate, in scene units.")
-    y: Positive | None = Field(default=None, description="Learning rate, in scene units.")
-    z: Positive | None = Field(default=None, description="Learning rate, in scene units.")
-    rotation: Positive | None = Field(default=None, description="Learning rate, in degrees.")
-    scale: Positive | None = Field(default=None, description="Learning rate of the scale factor.")
 
 
 # --- moving objects ---------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
@@ -21,9 +21,6 @@ from reslrb_cli.config.base import Count, Positive, Section, Seed, WorkPath, by_
 from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.optimizers import Stage, StopRule
 from reslrb_cli.config.views import SensorName
-
-#: Names of devices on Windows, with any suffix. Windows cannot copy a folder with such a name.
-_RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
 
 #: Paths: text that starts at a root or a home folder, or contains `.` or `..` as a part. Words with a slash between
 #: them are no path.
@@ -44,8 +41,6 @@ def check_name(name: str) -> str:
         raise wrong("must be a name and not a path; set run.output to choose the folder")
     if not folder:
         raise wrong("must contain a letter or a digit")
-    if _RESERVED.fullmatch(folder):
-        raise wrong(f"must be another name: {folder} is a device on Windows, not a folder")
     if len(folder.encode()) > NAME_BYTES:
         raise wrong(f"must have at most {NAME_BYTES} bytes in UTF-8, not {len(folder.encode())}")
     return name
@@ -128,6 +123,9 @@ _Shards = Annotated[
 class RunConfig(Section):
     """Length, samples and output of a run."""
 
+    #: Iterations between two saved images; a run saves only the first and the last image.
+    images_every: ClassVar[int] = 0
+
     name: Annotated[str, AfterValidator(check_name)] = Field(
         default="run", min_length=1, json_schema_extra=_without_default
     )
@@ -174,8 +172,6 @@ class RunConfig(Section):
     the parameter, or all parameters, unchanged in this iteration. `zero`: replace such entries of a gradient or of the
     loss's derivative by 0 and continue. Values that are not finite never reach a parameter. A run without progress for
     10 iterations ends."""
-    images_every: Annotated[int, Field(ge=0)] = 0
-    """Iterations between two saved images. 0: save only the initial and the final image."""
     final_spp: Count = 256
     """Samples per pixel of the initial and the final image, rounded up to whole passes of `samples_per_pass`."""
     views_per_iteration: Count | None = None

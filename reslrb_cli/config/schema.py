@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     BeforeValidator,
@@ -79,6 +79,9 @@ class Fabrication(Section):
     checks it.
     """
 
+    #: Id of the shape that the light falls on.
+    receiver: ClassVar[str] = "screen"
+
     kind: Literal["lens", "mirror"] = Field(default="lens", description="Whether the face refracts or reflects light.")
     faces: Annotated[
         list[Annotated[str, Field(min_length=1)]],
@@ -89,19 +92,13 @@ class Fabrication(Section):
     if it is free as well: a grid about z = -thickness that faces -z. With one id the back is flat."""
     thickness: Positive = Field(description="Distance from z = 0 down to the back, in mm.")
     outline: Literal["rectangle", "round"] = "rectangle"
-    """Outline of the solid. `round`: the ellipse of the given size; the face outside of it is cut off."""
-    size: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
-    """Width and height of the face in mm, centred at x = y = 0. null: the size of its mesh."""
+    """Outline of the solid. `round`: the ellipse inside the face; the face outside of it is cut off."""
     rim: Annotated[float, Field(ge=0)] = Field(default=0.0, description="Width of a flat rim around the face, in mm.")
     ior: Annotated[float, Field(gt=1, le=5)] = Field(default=1.49, description="Index of refraction of a lens.")
     tool_radius: Positive | None = None
     """Radius of the ball that cuts the faces, in mm. It does not reach into narrower hollows."""
-    min_thickness: Positive | None = Field(default=None, description="Smallest thickness for the material, in mm.")
     sun: Annotated[float, Field(ge=0, lt=90)] = Field(
         default=0.53, description="Angular diameter of the light source, in degrees."
-    )
-    receiver: Annotated[str, Field(min_length=1)] = Field(
-        default="screen", description="Id of the shape that the light falls on."
     )
     picture: ConfigPath | None = None
     """The picture before its dark parts were lifted, as the film sees it. The result is compared with it as well as

@@ -18,48 +18,64 @@ from pydantic import (
 from pydantic_core import CoreSchema
 from typing_extensions import Self
 
-from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, located, must, wrong
+from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, each_once, located, must, wrong
 from reslrb_cli.config.integrators import AnyIntegrator
 from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
 
-_KINDS = ("specular", "border", "clipped", "alpha")
+MaskKind = Literal["specular", "border", "clipped", "alpha"]
 
 
 class Mask(Section):
     """The pixels of a target that the loss leaves out, and the weights of all other pixels.
 
-    `specular`, `border`, `clipped` and `alpha` apply to targets that are read from files. `specular` and `border` leave
-    out pixels that light tracing cannot render. `specular` and `border` matter only if exactly one of the run's
-    integrator and the target's integrator traces from the lights. If exactly one of the two integrators traces from the
-    lights, `specular` and `border` also apply to rendered targets. Pixels of a file that are not finite are always left
-    out.
+    All kinds apply to targets that are read from files. `specular` and `border` leave out pixels that light tracing
+    cannot render. They matter only if exactly one of the run's integrator and the target's integrator traces from the
+    lights, and then also apply to rendered targets. Pixels of a file that are not finite are always left out.
     """
 
     file: ConfigPath | None = None
     """Image of weights, with the size of the target, relative to the config file. 0 leaves a pixel out. Values are used
     as stored; those of 8 and 16 bits are divided by the largest possible value. Several channels are averaged, and
     alpha is ignored."""
-    specular: bool = True
-    """Leave out pixels that see smooth glass or mirrors directly. Light tracing cannot render them. If shapes move,
-    each iteration finds these pixels anew."""
-    border: bool = True
-    """Leave out pixels within the radius of the reconstruction filter from the film's border, where light tracing is
-    darker."""
-    clipped: bool = True
-    """Leave out pixels of 8- and 16-bit files with the largest possible value in any channel, and the pixels that the
-    film's reconstruction filter mixes with them."""
-    alpha: bool = Field(default=True, description="Leave out pixels with an alpha of 0.")
+    kinds: Annotated[list[MaskKind], must(each_once, lambda _: "must name each kind once")] = Field(
+        default=["specular", "border", "clipped", "alpha"]
+    )
+    """Kinds of pixels to leave out. `specular`: pixels that see smooth glass or mirrors directly, which light tracing
+    cannot render; if shapes move, each iteration finds these pixels anew. `border`: pixels within the radius of the
+    reconstruction filter from the film's border, where light tracing is darker. `clipped`: pixels of 8- and 16-bit
+    files with the largest possible value in any channel, and the pixels that the film's reconstruction filter mixes
+    with them. `alpha`: pixels with an alpha of 0."""
+
+    @property
+    def specular(self) -> bool:
+        """Whether pixels are left out that see smooth glass or mirrors."""
+        return "specular" in self.kinds
+
+    @property
+    def border(self) -> bool:
+        """Whether pixels are left out at the border of the film."""
+        return "border" in self.kinds
+
+    @property
+    def clipped(self) -> bool:
+        """Whether pixels are left out that are clipped, or mixed with clipped ones."""
+        return "clipped" in self.kinds
+
+    @property
+    def alpha(self) -> bool:
+        """Whether pixels are left out with an alpha of 0."""
+        return "alpha" in self.kinds
 
 
 def _mask(value: Any) -> Any:
     if value == "auto":
         return {}
     if value == "none":
-        return dict.fromkeys(_KINDS, False)
+        return {"kinds": []}
     if isinstance(value, (str, Path)):
-        return dict.fromkeys(_KINDS, False) | {"file": value}
+        return {"kinds": [], "file": value}
     if not isinstance(value, (dict, Mask)):
-        raise wrong("must be `auto`, `none`, the path of an image of weights, or a section such as {clipped: false}")
+        raise wrong("must be `auto`, `none`, the path of an image of weights, or a section such as {kinds: [border]}")
     return value
 
 
@@ -75,7 +91,7 @@ AnyMask = Annotated[Mask, BeforeValidator(_mask), _OrText()]
 
 
 def _view_mask(value: Any) -> Any:
-    if isinstance(value, dict) and {**value, "file": None} == {**dict.fromkeys(_KINDS, False), "file": None}:
+    if isinstance(value, dict) and value.keys() <= {"kinds", "file"} and value.get("kinds") == []:
         return value  # as in the config.yaml of a run
     if not isinstance(value, (str, Path, Mask)) or value == "auto":
         raise wrong("must be `none` or the path of an image of weights (`target.mask` sets the kinds)")
@@ -146,7 +162,7 @@ class TargetConfig(Section):
     render: Rendering | None = Field(default=None, description="Render the target from the scene.")
     mask: AnyMask = Mask()
     """Pixels that the loss leaves out, and weights of the others. `auto`: leave out all kinds of pixels below. `none`:
-    leave out none. The path of an image of weights: use only these weights. A section turns kinds off, and may add
+    leave out none. The path of an image of weights: use only these weights. A section lists the kinds, and may add
     weights."""
     exposure: Exposure = 1.0
     """Factor of the image before it is compared: target = exposure * image. A number, `auto` (one factor, recovered

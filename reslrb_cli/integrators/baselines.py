@@ -110,7 +110,7 @@ class Projective(Replayed):
         If `sppp` is 0, such outlines are left out, and nothing is checked. A sensor that is not perspective is refused
         for any `moved` shapes. Shadow edges are not checked.
         """
-        advice = "or set integrator.sppp to 0, which leaves out outlines seen by the sensor"
+        advice = "or leave out these outlines by `sppp: 0` in an integrator of your own (type: custom)"
         for sensor in sensors if self.plugin.sppp != 0 else ():
             if sensor.class_name() != "PerspectiveCamera":
                 return (

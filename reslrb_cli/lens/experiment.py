@@ -25,6 +25,9 @@ from reslrb_cli.lens.surface import Array, Rays, Setting, Surface, transmitted
 #: Reflectance of the receiver, and its width in widths of the picture.
 ALBEDO, SCREEN = 0.8, 3.0
 
+#: Margin around the picture on the film, as a fraction of its longer side; light in it counts as lost.
+MARGIN = 0.125
+
 #: Distance of the camera before the receiver, as a multiple of the receiver's distance.
 _CAMERA = 0.75
 
@@ -97,16 +100,7 @@ def face_ply(setting: Setting, nx: int, ny: int, back: bool = False) -> bytes:
     return ply_file(points, cells)
 
 
-def film_size(shape: tuple[int, int], margin: float) -> tuple[int, int]:
-    """Return the (width, height) of a film that sees a picture of (rows, columns) and a margin.
-
-    The margin is a fraction of the picture's longer side.
-    """
-    beside = round(margin * max(shape))
-    return shape[1] + 2 * beside, shape[0] + 2 * beside
-
-
-def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array, float]:
+def target_image(picture: Array, surface: Surface) -> tuple[Array, float]:
     """Return the target image (H, W). Also return the light's irradiance or intensity that gives a mean of 1 inside the
     picture.
 
@@ -114,18 +108,18 @@ def target_image(picture: Array, surface: Surface, margin: float) -> tuple[Array
     floor. No light is lost.
     """
     setting = surface.setting
-    target = on_film(np.maximum(picture, surface.floor * picture.max()), surface, margin)
+    target = on_film(np.maximum(picture, surface.floor * picture.max()))
     return target, float(np.pi / ALBEDO * np.prod(setting.picture_size) / leaving(surface))
 
 
-def on_film(picture: Array, surface: Surface, margin: float) -> Array:
-    """Return a picture (rows, columns) on the film (H, W). The picture has mean 1, and pixels around the picture are
-    black.
+def on_film(picture: Array) -> Array:
+    """Return a picture (rows, columns) on the film (H, W), which also sees a margin around it. The picture has mean 1,
+    and the margin is black.
     """
-    width, height = film_size((picture.shape[0], picture.shape[1]), margin)
+    beside = round(MARGIN * max(picture.shape))
+    height, width = picture.shape[0] + 2 * beside, picture.shape[1] + 2 * beside
     film = np.zeros((height, width))
-    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
-    film[top : top + picture.shape[0], left : left + picture.shape[1]] = picture / picture.mean()
+    film[beside : height - beside, beside : width - beside] = picture / picture.mean()
     return film
 
 
@@ -237,8 +231,6 @@ def scene_xml(
         rays.up, f'<bsdf type="diffuse">\n            <rgb name="reflectance" value="{ALBEDO:g}"/>\n        </bsdf>',
     )  # fmt: skip
     camera = rays.middle - away * rays.normal
-    # Behind an opaque receiver a camera sees nothing. A mirrored camera before it sees the same as one behind it.
-    mirrored = '\n            <scale x="-1"/>' if setting.through else ""
     return f"""<?xml version="1.0" encoding="utf-8"?>
 <!-- A {setting.kind} that throws a picture; written by reslrb lens. Millimetres, y up: docs/lens.md, "Axes". -->
 <scene version="3.0.0">
@@ -254,7 +246,7 @@ def scene_xml(
         <string name="fov_axis" value="x"/>
         <float name="near_clip" value="{away / 100:.6g}"/>
         <float name="far_clip" value="{away * 100:.6g}"/>
-        <transform name="to_world">{mirrored}
+        <transform name="to_world">
             <lookat origin="{_triple(camera)}" target="{_triple(rays.middle)}" up="{_triple(rays.up)}"/>
         </transform>
         <film type="hdrfilm" id="film">
@@ -329,8 +321,7 @@ run:
   certainty: false  # of a design there is no true value
 fabrication:  # mm; what `reslrb export` makes a solid of
   {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},{also}
-   picture: picture.exr,  # as it was, without a floor
-   size: [{s.size[0]:.9g}, {s.size[1]:.9g}]}}
+   picture: picture.exr}}  # as it was, without a floor
 """
 
 

@@ -135,13 +135,13 @@ def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
     """Make the solid. The first of `sheets` is the front of the solid. The second sheet, if given, is the back.
     Otherwise, the back is a plane.
 
-    Raises ConfigError, with a key below `fabrication`, if the faces cross or have another size than requested.
+    Raises ConfigError, with a key below `fabrication`, if the faces cross or differ in size.
     """
-    half = sheets[0].half if plan.size is None else (plan.size[0] / 2, plan.size[1] / 2)
+    half = sheets[0].half
     for sheet in sheets:
         if any(abs(a - b) > _SIZE * b for a, b in zip(sheet.half, half, strict=True)):
-            raise ConfigError("", "fabrication.size", f"is {2 * half[0]:g} x {2 * half[1]:g} mm, but `{sheet.name}` "
-                                                      f"{2 * sheet.half[0]:g} x {2 * sheet.half[1]:g}")  # fmt: skip
+            sizes = f"{2 * half[0]:g} x {2 * half[1]:g} mm, but `{sheet.name}` {2 * sheet.half[0]:g} x "
+            raise ConfigError("", "fabrication.faces", f"`{sheets[0].name}` is {sizes}{2 * sheet.half[1]:g}")
         middle = sheet.x.mean(), sheet.y.mean()
         if max(map(abs, middle)) > _SIZE * max(half):
             raise ConfigError("", "fabrication.faces", f"the centre of `{sheet.name}` is at x = {middle[0]:.3g}, y = "
@@ -416,9 +416,6 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
             warnings.append(f"`{sheet.name}` was shaped with interpolated normals, which a solid does not have, so its "
                             'picture will differ; add <boolean name="face_normals" value="true"/> to the mesh in the '
                             "scene's file, and run `reslrb optimize` again")  # fmt: skip
-    if plan.min_thickness is not None and thin < plan.min_thickness:
-        warnings.append(f"its least thickness is {thin:.3g} mm, below {plan.min_thickness:g} mm; add "
-                        f"{plan.min_thickness - thin:.3g} mm to fabrication.thickness")  # fmt: skip
     return {
         "unit": "mm",
         "kind": plan.kind,
@@ -431,7 +428,6 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
         "volume_mm3": solid.volume,
         "triangles": len(solid.triangles),
         "tool_radius": plan.tool_radius,
-        "min_thickness": plan.min_thickness,
         "faces": faces,
         "warnings": warnings,
     }

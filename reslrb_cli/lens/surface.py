@@ -40,7 +40,6 @@ class Setting:
         distance starts at the light's centre. The distance is infinite for parallel light.
     - `incidence` is the angle (degrees, about y) between the central ray and z.
     - `tilt` has the angles (degrees) of the receiver about its horizontal and its vertical axis.
-    - `through` is true if the picture is seen from behind the receiver.
     """
 
     kind: Literal["lens", "mirror"] = "lens"
@@ -53,7 +52,6 @@ class Setting:
     light_distance: float = np.inf
     incidence: float = 0.0
     tilt: tuple[float, float] = (0.0, 0.0)
-    through: bool = False
 
 
 @dataclass
@@ -185,16 +183,6 @@ def within(setting: Setting, x: Array, y: Array) -> NDArray[np.bool_]:
     return (2 * x / setting.size[0]) ** 2 + (2 * y / setting.size[1]) ** 2 <= 1
 
 
-def on_receiver(picture: Array, through: bool) -> Array:
-    """Convert `picture` (row 0 at the top) to the receiver's axes, with row 0 at the least y and columns along x. The
-    conversion is its own inverse.
-
-    For an observer who looks at the receiver from the light's side, with y up, x points to the left. For an observer
-    behind the receiver, x points to the right.
-    """
-    return picture[::-1] if through else picture[::-1, ::-1]
-
-
 def shape_surface(
     picture: Array, setting: Setting, cells: int = 256, floor: float | Literal["auto"] = "auto"
 ) -> Surface:
@@ -205,7 +193,8 @@ def shape_surface(
     """
     _check(picture, setting)
     rays = Rays(setting)
-    target = on_receiver(np.asarray(picture, np.float64), setting.through)
+    # Row 0 at the least y, and columns along x, which points to the left of an observer on the light's side.
+    target = np.asarray(picture, np.float64)[::-1, ::-1]
     start, chosen = _start(rays), floor == "auto"
     if floor == "auto":
         with np.errstate(invalid="ignore", divide="ignore"):  # of trials that send no light

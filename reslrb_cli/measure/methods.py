@@ -152,7 +152,7 @@ def parse_own(text: str) -> list[Case]:
     """Parse a list of a user's own integrators, FILE.py:CLASS[(OPTION=VALUE,...)]. Raises like `parse_cases`."""
     cases = _parse(text, _OPTION, "", "integrator of your own; write FILE.py:CLASS[(OPTION=VALUE,...)]", False)
     if others := [case.label for case in cases if case.type != "custom"]:
-        reason = f"`{others[0]}` is not your own (FILE.py:CLASS); use --estimators for estimators of reslrb"
+        reason = f"`{others[0]}` is not your own (FILE.py:CLASS); name estimators of reslrb by `estimators`"
         raise ConfigError(_OPTION, "", reason)
     return cases
 

@@ -23,7 +23,7 @@ from reslrb_cli.records.measurements import Band, Range
 from reslrb_cli.records.metrics import Line
 from reslrb_cli.version import __version__
 
-SWEEP_FILE, PAGE_FILE, CONFIGS = "sweep.json", "sweep.html", "configs"
+SWEEP_FILE, PAGE_FILE, RESULTS_FILE, CONFIGS = "sweep.json", "sweep.html", "results.jsonl", "configs"
 
 #: Version of the file; other versions are not read.
 VERSION = 1

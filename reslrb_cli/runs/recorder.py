@@ -144,7 +144,7 @@ class Recording:
 
     def _iterate(self, stop: Callable[[], bool]) -> Iterator[Record]:
         run, saved, saved_at = self.problem.config.run, self.done, time.monotonic()
-        every, told = run.images_every, self.course.state.scaling
+        told = self.course.state.scaling
         if stop():
             return
         with MetricsWriter(self.folder.path) as metrics:
@@ -160,8 +160,6 @@ class Recording:
                     raise fault
                 if stop():
                     return
-                if every and self.done % every == 0 and self.done < run.iterations:
-                    self._write_images(f"iteration-{self.done:06d}")
                 if run.checkpoint_every.is_due(self.done - saved, time.monotonic() - saved_at):
                     metrics.sync()
                     self._save_checkpoint()
@@ -361,7 +359,7 @@ class Recording:
         self._saved = self.course.save(self.folder.checkpoint)
 
     def _write_images(self, name: str) -> None:
-        spp = saved_spp(self.problem, between=name.startswith("iteration"))
+        spp = saved_spp(self.problem, between=False)
         self.course.bring()
         if name == "final":
             logger.info(f"rendering the final image: {spp} spp")

@@ -211,12 +211,10 @@ def started(folder: Path, plan: Plan) -> Iterator[SweepPlan]:
 
 
 @contextlib.contextmanager
-def resumed(
-    folder: Path, seeds: int | None = None, retry: bool = False, allow_code: bool = False
-) -> Iterator[SweepPlan]:
+def resumed(folder: Path, seeds: int | None = None, allow_code: bool = False) -> Iterator[SweepPlan]:
     """Open the sweep in `folder`, and lock it while the block runs.
 
-    `seeds` may add more seeds to the sweep. With `retry`, runs that failed count as not yet done.
+    `seeds` may add more seeds to the sweep. Runs that failed count as not yet done.
 
     Raises ConfigError if the folder holds no sweep, or if user code is not allowed to run, or has changed since the
     start of the sweep.
@@ -226,9 +224,7 @@ def resumed(
     with _locked(folder):
         kept = read_sweep(folder)
         _check_files(folder, kept, allow_code)
-        sweep = _grown(kept, seeds)
-        if retry:
-            sweep = replace(sweep, failures={})
+        sweep = replace(_grown(kept, seeds), failures={})
         _write(folder, sweep)
         yield sweep
 

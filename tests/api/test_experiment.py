@@ -177,7 +177,7 @@ def test_calls_keep_the_own_loss_and_the_permission(folder: Path, monkeypatch: p
 
 
 def test_an_image_equals_that_of_the_command(folder: Path) -> None:
-    done("render", "tiny.yaml", "-o", "command.exr", "--spp", "8")
+    done("render", "tiny.yaml", "-o", "command.exr", "--set", "run.spp=8")
     done("render", "tiny.yaml", "-o", "scene.exr", "--scene")
     images = rl.render("tiny.yaml", spp=8)
     assert list(images) == [0]
@@ -265,7 +265,7 @@ def lines_of(file: str) -> list[dict[str, Any]]:
 
 
 def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
-    done("gradcheck", "tiny.yaml", "--estimators", "stack", "--seeds", "3", "--spp", "4", "--json", "g.jsonl")
+    done("gradcheck", "tiny.yaml", "--integrators", "reslrb:stack", "--seeds", "3", "--spp", "4", "--json", "g.jsonl")
     records = rl.gradcheck("tiny.yaml", "stack", seeds=3, spp=4)
     found = [json.loads(record.to_json()) for record in records]
     assert [record.parameter for record in records if record.reference.value == "walk_ad"] == [KEY, LAMP]

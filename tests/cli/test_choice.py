@@ -38,7 +38,7 @@ def optimize(capsys, *settings: str, verbose: bool = False) -> tuple[int, str]:
     capsys.readouterr()
     sets = [text for setting in settings for text in ("--set", setting)]
     with pytest.raises(SystemExit) as end:
-        main(["optimize", "box.yaml", *sets, "--force", *(["-v"] if verbose else [])])
+        main([*(["--debug"] if verbose else []), "optimize", "box.yaml", *sets, "--force"])
     return int(end.value.code or 0), capsys.readouterr().err
 
 

@@ -33,7 +33,7 @@ def offered(kind: type[ShellComplete], *words: str) -> list[tuple[str, str]]:
         (["optimize", "--resume", "ru"], [("dir", "ru")]),
         (["sweep", "--resume", "ru"], [("dir", "ru")]),
         (["export", "ru"], [("dir", "ru")]),
-        (["render", "--run", "ru"], [("dir", "ru")]),
+        (["render", "ru"], [("file", "ru")]),
         (["optimize", "a.yaml", "--set", "run.sp"], [("plain", "run.spp=")]),
         (["sweep", "a.yaml", "--vary", "optimizer.learn"], [("plain", "optimizer.learning_rate=")]),
         (["bench", "--set", "parameters[3].learning_rate.s"], [("plain", "parameters[3].learning_rate.scale=")]),

@@ -43,7 +43,7 @@ FIRST = {
 COMMANDS = {
     "optimize": (("room.yaml", "--set", "run.iterations=20", "--set", "run.final_spp=8"), "finished after 20"),
     "inspect": (("runs/room",), "can be recovered"),
-    "render": (("--run", "runs/room", "--spp", 8, "-o", "room.exr"), "room.exr"),
+    "render": (("runs/room", "--set", "run.spp=8", "-o", "room.exr"), "room.exr"),
     "gradcheck": (("room.yaml", "--budget", 25), "parameter"),
     "bench": (("room.yaml", "--max-depth", 16, "--budget", 40), "ptracer"),
     "export": (("runs/room", "-o", "exported"), "exported/scene.xml"),

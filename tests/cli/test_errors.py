@@ -170,15 +170,12 @@ def test_help_is_fast_and_loads_no_command() -> None:
     assert min(times) < 1
 
 
-def test_doctor_reports_as_json(llvm: str) -> None:
-    import json
-
-    script = "from reslrb_cli.cli import main; main(['doctor', '--json'])"
+def test_doctor_prints_the_backends_and_packages(llvm: str) -> None:
+    script = "from reslrb_cli.cli import main; main(['doctor'])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    report = json.loads(done.stdout)
-    assert report["variant"] in ("llvm_ad_rgb", "cuda_ad_rgb")
-    assert report["packages"]["mitsuba"]
-    assert {backend["variant"] for backend in report["backends"]} == {"llvm_ad_rgb", "cuda_ad_rgb"}
+    found = dict(line.split(maxsplit=1) for line in done.stdout.splitlines() if not line.startswith(" "))
+    assert found["variant"].startswith("auto is ")
+    assert {"llvm_ad_rgb", "cuda_ad_rgb", "python", "mitsuba", "drjit"} <= set(found)
 
 
 # Sizes that no machine can hold are refused at once, in one located line with the reason. Merely large sizes are
@@ -211,7 +208,7 @@ REFUSED = {
     ),
     "record": (
         [f"integrator={TRAJECTORY}"],
-        "integrator.max_depth: must be less than 65536, not 70000: the record of a path has one entry for each vertex",
+        "integrator.max_depth: must be at most 65535 segments, or -1 for no limit, not 70000",
     ),
 }
 

@@ -12,14 +12,13 @@ from agreement import compare
 from cli import tiny
 from cli.tiny import reslrb
 
-from reslrb_cli.cli.options import read_recovered
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.parameters import ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
 from reslrb_cli.records.images import load_image, read_parameters
-from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.records.run_folder import read_value, recovered
 from reslrb_cli.runs.export import choose_integrator
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
@@ -100,10 +99,10 @@ def test_rendering_a_run_renders_its_recovered_values(folder: Path) -> None:
         f"{{key: {LAMP}, initial: {left[LAMP].tolist()}}}, {{motion: {{of: wall, free: [translation, scale]}}, "
         f"initial: {{translation: {left['wall.translation'].tolist()}, scale: {left['wall.scale']}}}}}]"
     )
-    common = ("--spp", 16, "--sensor", 0, "--set", "run.seed=3", "-o")
+    common = ("--set", "run.spp=16", "--sensor", 0, "--set", "run.seed=3", "-o")
     expected = reslrb("render", folder / "tiny.yaml", "--set", f"parameters={by_hand}", *common, folder / "a.exr")
     assert expected.exit_code == 0, expected.output
-    assert reslrb("render", "--run", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
+    assert reslrb("render", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
     # The samples are equal, but a CPU adds them in any order.
     assert np.allclose(load_image(folder / "a.exr"), load_image(folder / "b.exr"), rtol=1e-5)
     initial = reslrb("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
@@ -124,15 +123,15 @@ def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
     assert np.all(np.abs(factor - 1) > 0.01)
     words = " ".join(f"{value:.4g}" for value in np.ravel(factor))
     for suffix in (".exr", ".png"):
-        result = reslrb("render", "--run", run, "--spp", 4, "-o", tmp_path / f"with{suffix}")
+        result = reslrb("render", run, "--set", "run.spp=4", "-o", tmp_path / f"with{suffix}")
         assert f"times {words}, the run's exposure (--exposure 1 ignores it)" in result.output
-        plain = reslrb("render", "--run", run, "--spp", 4, "--exposure", 1, "-o", tmp_path / f"without{suffix}")
+        plain = reslrb("render", run, "--set", "run.spp=4", "--exposure", 1, "-o", tmp_path / f"without{suffix}")
         assert plain.exit_code == 0
         assert "times" not in plain.output
     light, shown = (load_image(tmp_path / f"{name}.exr") for name in ("without", "with"))
     assert np.allclose(shown, light * factor, rtol=1e-5)
     assert load_image(tmp_path / "with.png").mean() != load_image(tmp_path / "without.png").mean()
-    assert "--exposure is for PNG" in reslrb("render", "--run", run, "--exposure", 2, "-o", tmp_path / "a.exr").output
+    assert "--exposure is for PNG" in reslrb("render", run, "--exposure", 2, "-o", tmp_path / "a.exr").output
     result = reslrb("export", run, "-o", tmp_path / "exported")
     line = f"multiply renderings by the exposure, {words}, to match the photographs"
     assert line in result.output.splitlines()
@@ -145,7 +144,7 @@ def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "rendered by ptracer" in result.output
     theirs = mi.load_file(str(folder / "exported/scene.xml"))
-    problem = assemble_scene(read_recovered(folder / "runs/tiny", ("integrator.rr_depth=9",)))
+    problem = assemble_scene(recovered(folder / "runs/tiny", ("integrator.rr_depth=9",)))
     found = np.stack([np.array(mi.render(theirs, spp=64, seed=seed)) for seed in range(16)])
     result = compare(np.stack([problem.render(0, 64, seed, "test") for seed in range(16)]), found)
     assert result, result
@@ -159,12 +158,12 @@ def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "Missing argument 'CONFIG'"),
-        (("tiny.yaml", "--run", "runs/tiny"), "not both"),
-        (("--run", "runs/tiny", "--scene"), "remove --initial or --scene"),
-        (("--run", "runs/none"), "no such folder"),
-        (("--run", "tiny.yaml"), "is a file, not the folder of a run"),
-        (("--run", "runs"), "has no manifest.json"),
+        ((), "Missing argument 'CONFIG|RUN'"),
+        (("--run", "runs/tiny"), "--run was removed; name the folder of the run in place of CONFIG"),
+        (("tiny.yaml", "--spp", "4"), "--spp was removed; use --set run.spp=N"),
+        (("runs/tiny", "--scene"), "remove --initial or --scene"),
+        (("runs/none",), "no such file"),
+        (("runs",), "has no manifest.json"),
     ],
 )
 def test_other_folders_are_refused(
@@ -184,7 +183,7 @@ def test_missing_or_bad_values_of_a_run_are_refused_in_one_line(folder: Path, tm
         (run / name).write_bytes((folder / "runs/tiny" / name).read_bytes())
 
     def refusal() -> str:
-        result = reslrb("render", "--run", run, "-o", tmp_path / "x.exr")
+        result = reslrb("render", run, "-o", tmp_path / "x.exr")
         assert result.exit_code == 2, result.output
         assert "Traceback" not in result.output
         return result.output
@@ -223,7 +222,7 @@ def test_an_exported_scene_names_path_if_ptracer_is_wrong(tmp_path: Path) -> Non
     assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")
 
 
-# Continuing from runs whose cameras come from a file, and which recovered a relief: `render --run` and `export`.
+# Continuing from runs whose cameras come from a file, and which recovered a relief: `render` and `export`.
 
 SIZE = 12
 #: A sheet of 5x5 vertices that is lit by a lamp. The cameras of the file replace this sensor.
@@ -301,13 +300,13 @@ def test_each_camera_is_rendered_with_the_relief(run: Path, tmp_path: Path, sens
     heights = read_value(run, "sheet.heightmap")
     assert np.abs(heights).max() > 0.05, "it never rose, so this would show nothing"
     file = tmp_path / "image.exr"
-    common = ("--spp", 256, "--exposure", 1, "--set", "run.seed=3")
-    done = reslrb("render", "--run", run, "--sensor", sensor, *common, "-o", file)
+    common = ("--set", "run.spp=256", "--exposure", 1, "--set", "run.seed=3")
+    done = reslrb("render", run, "--sensor", sensor, *common, "-o", file)
     assert done.exit_code == 0, done.output
     image = load_image(file)
     assert image.shape == (SIZE, SIZE, 3)
-    recovered, begun = (assemble_scene(config) for config in (read_recovered(run, ()), load(run / "config.yaml")))
-    own, first = (np.stack([one.render(sensor, 16, k, "test").mean() for k in range(16)]) for one in (recovered, begun))
+    ended, begun = (assemble_scene(config) for config in (recovered(run, ()), load(run / "config.yaml")))
+    own, first = (np.stack([one.render(sensor, 16, k, "test").mean() for k in range(16)]) for one in (ended, begun))
     error = own.std(ddof=1) * np.sqrt(2 / len(own))  # the image has as many samples as all these renderings
     far = np.abs(np.array([own.mean(), first.mean()]) - image.mean()) / error
     assert far[0] < 3 < far[1], (image.mean(), own, first)
@@ -320,8 +319,8 @@ def test_mitsuba_sees_the_relief_from_each_camera(run: Path, tmp_path: Path, sen
     assert done.exit_code == 0, done.output
     theirs = mi.load_file(str(tmp_path / "exported/scene.xml"))
     assert len(theirs.sensors()) == 2
-    recovered, begun = (assemble_scene(config) for config in (read_recovered(run, ()), load(run / "config.yaml")))
-    own, first = (np.stack([one.render(sensor, 64, k, "test") for k in range(16)]) for one in (recovered, begun))
+    ended, begun = (assemble_scene(config) for config in (recovered(run, ()), load(run / "config.yaml")))
+    own, first = (np.stack([one.render(sensor, 64, k, "test") for k in range(16)]) for one in (ended, begun))
     found = np.stack([np.array(mi.render(theirs, sensor=sensor, spp=64, seed=seed)) for seed in range(16)])
     result = compare(own, found)
     assert result, result

@@ -45,7 +45,7 @@ def read(path: Path) -> list[dict]:
 def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     json_file, maps = tmp_path / "a.jsonl", tmp_path / "maps" / "here"
     files = ["--json", str(json_file), "--images", str(maps)]
-    assert call(*SMALL, "--seeds", "8", "--estimators", "stack,event(capacity=2)", *files) == 0
+    assert call(*SMALL, "--seeds", "8", "--integrators", "reslrb:stack,reslrb:event(capacity=2)", *files) == 0
     rows = read(json_file)
     assert [list(row) for row in rows] == [KEYS] * 11
     assert [(row["parameter"], row["estimator"], row["reference"], row["kind"]) for row in rows] == [
@@ -77,7 +77,7 @@ def test_failures_are_named(
     right = stack.push
     monkeypatch.setattr(stack, "push", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.5))
     json_file = tmp_path / "a.jsonl"
-    assert call(*SMALL, "--seeds", "8", "--estimators", "stack,gather", "--json", str(json_file)) == 1
+    assert call(*SMALL, "--seeds", "8", "--integrators", "reslrb:stack,reslrb:gather", "--json", str(json_file)) == 1
     assert {row["estimator"] for row in read(json_file) if row["holds"] is False} == {"stack"}
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILS: ")]
     assert len(lines) == 4
@@ -88,19 +88,22 @@ def test_failures_are_named(
 @pytest.mark.parametrize(
     ("args", "line"),
     [
-        (["--estimators", "stak"], "--estimators reslrb:stak: integrator.estimator: must be one of"),
-        (["--estimators", "stack("], "--estimators: `stack(` is not an estimator"),
+        (["--integrators", "reslrb:stak"], "--integrators reslrb:stak: integrator.estimator: must be one of"),
+        (["--integrators", "reslrb:stack("], "--integrators: `reslrb:stack(` is not an integrator"),
+        (["--integrators", "prb"], "--integrators: `prb` is neither an estimator, reslrb:ESTIMATOR, nor your own"),
+        (["--estimators", "stack"], "--estimators was removed; name them by --integrators, such as reslrb:stack"),
         (["--set", "run.sp=3"], "did you mean `spp`?"),
         (["--seeds", "2"], "--seeds"),
         (["--json", "/nowhere/a.jsonl"], "--json: cannot write /nowhere/a.jsonl"),
         (["--images", f"{__file__}/here"], f"--images: cannot write into {__file__}"),
         (["nothing.yaml"], "nothing.yaml: no such file"),
-        (["--case", "furnace"], "--case: names a case of a suite; add --suite extreme"),
-        (["--suite", "extrem"], "--suite"),
+        (["--case", "furnace"], "--case was removed; name the case after the suite, as in --suite extreme:furnace"),
+        (["--suite", "extrem"], "--suite: there is no suite `extrem`; write extreme, or extreme:CASE"),
         (["--suite", "extreme", "a.yaml"], "--suite: CONFIG has no effect on a suite"),
         (["--suite", "extreme", "--spp", "4"], "--suite: --spp has no effect on a suite"),
-        (["--suite", "extreme", "--estimators", "stak"], "--estimators: `stak` is no estimator; there are reservoir"),
-        (["--suite", "extreme", "--estimators", "event(capacity=2)"], "a suite allows no option except paths"),
+        (["--suite", "extreme", "--integrators", "reslrb:stak"], "`stak` is no estimator; there are reservoir"),
+        (["--suite", "extreme", "--integrators", "own.py:A"], "a suite allows estimators of reslrb, and no option"),
+        (["--suite", "extreme", "--integrators", "reslrb:event(capacity=2)"], "and no option except paths"),
     ],
 )
 def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,8 +114,8 @@ def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: py
 
 def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     json_file = tmp_path / "a.jsonl"
-    words = ["--estimators", "stack", "--json", str(json_file)]
-    assert call("--suite", "extreme", "--case", "furnace", *words) == 0
+    words = ["--integrators", "reslrb:stack", "--json", str(json_file)]
+    assert call("--suite", "extreme:furnace", *words) == 0
     rows = read(json_file)
     assert {(row["case"], row["estimator"], row["holds"]) for row in rows} == {("furnace", "stack", True)}
     assert "analytic" in {row["reference"] for row in rows}
@@ -120,7 +123,7 @@ def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert lines[1].startswith("furnace ")
     assert lines[1].endswith("holds")
     assert lines[-1] == f"{len(rows)} of {len(rows)} comparisons hold, 0 fail"
-    assert call("--suite", "extreme", "--case", "furnac") == 2
+    assert call("--suite", "extreme:furnac") == 2
     assert "there is no case `furnac`; did you mean furnace?" in capsys.readouterr().err
 
 
@@ -161,7 +164,11 @@ def test_finished_cases_are_not_repeated(
 def test_ctrl_c_prints_finished_comparisons() -> None:
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "gradcheck", *SMALL, "--seeds", "80"]
     process = subprocess.Popen(
-        [*command, "--estimators", "stack"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
+        [*command, "--integrators", "reslrb:stack"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ,
     )
     assert process.stderr is not None
     for line in process.stderr:
@@ -176,7 +183,7 @@ def test_ctrl_c_prints_finished_comparisons() -> None:
 
 
 def test_a_budget_too_small_for_anything_is_no_success(capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(*SMALL, "--budget", "0", "--estimators", "stack") == 1
+    assert call(*SMALL, "--budget", "0", "--integrators", "reslrb:stack") == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2] == "0 of 6 comparisons hold, 0 fail, 6 leave the question open"
     assert lines[-1] == "open: 6 not measured: the budget was spent; allow more with --budget"

@@ -242,7 +242,7 @@ def conditioning(*arguments: str) -> str:
 
 
 def test_conditioning_as_a_table_and_as_json():
-    lines = conditioning("--samples", "3").splitlines()
+    lines = conditioning().splitlines()
     assert lines[-4].split() == [
         "parameter",
         "entries",
@@ -255,8 +255,8 @@ def test_conditioning_as_a_table_and_as_json():
         "curvature",
         "length",
     ]
-    assert lines[-5] == "conditioning (3 gradients of 32 spp, seed 0)"
-    measured = json.loads(conditioning("--samples", "3", "--json"))["conditioning"]
+    assert lines[-5] == "conditioning (8 gradients of 32 spp, seed 0)"
+    measured = json.loads(conditioning("--json"))["conditioning"]
     floor, lamp = measured["parameters"]
     for row, line in ((floor, lines[-3]), (lamp, lines[-2])):
         cells = line.split()
@@ -281,9 +281,3 @@ def test_a_spread_needs_two_samples():
     rows.append(Sensitivity("c", 1, 1.0, 1e-3, 0.1, change=8.0))
     assert Conditioning(rows, 2, 1, 0).spread("change") == 2.0
     assert Conditioning(rows, 2, 1, 0).spread("gradient") == pytest.approx(2e3)
-
-
-def test_samples_require_conditioning():
-    result = CliRunner().invoke(main, ["inspect", str(STIFF), "--samples", "4"])
-    assert result.exit_code == 2
-    assert "--conditioning" in result.output

@@ -131,8 +131,7 @@ def test_a_texture_is_recovered_with_a_transform(experiment, capsys, transform):
 
 
 def test_saved_files_of_a_run_agree(experiment, capsys):
-    assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=3", "--set", "run.images_every=2")[0] == 0
-    assert "iteration-000002.exr" in names("runs/box/images")
+    assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=3")[0] == 0
     with np.load("runs/box/checkpoint/state.npz") as state, np.load("runs/box/parameters/parameters.npz") as values:
         np.testing.assert_array_equal(state[f"parameter/{KEY}"], values[KEY])
         assert int(state["iteration"]) == 3
@@ -179,7 +178,7 @@ def test_a_target_without_light_is_refused(experiment, capsys):
 
 
 def test_a_target_file_gives_no_parameter_error(experiment, capsys):
-    assert reslrb(capsys, "render", "box.yaml", "--scene", "-o", "target.exr", "--spp", 64)[0] == 0
+    assert reslrb(capsys, "render", "box.yaml", "--scene", "-o", "target.exr", "--set", "run.spp=64")[0] == 0
     Path("file.yaml").write_text(CONFIG.replace("{render: {spp: 512}}", "{file: target.exr}"))
     assert reslrb(capsys, "optimize", "file.yaml", "--set", "run.iterations=2")[0] == 0
     records = read_metrics("runs/file")
@@ -287,7 +286,7 @@ def test_camera_paths_render_scenes_that_light_paths_cannot(experiment, capsys, 
 def test_a_render_is_written_and_bad_outputs_are_refused(experiment, capsys):
     import mitsuba as mi
 
-    code, out, _ = reslrb(capsys, "render", "box.yaml", "-o", "small.png", "--sensor", 1, "--spp", 8)
+    code, out, _ = reslrb(capsys, "render", "box.yaml", "-o", "small.png", "--sensor", 1, "--set", "run.spp=8")
     assert code == 0
     assert "small.png: 12x8" in out
     assert np.array(mi.Bitmap("small.png")).dtype == np.uint8

@@ -36,7 +36,7 @@ from reslrb_cli.runs import recorder
 
 #: Moments of a run, each with a text that the run has then printed, or with a file that the run folder then holds.
 MOMENTS = {"loading": "variant ", "the target": "rendering ", "the mask": "finding ", "iterations": "metrics.jsonl"}
-LONG = ["-v", "--set", "run.iterations=20000"]
+LONG = ["--set", "run.iterations=20000"]
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def hit(process: subprocess.Popen[str], number: int, times: int) -> tuple[int, s
 @pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.long)])
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_ctrl_c_at_every_stage(experiment: Path, moment: str, times: int) -> None:
-    process = start(experiment, *LONG)
+    process = start(experiment, *LONG, details=True)
     run = experiment / "runs" / "tiny"
     wait_for(process, run, MOMENTS[moment])
     code, err = hit(process, signal.SIGINT, times)
@@ -89,7 +89,7 @@ def test_ctrl_c_at_every_stage(experiment: Path, moment: str, times: int) -> Non
 
 @pytest.mark.usefixtures("llvm")
 def test_a_killed_run_can_be_read_and_replaced(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    process = start(experiment, *LONG)
+    process = start(experiment, *LONG, details=True)
     run = experiment / "runs" / "tiny"
     wait_for(process, run, "metrics.jsonl")
     assert read_manifest(run)["status"] == "running"  # type: ignore[index]
@@ -113,7 +113,7 @@ def storm(experiment: Path, number: int, count: int, times: int = 1) -> Counter[
     for index in range(count):
         name = f"run-{index}"
         run = experiment / "runs" / name
-        process = start(experiment, "-v", "--set", f"run.name={name}", "--set", "run.iterations=30")
+        process = start(experiment, "--set", f"run.name={name}", "--set", "run.iterations=30", details=True)
         wait_for(process, run, stages[index % len(stages)])
         time.sleep(chance.uniform(0, 1))
         code, err = hit(process, number, times)

@@ -52,7 +52,7 @@ def folder(llvm, tmp_path, monkeypatch):
     return tmp_path
 
 
-def call(arguments, interrupts, verbose=False, fresh=False):
+def call(arguments, interrupts, fresh=False):
     """Call the command in this process, in place of `sweep.call`."""
     result = CliRunner().invoke(main, list(arguments))
     return result.exit_code, result.output.strip().splitlines()[-1]
@@ -170,7 +170,7 @@ def test_a_folder_has_one_sweep(folder):
     more = tiny.done("sweep", "--resume", "s", "--seeds", 2)
     assert "2 of 2 runs done" in more.output
     assert "--seeds: is 1; the sweep has 2 seeds already" in reslrb("sweep", "--resume", "s", "--seeds", 1).output
-    assert "add only --seeds, --retry" in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
+    assert "add only --seeds or --allow-code" in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
 
 
 def test_damage_is_located(folder):
@@ -221,7 +221,7 @@ def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
             copy("over-final-images")
         end(self)
 
-    def calling(arguments, interrupts, verbose=False, fresh=False):
+    def calling(arguments, interrupts, fresh=False):
         calls.append(arguments)
         if len(calls) == 4:
             copy("between-runs")
@@ -261,7 +261,7 @@ def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
     ends = {"learning_rate=0.02-seed=1": (5, "the loss is not finite"), "learning_rate=0.2-seed=0": (-9, "killed")}
     called = []
 
-    def failing(arguments, interrupts, verbose=False, fresh=False):
+    def failing(arguments, interrupts, fresh=False):
         called.append(arguments)
         name = next(word for word in ends if any(word in each for each in arguments)) if any(
             word in each for word in ends for each in arguments) else None  # fmt: skip
@@ -269,20 +269,20 @@ def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
 
     monkeypatch.setattr(sweep, "call", failing)
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "2", "-o", "s"]
-    result = reslrb(*words, "--json", "s.jsonl")
+    result = reslrb(*words)
     assert result.exit_code == 1
     for line in ("1 of 2, 1 failed", "learning_rate=0.02-seed=1 failed: the loss is not finite",
-                 "finished, 2 of 4 runs done, 2 failed; look at s/sweep.html; --retry repeats"):  # fmt: skip
+                 "finished, 2 of 4 runs done, 2 failed; look at s/sweep.html; `reslrb sweep --resume s"):  # fmt: skip
         assert line in result.output
     assert "lowest median" not in result.output  # remaining runs of failed combinations are the lucky ones
-    kinds = [json.loads(line)["kind"] for line in Path("s.jsonl").read_text().splitlines()]
+    kinds = [json.loads(line)["kind"] for line in Path("s/results.jsonl").read_text().splitlines()]
     assert kinds == ["origin", *["sweep_run"] * 4, *["sweep_row"] * 2]
     called.clear()
-    assert reslrb("sweep", "--resume", "s").exit_code == 1
-    assert called == []
     ends = {}
-    result = reslrb("sweep", "--resume", "s", "--retry")
+    result = reslrb("sweep", "--resume", "s")
     assert (result.exit_code, len(called)) == (0, 2)
+    for option in ("--retry", "--json=s.jsonl", "--dry-run", "--quiet", "-v"):
+        assert f"{option.partition('=')[0]} was removed; " in reslrb(*words, option).output
     assert "lowest median parameter RMSE: learning_rate=0.02" in result.output
 
 
@@ -317,7 +317,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_complete_folders(folder, monkey
 def test_a_sweep_locks_its_folder(folder, monkeypatch):
     said = []
 
-    def another(arguments, interrupts, verbose=False, fresh=False):
+    def another(arguments, interrupts, fresh=False):
         said.append(reslrb("sweep", "--resume", "s").output)
         return 130, ""
 
@@ -380,7 +380,7 @@ def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
 def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
     asked = []
 
-    def noting(arguments, interrupts, verbose=False, fresh=False):
+    def noting(arguments, interrupts, fresh=False):
         asked.append(fresh)
         return call(arguments, interrupts)
 
@@ -679,12 +679,3 @@ def test_the_page_has_a_table_curves_and_pictures(folder):
     assert "&lt;b&gt;x" in text
     assert "<b>x" not in text
     assert "<i>k" not in text
-
-
-def test_a_dry_run_reports_the_number_and_time_of_runs(folder):
-    before = tiny.files(folder)
-    result = tiny.done("sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "3", "--dry-run")
-    assert "2 combinations with 3 seeds: 6 runs, one after the other; nothing was written" in result.output
-    assert "learning_rate=0.02" in result.output
-    assert "time of the whole sweep: about" in result.output
-    assert tiny.files(folder) == before

@@ -130,10 +130,15 @@ def write_experiment(folder: Path, text: str = SCENE) -> None:
     (folder / "tiny.yaml").write_text(CONFIG)
 
 
-def start(folder: Path, *args: str, **options: Any) -> subprocess.Popen[str]:
-    """Start `reslrb optimize tiny.yaml` in its own process, with `folder` as its working directory."""
+def start(folder: Path, *args: str, details: bool = False, **options: Any) -> subprocess.Popen[str]:
+    """Start `reslrb optimize tiny.yaml` in its own process, with `folder` as its working directory. With `details`, it
+    prints all messages.
+    """
     # Start the program like its entry point, so that its name is `reslrb` from the first line on.
-    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
+    script = "import logging, sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import LogLines, run; "
+    if details:  # without the tracebacks of --debug
+        script += "log = logging.getLogger('reslrb_cli'); log.addHandler(LogLines()); log.setLevel('DEBUG'); "
+    script += "run()"
     command = [sys.executable, "-c", script, "optimize", "tiny.yaml", *args]
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}

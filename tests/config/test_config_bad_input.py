@@ -296,7 +296,6 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "name from a home": (GOOD + "run: {name: ~root/x}\n", "run.name: must be a name and not a path"),
     "name of the folder": (GOOD + "run: {name: '..'}\n", "run.name: must be a name and not a path"),
     "name of a drive": (GOOD + "run: {name: 'C:\\x'}\n", "run.name: must be a name and not a path"),
-    "name of a device": (GOOD + "run: {name: Aux.1}\n", "run.name: must be another name: Aux.1"),
     "empty key of a target": (
         target("{render: {parameters: {'': 1}}}"),
         "target.render.parameters: must have keys that are not empty",
@@ -360,10 +359,11 @@ def test_the_suggested_override_is_valid(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", REMOVED)
 def test_removed_settings_are_refused_with_a_replacement(name: str, tmp_path: Path) -> None:
     place, _, value = name.partition(": ")
-    lists = {"views.": "views[0].", "stages.": "run.stages[0].", "render.": "target.render."}
+    lists = {"views.": "views[0].", "stages.": "run.stages[0].", "render.": "target.render.", "mask.": "target.mask."}
     for short, whole in lists.items():
         place = whole + place.removeprefix(short) if place.startswith(short) else place
-    line = line_of(tmp_path, GOOD, ("views=[{sensor: 0}]", "run.stages=[{until: 0.5}]", f"{place}={value or 1}"))
+    sections = ("views=[{sensor: 0}]", "run.stages=[{until: 0.5}]", "fabrication.thickness=9")
+    line = line_of(tmp_path, GOOD, (*sections, f"{place}={value or 1}"))
     assert line.startswith(f"--set {place}={value or 1}: {place}: ")
     assert line.endswith(f"was removed; {REMOVED[name]}")
 

@@ -427,8 +427,8 @@ def test_impossible_paths(options: dict[str, Any], words: str) -> None:
 
 def test_naive_differentiation_uses_the_given_paths() -> None:
     assert WalkAdConfig().options()["paths"] == "light"
-    with pytest.raises(ValueError, match="has no effect with paths: camera, only with both"):
-        WalkAdConfig(paths="camera", light_share=0.3)
+    with pytest.raises(ValueError, match="light_share"):
+        WalkAdConfig(paths="both", light_share=0.3)
 
 
 def test_auto_is_stack() -> None:

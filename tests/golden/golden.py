@@ -85,7 +85,7 @@ _FLOOR = (
     "target.render.spp=4",
 )
 MEASUREMENTS = {
-    "gradcheck": ("gradcheck", *_TINY, "--seeds", "4", "--estimators", "stack"),
+    "gradcheck": ("gradcheck", *_TINY, "--seeds", "4", "--integrators", "reslrb:stack"),
     "bench": ("bench", *_TINY, "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack"),
     "convergence": ("convergence", *_FLOOR, "--integrators", "reslrb:stack,prb", "--rounds", "4"),
     "inspect": ("inspect", "configs/cornell_floor.yaml", "--json"),

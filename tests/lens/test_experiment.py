@@ -24,8 +24,7 @@ from reslrb_cli.scene.images import read_image
 
 OPTIONS = {
     "lens": [],
-    "mirror": ["--mirror"],
-    "through": ["--through"],
+    "mirror": ["--mirror", "30"],
     "portrait": [],
     "round": ["--outline", "round"],
     "tilt": ["--tilt", "10", "20"],
@@ -33,8 +32,8 @@ OPTIONS = {
     "round_point": ["--light-distance", "300", "--thickness", "50", "--outline", "round"],
     "sun": ["--sun", "0.53"],
     "both": ["--both"],
-    "mirror_point": ["--mirror", "--light-distance", "300"],
-    "mirror_tilt": ["--mirror", "--tilt", "0", "15"],
+    "mirror_point": ["--mirror", "30", "--light-distance", "300"],
+    "mirror_tilt": ["--mirror", "30", "--tilt", "0", "15"],
 }
 
 
@@ -137,15 +136,14 @@ BAD = {
         "--distance: at 50 mm light cannot reach the whole picture",
     ),
     "index": (["--ior", "1"], "--ior: is 1; glass and plastics"),
-    "incidence": (["--mirror", "--incidence", "0"], "--incidence: at 0 degrees the receiver blocks the mirror's"),
+    "incidence": (["--mirror", "0"], "--mirror: at 0 degrees the receiver blocks the mirror's"),
     "size": (["--size", "nan"], "--size: is nan mm; it must be above 0"),
     "thickness": (["--thickness", "0.5"], "--thickness: the relief is"),
     "light": (["--light-distance", "20"], "--light-distance: is 20 mm, at which no lens was found"),
     "sun": (["--sun", "40"], "--sun: is 40 degrees; it must be from 0 to below 10"),
     "sun of a point": (["--sun", "0.5", "--light-distance", "300"], "--sun: needs parallel light"),
-    "two faces": (["--mirror", "--both"], "--both: needs a lens"),
-    "margin": (["--margin", "2"], "--margin: is 2; it must be from 0 to 1"),
-    "round": (["--mirror", "--outline", "round", "--light-distance", "300"], "--outline: round needs parallel"),
+    "two faces": (["--mirror", "30", "--both"], "--both: needs a lens"),
+    "round": (["--mirror", "30", "--outline", "round", "--light-distance", "300"], "--outline: round needs parallel"),
     "one colour": ([], "p.exr: has only one colour"),
     "dithered": ([], "p.exr: has only one colour"),
     "one pixel": ([], "p.exr: is 1 x 1"),
@@ -161,8 +159,7 @@ BAD = {
     "no glass": (["--ior", "9"], "--ior: is 9; glass and plastics"),
     "floor": (["--floor", "1"], "--floor: is 1; it must be from 0 to below 1"),
     "tilt": (["--tilt", "0", "85"], "--tilt: is 0 and 85 degrees; both must be between"),
-    "incidence of a lens": (["--incidence", "10"], "--incidence: needs --mirror"),
-    "grazing": (["--mirror", "--incidence", "85"], "--incidence: is 85 degrees; it must be between"),
+    "grazing": (["--mirror", "85"], "--mirror: is 85 degrees; it must be between"),
     "total reflection": (
         ["--ior", "1.1", "--distance", "60", "--picture-size", "200"],
         "bends light by at most 25 degrees before total",

@@ -29,14 +29,12 @@ SETTINGS = {
     "lens, round": replace(LENS, outline="round"),
     "lens, deep": replace(LENS, distance=80.0, picture_size=(80.0, 80.0), thickness=30.0),
     "lens, wide": replace(LENS, size=(100.0, 60.0), picture_size=(80.0, 80.0)),
-    "lens, looked at through the receiver": replace(LENS, through=True),
     "mirror": MIRROR,
     "mirror, point light": replace(MIRROR, light_distance=500.0),
     "mirror, tilted receiver": replace(MIRROR, tilt=(-15.0, 20.0)),
 }
 FEW = {
-    "lens", "lens, point light", "lens, tilted receiver", "lens, round", "lens, looked at through the receiver",
-    "mirror", "mirror, point light",
+    "lens", "lens, point light", "lens, tilted receiver", "lens, round", "mirror", "mirror, point light",
 }  # fmt: skip
 
 

@@ -69,8 +69,7 @@ def test_grey_blacks_and_dark_corners_give_warnings() -> None:
 SETUPS = {
     "lens": ((), "back", "parallel", False, "the flat back"),
     "lamp": (("--light-distance", 400, "--thickness", 60), "back", 400, False, "a small lamp, 400 mm from the flat"),
-    "mirror": (("--mirror", "--incidence", 30), "front", "parallel", False, "30° from the perpendicular"),
-    "through": (("--through",), "back", "parallel", True, "behind the receiver"),
+    "mirror": (("--mirror", 30), "front", "parallel", False, "30° from the perpendicular"),
     "tilted": (("--tilt", 20, 0), "back", "parallel", False, "tilted by 20°"),
 }
 

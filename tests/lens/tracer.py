@@ -98,8 +98,6 @@ def caustic(made: Surface, shape: tuple[int, int], rays: int = 400, wider: float
     offset = p - (forward * s.distance)[:, None]
     landed = offset - (ahead @ offset) / (ahead @ d) * d
     columns, rows = right @ landed, -(up @ landed)
-    if s.through:
-        columns = -columns
     w, h = s.picture_size[0] * wider, s.picture_size[1] * wider
     column, row = (columns / w + 0.5) * shape[1] - 0.5, (rows / h + 0.5) * shape[0] - 0.5
     result = np.zeros((shape[0] + 2, shape[1] + 2))  # rays are a pixel wide, and a border takes light just outside

@@ -19,6 +19,7 @@ import pytest
 from measure.faults import room
 
 from reslrb_cli.cli import main
+from reslrb_cli.measure import methods
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
 from reslrb_cli.measure.stepper import Stepper
@@ -105,9 +106,10 @@ def test_a_budget_too_small_for_anything_is_reported(capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.usefixtures("llvm")
-def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "bench.json"
-    args = ["--max-depth", "4", "--integrators", "ptracer", "--memory-limit", "100MiB", "--json", str(file)]
+    monkeypatch.setattr(methods, "memory_bytes", lambda variant: 100 * 2**20)
+    args = ["--max-depth", "4", "--integrators", "ptracer", "--json", str(file)]
     assert call(*SMALL, *args) == 4
     rows = read(file)
     assert [list(row) for row in rows] == [KEYS] * 2
@@ -132,10 +134,13 @@ def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("limit", ["200MiB", "420MiB"])
-def test_an_end_at_a_low_limit_is_attributed_to_memory(limit: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("limit", [200, 420])
+def test_an_end_at_a_low_limit_is_attributed_to_memory(
+    limit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "bench.json"
-    args = ["--max-depth", "2", "--integrators", "reslrb:stack", "--memory-limit", limit, "--json", str(file)]
+    monkeypatch.setattr(methods, "memory_bytes", lambda variant: limit * 2**20)
+    args = ["--max-depth", "2", "--integrators", "reslrb:stack", "--json", str(file)]
     assert call(*SMALL, *args) in (0, 4)  # memory use depends on the number of cores
     assert read(file)[0]["status"] in ("ok", "out_of_memory")
 
@@ -149,13 +154,12 @@ def test_an_end_at_a_low_limit_is_attributed_to_memory(limit: str, tmp_path: Pat
             ["--set", "scene.options.colour=3", "--max-depth", "2", "--integrators", "reslrb:stack"],
             "scene.options.colour: the options are",
         ),
-        (["--memory-limit", "much"], "`much` is not a size"),
-        (["--memory-limit", "2G"], "`2G` is not a size; write 2GiB or 500MB"),
+        (["--memory-limit", "2GiB"], "--memory-limit was removed; the shell's `ulimit -v KIB` limits every process"),
         (["--max-depth", "1"], "--max-depth"),
         (["--integrators", "pt"], "--integrators pt: integrator.type"),
         (["--json", "no/such/folder.json"], "--json: cannot write"),
         (["--plot", "a.png"], "--plot was removed; `reslrb report FILE -o page.html` plots results of --json FILE"),
-        (["--resume=a"], "--resume was removed here; --json FILE continues from the results in FILE"),
+        (["--resume=a"], "--resume was removed; --json FILE continues from the results in FILE"),
         (["--resum", "a"], "bench: No such option"),
     ],
 )

@@ -57,10 +57,10 @@ CONFIG = f"""variant: llvm_ad_rgb
 scene: {{file: scene.xml, options: {{bright: 8}}}}
 parameters: [{{key: {KEY}, initial: {{file: start.exr, color_space: linear}}, bounds: [0, 1]}}]
 integrator: {{max_depth: 3, estimator: stack, paths: light, sequence: independent}}
-run: {{iterations: 1, spp: 4, certainty: false, images_every: 0}}
+run: {{iterations: 1, spp: 4, certainty: false}}
 """
 PHOTO = """loss: {type: custom, file: own.py:own}
-target: {file: photo.exr, mask: {file: weights.exr, border: false}}
+target: {file: photo.exr, mask: {file: weights.exr, kinds: [specular, clipped, alpha]}}
 """
 CAMERAS = PHOTO.replace("file: photo.exr, ", "")
 
@@ -234,7 +234,7 @@ def test_decisions_of_another_experiment_are_not_used(folder: Path, files: tuple
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", [
-    ("gradcheck", "--seeds", "3", "--estimators", "stack"),
+    ("gradcheck", "--seeds", "3", "--integrators", "reslrb:stack"),
     ("bench", "--max-depth", "2", "--rounds", "3", "--integrators", "reslrb:stack"),
     ("convergence", "--rounds", "3", "--integrators", "reslrb:stack"),
 ])  # fmt: skip

@@ -224,11 +224,11 @@ def test_the_command_and_more_seeds(
     config = tmp_path / "lamp.yaml"
     config.write_text(LAMP.format(folder=Path(__file__).parent))
     whole, part = (tmp_path / f"{name}.jsonl" for name in ("whole", "part"))
-    again = ["--missing", "--directions", "2", "--spp", "4"]
+    again = ["--missing", "--spp", "4"]
     assert call(str(config), *again, "--seeds", "6", "--json", str(whole)) == 0
     origin, row = map(json.loads, whole.read_text().splitlines())
     assert origin["kind"] == "origin"
-    assert (row["kind"], row["parameter"], row["directions"], row["seeds"]) == ("missing", "lamp.position", 2, 6)
+    assert (row["kind"], row["parameter"], row["directions"], row["seeds"]) == ("missing", "lamp.position", 3, 6)
     shown = capsys.readouterr().out.splitlines()
     assert shown[-1].startswith("lamp.position: ")
     assert "dL/dI of the loss at the initial values" in shown[-2]
@@ -243,8 +243,8 @@ def test_the_command_and_more_seeds(
         patch.setattr(Missing, "take", None)
         assert call(str(config), *again, "--seeds", "6", "--json", str(part)) == 0
     assert json.loads(part.read_text().splitlines()[-1]) == other
-    assert call(str(config), "--missing", "--seeds", "9", "--spp", "4", "--json", str(part)) == 2
-    assert "belongs to another measurement: directions is 2 there, None here" in capsys.readouterr().err
+    assert call(str(config), "--missing", "--seeds", "9", "--spp", "8", "--json", str(part)) == 2
+    assert "belongs to another measurement: spp is 4 there, 8 here" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("_quiet")
@@ -252,9 +252,9 @@ def test_the_command_and_more_seeds(
     ("arguments", "message"),
     [
         (["--missing"], "--missing: needs a CONFIG"),
-        (["CONFIG", "--missing", "--estimators", "stack"], "--estimators: has no effect with --missing"),
+        (["CONFIG", "--missing", "--integrators", "reslrb:stack"], "--integrators: has no effect with --missing"),
         (["CONFIG", "--missing", "--markdown", "a.md"], "--markdown was removed; `reslrb report FILE"),
-        (["CONFIG", "--directions", "2"], "--directions: needs --missing"),
+        (["CONFIG", "--directions", "2"], "--directions was removed; each parameter has three directions"),
     ],
 )
 def test_incompatible_options(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

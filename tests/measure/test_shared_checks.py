@@ -119,7 +119,7 @@ def call(*words: str) -> int:
 @pytest.mark.long
 def test_cases_of_the_suite_are_calls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The cases keep the order of one process. Threads add in any order, so that the last digits differ."""
-    cases = ["--suite", "extreme", "--case", "furnace", "--case", "film_crop", "--estimators", "stack", "--seeds", "4"]
+    cases = ["--suite", "extreme:furnace,film_crop", "--integrators", "reslrb:stack", "--seeds", "4"]
     assert call(*cases, "--json", str(tmp_path / "alone.jsonl")) == 0
     alone = capsys.readouterr().out.splitlines()
     assert call(*cases, "--json", str(tmp_path / "two.jsonl"), "--cluster", "local:2") == 0

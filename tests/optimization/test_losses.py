@@ -403,13 +403,19 @@ def test_a_masked_loss_equals_that_of_the_remaining_pixels(name):
     assert gradient[kept].all()
 
 
+#: All kinds of pixels but those at the border.
+NO_BORDER = "target.mask={kinds: [specular, clipped, alpha]}"
+
+
 def test_kinds_of_a_file(masked_folder):
     problem, lines = make_masked(masked_folder, "target.file=photo.png")
     assert left_out(problem) == [CLIPPED, CLEAR]
     [record] = view_records(problem.views)
     assert (record["kinds"], record["left_out"]) == ({"clipped": 1, "alpha": 1}, 2)
     assert lines == ["view 0: 2 of 64 pixels (3.1%) are left out: 1 are clipped, 1 have alpha 0"]
-    assert left_out(make_masked(masked_folder, "target.file=photo.png", "target.mask={clipped: false}")[0]) == [CLEAR]
+    assert left_out(
+        make_masked(masked_folder, "target.file=photo.png", "target.mask={kinds: [specular, border, alpha]}")[0]
+    ) == [CLEAR]
     problem, lines = make_masked(masked_folder, "target.file=photo.png", "target.mask=none")
     assert (left_out(problem), lines) == ([], [])
 
@@ -417,12 +423,12 @@ def test_kinds_of_a_file(masked_folder):
 def test_pixels_mixed_with_clipped_ones_are_excluded(masked_folder):
     scene = masked_folder / "scene.xml"
     scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))  # its radius is 2
-    problem, lines = make_masked(masked_folder, "target.file=photo.png", "target.mask={border: false}")
+    problem, lines = make_masked(masked_folder, "target.file=photo.png", NO_BORDER)
     y, x = CLIPPED
     near = {(v, u) for v in range(max(y - 2, 0), min(y + 3, 8)) for u in range(max(x - 2, 0), min(x + 3, 8))}
     assert set(left_out(problem)) == near | {CLEAR}
     assert f"1 are clipped, {len(near) - 1} are within the film's filter of clipped ones, 1 have" in lines[0]
-    off = "target.mask={border: false, clipped: false}"
+    off = "target.mask={kinds: [specular, alpha]}"
     assert left_out(make_masked(masked_folder, "target.file=photo.png", off)[0]) == [CLEAR]
 
 
@@ -453,7 +459,7 @@ def test_photograph_and_weights_are_rotated_by_their_own_exif(masked_folder):
             exif = image.getexif()
             exif[0x0112] = orientation
             image.save(masked_folder / f"{kind}-{name}.png", exif=exif)
-    only = "target.mask={file: weights-%s.png, border: false}"
+    only = "target.mask={file: weights-%s.png, kinds: [specular, clipped, alpha]}"
     upright, _ = make_masked(masked_folder, "target.file=photo-up.png", only % "up")
     said = []
     sets = ["target.render=null", "target.file=photo-down.png", only % "down"]
@@ -493,7 +499,7 @@ def test_the_border_is_excluded_unless_both_are_light_traced(masked_folder, make
     scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
     render = f"target.render={{spp: 4, integrator: {{type: {maker}, max_depth: 3}}}}"
     assert len(left_out(assemble(load(masked_folder / "tiny.yaml", [render])))) == count
-    assert not left_out(assemble(load(masked_folder / "tiny.yaml", [render, "target.mask={border: false}"])))
+    assert not left_out(assemble(load(masked_folder / "tiny.yaml", [render, NO_BORDER])))
     if maker == "prb":  # camera paths lose no light at the border
         for same in ("type: prb", "paths: camera", "paths: both, light_share: 0.5"):
             sets = [f"integrator={{{same}, max_depth: 3}}", render]

@@ -130,7 +130,7 @@ def test_a_run_is_read_without_its_code_and_continues_only_with_the_same(
     assert "the code was run" in capsys.readouterr().out
     before = set(sys.modules)
     for call in (("report", "runs/a", "-o", "page.html"), ("inspect", "runs/a/config.yaml"),
-                 ("render", "--run", "runs/a", "-o", "image.exr", "--spp", "4")):  # fmt: skip
+                 ("render", "runs/a", "-o", "image.exr", "--set", "run.spp=4")):  # fmt: skip
         result = reslrb(*call)
         assert result.exit_code == 0, (call, result.output)
         assert "the code was run" not in result.output

@@ -83,23 +83,18 @@ def test_a_box_moves_to_its_place(tmp_path: Path) -> None:
     assert np.sqrt(np.mean(np.square(errors[1]))) < 0.8 * errors[0]
 
 
-def test_parts_have_their_own_samples_and_steps_keep_no_memory(tmp_path: Path) -> None:
+def test_steps_keep_no_memory(tmp_path: Path) -> None:
     path = write_experiment(tmp_path)
 
-    def found(*sets: str, spp: int = 4, threshold: float = 0.0) -> np.ndarray:
-        problem = unguided(assemble_scene(load(path, sets)))
+    def found(threshold: float) -> np.ndarray:
+        problem = unguided(assemble_scene(load(path)))
         plugin: Any = problem.integrator
         plugin.plugin.octree_contruction_thres = threshold
-        result = gradient(problem, spp)
+        result = gradient(problem, 4)
         assert plugin.plugin.octree_contruction_thres == 0  # the step resets the earlier value
         return result
 
-    smooth = "integrator.sppp=0", "integrator.sppi=0"
-    whole = found()
-    assert np.array_equal(found(threshold=7.0), whole)
-    assert np.array_equal(found("integrator.sppc=4", "integrator.sppp=4", "integrator.sppi=4", spp=8), whole)
-    assert np.array_equal(found("integrator.sppc=8", *smooth), found(*smooth, spp=8))
-    assert not np.array_equal(found("integrator.sppc=8", *smooth), found(*smooth))
+    assert np.array_equal(found(7.0), found(0.0))
 
 
 #: Settings, whether a spot lamp exists, the location of the error, and a part of its text.
@@ -122,19 +117,14 @@ def test_wrong_cases_of_mitsuba_are_refused(case: str, tmp_path: Path) -> None:
     assert what in error.value.message
 
 
-@pytest.mark.parametrize(
-    ("spot", "sets"), [(True, []), (False, ["scene.options.sensor=orthographic", "integrator.sppp=0"])]
-)
-def test_correct_cases_of_mitsuba_are_accepted(spot: bool, sets: list[str], tmp_path: Path) -> None:
-    config = load(write_experiment(tmp_path, spot), sets)
-    assert type(assemble_scene(config).integrator) is Projective
+def test_correct_cases_of_mitsuba_are_accepted(tmp_path: Path) -> None:
+    assert type(assemble_scene(load(write_experiment(tmp_path, True))).integrator) is Projective
 
 
 def test_measurements_accept_it_like_prb(tmp_path: Path) -> None:
-    config, kind = load(write_experiment(tmp_path), ["integrator.sppp=3"]), "prb_projective"
-    [case] = parse_cases(f"{kind}(sppi=2)")
-    made = case.at(config, 2, known=False)
-    assert (made.integrator.type, *(made.integrator.options()[name] for name in ("sppp", "sppi"))) == (kind, 3, 2)
+    [case] = parse_cases("prb_projective")
+    made = case.at(load(write_experiment(tmp_path)), 2, known=False)
+    assert made.integrator.type == "prb_projective"
     assert paths_in_records(made) == {"paths": "camera", "light_share": None}
 
 
@@ -153,10 +143,10 @@ def test_commands_accept_it_like_prb(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return int(end.value.code or 0)
 
     own, passes = ["--set", f"integrator.type={kind}"], (0, ExitCode.CHECK_FAILED)
-    assert call("render", *own, "-o", "a.exr", "--spp", "4") == 0
-    assert call("bench", "--max-depth", "2", "--integrators", f"{kind}(sppi=2),prb", "--json", "b.json") == 0
+    assert call("render", *own, "-o", "a.exr", "--set", "run.spp=4") == 0
+    assert call("bench", "--max-depth", "2", "--integrators", f"{kind},prb", "--json", "b.json") == 0
     words = ["--rounds", "4", "--integrators", f"{kind},prb", "--json", "c.jsonl"]
     assert call("convergence", *words) in passes
     lines = [json.loads(line) for line in Path("c.jsonl").read_text().splitlines()]
     assert kind in [line.get("label") for line in lines if line["kind"] == "method"]
-    assert call("gradcheck", *own, "--estimators", "stack", "--seeds", "3", "--spp", "16") in passes
+    assert call("gradcheck", *own, "--integrators", "reslrb:stack", "--seeds", "3", "--spp", "16") in passes

@@ -131,8 +131,6 @@ def seen_table(runs: Sequence[ShownRun]) -> Markup:
     return lay_out("run.seen", rows) if rows else Markup()
 
 
-#: Maximum number of images shown per sensor between the first and the last.
-MOST_BETWEEN = 12
 _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 
@@ -164,9 +162,7 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float 
         shown.append(show(share, f"mask{sensor}", lay_out("titled", "mask", ": black is left out of the loss")))
     shown += _error_maps(folder, suffix, results)
     title = f"Sensor {suffix[1:]}" if suffix else ""
-    between = _between(folder, suffix, exposure)
-    return lay_out("gallery", shown, title, exposure_words(exposure, loaded["target"])) + (
-        lay_out("gallery", between, "", "on the way:") if between else "")  # fmt: skip
+    return lay_out("gallery", shown, title, exposure_words(exposure, loaded["target"]))
 
 
 def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[Picture]:
@@ -183,13 +179,3 @@ def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[P
         caption = lay_out("titled", "∂loss/∂image", " at the end, sum over channels")
         shown.append(show_map(total, signed_end(total), "derivative of the loss", caption, signed=True))
     return shown
-
-
-def _between(folder: Path, suffix: str, exposure: float) -> list[Picture]:
-    """Return the images saved between iterations. If there are many, return an even selection."""
-    pattern = re.compile(rf"iteration-(\d+){suffix}\.exr")
-    found = sorted((int(match[1]), path) for path in folder.iterdir() if (match := pattern.fullmatch(path.name)))
-    if len(found) > MOST_BETWEEN:
-        found = [found[round(place)] for place in np.linspace(0, len(found) - 1, MOST_BETWEEN)]
-    named = [(f"after {iteration} iterations", load_image(path)) for iteration, path in found]
-    return [show(image * exposure, name, name) for name, image in named if image is not None]
