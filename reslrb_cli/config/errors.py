@@ -45,18 +45,19 @@ REMOVED = {
     "integrator.jacobian_damping": "it is always 0.1; remove it",
     "integrator.stack_size": "64 vertices are stored, and longer paths are traced again; remove it",
     "integrator.type: direct_projective": "take prb_projective with max_depth: 2",
-    "loss.scales": "lower the film's resolution at first, by run.stages",
+    "loss.scale": "set target.exposure: auto, which recovers the factor with the parameters",
+    "loss.scales": "start from the values of a run with a smaller scene.size, by initial: {run: RUN}",
     "loss.data_range": "it is always the target's largest value; remove it",
     "loss.type: log_l2": "take relative_l2, or a loss of your own (type: custom)",
     "loss.type: smape": "take relative_l2, or a loss of your own (type: custom)",
     "optimizer.average": "let optimizer.schedule lower the rate; the last values then have as little noise",
+    "optimizer.clamp_gradient": "use more samples, or optimizer.type: adam with a larger beta_2",
+    "optimizer.schedule: plateau": "take cosine or exponential, and run.stop to end early",
     "optimizer.type: adamw": "take adam; `bounds` and `regularizers` hold values back",
     "optimizer.type: rmsprop": "take adam with beta_1: 0",
     "run.first_batch": "the first batch always gives an image alone; remove it",
     "run.reach_spp": "it is always 64; remove it",
-    "stages.spp": "all stages have run.spp; remove it",
-    "stages.learning_rate": "set optimizer.schedule",
-    "stages.regularizers": "all stages have the weights in `regularizers`; remove it",
+    "run.stages": "start from the values of a coarser run, by initial: {run: RUN}",
 }
 
 
@@ -121,6 +122,8 @@ def _problem(detail: ErrorDetails, data: Any) -> SettingError:
     if kind == "wrong":
         return SettingError(key, _but_is(context.get("message") or detail["msg"], value))
     if kind == "literal_error":
+        if advice := _removed(location, value):
+            return SettingError(key, f"{value} {advice}")
         return SettingError(
             key, _but_is("must be " + _one_of(re.findall(r"'([^']*)'", context["expected"]), value), value)
         )

@@ -26,14 +26,12 @@ from reslrb_cli.optimization.nonfinite import (
     why_end,
     zero_nonfinite,
 )
-from reslrb_cli.optimization.optimizers import clamp_gradients
 from reslrb_cli.optimization.own_code import own_losses
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
-from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import State, put, standing
-from reslrb_cli.optimization.stopping import Watch, lowered, out_of_time, time_share
+from reslrb_cli.optimization.stopping import Watch, out_of_time, time_share
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
@@ -55,8 +53,6 @@ def learning_rate_factor(
 
     `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
-    if schedule == "plateau":  # which depends on losses (`stopping.lowered`)
-        return 1.0
     return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
 
 
@@ -84,7 +80,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     if optimizer.stands_at is not state:
         put(problem, state)
     clock = StepClock(state.elapsed_s)
-    scaling, clamped, clamp, clamp_sums = state.scaling, None, state.clamp, state.clamp_sums
+    scaling = state.scaling
     if config.optimizer.scale != "none" and scaling is None:
         with clock.counted():
             scaling = rescale(problem) if config.optimizer.scale == "auto" else measure_curvatures(problem)
@@ -95,7 +91,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         loss, squares, counts, refused, costs = gradient(problem, iteration, split)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
-    factor = lowered(config.optimizer, state.drops) * learning_rate_factor(
+    factor = learning_rate_factor(
         config.optimizer.schedule,
         iteration,
         config.run.iterations,
@@ -110,9 +106,6 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         held = held_back(config.run.on_nonfinite, found, optimizer.keys())
         for key in found.gradients if config.run.on_nonfinite == "zero" else ():
             zero_nonfinite(optimizer[key])
-        if (limit := config.optimizer.clamp_gradient) is not None:
-            moved = {key: optimizer[key] for key in optimizer.keys() if key not in held}  # noqa: SIM118
-            clamped, clamp, clamp_sums = clamp_gradients(limit, moved, clamp, clamp_sums)
         found.updates = optimizer.step(factor, skip=held)
         problem.hold_apart()
         problem.apply()
@@ -125,8 +118,6 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         peak_mib=max(state.peak_mib, peak_mib(dr.backend_v(loss))),
         standstill=standstill,
         scaling=scaling,
-        clamp=clamp,
-        clamp_sums=clamp_sums,
         end=why_end(config.run.on_nonfinite, found, standstill),
         gradients=gradients,
     )
@@ -147,25 +138,22 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         parameter_rmse=problem.meter.total(errors),
         parameter_errors=errors,
         nonfinite_by_parameter=found.by_parameter,
-        clamped=clamped,
         held_out=held_out,
         regularized=None if costs is None else Regularized(costs, problem.held()),
     )
 
 
 def iterate(
-    stages: Stages, state: State, on_nonfinite: Told = lambda found: None, watch: Watch | None = None
+    problem: Problem, state: State, on_nonfinite: Told = lambda found: None, watch: Watch | None = None
 ) -> Iterator[tuple[State, Record]]:
-    """Make all remaining iterations of the run, starting at `state`. `step` makes each iteration, with the problem of
-    the iteration's stage.
+    """Make all remaining iterations of the run, starting at `state`. `step` makes each iteration.
 
     `watch` has the losses of the earlier iterations, and decides which iteration is the last. It is None without such a
     test. Raises NonFinite if the run fails.
     """
     reset_peak()
-    watch = Watch(stages.whole.config) if watch is None else watch
-    while state.iteration < stages.whole.config.run.iterations and not state.stopped:
-        problem, state = stages.enter(state)
+    watch = Watch(problem.config) if watch is None else watch
+    while state.iteration < problem.config.run.iterations and not state.stopped:
         state, record = step(problem, state, on_nonfinite)
         problem.optimizer.stands_at = state = watch.after(state, record)
         yield state, record
@@ -177,9 +165,7 @@ def optimize(problem: Problem, on_nonfinite: Told = lambda found: None) -> Itera
     """Yield the records of all iterations of `problem` from its current values. Parameters are updated before each
     record.
     """
-    stages = Stages(problem)
-    for state, record in iterate(stages, standing(problem), on_nonfinite):
-        stages.bring(state)
+    for _, record in iterate(problem, standing(problem), on_nonfinite):
         yield record
 
 

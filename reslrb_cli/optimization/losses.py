@@ -4,7 +4,7 @@ Each loss takes the image I and the target T, both (H, W, C) in linear radiance.
 weights have the same shape and a mean of 1. A loss is an array of width 1. A loss is a mean over pixels and channels.
 The value depends neither on the resolution nor on the number of masked pixels.
 
-`weighted` returns a weighted sum of losses. `fitted` returns the loss of the image multiplied by the best factor.
+`weighted` returns a weighted sum of losses.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
-
-from reslrb_cli.integrators.protocol import halves_of
 
 #: A loss with bound options, as a function of an image, its target, and optional weights.
 Loss = Callable[..., "mi.Float"]
@@ -126,61 +124,3 @@ def weighted(
     """Return the sum of losses, each multiplied by its weight."""
     first, *others = (factor * loss(image, target, weights) for factor, loss in losses)
     return sum(others, first)
-
-
-def _product(first: mi.TensorXf, second: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
-    return _mean(first * second, weights)
-
-
-def best_scale(
-    halves: tuple[mi.TensorXf, mi.TensorXf],
-    target: mi.TensorXf,
-    weights: mi.TensorXf | None = None,
-    across: bool = False,
-) -> mi.Float:
-    """Return s = <I, T> / <I, I>, of width 1, attached. I is the mean of two images (H, W, C) with the same expected
-    value.
-
-    If <I, T> or <I, I> is not positive, for example for black images, s is 1 and has no derivative. <I, I> is computed
-    as the product of the two images. The two images have independent noise. The derivative of <I, I> is 2 <I, dI>. The
-    noise of I does not bias the derivative if dI comes from other samples. With `across`, the derivative is <I_a, dI_b>
-    + <I_b, dI_a>.
-    """
-    image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
-    if not across:
-        whole = _product(image, image, weights)
-        square = dr.detach(square) + (whole - dr.detach(whole))
-    along = _product(image, target, weights)
-    there = (square > 0) & (along > 0)
-    return dr.select(there, along / dr.select(there, square, 1), 1)
-
-
-def fitted(
-    loss: Loss,
-    image: mi.TensorXf,
-    target: mi.TensorXf,
-    weights: mi.TensorXf | None = None,
-    /,
-    across: bool = False,
-) -> mi.Float:
-    """Return the loss of s I with s = <I, T> / <I, I> (`best_scale`), for an image (H, W, C) or two halves (2, H, W,
-    C).
-
-    The result's derivative is s l(s I) + L_s ds/dI, where l is the derivative of `loss`. L_s = <l(s I), I> contains the
-    image twice. L_s is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. The derivative of a quadratic loss
-    therefore contains no product of noise with itself. If both halves are the same image, the result is the exact
-    derivative. With `across`, the derivative with respect to the half I_a uses the half I_b in place of I. The
-    derivative with respect to I_b uses I_a. No path of a half then uses a dL/dI to which the path itself contributes.
-    """
-    first, second = halves_of(image)
-    factor = best_scale((first, second), target, weights, across)
-    fixed, one, other = dr.detach(factor), dr.detach(first), dr.detach(second)
-    value = loss(fixed * (0.5 * (first + second)), target, weights)
-    change = factor - fixed  # 0, with a derivative
-    parts = [loss(fixed * a + change * b, target, weights) for a, b in ((one, other), (other, one))]
-    if across:
-        value = dr.detach(value)
-        parts += [loss(fixed * (b + (a - dr.detach(a))), target, weights) for a, b in ((first, other), (second, one))]
-    for part in parts:
-        value = value + 0.5 * (part - dr.detach(part))
-    return value

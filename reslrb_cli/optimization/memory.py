@@ -40,9 +40,6 @@ FILM_IMAGES = 12
 #: Copies of a parameter: gradients, the optimiser's moments, their next values, the best values of a run.
 PARAMETER_COPIES = 9
 
-#: Further copies for a clamp: the usual size, the sums over the iterations, and their next values.
-CLAMP_COPIES = 7
-
 #: Minimum bytes per entry of a parameter: value, the optimiser's copy, gradient, and the array for updates.
 ENTRY_BYTES = 4 * 4
 
@@ -108,10 +105,9 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
         images = max(images, FILM_IMAGES * allocated(4 * block), 2 * allocated(4 * block) + _replicas(block))
         targets += allocated(4 * block)
         scratch = max(scratch, integrator.scratch_bytes(plan))
-    copies = PARAMETER_COPIES + (0 if problem.config.optimizer.clamp_gradient is None else CLAMP_COPIES)
     for key in problem.selection.keys:
         size = int(dr.prod(dr.shape(problem.selection.value(key))))
-        images += copies * allocated(4 * size) + _replicas(size)
+        images += PARAMETER_COPIES * allocated(4 * size) + _replicas(size)
     guiding = integrator.preparation.guiding
     tables = 0 if guiding is None else guiding.bytes(len(problem.sensors))
     return Estimate(fixed + targets + tables, images, scratch * resident_paths(), paths)

@@ -249,8 +249,7 @@ class Problem:
         if not views:
             return None
         spp = saved_spp(self, between=True)
-        images = (self.see(view, spp, 0, "held out") for view in views)
-        losses = [float(view.compare(image)[0]) for view, image in zip(views, images, strict=True)]
+        losses = [float(view.compare(to_tensor(self.render(view.sensor, spp, 0, "held out")))[0]) for view in views]
         return float(np.mean(losses))
 
     def on_samples(self, view: View) -> OnSamples | None:
@@ -278,17 +277,6 @@ class Problem:
         return render_in_passes(
             self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
-
-    def see(self, view: View, spp: int, iteration: int, purpose: str) -> mi.TensorXf:
-        """Render a view in the form that its loss needs. The form is (H, W, C), or two halves (2, H, W, C) if the loss
-        fits a scale.
-        """
-        if not view.fits:
-            return to_tensor(self.render(view.sensor, spp, iteration, purpose))
-        unit = self.samples_per_pass or 1
-        half = min(unit, spp) * max(spp // (2 * min(unit, spp)), 1)
-        images = [self.render(view.sensor, half, iteration, f"{purpose}, half {number}") for number in (1, 2)]
-        return to_tensor(np.stack(images))
 
     @functools.cached_property
     def meter(self) -> ErrorMeter:

@@ -33,7 +33,7 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.tables import Guiding
-from reslrb_cli.integrators.protocol import Job, whole_of
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import NONE, Refused, derivative_of, given_step, gradient_step, render_image
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of
@@ -79,7 +79,7 @@ class ShardGradient:
 
     `gradients` has the gradient of each parameter (float32). For each part, the result has the loss and the refused
     entries of dL/dI. A record of refused entries has the entry count, the first entry's flat index, and the array's
-    shape. If requested, the result also has the part's image, (H, W, C) or (2, H, W, C) with halves.
+    shape. If requested, the result also has the part's image, (H, W, C).
     """
 
     gradients: dict[str, Array]
@@ -119,13 +119,10 @@ def shard_seed(config: Config, iteration: int, sensor: int, shard: int) -> int:
 
 
 def shard_image(problem: Problem, task: Task) -> Array:
-    """Return the image of a shard of one view as float32, (H, W, C) or (2, H, W, C) with halves."""
+    """Return the image of a shard of one view as float32, (H, W, C)."""
     [part] = task.parts
     with _held(problem):
-        image = render_image(
-            problem.integrator, problem.scene, part.sensor, part.seed, task.spp, problem.config.halves == 2
-        )
-        return np.array(image)
+        return np.array(render_image(problem.integrator, problem.scene, part.sensor, part.seed, task.spp))
 
 
 def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> ShardGradient:
@@ -144,8 +141,7 @@ def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> 
             at = problem.integrator, problem.scene, part.sensor
             own: dict[str, Any] = {"params": problem.selection.params, "on_samples": problem.on_samples(view)}
             if delta is not None:
-                own |= {"spp": task.spp, "halves": config.halves == 2}
-                given_step(*at, _tensor(delta), seed=part.seed, **own)
+                given_step(*at, _tensor(delta), seed=part.seed, spp=task.spp, **own)
                 continue
             own |= config.step_options(shard=True)
             step = gradient_step(*at, scaled(view, part.scale), seed=part.seed, **own)
@@ -312,4 +308,4 @@ def _teach(problem: Problem, iteration: int, view: View, image: Sum) -> None:
     _, gradient = derivative_of(view.objective, _mean(image), Refused())
     sensor, own = problem.scene.sensors()[view.sensor], seed(config.run.seed, iteration, view.sensor, "image")
     job = Job(problem.scene, sensor, dr.opaque(mi.UInt32, own), config.set_spp, problem.selection.params)
-    problem.integrator.learn_now(job, whole_of(gradient))
+    problem.integrator.learn_now(job, gradient)

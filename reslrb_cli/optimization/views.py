@@ -28,9 +28,9 @@ from reslrb_cli.config.parameters import Settings
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators.protocol import first_channels, halves_of, whole_of
+from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors
-from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, best_scale, fitted, l2, make_loss, weighted
+from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, l2, make_loss, weighted
 from reslrb_cli.optimization.own_code import OwnLoss
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
@@ -207,7 +207,6 @@ class View:
         LookupError.
     - `weights` have the target's shape and a mean of 1. Entries that `masked` excludes have the weight 0. `weights` is
         None if all weights are equal.
-    - `fits` is true if the image is scaled to fit the target (`fitted`, with the argument `across`).
     - A `held_out` view is not trained on, and has its own loss.
     - `codes` are the user's losses.
     - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`). `fixed` is None if no such
@@ -223,8 +222,6 @@ class View:
     held_out: bool = False
     wanted: Wanted = field(default_factory=Wanted)
     masked: Masked = field(default_factory=Masked)
-    fits: bool = False
-    across: bool = False
     codes: list[OwnLoss] = field(default_factory=list)
     fixed: Array | None = None
 
@@ -261,22 +258,18 @@ class View:
             self.weigh(weights)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
-        """Return the attached loss of an image, with width 1. Alpha is dropped, and the view's exposure is applied.
-
-        The image has the shape (H, W, C), or (2, H, W, C) for two halves of its samples. `fitted` uses the two halves.
+        """Return the attached loss of an image (H, W, C), with width 1. Alpha is dropped, and the view's exposure is
+        applied.
         """
         return self.judge(self.exposure.applied(first_channels(image, self.target.shape[2])))
 
     def judge(self, image: mi.TensorXf) -> mi.Float:
         """Return the loss of an image. The exposure is already applied, and the image has the target's channels."""
         target = self.target
-        loss = functools.partial(fitted, self.loss, across=self.across) if self.fits else self.loss
-        if not self.fits:
-            image = whole_of(image)
         if self.weights is None:
-            return loss(image, target)
+            return self.loss(image, target)
         # Excluded pixels, even with non-finite values, have neither loss nor derivative.
-        return loss(dr.select(self.weights > 0, image, target), target, self.weights)
+        return self.loss(dr.select(self.weights > 0, image, target), target, self.weights)
 
     def curvature(self, known: bool) -> Array:
         """Return the loss's curvature (H, W) in each pixel, scaled to a mean of 1. If it is not `known`, return that of
@@ -289,25 +282,6 @@ class View:
         change_of_slope = slope(lambda image: loss(image, self.target, self.weights), target + change)
         curvature = np.linalg.norm(change_of_slope, axis=2) / np.linalg.norm(change, axis=2)
         return np.asarray(curvature / curvature.mean())
-
-    def scale(self, image: mi.TensorXf) -> float:
-        """Return the factor by which `compare` multiplies an image in addition to the exposure. It is 1 unless the loss
-        is `fitted`.
-        """
-        if not self.fits:
-            return 1.0
-        exposed = self.exposure.applied(first_channels(image, self.target.shape[2]))
-        if self.weights is not None:
-            exposed = dr.select(self.weights > 0, exposed, self.target)
-        return float(best_scale(halves_of(exposed), self.target, self.weights)[0])
-
-    def exposed(self, seen: mi.TensorXf) -> tuple[Array, Array, float]:
-        """Return three results for an image in a shape that `compare` accepts. The results are the image (H, W, C), the
-        image with the exposure of its target, and the image's `scale`.
-        """
-        image, scale = np.array(whole_of(seen)), self.scale(seen)
-        exposure = Exposure(self.exposure.fixed * scale) if self.fits else self.exposure
-        return image, exposure.of_array(image), scale
 
     def kept(self, image: Array) -> Array:
         """Return an image of the target's shape with excluded pixels set to 0."""
@@ -368,9 +342,7 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
             else:
                 parts.append((kind.weight, make_loss(kind.type, **kind.own_options())))
         loss = parts[0][1] if isinstance(config.loss, LossConfig) else functools.partial(weighted, parts)
-        fits, across = config.losses[0].scale == "fitted", config.adjoint == "correlated"
-        views.append(View(one.sensor, loss, share, fits=fits, across=across, held_out=one.held_out, wanted=one,
-                          codes=codes))  # fmt: skip
+        views.append(View(one.sensor, loss, share, held_out=one.held_out, wanted=one, codes=codes))
     return views
 
 

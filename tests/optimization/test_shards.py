@@ -101,16 +101,6 @@ def test_views_and_exposures_are_unbiased(folder):
     assert found, found
 
 
-def test_halves_are_unbiased_except_for_the_quotient(folder):
-    """With `loss.scale: fitted`, shards of two halves with many samples each are unbiased. Any remaining bias is that
-    of a quotient.
-    """
-    sets = ["loss.scale=fitted", "run.spp=64"]
-    reference = independent(make(folder, *sets, "run.adjoint=independent"), 16, 1024)
-    found = compare(rows(make(folder, *sets, "run.shards=4", OTHERS), 60), reference, block=None)
-    assert found, found
-
-
 # --- one sum ----------------------------------------------------------------------------------------------------------
 
 
@@ -130,7 +120,7 @@ def shuffled(problem: Problem, function: Callable[..., Any], work: Any) -> Itera
         ["run.spp=8", "run.shards=4", OTHERS, "target.exposure=1.5"],
         ["run.spp=16", "run.shards=4", "run.adjoint=batched", "integrator.guiding=on"],
         ["run.spp=4", "run.shards=2", "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]", "integrator.guiding=on"],
-        ["run.spp=8", "run.shards=4", OTHERS, "loss.scale=fitted", TWO_VIEWS.replace("auto", "2")],
+        ["run.spp=8", "run.shards=4", OTHERS, TWO_VIEWS.replace("auto", "2")],
     ],
 )
 def test_the_order_of_evaluation_does_not_matter(folder, sets):
@@ -315,7 +305,6 @@ BAD = [
     (["run.spp=6", "run.shards=4"], "run.shards: 4 per view do not divide run.spp, 6"),
     ([VIEWS, "run.shards=4"], "run.shards: is 4; with 3 views in an iteration it must be at most 3, or a multiple"),
     (["run.spp=8", "run.shards=4", "run.adjoint=batched"], "run.batches: 4 does not divide the samples of a shard"),
-    (["run.spp=12", "run.shards=4", "loss.scale=fitted"], "run.spp: must be a multiple of 8, not 12"),
     (["run.spp=8", "run.shards=4", "integrator.samples_per_pass=4"], None),
     (["run.spp=24", "run.shards=4", "integrator.samples_per_pass=4"], "integrator.samples_per_pass: 4 does not divide"),
 ]

@@ -109,8 +109,7 @@ class Certainty:
     def see(self, before: State, state: State) -> None:
         """Record data of the iteration that leads from `before` to `state`. This costs almost nothing."""
         planned, iterations = self.problem.config.run.iterations, state.iteration
-        is_last = state.stage == before.stage == len(self.problem.config.run.stages)
-        if is_last and 0 < self._seen < iterations:
+        if 0 < self._seen < iterations:
             for key, initial in self._initial.items():
                 if initial.size <= MOST_ENTRIES:
                     self._add_step(key, before, state)

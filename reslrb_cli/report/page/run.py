@@ -148,7 +148,6 @@ def record_parts(run: ShownRun) -> dict[str, Markup]:
     results, manifest = run.results, run.manifest
     parts: dict[str, Callable[[], Markup]] = {
         "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
-        "Clamped gradients": lambda: lay_out("run.clamped", results.get("clamped") or {}),
         "Regularizers": lambda: lay_out("run.regularized", results.get("regularized") or {}),
         "Run": lambda: lay_out("run.run", run, step_words(run.records), _wall(manifest)),
         "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
