@@ -93,7 +93,6 @@ class Fabrication(Section):
     ior: Annotated[float, Field(gt=1, le=5)] = Field(default=1.49, description="Index of refraction of a lens.")
     tool_radius: Positive | None = None
     """Radius of the ball that cuts the faces, in mm. It does not reach into narrower hollows."""
-    min_thickness: Positive | None = Field(default=None, description="Smallest thickness for the material, in mm.")
     sun: Annotated[float, Field(ge=0, lt=90)] = Field(
         default=0.53, description="Angular diameter of the light source, in degrees."
     )

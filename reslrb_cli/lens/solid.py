@@ -416,9 +416,6 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
             warnings.append(f"`{sheet.name}` was shaped with interpolated normals, which a solid does not have, so its "
                             'picture will differ; add <boolean name="face_normals" value="true"/> to the mesh in the '
                             "scene's file, and run `reslrb optimize` again")  # fmt: skip
-    if plan.min_thickness is not None and thin < plan.min_thickness:
-        warnings.append(f"its least thickness is {thin:.3g} mm, below {plan.min_thickness:g} mm; add "
-                        f"{plan.min_thickness - thin:.3g} mm to fabrication.thickness")  # fmt: skip
     return {
         "unit": "mm",
         "kind": plan.kind,
@@ -431,7 +428,6 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
         "volume_mm3": solid.volume,
         "triangles": len(solid.triangles),
         "tool_radius": plan.tool_radius,
-        "min_thickness": plan.min_thickness,
         "faces": faces,
         "warnings": warnings,
     }

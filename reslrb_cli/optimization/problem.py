@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import HEIGHTMAP, Laplacian, Thickness
+from reslrb_cli.config.parameters import HEIGHTMAP, Thickness
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
@@ -20,7 +20,7 @@ from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
-from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, mesh_cost, spans_of
+from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.decisions import (
     GuidedRecord,
@@ -320,9 +320,6 @@ def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost | Plate]
                 name = f"{each.opposite}.{HEIGHTMAP}"
                 own, there = ((*selection.deformation.laid_over(k), selection.array(k).shape) for k in (key, name))
                 cost = make_plate(each, own, there, name)
-            elif isinstance(each, Laplacian) and selection.kind(key) == "mesh":
-                faces = np.array(selection.params[f"{key.rpartition('.')[0]}.faces"], dtype=np.int64)
-                cost = mesh_cost(each.weight, selection.array(key), faces)
             else:
                 flat = selection.kind(key) == "bitmap"
                 spans = (Span(), Span()) if flat else spans_of(*selection.deformation.laid_over(key))
