@@ -28,7 +28,7 @@ from reslrb_cli.optimization.loading import (
     paths_of,
     samples_per_pass,
 )
-from reslrb_cli.optimization.memory import check_announced, check_described, check_films, fit_memory, outlook
+from reslrb_cli.optimization.memory import check_announced, check_described, check_films, fit_memory
 from reslrb_cli.optimization.moving import check_moving, moves_anything
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
@@ -64,9 +64,6 @@ def assemble(
     if settled is not None:
         begin_as(problem, settled)
     problem = fit_memory(problem)
-    line = outlook(config, problem.scene, problem.sensors) if to_run else None
-    if line is not None:
-        say(line)
     problem = make_targets(problem, say)
     for view in problem.views if to_run else ():
         for own in view.codes:

@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.integrators.step import Refused, gradient_step
+from reslrb_cli.optimization.losses import own_losses
 from reslrb_cli.optimization.nonfinite import (
     Findings,
     RefusedAt,
@@ -26,7 +27,6 @@ from reslrb_cli.optimization.nonfinite import (
     why_end,
     zero_nonfinite,
 )
-from reslrb_cli.optimization.own_code import own_losses
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled

@@ -30,8 +30,7 @@ from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors
-from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, l2, make_loss, weighted
-from reslrb_cli.optimization.own_code import OwnLoss
+from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, OwnLoss, l2, make_loss, weighted
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.visibility import sees_specular

@@ -28,7 +28,6 @@ from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUE
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Best, Images, Least, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
@@ -148,7 +147,6 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgr
     `say` is called with lines about slow steps, `warn` with warnings. Raises ConfigError and UnsupportedScene.
     """
     problem = assemble(config, say, PilotCache(), to_run=True)
-    warn_of_border(problem, warn)
     missing = check_missing(problem, warn)
     if missing:  # the check moves geometry, possibly beyond the bounding sphere of the lamps at infinity
         problem = problem.afresh(problem.values())
