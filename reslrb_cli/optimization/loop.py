@@ -7,7 +7,6 @@ A schedule gives the learning-rate factor for iteration i of n. The factor goes 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -87,8 +86,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     errors = problem.meter.errors(problem.selection.array)
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
     with clock.step() as times:
-        split = Split()
-        loss, squares, counts, refused, costs = gradient(problem, iteration, split)
+        loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
     factor = learning_rate_factor(
@@ -126,8 +124,6 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         iteration=iteration,
         loss=value,
         step_ms=times.wall_ms,
-        primal_ms=split.primal_ms,
-        adjoint_ms=None if split.primal_ms is None else times.wall_ms - split.primal_ms,
         codegen_ms=times.codegen_ms,
         elapsed_s=clock.elapsed_s,
         peak_mib=state.peak_mib,
@@ -183,38 +179,10 @@ def _findings(
     return found
 
 
-class Split:
-    """Clock for the part of a step until image and loss are known. Some integrators have no moment at which both image
-    and loss are known.
-    """
-
-    def __init__(self) -> None:
-        self.primal_ms: float | None = 0.0
-        self._start: float | None = None
-
-    def start(self) -> None:
-        """Start a view."""
-        if self._start is not None:  # the previous view never reached `image`
-            self.primal_ms = None
-        self._start = time.perf_counter()
-
-    def image(self) -> None:
-        """Record that the view's image and loss are evaluated, or that their kernels are launched."""
-        dr.sync_thread()
-        if self.primal_ms is not None and self._start is not None:
-            self.primal_ms += 1e3 * (time.perf_counter() - self._start)
-        self._start = None
-
-    def end(self) -> None:
-        """End the last view."""
-        if self._start is not None:
-            self.primal_ms = None
-
-
 def gradient(
-    problem: Problem, iteration: int, split: Split
+    problem: Problem, iteration: int
 ) -> tuple[Any, dict[str, Any], dict[str, Any], list[tuple[int, Refused]], dict[str, dict[str, float]] | None]:
-    """Accumulate the gradient of the loss into the parameters. `split` is called for each part of a view.
+    """Accumulate the gradient of the loss into the parameters.
 
     Returns arrays of width 1: the loss, two numbers for each parameter, the refused entries by sensor, and the costs of
     regularizers by key and type (None without any). The two numbers are the sum of squares of the gradient's finite
@@ -226,13 +194,10 @@ def gradient(
     costs = None
     apart = config.shards != 1
     if apart:
-        if not config.in_rounds:
-            split.start()  # there is no moment with all images
-        loss, refused = add_gradient(problem, iteration, split.start, split.image)
+        loss, refused = add_gradient(problem, iteration)
         total = mi.Float(loss)
         gradients = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
     for view, scale in () if apart else problem.drawn(iteration):
-        split.start()
         step = gradient_step(
             problem.integrator,
             problem.scene,
@@ -241,7 +206,6 @@ def gradient(
             seed=seed(config.run.seed, iteration, view.sensor, "image"),
             **config.step_options(),
             params=problem.selection.params,
-            on_image=split.image,
             on_samples=problem.on_samples(view),
         )
         # One view's kernels must not wait for the next one's: memory would grow with the number of views.
@@ -249,7 +213,6 @@ def gradient(
         dr.eval(step.loss, gradients)
         total = total + step.loss
         refused.append((view.sensor, step.refused))
-    split.end()
     if problem.regularizers:
         costs = problem.regularize()
         gradients = {key: problem.optimizer.gradient(key) for key in gradients}

@@ -224,13 +224,10 @@ class Sum:
             return np.asarray((self.total - array.astype(np.float64) * weight) / (1 - weight), dtype=np.float32)
 
 
-def add_gradient(
-    problem: Problem, iteration: int, on_start: Callable[[], None], on_image: Callable[[], None]
-) -> tuple[float, list[tuple[int, Refused]]]:
+def add_gradient(problem: Problem, iteration: int) -> tuple[float, list[tuple[int, Refused]]]:
     """Set the parameters' gradients to the sum over an iteration's shards.
 
-    Returns the loss, and the refused entries of dL/dI by sensor. `on_start` is called when a step of two rounds starts.
-    `on_image` is called when the step's images and losses are known.
+    Returns the loss, and the refused entries of dL/dI by sensor.
     """
     engine, guiding = problem.engine or serially, guiding_of(problem)
     due = [] if guiding is None else _due(problem, guiding, iteration)
@@ -241,12 +238,10 @@ def add_gradient(
     loss = 0.0
     deltas: list[Array | None] = [None] * len(tasks)
     if problem.config.in_rounds:
-        on_start()
         images = list(in_order(engine(problem, shard_image, [(task,) for task in tasks])))
         for task, image in zip(tasks, images, strict=True):
             means.setdefault(task.parts[0].sensor, Sum()).add(image, task.weight)
         deltas = [_delta(problem, task, image, means, refused) for task, image in zip(tasks, images, strict=True)]
-        on_image()
         del images
     work = [(task, delta) for task, delta in zip(tasks, deltas, strict=True)]
     for task, found in zip(tasks, in_order(engine(problem, shard_gradient, work)), strict=True):

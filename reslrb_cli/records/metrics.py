@@ -78,7 +78,6 @@ class Record(Line):
 
     - `step_ms` is the wall time of the step: image, loss and gradient of every sensor, without the optimiser's update.
     - `codegen_ms` is the part of `step_ms` for generating and compiling kernels.
-    - `primal_ms` and `adjoint_ms` are the times of image and gradient, or None if one kernel computes both.
     - `elapsed_s` is the time in steps and updates since the start. Writing files and computing `parameter_errors` do
         not count.
     - `peak_mib` is the peak memory of the allocator since the start.
@@ -100,8 +99,6 @@ class Record(Line):
     iteration: int
     loss: Figure
     step_ms: float
-    primal_ms: float | None
-    adjoint_ms: float | None
     codegen_ms: float
     elapsed_s: float
     peak_mib: float

@@ -47,7 +47,7 @@ def rows(problem: Problem, iterations: int) -> np.ndarray:
     """
     found = []
     for iteration in range(iterations):
-        shards.add_gradient(problem, iteration, lambda: None, lambda: None)
+        shards.add_gradient(problem, iteration)
         found.append(np.concatenate(list(take_gradient(problem).values())))
     return np.array(found, np.float64)
 
@@ -162,7 +162,7 @@ def test_shards_of_whole_views_sum_up(folder):
         )  # fmt: skip
         expected += take_gradient(problem)[KEY]
         loss += float(step.loss[0])
-    found, _ = shards.add_gradient(problem, 3, lambda: None, lambda: None)
+    found, _ = shards.add_gradient(problem, 3)
     assert found == pytest.approx(loss, rel=1e-5)
     np.testing.assert_allclose(take_gradient(problem)[KEY], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
@@ -172,7 +172,7 @@ def test_shares_sum_up_to_a_gradient_at_their_mean(folder):
     problem = make(folder, "run.spp=8", "run.shards=4", "run.adjoint=independent")
     found = [shards.shard_gradient(problem, task) for task in shards.make_tasks(problem, 0)]
     mean = np.mean([one.images[0] for one in found], axis=0, dtype=np.float64)
-    loss, _ = shards.add_gradient(problem, 0, lambda: None, lambda: None)
+    loss, _ = shards.add_gradient(problem, 0)
     assert loss == pytest.approx(float(problem.views[0].objective(mi.TensorXf(mean.astype(np.float32)))[0]), rel=1e-5)
     expected = np.mean([one.gradients[KEY] for one in found], axis=0).ravel()
     np.testing.assert_allclose(take_gradient(problem)[KEY], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
@@ -204,7 +204,7 @@ def test_a_subset_of_the_views_is_sharded(folder):
             leaf = problem.optimizer[KEY]
             dr.accum_grad(leaf, dr.full(type(leaf), 1, leaf.shape))  # must not show in the result
             expected += shards.shard_gradient(problem, task, delta).gradients[KEY].ravel() / 4
-        shards.add_gradient(problem, iteration, lambda: None, lambda: None)
+        shards.add_gradient(problem, iteration)
         np.testing.assert_allclose(take_gradient(problem)[KEY], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
 
@@ -263,7 +263,7 @@ def test_non_finite_values_are_counted_in_each_shard(folder, adjoint):
     target = np.array(problem.views[0].target)
     target[2, 5, 1] = np.nan
     problem.views[0].see(target)
-    _, refused = shards.add_gradient(problem, 0, lambda: None, lambda: None)
+    _, refused = shards.add_gradient(problem, 0)
     [(sensor, found)] = refused
     assert (sensor, int(found.count[0]), found.entry()) == (0, 4, (5, 2, 1))
     assert np.isfinite(take_gradient(problem)[KEY]).all()

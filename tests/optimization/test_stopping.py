@@ -33,7 +33,7 @@ def follow(given: Config, losses: np.ndarray, held_out: dict[int, float] | None 
     watch, state, states = Watch(given), State(0, 0.0, 0.0, 0, {}), []
     for number, loss in enumerate(losses):
         seen = None if held_out is None else held_out.get(number)
-        record = Record(number, float(loss), 0, 0, 0, 0, 0, 0, 4, 1, 0, 0, None, held_out=seen)
+        record = Record(number, float(loss), 0, 0, 0, 0, 4, 1, 0, 0, None, held_out=seen)
         state = watch.after(State(number + 1, 0.0, 0.0, 0, {}), record)
         states.append(state)
         if state.stopped:

@@ -21,7 +21,7 @@ from reslrb_cli.records.metrics import MetricsWriter, Record, Regularized, cut_b
 # metrics.jsonl: its keys, values without a number, and lines that a crash cut short.
 
 KEYS = [
-    "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
+    "iteration", "loss", "step_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
     "grad_norm", "nonfinite", "parameter_rmse", "parameter_errors", "nonfinite_by_parameter",
     "held_out", "regularized",
 ]  # fmt: skip
@@ -29,7 +29,7 @@ KEYS = [
 
 def make_record(**changes):
     values = {
-        "iteration": 0, "loss": 0.5, "step_ms": 3.0, "primal_ms": None, "adjoint_ms": None, "codegen_ms": 1.0,
+        "iteration": 0, "loss": 0.5, "step_ms": 3.0, "codegen_ms": 1.0,
         "elapsed_s": 0.1, "peak_mib": 2.0, "spp": 16, "lr": 0.02, "grad_norm": 1.0, "nonfinite": 0,
         "parameter_rmse": None,
     }  # fmt: skip
@@ -118,7 +118,7 @@ def test_non_finite_values_and_bad_lines_are_reported_on_reading(tmp_path):
 # The part of `metrics.jsonl` from which a run resumes.
 
 RECORD = Record(
-    iteration=0, loss=0.1 + 0.2, step_ms=1.5, primal_ms=None, adjoint_ms=None, codegen_ms=0.0, elapsed_s=1 / 3,
+    iteration=0, loss=0.1 + 0.2, step_ms=1.5, codegen_ms=0.0, elapsed_s=1 / 3,
     peak_mib=3.0, spp=4, lr=0.02, grad_norm=math.nan, nonfinite=2, parameter_rmse=None,
     parameter_errors={"a": 0.1}, nonfinite_by_parameter={"a": 2},
     held_out=0.7, regularized=Regularized({"a": {"thickness": 0.5}}, {"a": 3}),
