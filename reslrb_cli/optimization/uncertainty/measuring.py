@@ -223,7 +223,7 @@ class Certainty:
 
     def _target_noise(self) -> str:
         """Return `target_noise` of `CertaintyRecord`, which states whether the spreads include the targets' noise."""
-        read = [view.wanted.file is not None for view in self.problem.trained]
+        read = [view.file is not None for view in self.problem.trained]
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
     def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:
