@@ -278,9 +278,7 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
         if is_held and own and isinstance(exposure, str):
             reason = f"has sensor {spec.sensor}, whose own exposure no image determines; give it a number, or one "
             raise ConfigError(config.source, "run.held_out", f"{reason}exposure to all views")
-        key, fixed = (
-            (f"{SHARED}.{spec.sensor}" if own else SHARED, 1.0) if isinstance(exposure, str) else ("", exposure)
-        )
+        key = f"{SHARED}.{spec.sensor}" if own else SHARED
         file, file_key = spec.target, "target.file" if config.views is None else f"{place}.target"
         if spec.target is None:
             file, file_key = images.get(spec.sensor), "scene.cameras"
@@ -290,7 +288,7 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
                 spec.sensor,
                 loss,
                 share=1.0 if is_held else spec.weight / total,
-                exposure=Exposure(fixed, key),
+                exposure=Exposure(key=key) if isinstance(exposure, str) else Exposure(exposure),
                 per_channel=exposure == "per_channel",
                 held_out=is_held,
                 file=file,
