@@ -58,6 +58,7 @@ REMOVED = {
     "fabrication.min_thickness": "set `least` of the regularizer `thickness`; the export states the least thickness",
     "regularizers.type: slope": "take total_variation, or curvature",
     "regularizers.type: laplacian": "take total_variation, or set `precondition`",
+    "run.adjoint: others": "take auto, which does the same",
     "run.first_batch": "the first batch always gives an image alone; remove it",
     "run.reach_spp": "it is always 64; remove it",
     "run.stages": "start from the values of a coarser run, by initial: {run: RUN}",

@@ -143,16 +143,16 @@ class RunConfig(Section):
     the time or with the iterations, whichever comes first. null: no limit."""
     spp: Count = Field(default=16, description="Samples per pixel in each step.")
     seed: Seed = Field(default=0, description="Seed of the run. All other seeds are derived from it.")
-    adjoint: Literal["auto", "correlated", "independent", "batched", "others"] = "auto"
+    adjoint: Literal["auto", "correlated", "independent", "batched"] = "auto"
     """Samples from which the adjoint image dL/dI is computed. `correlated`: the samples of the gradient itself.
     `independent`: a second set of samples, which doubles the number of paths. `batched`: the batches before the one
-    that is differentiated. `others`: the other shards, if `shards` splits the samples of a view; each path is traced
-    twice. If shards are whole views, `others` acts like `auto`. Gradients of `l2` and `relative_l2` are unbiased with
-    all settings except `correlated`. With `correlated`, the noise that image and gradient share pulls parameters,
-    mostly towards darker values; a run reports by how much if its measurement before the first iteration can see it.
-    Gradients of `l1` and `ssim` are biased with all settings, because noise in the image does not average out of their
-    derivatives; more samples help. A list of losses has the bias of its entries, and your own loss that of its formula.
-    `auto`: `others` if it is possible, otherwise `batched` if `batches` divides `spp`, otherwise `independent`."""
+    that is differentiated. `auto`: if `shards` splits the samples of a view, the other shards, so that each path is
+    traced twice; otherwise `batched` if `batches` divides `spp`, otherwise `independent`. Gradients of `l2` and
+    `relative_l2` are unbiased with all settings except `correlated`. With `correlated`, the noise that image and
+    gradient share pulls parameters, mostly towards darker values; a run reports by how much if its measurement before
+    the first iteration can see it. Gradients of `l1` and `ssim` are biased with all settings, because noise in the
+    image does not average out of their derivatives; more samples help. A list of losses has the bias of its entries,
+    and your own loss that of its formula."""
     batches: Annotated[int, Field(ge=2)] = 4
     """Number of batches that the samples of a step, or of a shard, are split into. With `adjoint: batched` it must
     divide them. Not with `correlated` and `independent`."""
@@ -215,7 +215,7 @@ class RunConfig(Section):
         values: dict[str, Any] = handler(self)
         if self.stop is None:
             values.pop("stop", None)
-        if self.adjoint not in ("auto", "batched", "others"):
+        if self.adjoint not in ("auto", "batched"):
             del values["batches"]
         return values
 

@@ -127,15 +127,14 @@ class Config(Section):
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
-        """Value of `run.adjoint` for a single step or shard, after `auto` and `others` are resolved.
+        """Value of `run.adjoint` for a single step or shard, after `auto` is resolved.
 
-        If shards split the samples of a view (`in_rounds`), `auto` and `others` become `independent`. Otherwise, `auto`
-        and `others` become `batched` if `run.spp` can be split into `run.batches` batches and the passes.
-        If not, `auto` and `others` become `independent`.
+        If shards split the samples of a view (`in_rounds`), `auto` becomes `independent`. Otherwise, `auto` becomes
+        `batched` if `run.spp` can be split into `run.batches` batches and the passes, and if not, `independent`.
         """
         if self.in_rounds:
             return "independent"
-        if self.run.adjoint != "auto" and self.run.adjoint != "others":
+        if self.run.adjoint != "auto":
             return self.run.adjoint
         return "batched" if self._splits(self.run.spp, self.run.batches) else "independent"
 
@@ -184,7 +183,7 @@ class Config(Section):
     @property
     def in_rounds(self) -> bool:
         """Whether a step has two rounds: the images of all shards, then their gradients."""
-        return self.run.adjoint in ("auto", "others") and self.shares > 1
+        return self.run.adjoint == "auto" and self.shares > 1
 
     @property
     def losses(self) -> list[Loss]:
@@ -339,7 +338,7 @@ class Config(Section):
             obstacle = self.samples_obstacle(self.scene.size[0] * self.scene.size[1])
             if obstacle is not None:
                 raise located("run.spp", obstacle)
-        if "batches" in self.run.model_fields_set and self.run.adjoint not in ("auto", "batched", "others"):
+        if "batches" in self.run.model_fields_set and self.run.adjoint not in ("auto", "batched"):
             raise located("run.batches", f"has no effect with run.adjoint: {self.run.adjoint}, only with batched")
         if self.run.adjoint == "batched":
             spp, what = self.share_spp, "run.spp" if self.shares == 1 else "the samples of a shard"

@@ -9,7 +9,7 @@ with respect to the parameters.
 
     I = sum of w_s I_s,    gradient = sum over s of w_s J_s^T dL/dI
 
-With one round, each share computes dL/dI from its own samples, as `run.adjoint` specifies. With two rounds (`others`),
+With one round, each share computes dL/dI from its own samples, as `run.adjoint` specifies. With two rounds (`auto`),
 each share evaluates dL/dI at the mean image of the other shares, (I - w_s I_s) / (1 - w_s). No path then uses a dL/dI
 to which the path itself contributes. For an L2 loss, the gradient with two rounds is the sum over all pairs of
 different shares. The gradient is unbiased. Images and gradients are added in the order of the shards, in double

@@ -254,7 +254,7 @@ def test_each_set_of_samples_is_checked(spoilt_experiment, capsys, adjoint):
 
 
 def test_each_shard_is_checked(spoilt_experiment, capsys):
-    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", "run.adjoint=others", "run.shards=2")
+    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", "run.shards=2")
     _, [offender], _ = inspect(capsys, err)
     assert offender["where"]["samples"] in ("shard 1, image and gradient", "shard 2, image and gradient")
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err

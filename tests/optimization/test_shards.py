@@ -25,7 +25,7 @@ from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.records.clock import peak_mib, reset_peak
 
-OTHERS = "run.adjoint=others"
+ROUNDS = "run.adjoint=auto"
 #: Two views, each with an exposure of its own.
 TWO_VIEWS = "views=[{sensor: 0, weight: 3, exposure: 1}, {sensor: 1, exposure: auto}]"
 
@@ -64,13 +64,13 @@ def independent(problem: Problem, rounds: int, spp: int) -> np.ndarray:
 # --- unbiased ---------------------------------------------------------------------------------------------------------
 
 WAYS = {
-    "2 in rounds": (["run.spp=2", "run.shards=2", OTHERS], 400),
-    "4 in rounds": (["run.spp=4", "run.shards=4", OTHERS], 200),
-    "16 in rounds": (["run.spp=16", "run.shards=16", OTHERS], 100),
+    "2 in rounds": (["run.spp=2", "run.shards=2", ROUNDS], 400),
+    "4 in rounds": (["run.spp=4", "run.shards=4", ROUNDS], 200),
+    "16 in rounds": (["run.spp=16", "run.shards=16", ROUNDS], 100),
     "2 in batches": (["run.spp=4", "run.shards=2", "run.batches=2", "run.adjoint=batched"], 200),
     "4 by themselves": (["run.spp=4", "run.shards=4", "run.adjoint=independent"], 200),
-    "guided": (["run.spp=4", "run.shards=4", OTHERS, "integrator.guiding=on"], 200),
-    "relative": (["run.spp=4", "run.shards=4", OTHERS, "loss.type=relative_l2"], 200),
+    "guided": (["run.spp=4", "run.shards=4", ROUNDS, "integrator.guiding=on"], 200),
+    "relative": (["run.spp=4", "run.shards=4", ROUNDS, "loss.type=relative_l2"], 200),
 }
 
 
@@ -97,7 +97,7 @@ def test_a_single_set_of_samples_would_be_found(folder):
 def test_views_and_exposures_are_unbiased(folder):
     """Two views with different weights have two shards each. The second view's exposure is recovered."""
     reference = independent(make(folder, TWO_VIEWS, "run.adjoint=independent"), 16, 1024)
-    found = compare(rows(make(folder, TWO_VIEWS, "run.spp=2", "run.shards=4", OTHERS), 300), reference, block=None)
+    found = compare(rows(make(folder, TWO_VIEWS, "run.spp=2", "run.shards=4", ROUNDS), 300), reference, block=None)
     assert found, found
 
 
@@ -117,10 +117,10 @@ def shuffled(problem: Problem, function: Callable[..., Any], work: Any) -> Itera
 @pytest.mark.parametrize(
     "sets",
     [
-        ["run.spp=8", "run.shards=4", OTHERS, "target.exposure=1.5"],
+        ["run.spp=8", "run.shards=4", ROUNDS, "target.exposure=1.5"],
         ["run.spp=16", "run.shards=4", "run.adjoint=batched", "integrator.guiding=on"],
         ["run.spp=4", "run.shards=2", "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]", "integrator.guiding=on"],
-        ["run.spp=8", "run.shards=4", OTHERS, TWO_VIEWS.replace("auto", "2")],
+        ["run.spp=8", "run.shards=4", ROUNDS, TWO_VIEWS.replace("auto", "2")],
     ],
 )
 def test_the_order_of_evaluation_does_not_matter(folder, sets):
@@ -179,7 +179,7 @@ def test_shares_sum_up_to_a_gradient_at_their_mean(folder):
 
 
 def test_no_two_shards_share_a_seed(folder):
-    problem = make(folder, "views=[{sensor: 0}, {sensor: 1}]", "run.spp=32", "run.shards=32", OTHERS)
+    problem = make(folder, "views=[{sensor: 0}, {sensor: 1}]", "run.spp=32", "run.shards=32", ROUNDS)
     tasks = [task for iteration in range(20) for task in shards.make_tasks(problem, iteration)]
     seeds = [part.seed for task in tasks for part in task.parts]
     assert len(seeds) == 20 * 32
@@ -191,7 +191,7 @@ def test_no_two_shards_share_a_seed(folder):
 def test_a_subset_of_the_views_is_sharded(folder):
     """Each shard has dL/dI at the mean image of the other shards. The drawn view counts for all three views."""
     views = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
-    problem = make(folder, views, "run.views_per_iteration=1", "run.spp=8", "run.shards=4", OTHERS)
+    problem = make(folder, views, "run.views_per_iteration=1", "run.spp=8", "run.shards=4", ROUNDS)
     for iteration in range(4):
         [(view, scale)] = problem.drawn(iteration)
         assert scale == 3
@@ -233,7 +233,7 @@ def test_memory_does_not_grow_with_the_shards(folder):
     """The peak memory of the backend's allocator does not grow from 2 to 16 shards of equal size."""
     peaks = []
     for count in (2, 16):
-        problem = make(folder, f"run.spp={64 * count}", f"run.shards={count}", OTHERS, "scene.size=[64, 64]")
+        problem = make(folder, f"run.spp={64 * count}", f"run.shards={count}", ROUNDS, "scene.size=[64, 64]")
         rows(problem, 1)
         reset_peak()
         rows(problem, 1)
@@ -257,7 +257,7 @@ def test_passes_divide_a_shard(folder):
     assert np.isfinite(rows(split, 2)).all()
 
 
-@pytest.mark.parametrize("adjoint", ["others", "independent"])
+@pytest.mark.parametrize("adjoint", ["auto", "independent"])
 def test_non_finite_values_are_counted_in_each_shard(folder, adjoint):
     problem = make(folder, "run.spp=8", "run.shards=4", f"run.adjoint={adjoint}")
     target = np.array(problem.views[0].target)
@@ -275,19 +275,19 @@ VIEWS = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
 CAMERAS = "scene.cameras=transforms.json"
 SETTLED = [
     (["run.spp=16"], (1, 1, "batched", False)),
-    (["run.spp=16", OTHERS], (1, 1, "batched", False)),
+    (["run.spp=16", ROUNDS], (1, 1, "batched", False)),
     (["run.spp=16", "run.shards=4"], (4, 4, "independent", True)),
-    (["run.spp=16", "run.shards=4", OTHERS], (4, 4, "independent", True)),
+    (["run.spp=16", "run.shards=4", ROUNDS], (4, 4, "independent", True)),
     (["run.spp=16", "run.shards=4", "run.adjoint=batched"], (4, 4, "batched", False)),
     (["run.spp=16", "run.shards=16", "run.adjoint=independent"], (16, 16, "independent", False)),
     (["run.spp=16", "run.shards=auto"], (16, 16, "independent", True)),
     (["run.spp=16", "run.shards=auto", "run.adjoint=batched"], (4, 4, "batched", False)),
     (["run.spp=24", "run.shards=auto", "integrator.samples_per_pass=2"], (4, 4, "independent", True)),
-    ([VIEWS, "run.spp=16", "run.shards=2", OTHERS], (2, 1, "batched", False)),
-    ([VIEWS, "run.spp=16", "run.shards=6", OTHERS], (6, 2, "independent", True)),
+    ([VIEWS, "run.spp=16", "run.shards=2", ROUNDS], (2, 1, "batched", False)),
+    ([VIEWS, "run.spp=16", "run.shards=6", ROUNDS], (6, 2, "independent", True)),
     ([VIEWS, "run.spp=16", "run.shards=auto"], (12, 4, "independent", True)),
     ([VIEWS, "run.held_out=[1]", "run.spp=16", "run.shards=4"], (4, 2, "independent", True)),
-    ([CAMERAS, "run.spp=16", "run.shards=3", OTHERS], (3, 1, "batched", False)),
+    ([CAMERAS, "run.spp=16", "run.shards=3", ROUNDS], (3, 1, "batched", False)),
     ([CAMERAS, "run.spp=16", "run.shards=auto"], (16, 1, "batched", False)),
 ]
 

@@ -84,7 +84,7 @@ CASES: dict[str, list[str]] = {
     "gather": [*BATCHED, "integrator.estimator=gather"],
     "guided": [*BATCHED, "integrator.guiding=on", "integrator.estimator=stack"],
     "pixels": [*BATCHED, "run.spp=16", "integrator={estimator: stack, paths: both, pixels: measured}"],
-    "shards": ["run.spp=8", "run.adjoint=others", "run.shards=4", "integrator.guiding=on", "optimizer.scale=auto"],
+    "shards": ["run.spp=8", "run.shards=4", "integrator.guiding=on", "optimizer.scale=auto"],
     "shards of views": [*BATCHED, VIEWS, "run.shards=2"],
     "passes": [*BATCHED, "integrator.samples_per_pass=1"],
     "budget": [*BATCHED, "run.memory_budget=8"],
