@@ -193,7 +193,6 @@ def gradient(
         reseeded = config if seed is None else load(config, {"run.seed": seed})
         keep_variant(config.variant, config.source)
         from reslrb_cli.optimization.assemble import assemble, set_values
-        from reslrb_cli.optimization.loop import Split
         from reslrb_cli.optimization.loop import gradient as step_gradient
         from reslrb_cli.records.decisions import DecisionCache
 
@@ -201,7 +200,7 @@ def gradient(
         if values is not None:
             problem = set_values(problem, values)
         problem = replace(problem, config=reseeded)
-        loss = step_gradient(problem, 0, Split())[0]
+        loss = step_gradient(problem, 0)[0]
         found = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
         return float(loss[0]), {key: problem.selection.shown(key, value) for key, value in found.items()}
 

@@ -125,7 +125,7 @@ class Run:
         course, self._status = self._begun.course, Status.FAILED
         try:
             told = functools.partial(logger.warning, "%s")
-            for state, record in iterate(course.stages, course.state, told, watch=course.watch):
+            for state, record in iterate(course.problem, course.state, told, watch=course.watch):
                 course.add(state, record)
                 yield record
         except (GeneratorExit, KeyboardInterrupt):
@@ -221,9 +221,8 @@ class Run:
     def gradients(self) -> dict[str, Array]:
         """The gradients of the last iteration, by key. The result is empty before the first iteration.
 
-        Each gradient has the shape of its parameter. In a stage of `run.stages`, gradients have the parameter's shape
-        in this stage. Gradients include regularizers and are not clamped. Gradients may contain values that are not
-        finite.
+        Each gradient has the shape of its parameter. Gradients include regularizers. Gradients may contain values that
+        are not finite.
         """
         course = self._begun.course
         return course.shown(course.state.gradients)
@@ -240,9 +239,8 @@ class Run:
         problem = course.problem
         with held():
             course.stand()
-            course.bring()
             spp = saved_spp(problem, between=True)
-            seen = {view.sensor: view.exposed(problem.see(view, spp, course.done, "saved image"))[1]
+            seen = {view.sensor: view.exposure.of_array(problem.render(view.sensor, spp, course.done, "saved image"))
                     for view in problem.views}  # fmt: skip
         return seen
 

@@ -164,7 +164,7 @@ def command(**given: Any) -> None:
         kind="mirror" if is_mirror else "lens",
         size=tuple(size * share),
         distance=options.distance,
-        picture_size=tuple((options.picture_size or size) * share),
+        picture_size=tuple((size if options.picture_size is None else options.picture_size) * share),
         ior=options.ior,
         thickness=size / 4 if options.thickness is None else options.thickness,
         outline=options.outline,

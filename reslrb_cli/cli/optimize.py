@@ -118,12 +118,10 @@ def command(**given: Any) -> int:
 
 
 def _check_shards(config: Config, workers: Place | None) -> None:
-    """Raise ConfigError if `--cluster` is used with only one shard, or with `run.stages`."""
+    """Raise ConfigError if `--cluster` is used with only one shard."""
     if workers is not None and config.shards == 1:
         reason = "--cluster needs more than one shard; set run.shards to auto, or to a number above 1"
         raise ConfigError(config.source, "run.shards", reason)
-    if workers is not None and config.run.stages:
-        raise ConfigError(config.source, "run.stages", "cannot be combined with --cluster yet; remove one of them")
 
 
 def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -> int:
@@ -188,7 +186,7 @@ def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
     if not quiet:
         for line in parameter_lines(manifest.results, terminal_width()):
             echo(line)
-    kept = course.nonfinite, course.clamped, course.regularized
+    kept = course.nonfinite, course.regularized
     tallies = [str(tally) for tally in kept if tally.iterations]
     page = place.path / "report.html"
     echo(last_line(status.value, manifest.results, tallies, os.path.relpath(page if page.exists() else place.path)))

@@ -1,9 +1,8 @@
-"""The losses, the optimisers and the stages of a run, with their options."""
+"""The losses and the optimisers of a run, with their options."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,21 +34,15 @@ class Loss(Choice):
     """A mean over pixels and channels of a function of the image I and the target T."""
 
     type: str
-    scale: Literal["none", "fitted"] = "none"
-    """`fitted`: multiply the image by s = <I, T> / <I, I> before it is compared, so that its brightness does not
-    matter. The sums run over all channels and the pixels inside the mask; s is computed for each step and each view.
-    The gradient includes the derivative of s. <I, I> is computed between two halves of the samples, because noise would
-    make s too small. `none`: compare the image as it is."""
     weight: Positive = 1.0
     """Factor of an entry in a list of losses, such as `loss: [{type: l2, weight: 1}, {type: ssim, weight: 0.1}]`. Only
-    in a list. All entries of a list must have the same `scale`."""
+    in a list."""
 
     @model_serializer(mode="wrap")
     def _without_unasked(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
-        for name, usual in (("scale", "none"), ("weight", 1.0)):
-            if values.get(name) == usual:
-                del values[name]
+        if values.get("weight") == 1.0:
+            del values["weight"]
         return values
 
     def own_options(self) -> dict[str, Any]:
@@ -116,13 +109,6 @@ def _loss_kind(value: Any) -> str:
     return MARK + "list" if isinstance(value, list) else MARK + "mapping"
 
 
-def _check_list(losses: list[Loss]) -> list[Loss]:
-    for place, loss in enumerate(losses):
-        if loss.scale != losses[0].scale:
-            raise located(f"[{place}].scale", "must be the same in all entries of a list")
-    return losses
-
-
 def _check_single(loss: Loss) -> Loss:
     if "weight" in loss.model_fields_set:
         raise located("weight", "needs a list of losses, `loss: [{type: l2, weight: 1}, ...]`; remove it")
@@ -132,7 +118,7 @@ def _check_single(loss: Loss) -> Loss:
 #: One loss, or a list of losses that are summed.
 Losses = Annotated[
     Annotated[AnyLoss, AfterValidator(_check_single), mark("mapping")]
-    | Annotated[list[AnyLoss], Field(min_length=1, max_length=16), AfterValidator(_check_list), mark("list")],
+    | Annotated[list[AnyLoss], Field(min_length=1, max_length=16), mark("list")],
     Discriminator(_loss_kind),
 ]
 
@@ -184,15 +170,10 @@ class OptimizerSettings(Choice):
     `curvature`, only for `sgd`: divide the gradient of each parameter by the largest curvature of the loss, which a run
     measures. A learning rate of 1 is then the step that reaches the minimum along the steepest direction; the default
     is 0.5."""
-    schedule: Literal["constant", "cosine", "exponential", "plateau"] = "constant"
-    """How the learning rate changes from its first to its last value. `plateau`: it is halved each time the loss has
-    stopped falling, by the test in `run.stop`."""
+    schedule: Literal["constant", "cosine", "exponential"] = "constant"
+    """How the learning rate changes from its first to its last value."""
     final_fraction: float = Field(default=0.01, gt=0, le=1)
     """Last learning rate divided by the first. Only with a schedule other than `constant`."""
-    clamp_gradient: Annotated[float, Field(ge=1)] | None = None
-    """Limit on each entry of a gradient, as a multiple of its usual size. The usual size is the larger of two running
-    means of absolute values: that of the entry, and that of all entries of the parameter. The limit removes the noise
-    of rare bright paths. It biases the gradient by what it removes, and the run reports how much. null: no limit."""
 
     @model_validator(mode="after")
     def _check_schedule(self) -> Self:
@@ -247,41 +228,3 @@ class SGD(OptimizerSettings, json_schema_extra=NEEDS_TYPE):
 
 
 AnyOptimizer = Annotated[Adam | SGD, ByType("adam")]
-
-
-_Share = Annotated[float, Field(gt=0, le=1)]
-
-
-class Stage(Section):
-    """A coarser stage at the start of a run. If a stage leaves out a setting, the run's setting applies."""
-
-    until: Annotated[float, Field(gt=0, lt=1)]
-    """Fraction of the run's iterations at which the stage ends. The next stage follows; after the last stage, the run
-    continues as configured."""
-    resolution: _Share = 1.0
-    """Factor for the width and height of heightmaps and textures. It also applies to a heightmap's mesh if the mesh is
-    a flat grid with one vertex for each texel. Tied textures (a list of keys), and textures that only a mesh
-    file contains, keep their resolution."""
-    film: _Share = 1.0
-    """Factor for the width and height of the film: 1/n, with a whole number n that divides both. The pixels of the
-    target become weighted means of n x n pixels."""
-
-    @property
-    def grain(self) -> tuple[float, float]:
-        """The settings that change the problem: resolution and film."""
-        return self.resolution, self.film
-
-
-#: The stage after the last one: the run as configured.
-AS_CONFIGURED = Stage.model_construct(until=1.0)
-
-
-def check_stages(stages: list[Stage]) -> None:
-    """Raise a located error if stages are out of order, or one is coarser than the stage before it."""
-    for place, (before, stage) in enumerate(pairwise(stages), 1):
-        if stage.until <= before.until:
-            raise located(f"run.stages[{place}].until", f"must be above {before.until:g}, that of the previous stage")
-        for name in ("resolution", "film"):
-            if getattr(stage, name) < getattr(before, name):
-                reason = f"must be at least {getattr(before, name):g}, that of the previous stage"
-                raise located(f"run.stages[{place}].{name}", reason)

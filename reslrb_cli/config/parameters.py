@@ -257,13 +257,6 @@ class Curvature(Regularizer, json_schema_extra={"required": ["type", "radius"]})
     radius: Positive = Field(description="Radius of the ball of the tool, in scene units.")
 
 
-class Slope(Regularizer, json_schema_extra={"required": ["type", "degrees"]}):
-    """Slopes of a heightmap that are too steep: integral of max(0, slope - tan(degrees))²."""
-
-    type: Literal["slope"] = Field(default="slope", description="For a heightmap: integral of max(0, slope - tan)².")
-    degrees: float = Field(ge=0, lt=90, description="Largest angle of a slope without a cost, in degrees.")
-
-
 class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness", "least"]}):
     """A plate that is too thin: integral of max(0, least - (thickness + h))², with the heightmap h. After each step,
     heights are clamped so that the plate keeps a tenth of `least`, and its faces never cross. The run records the
@@ -305,23 +298,13 @@ class TotalVariation(Regularizer, json_schema_extra=NEEDS_TYPE):
     epsilon: Positive = Field(default=1e-3, description="Gradients well below this value have a quadratic cost.")
 
 
-class Laplacian(Regularizer, json_schema_extra=NEEDS_TYPE):
-    """Roughness of a heightmap, a bitmap or the vertex positions of a mesh: integral of the squared Laplacian. For
-    vertex positions, the Laplacian is the cotangent Laplacian of the initial mesh, without the mesh's boundary
-    vertices.
-    """
-
-    type: Literal["laplacian"] = "laplacian"
-    """For a heightmap, a bitmap or the vertex positions of a mesh: integral of the squared Laplacian."""
-
-
-AnyRegularizer = Annotated[Curvature | Slope | Thickness | TotalVariation | Laplacian, ByType("")]
+AnyRegularizer = Annotated[Curvature | Thickness | TotalVariation, ByType("")]
 
 #: The regularizers of each kind of parameter.
 REGULARIZERS = {
-    "heightmap": ("curvature", "slope", "thickness", "total_variation", "laplacian"),
-    "bitmap": ("total_variation", "laplacian"),
-    "mesh": ("laplacian",),
+    "heightmap": ("curvature", "thickness", "total_variation"),
+    "bitmap": ("total_variation",),
+    "mesh": (),
 }
 
 
@@ -340,17 +323,6 @@ class Settings:
     word: str = ""
     smoothing: float | None = None
     regularizers: tuple[Regularizer, ...] = ()
-
-
-class Precondition(Section):
-    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021). The optimizer moves v. The parameter is (1 - l²
-    Δ)⁻¹ v.
-    """
-
-    laplacian: Annotated[float, Field(gt=0, le=10)]
-    """Length l, as a fraction of the longer side of a map, a texture or a mesh. Its effect does not depend on the
-    resolution. Details smaller than l move less in a step. With gradient descent, their steps shrink with the fourth
-    power of their size divided by l."""
 
 
 class ParameterSpec(Section):
@@ -382,8 +354,11 @@ class ParameterSpec(Section):
     """Step size of this parameter, in the units of `optimizer.learning_rate`. null: `optimizer.learning_rate`."""
     resolution: Annotated[Size, few("texels")] | None = None
     """[width, height] in texels. The texture is resampled to this size before the start. null: it keeps its size."""
-    precondition: Precondition | None = None
-    """Smooth steps, for textures, heightmaps and mesh vertices. null: off."""
+    precondition: Annotated[float, Field(gt=0, le=10)] | None = None
+    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021), for textures, heightmaps and mesh vertices: a
+    length l, as a fraction of the longer side. The optimizer moves v, and the parameter is (1 - l² Δ)⁻¹ v. Details
+    smaller than l move less in a step: with gradient descent, by the fourth power of their size divided by l. The
+    effect does not depend on the resolution. null: off."""
     regularizers: list[AnyRegularizer] = Field(default=[], max_length=16)
     """Costs of the value itself. They are integrals over its surface, added to the loss once per step and recorded
     separately. Lengths are in scene units, and for a bitmap in units of its texture coordinates. The integrals hardly
@@ -441,8 +416,14 @@ class ParameterSpec(Section):
         if lowest:
             low, high = bounds or (-math.inf, math.inf)
             bounds = max(low, *lowest), high
-        smoothing = None if self.precondition is None else self.precondition.laplacian
-        rest = of("transform", "none"), of("learning_rate"), resolution, word, smoothing, tuple(self.regularizers)
+        rest = (
+            of("transform", "none"),
+            of("learning_rate"),
+            resolution,
+            word,
+            self.precondition,
+            tuple(self.regularizers),
+        )
         return Settings(of("initial", "scene"), bounds, *rest)
 
     @model_validator(mode="after")

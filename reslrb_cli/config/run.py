@@ -19,7 +19,7 @@ from typing_extensions import Self
 
 from reslrb_cli.config.base import Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from reslrb_cli.config.files import NAME_BYTES
-from reslrb_cli.config.optimizers import Stage, StopRule
+from reslrb_cli.config.optimizers import StopRule
 from reslrb_cli.config.views import SensorName
 
 #: Paths: text that starts at a root or a home folder, or contains `.` or `..` as a part. Words with a slash between
@@ -138,19 +138,19 @@ class RunConfig(Section):
     """Time limit in seconds. The run ends, as finished, before the iteration that would exceed the limit if it took the
     mean time of an iteration. The first iteration is always completed. The limit includes the measurement of automatic
     settings, compiling, steps and updates, but not loading, targets and saved images. `optimizer.schedule` ends with
-    the time or with the iterations, whichever comes first. Not with `stages`. null: no limit."""
+    the time or with the iterations, whichever comes first. null: no limit."""
     spp: Count = Field(default=16, description="Samples per pixel in each step.")
     seed: Seed = Field(default=0, description="Seed of the run. All other seeds are derived from it.")
-    adjoint: Literal["auto", "correlated", "independent", "batched", "others"] = "auto"
+    adjoint: Literal["auto", "correlated", "independent", "batched"] = "auto"
     """Samples from which the adjoint image dL/dI is computed. `correlated`: the samples of the gradient itself.
     `independent`: a second set of samples, which doubles the number of paths. `batched`: the batches before the one
-    that is differentiated. `others`: the other shards, if `shards` splits the samples of a view; each path is traced
-    twice. If shards are whole views, `others` acts like `auto`. Gradients of `l2` and `relative_l2` are unbiased with
-    all settings except `correlated`. With `correlated`, the noise that image and gradient share pulls parameters,
-    mostly towards darker values; a run reports by how much if its measurement before the first iteration can see it.
-    Gradients of `l1` and `ssim` are biased with all settings, because noise in the image does not average out of their
-    derivatives; more samples help. A list of losses has the bias of its entries, and your own loss that of its formula.
-    `auto`: `others` if it is possible, otherwise `batched` if `batches` divides `spp`, otherwise `independent`."""
+    that is differentiated. `auto`: if `shards` splits the samples of a view, the other shards, so that each path is
+    traced twice; otherwise `batched` if `batches` divides `spp`, otherwise `independent`. Gradients of `l2` and
+    `relative_l2` are unbiased with all settings except `correlated`. With `correlated`, the noise that image and
+    gradient share pulls parameters, mostly towards darker values; a run reports by how much if its measurement before
+    the first iteration can see it. Gradients of `l1` and `ssim` are biased with all settings, because noise in the
+    image does not average out of their derivatives; more samples help. A list of losses has the bias of its entries,
+    and your own loss that of its formula."""
     batches: Annotated[int, Field(ge=2)] = 4
     """Number of batches that the samples of a step, or of a shard, are split into. With `adjoint: batched` it must
     divide them. Not with `correlated` and `independent`."""
@@ -199,27 +199,19 @@ class RunConfig(Section):
     checkpoint_every: CheckpointEvery = CheckpointEvery(seconds=30.0)
     """`iterations` or `seconds` between two checkpoints, for `reslrb optimize --resume`. A run also writes a checkpoint
     before the first iteration and at its end, unless it is killed."""
-    stages: list[Stage] = Field(default=[], max_length=16)
-    """Coarser stages at the start of the run, from coarse to fine. Each reduces the resolution or the film until a
-    fraction of the iterations is done. After the last stage the run continues as configured. When resolution or film
-    change, the optimizer restarts, and the units of `optimizer.scale` are measured again."""
-
     stop: StopRule | None = None
     """End the run, as finished, before its last iteration if the loss has stopped falling. The test uses the loss of
-    held-out views if there are any, otherwise the loss of the iterations. With `schedule: plateau` the run ends only at
-    the smallest learning rate. At most 5 % of the runs end while the loss still falls by more than `relative` per
-    window. With the defaults, a run continues for about 300 iterations after its loss has stopped falling if losses
-    have 10 % noise, and for about 500 at 30 % ([When a loss is flat](steps.md#when-a-loss-is-flat)). `{}`: the
-    defaults. null: never."""
+    held-out views if there are any, otherwise the loss of the iterations. At most 5 % of the runs end while the loss
+    still falls by more than `relative` per window. With the defaults, a run continues for about 300 iterations after
+    its loss has stopped falling if losses have 10 % noise, and for about 500 at 30 % ([When a loss is
+    flat](steps.md#when-a-loss-is-flat)). `{}`: the defaults. null: never."""
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
-        if not self.stages:
-            del values["stages"]
         if self.stop is None:
             values.pop("stop", None)
-        if self.adjoint not in ("auto", "batched", "others"):
+        if self.adjoint not in ("auto", "batched"):
             del values["batches"]
         return values
 

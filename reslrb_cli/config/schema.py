@@ -33,15 +33,12 @@ from reslrb_cli.config.base import (
 from reslrb_cli.config.integrators import AnyIntegrator, Integrator, Own, largest_pass, passes_obstacle
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.optimizers import (
-    AS_CONFIGURED,
     L2,
     Adam,
     AnyOptimizer,
     Custom,
     Loss,
     Losses,
-    Stage,
-    check_stages,
     loss_keys,
     losses_of,
 )
@@ -128,22 +125,20 @@ class Config(Section):
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
-        """Value of `run.adjoint` for a single step or shard, after `auto` and `others` are resolved.
+        """Value of `run.adjoint` for a single step or shard, after `auto` is resolved.
 
-        If shards split the samples of a view (`in_rounds`), `auto` and `others` become `independent`. Otherwise, `auto`
-        and `others` become `batched` if `run.spp` can be split into `run.batches` batches, their halves and the passes.
-        If not, `auto` and `others` become `independent`.
+        If shards split the samples of a view (`in_rounds`), `auto` becomes `independent`. Otherwise, `auto` becomes
+        `batched` if `run.spp` can be split into `run.batches` batches and the passes, and if not, `independent`.
         """
         if self.in_rounds:
             return "independent"
-        if self.run.adjoint != "auto" and self.run.adjoint != "others":
+        if self.run.adjoint != "auto":
             return self.run.adjoint
         return "batched" if self._splits(self.run.spp, self.run.batches) else "independent"
 
     def _splits(self, spp: int, sets: int) -> bool:
-        """True if `spp` samples per pixel can be split into `sets` sets, their halves and the passes."""
-        parts = sets * self.halves
-        return spp % parts == 0 and _passes_divide(self.integrator, spp // parts)
+        """True if `spp` samples per pixel can be split into `sets` sets and the passes."""
+        return spp % sets == 0 and _passes_divide(self.integrator, spp // sets)
 
     @property
     def drawn_views(self) -> int | None:
@@ -186,7 +181,7 @@ class Config(Section):
     @property
     def in_rounds(self) -> bool:
         """Whether a step has two rounds: the images of all shards, then their gradients."""
-        return self.run.adjoint in ("auto", "others") and self.shares > 1
+        return self.run.adjoint == "auto" and self.shares > 1
 
     @property
     def losses(self) -> list[Loss]:
@@ -235,19 +230,14 @@ class Config(Section):
         return own | {key: one for key, one in loss_keys("file", self.loss) if isinstance(one, Custom)}
 
     @property
-    def halves(self) -> Literal[1, 2]:
-        """Number of halves of each set of samples: 2 if a loss needs two images (`scale: fitted`)."""
-        return 2 if any(loss.scale == "fitted" for loss in self.losses) else 1
-
-    @property
     def by_pixel(self) -> bool:
         """Whether every loss is a sum of functions of single pixels."""
-        return all(loss.scale == "none" and loss.type not in ("ssim", "custom") for loss in self.losses)
+        return all(loss.type not in ("ssim", "custom") for loss in self.losses)
 
     @property
     def set_spp(self) -> int:
         """Samples per pixel of each set of samples in a step."""
-        return self.share_spp // ((self.run.batches if self.adjoint == "batched" else 1) * self.halves)
+        return self.share_spp // (self.run.batches if self.adjoint == "batched" else 1)
 
     def samples_obstacle(self, pixels: int) -> str | None:
         """Return why the samples of a step cannot be traced with films of `pixels` pixels, and what to change."""
@@ -270,20 +260,6 @@ class Config(Section):
         ]
         return self.model_copy(update={"target": target, "views": views})
 
-    def stage(self, number: int) -> Stage:
-        """Return the stage of this number. After the last stage, return the run as configured."""
-        return self.run.stages[number] if number < len(self.run.stages) else AS_CONFIGURED
-
-    def stage_number(self, progress: float) -> int:
-        """Return the number of the stage at `progress` (0 to 1) of the run, or the number of stages after the
-        last one.
-        """
-        return sum(progress >= stage.until for stage in self.run.stages)
-
-    def without_stages(self) -> Config:
-        """Return the experiment without stages."""
-        return self.model_copy(update={"run": self.run.model_copy(update={"stages": []})})
-
     def step_options(self, shard: bool = False) -> dict[str, Any]:
         """Return the sampling options of a gradient step. If `shard` is True, return the sampling options of one shard
         instead.
@@ -291,8 +267,6 @@ class Config(Section):
         options: dict[str, Any] = {"spp": self.share_spp if shard else self.run.spp, "adjoint": self.adjoint}
         if self.adjoint == "batched":
             options["batches"] = self.run.batches
-        if self.halves == 2:
-            options["halves"] = True
         return options
 
     @property
@@ -330,7 +304,6 @@ class Config(Section):
                     raise located(f"parameters[{i}].{at}", f"`{name}` is already in parameters[{places[option, name]}]")
         self._check_samples()
         self._check_standing()
-        check_stages(self.run.stages)
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(
                 "integrator.weight",
@@ -349,14 +322,11 @@ class Config(Section):
         return self
 
     def _check_standing(self) -> None:
-        """Raise an error that names the key if `run.stop` or `run.max_seconds` contradicts other settings."""
+        """Raise an error that names the key if `run.stop` contradicts other settings."""
         stop = self.run.stop
         if stop is not None and self.run.held_out and stop.patience < 20:
             reason = f"must be at least 20, not {stop.patience}: held-out views are rendered every 10 iterations"
             raise located("run.stop.patience", reason)
-        if self.run.max_seconds is not None and self.run.stages:
-            reason = "cannot be combined with run.stages, fractions of run.iterations; remove one"
-            raise located("run.max_seconds", reason)
 
     def _check_samples(self) -> None:
         """Raise an error that names the key if the samples of a step cannot be split as configured."""
@@ -366,7 +336,7 @@ class Config(Section):
             obstacle = self.samples_obstacle(self.scene.size[0] * self.scene.size[1])
             if obstacle is not None:
                 raise located("run.spp", obstacle)
-        if "batches" in self.run.model_fields_set and self.run.adjoint not in ("auto", "batched", "others"):
+        if "batches" in self.run.model_fields_set and self.run.adjoint not in ("auto", "batched"):
             raise located("run.batches", f"has no effect with run.adjoint: {self.run.adjoint}, only with batched")
         if self.run.adjoint == "batched":
             spp, what = self.share_spp, "run.spp" if self.shares == 1 else "the samples of a shard"
@@ -374,8 +344,6 @@ class Config(Section):
                 is_are = "is" if self.shares == 1 else "are"
                 raise located("run.batches", f"{self.run.batches} does not divide {what}, which {is_are} {spp}")
             _check_passes(self.integrator, spp // self.run.batches, "integrator", f"{what} / run.batches")
-        if self.halves == 2:
-            self._check_halves()
 
     def _check_shards(self) -> None:
         """Raise an error that names the key if shards are neither whole views nor equal parts of one view."""
@@ -390,21 +358,6 @@ class Config(Section):
         if spp % self.shares:
             raise located("run.shards", f"{self.shares} per view do not divide run.spp, {spp}")
         _check_passes(self.integrator, self.share_spp, "integrator", "the samples of a shard")
-
-    def _check_halves(self) -> None:
-        """Raise an error that names the key if samples cannot be halved, or if two settings scale a view's
-        brightness.
-        """
-        sets = (self.run.batches if self.adjoint == "batched" else 1) * self.shares
-        if self.run.spp % (2 * sets):
-            reason = f"must be a multiple of {2 * sets}, not {self.run.spp}: loss.scale: fitted halves the samples"
-            raise located("run.spp", reason)
-        _check_passes(self.integrator, self.set_spp, "integrator", f"run.spp / {2 * sets}, by loss.scale: fitted")
-        exposures = {f"views[{number}].exposure": view.exposure for number, view in enumerate(self.views or ())}
-        for by, exposure in {"target.exposure": self.target.exposure, **exposures}.items():
-            if isinstance(exposure, str):
-                key, _ = loss_keys("scale", self.loss)[0]
-                raise located(key, f"cannot be fitted while {by} is recovered: both scale the image")
 
 
 def _passes_divide(integrator: Integrator, spp: int) -> bool:

@@ -289,7 +289,7 @@ def lens_yaml(
     plate = f"type: thickness, thickness: {s.thickness:.9g}, least: {least:.4g}, weight: {1e6 / max(s.size) ** 4:.4g}"
     more = (
         f"""  - heightmap: {{mesh: back, resolution: [{nx}, {ny}]}}  # mm along -z
-    precondition: {{laplacian: 0.03}}
+    precondition: 0.03
 """
         if both
         else ""
@@ -306,7 +306,7 @@ target:
 parameters:
   - heightmap: {{mesh: face, resolution: [{nx}, {ny}]}}  # mm along +z
     initial: {{file: start.exr}}  # by transport of light: docs/lens.md
-    precondition: {{laplacian: 0.03}}  # smooth steps: without them the finest ripples decide how long one may be
+    precondition: 0.03  # smooth steps: without them the finest ripples decide how long one may be
     regularizers: [{{{plate}{", opposite: back" if both else ""}}}]  # mm; faces never cross
 {more}integrator:
   type: reslrb

@@ -1,23 +1,17 @@
 """Assembly of a configuration's problem. The problem is loaded and checked, its targets are made, and its open settings
-are decided. Also the coarser problem of a stage.
+are decided.
 """
 
 from __future__ import annotations
 
 import difflib
 import functools
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from fnmatch import fnmatchcase
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
 
 from reslrb_cli.config.loader import check_code
-from reslrb_cli.config.parameters import HEIGHTMAP, ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.own import OwnIntegrator
@@ -34,16 +28,15 @@ from reslrb_cli.optimization.loading import (
     paths_of,
     samples_per_pass,
 )
-from reslrb_cli.optimization.memory import check_announced, check_described, check_films, fit_memory, outlook
+from reslrb_cli.optimization.memory import check_announced, check_described, check_films, fit_memory
 from reslrb_cli.optimization.moving import check_moving, moves_anything
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
-from reslrb_cli.optimization.views import View, expose, make_views
+from reslrb_cli.optimization.views import expose, make_views
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.parameters import Selection, select_parameters
-from reslrb_cli.scene.values import resample
 
 Array = np.ndarray[Any, Any]
 
@@ -71,9 +64,6 @@ def assemble(
     if settled is not None:
         begin_as(problem, settled)
     problem = fit_memory(problem)
-    line = outlook(config, problem.scene, problem.sensors) if to_run else None
-    if line is not None:
-        say(line)
     problem = make_targets(problem, say)
     for view in problem.views if to_run else ():
         for own in view.codes:
@@ -181,9 +171,6 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     check_moving(problem)
     if values is None:
         _check_plates(problem)
-    for number in range(len(config.run.stages)):
-        _film_at(problem, number)
-        _specs_at(problem, number)
     return problem
 
 
@@ -211,170 +198,3 @@ def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
             raise ValueError(f"`{key}` is {value.dtype} of shape {value.shape}, not numbers of shape {shape}")
         if not np.isfinite(value).all():
             raise ValueError(f"`{key}` has a value that is not finite")
-
-
-# --- stages -----------------------------------------------------------------------------------------------------------
-
-
-def at_stage(problem: Problem, number: int, values: Mapping[str, Array] | None = None) -> Problem:
-    """Return the problem of a stage with its own resolution or film. The problem has another scene, with coarser maps
-    and targets.
-
-    The stage's problem samples like `problem`, but has no learned state. `values` are the values of the stage's
-    parameters, in the stage's resolution. If `values` is None, the current values of `problem` are resampled. Raises
-    ValueError for wrong shapes.
-    """
-    config, film = problem.config.without_stages(), _film_at(problem, number)
-    scene = config.scene if film is None else config.scene.model_copy(update={"size": film})
-    config = config.model_copy(update={"parameters": _specs_at(problem, number), "scene": scene})
-    # Warnings about the scene were given for the whole problem.
-    made = assemble_scene(config, load_configured(config, warn=False), values)
-    if values is None:
-        made.selection.set_arrays({key: bounded(made, key, resized(made, key, value))
-                                   for key, value in problem.values().items()})  # fmt: skip
-        made = replace(made, optimizer=make_optimizer(made.config, made.selection))
-        made.apply()
-    for view, whole in zip(made.views, problem.views, strict=True):
-        _see_coarsely(view, whole, made.scene.sensors()[view.sensor].film())
-        view.follow(made.scene)
-    integrator, size = problem.integrator, problem.samples_per_pass
-    if isinstance(integrator, LightTracer):
-        integrator = integrator.afresh()
-        if config.run.memory_budget is not None and integrator.samples_per_pass is not None:
-            size = math.gcd(integrator.samples_per_pass, config.set_spp)
-            integrator = integrator.with_options(samples_per_pass=size, freeze=integrator.freeze)
-        integrator.expect(pass_spp(config))
-    return replace(
-        made, integrator=integrator, samples_per_pass=size, paths=problem.paths, truth=problem.truth,
-        masks=problem.masks, decisions=problem.decisions,
-    )  # fmt: skip
-
-
-def _film_at(problem: Problem, number: int) -> tuple[int, int] | None:
-    """Return the (width, height) of all films in a stage, or None if the stage uses the scene's films. Raises
-    ConfigError.
-    """
-    config, share, key = problem.config, problem.config.stage(number).film, f"run.stages[{number}].film"
-    if share == 1:
-        return None
-    films = [problem.scene.sensors()[sensor].film() for sensor in problem.sensors]
-    sizes = {tuple(int(n) for n in film.crop_size()) for film in films}
-    if len(sizes) > 1 or sizes != {tuple(int(n) for n in film.size()) for film in films}:
-        raise ConfigError(config.source, key, "requires films of one size without a crop window; remove it")
-    (size,) = sizes
-    width, height = (round(n * share) for n in size)
-    if min(width, height) < 1 or (size[0] % width, size[1] % height) != (0, 0) or size[0] * height != size[1] * width \
-            or abs(size[0] / width * share - 1) > 1e-3:  # fmt: skip
-        least = math.gcd(*size)
-        would = [f"1/{n}" for n in range(2, least + 1) if least % n == 0][:4]
-        advice = f"{', '.join(would)} would do" if would else "no smaller film has an integer size"
-        raise ConfigError(
-            config.source, key, f"{share:g} of {size[0]}x{size[1]} pixels is not an integer size; {advice}"
-        )
-    return width, height
-
-
-def _specs_at(problem: Problem, number: int) -> list[ParameterSpec]:
-    """Return the parameters of a stage, with globs replaced by the selected keys.
-
-    Raises ConfigError if the stage asks for coarser parameters, but no parameter can be made coarser.
-    """
-    config, selection, share = problem.config, problem.selection, problem.config.stage(number).resolution
-    specs: list[ParameterSpec] = []
-    coarser = share == 1
-    for spec in config.parameters:
-        if share == 1 or spec.motion is not None or len(spec.keys) > 1:
-            specs.append(spec)
-            continue
-        for key in selection.keys:
-            if not any(key == name or fnmatchcase(key, name) for name in spec.names):
-                continue
-            changes: dict[str, Any] = {} if spec.heightmap is not None else {"key": key}
-            slot = selection.slot(key)
-            if slot.is_texture:
-                height, width = slot.get().shape[:2]
-                size = max(round(width * share), 3 if slot.halo else 2), max(round(height * share), 2)
-                coarser = True
-                if spec.heightmap is None:
-                    changes["resolution"] = size
-                else:
-                    grid = {"grid": size} if _is_grid(problem, key, spec) else {}
-                    changes["heightmap"] = spec.heightmap.model_copy(update={"resolution": size, **grid})
-            specs.append(spec.model_copy(update=changes))
-    if not coarser:
-        place = f"run.stages[{number}].resolution"
-        raise ConfigError(config.source, place, "makes nothing coarser: no parameter is only a texture or a heightmap")
-    return specs
-
-
-def _is_grid(problem: Problem, key: str, spec: ParameterSpec) -> bool:
-    """True if a heightmap's mesh is a flat grid with a vertex at each texel. If True, both mesh and heightmap can be
-    made coarser.
-    """
-    assert spec.heightmap is not None
-    height, width = problem.selection.array(key).shape[:2]
-    points, uv = problem.selection.deformation.laid_over(key)
-    if len(spec.heightmap.mesh) > 1 or len(points) != width * height:
-        return False
-    place = uv * (width, height) - 0.5
-    nodes = np.rint(place)
-    if np.abs(place - nodes).max() > 1e-2 or len(np.unique(nodes, axis=0)) < len(nodes):
-        return False
-    design = np.column_stack([np.ones(len(nodes)), nodes])
-    away = design @ np.linalg.lstsq(design, points, rcond=None)[0] - points
-    return bool(np.abs(away).max() < 1e-4 * np.ptp(points, axis=0).max())
-
-
-def resized(problem: Problem, key: str, value: Array) -> Array:
-    """Return `value`, a parameter value of another problem, in the resolution of `problem`. `value` may also be a
-    change of the parameter's value.
-
-    Heights are resampled by cubic splines at their positions in space. On a flat grid with a vertex for each height,
-    the heights cover the grid from edge to edge. On other meshes, heights are at the centres of texels. Along an axis
-    that shrinks, texels of a texture are averaged. Along an axis that grows, texels are interpolated linearly.
-    """
-    shape, selection = problem.selection.array(key).shape, problem.selection
-    if value.shape == shape:
-        return value
-    if selection.kind(key) != HEIGHTMAP:
-        return resample(value, (shape[1], shape[0]))
-    spec = next(spec for spec in problem.config.parameters if key in spec.names)
-    whole = _is_grid(problem, key, spec)
-    rows, columns = (_places(new, old, whole) for new, old in zip(shape[:2], value.shape[:2], strict=True))
-    (kx, ky), nodes = (min(3, n - 1) for n in value.shape[:2]), (np.arange(n) for n in value.shape[:2])
-    spline = RectBivariateSpline(*nodes, value[:, :, 0], kx=kx, ky=ky)
-    return np.asarray(spline(rows, columns), np.float32)[:, :, None]
-
-
-def bounded(problem: Problem, key: str, value: Array) -> Array:
-    """Return the value of a parameter, clamped to its bounds."""
-    low, high = problem.selection.spec(key).bounds or (-np.inf, np.inf)
-    return np.clip(value, np.float32(low), np.float32(high))
-
-
-def _places(new: int, old: int, edge_to_edge: bool) -> Array:
-    """Return the positions of `new` nodes among `old` nodes, in units of the distance of old nodes."""
-    if edge_to_edge:
-        return np.linspace(0, old - 1, new)
-    return np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
-
-
-def _see_coarsely(view: View, whole: View, film: mi.Film) -> None:
-    """Set the target of a view with a smaller film, from the full film's target. Each coarse pixel is a weighted mean
-    of the full film's pixels that the coarse pixel covers.
-    """
-    target, weights = np.array(whole.target, dtype=np.float64), whole.fixed
-    if weights is None:
-        weights = np.ones(target.shape[:2]) if whole.weights is None else np.array(whole.weights)[:, :, 0]
-    weights = weights.astype(np.float64)
-    width, height = (int(n) for n in film.crop_size())
-    down, across = target.shape[0] // height, target.shape[1] // width
-
-    def summed(image: Array) -> Array:
-        return image.reshape(height, down, width, across, -1).sum(axis=(1, 3))
-
-    total = summed(weights)
-    view.masked = whole.masked
-    coarse = total[:, :, 0] / (down * across)
-    view.see(summed(weights[:, :, None] * target) / np.maximum(total, 1e-300), coarse)
-    view.fixed = None if whole.fixed is None else coarse

@@ -26,7 +26,6 @@ from reslrb_cli.optimization.autotune.race import lessons, sets_of
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem, saved_spp
-from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.records.clock import MIB
@@ -60,23 +59,6 @@ class Steps:
 
 
 def measure_steps(problem: Problem) -> Steps:
-    """Measure the steps of the run. For a run with stages, return the mean step time over the run's iterations. The
-    start times are summed over all stages.
-    """
-    config, stages = problem.config, Stages(problem)
-    numbers = [config.stage_number(each / config.run.iterations) for each in range(config.run.iterations)]
-    found = {number: _measure_stage(stages.at(number)) for number in sorted({*numbers, stages.last})}
-    parts = [found[number] for number in numbers]
-    return Steps(
-        found[stages.last].spp,
-        statistics.fmean(each.iteration_s for each in parts),
-        sum(each.start_s for each in found.values()),
-        sum(each.compile_s for each in found.values()),
-        max(each.peak for each in found.values()),
-    )
-
-
-def _measure_stage(problem: Problem) -> Steps:
     """Measure a step of `problem`, or extrapolate from two smaller steps."""
     config = problem.config
     unit, whole = sets_of(config) * (problem.samples_per_pass or 1), config.run.spp
@@ -108,7 +90,7 @@ def trial(problem: Problem, spp: int) -> Iterator[Problem]:
     afterwards.
     """
     run = problem.config.run
-    enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "stages": [], "max_seconds": None}
+    enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "max_seconds": None}
     config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
     try:
         yield replace(problem.afresh(problem.values()), config=config)

@@ -7,7 +7,6 @@ A schedule gives the learning-rate factor for iteration i of n. The factor goes 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -17,6 +16,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.integrators.step import Refused, gradient_step
+from reslrb_cli.optimization.losses import own_losses
 from reslrb_cli.optimization.nonfinite import (
     Findings,
     RefusedAt,
@@ -26,14 +26,11 @@ from reslrb_cli.optimization.nonfinite import (
     why_end,
     zero_nonfinite,
 )
-from reslrb_cli.optimization.optimizers import clamp_gradients
-from reslrb_cli.optimization.own_code import own_losses
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
-from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import State, put, standing
-from reslrb_cli.optimization.stopping import Watch, lowered, out_of_time, time_share
+from reslrb_cli.optimization.stopping import Watch, out_of_time, time_share
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
@@ -55,8 +52,6 @@ def learning_rate_factor(
 
     `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
-    if schedule == "plateau":  # which depends on losses (`stopping.lowered`)
-        return 1.0
     return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
 
 
@@ -84,18 +79,17 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     if optimizer.stands_at is not state:
         put(problem, state)
     clock = StepClock(state.elapsed_s)
-    scaling, clamped, clamp, clamp_sums = state.scaling, None, state.clamp, state.clamp_sums
+    scaling = state.scaling
     if config.optimizer.scale != "none" and scaling is None:
         with clock.counted():
             scaling = rescale(problem) if config.optimizer.scale == "auto" else measure_curvatures(problem)
     errors = problem.meter.errors(problem.selection.array)
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
     with clock.step() as times:
-        split = Split()
-        loss, squares, counts, refused, costs = gradient(problem, iteration, split)
+        loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
-    factor = lowered(config.optimizer, state.drops) * learning_rate_factor(
+    factor = learning_rate_factor(
         config.optimizer.schedule,
         iteration,
         config.run.iterations,
@@ -110,9 +104,6 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         held = held_back(config.run.on_nonfinite, found, optimizer.keys())
         for key in found.gradients if config.run.on_nonfinite == "zero" else ():
             zero_nonfinite(optimizer[key])
-        if (limit := config.optimizer.clamp_gradient) is not None:
-            moved = {key: optimizer[key] for key in optimizer.keys() if key not in held}  # noqa: SIM118
-            clamped, clamp, clamp_sums = clamp_gradients(limit, moved, clamp, clamp_sums)
         found.updates = optimizer.step(factor, skip=held)
         problem.hold_apart()
         problem.apply()
@@ -125,8 +116,6 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         peak_mib=max(state.peak_mib, peak_mib(dr.backend_v(loss))),
         standstill=standstill,
         scaling=scaling,
-        clamp=clamp,
-        clamp_sums=clamp_sums,
         end=why_end(config.run.on_nonfinite, found, standstill),
         gradients=gradients,
     )
@@ -135,8 +124,6 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         iteration=iteration,
         loss=value,
         step_ms=times.wall_ms,
-        primal_ms=split.primal_ms,
-        adjoint_ms=None if split.primal_ms is None else times.wall_ms - split.primal_ms,
         codegen_ms=times.codegen_ms,
         elapsed_s=clock.elapsed_s,
         peak_mib=state.peak_mib,
@@ -147,25 +134,22 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         parameter_rmse=problem.meter.total(errors),
         parameter_errors=errors,
         nonfinite_by_parameter=found.by_parameter,
-        clamped=clamped,
         held_out=held_out,
         regularized=None if costs is None else Regularized(costs, problem.held()),
     )
 
 
 def iterate(
-    stages: Stages, state: State, on_nonfinite: Told = lambda found: None, watch: Watch | None = None
+    problem: Problem, state: State, on_nonfinite: Told = lambda found: None, watch: Watch | None = None
 ) -> Iterator[tuple[State, Record]]:
-    """Make all remaining iterations of the run, starting at `state`. `step` makes each iteration, with the problem of
-    the iteration's stage.
+    """Make all remaining iterations of the run, starting at `state`. `step` makes each iteration.
 
     `watch` has the losses of the earlier iterations, and decides which iteration is the last. It is None without such a
     test. Raises NonFinite if the run fails.
     """
     reset_peak()
-    watch = Watch(stages.whole.config) if watch is None else watch
-    while state.iteration < stages.whole.config.run.iterations and not state.stopped:
-        problem, state = stages.enter(state)
+    watch = Watch(problem.config) if watch is None else watch
+    while state.iteration < problem.config.run.iterations and not state.stopped:
         state, record = step(problem, state, on_nonfinite)
         problem.optimizer.stands_at = state = watch.after(state, record)
         yield state, record
@@ -177,9 +161,7 @@ def optimize(problem: Problem, on_nonfinite: Told = lambda found: None) -> Itera
     """Yield the records of all iterations of `problem` from its current values. Parameters are updated before each
     record.
     """
-    stages = Stages(problem)
-    for state, record in iterate(stages, standing(problem), on_nonfinite):
-        stages.bring(state)
+    for _, record in iterate(problem, standing(problem), on_nonfinite):
         yield record
 
 
@@ -197,38 +179,10 @@ def _findings(
     return found
 
 
-class Split:
-    """Clock for the part of a step until image and loss are known. Some integrators have no moment at which both image
-    and loss are known.
-    """
-
-    def __init__(self) -> None:
-        self.primal_ms: float | None = 0.0
-        self._start: float | None = None
-
-    def start(self) -> None:
-        """Start a view."""
-        if self._start is not None:  # the previous view never reached `image`
-            self.primal_ms = None
-        self._start = time.perf_counter()
-
-    def image(self) -> None:
-        """Record that the view's image and loss are evaluated, or that their kernels are launched."""
-        dr.sync_thread()
-        if self.primal_ms is not None and self._start is not None:
-            self.primal_ms += 1e3 * (time.perf_counter() - self._start)
-        self._start = None
-
-    def end(self) -> None:
-        """End the last view."""
-        if self._start is not None:
-            self.primal_ms = None
-
-
 def gradient(
-    problem: Problem, iteration: int, split: Split
+    problem: Problem, iteration: int
 ) -> tuple[Any, dict[str, Any], dict[str, Any], list[tuple[int, Refused]], dict[str, dict[str, float]] | None]:
-    """Accumulate the gradient of the loss into the parameters. `split` is called for each part of a view.
+    """Accumulate the gradient of the loss into the parameters.
 
     Returns arrays of width 1: the loss, two numbers for each parameter, the refused entries by sensor, and the costs of
     regularizers by key and type (None without any). The two numbers are the sum of squares of the gradient's finite
@@ -240,13 +194,10 @@ def gradient(
     costs = None
     apart = config.shards != 1
     if apart:
-        if not config.in_rounds:
-            split.start()  # there is no moment with all images
-        loss, refused = add_gradient(problem, iteration, split.start, split.image)
+        loss, refused = add_gradient(problem, iteration)
         total = mi.Float(loss)
         gradients = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
     for view, scale in () if apart else problem.drawn(iteration):
-        split.start()
         step = gradient_step(
             problem.integrator,
             problem.scene,
@@ -255,7 +206,6 @@ def gradient(
             seed=seed(config.run.seed, iteration, view.sensor, "image"),
             **config.step_options(),
             params=problem.selection.params,
-            on_image=split.image,
             on_samples=problem.on_samples(view),
         )
         # One view's kernels must not wait for the next one's: memory would grow with the number of views.
@@ -263,7 +213,6 @@ def gradient(
         dr.eval(step.loss, gradients)
         total = total + step.loss
         refused.append((view.sensor, step.refused))
-    split.end()
     if problem.regularizers:
         costs = problem.regularize()
         gradients = {key: problem.optimizer.gradient(key) for key in gradients}

@@ -4,19 +4,29 @@ Each loss takes the image I and the target T, both (H, W, C) in linear radiance.
 weights have the same shape and a mean of 1. A loss is an array of width 1. A loss is a mean over pixels and channels.
 The value depends neither on the resolution nor on the number of masked pixels.
 
-`weighted` returns a weighted sum of losses. `fitted` returns the loss of the image multiplied by the best factor.
+`weighted` returns a weighted sum of losses. `OwnLoss` is a user's loss (`loss.type: custom`), from a file FILE.py:NAME,
+or from Python.
 """
 
 from __future__ import annotations
 
 import functools
+import inspect
 import math
+import secrets
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from reslrb_cli.integrators.protocol import halves_of
+from reslrb_cli.config.code import Guard, load_named
+from reslrb_cli.config.loader import check_code
+from reslrb_cli.config.optimizers import Custom
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
 
 #: A loss with bound options, as a function of an image, its target, and optional weights.
 Loss = Callable[..., "mi.Float"]
@@ -128,59 +138,111 @@ def weighted(
     return sum(others, first)
 
 
-def _product(first: mi.TensorXf, second: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
-    return _mean(first * second, weights)
+# --- losses of the user -----------------------------------------------------------------------------------------------
 
 
-def best_scale(
-    halves: tuple[mi.TensorXf, mi.TensorXf],
-    target: mi.TensorXf,
-    weights: mi.TensorXf | None = None,
-    across: bool = False,
-) -> mi.Float:
-    """Return s = <I, T> / <I, I>, of width 1, attached. I is the mean of two images (H, W, C) with the same expected
-    value.
+class OwnLoss:
+    """A user's loss: `loss(image, target)`, or `loss(image, target, weights)`.
 
-    If <I, T> or <I, I> is not positive, for example for black images, s is 1 and has no derivative. <I, I> is computed
-    as the product of the two images. The two images have independent noise. The derivative of <I, I> is 2 <I, dI>. The
-    noise of I does not bias the derivative if dI comes from other samples. With `across`, the derivative is <I_a, dI_b>
-    + <I_b, dI_a>.
+    Both images are (H, W, C). `weights` is None, or has the images' shape and a mean of 1. If the function has no
+    parameter `weights`, masked pixels have equal values in both images. The weights of all unmasked pixels must then be
+    equal. The function returns an array of width 1, or a tensor of one entry. The file is loaded when the loss is first
+    called or tried. If a function was passed in Python, errors name the function as their location.
     """
-    image, square = 0.5 * (halves[0] + halves[1]), _product(*halves, weights)
-    if not across:
-        whole = _product(image, image, weights)
-        square = dr.detach(square) + (whole - dr.detach(whole))
-    along = _product(image, target, weights)
-    there = (square > 0) & (along > 0)
-    return dr.select(there, along / dr.select(there, square, 1), 1)
+
+    def __init__(self, config: Config, key: str, spec: Custom) -> None:
+        self.source: object = config.source
+        self.key, self.spec, self._config = key, spec, config
+        self._place, self._file = key, spec.path
+        self._function = None if spec.file is not None else config.own_loss
+        if self._function is not None:
+            self.source, self.key = "loss", _name_of(self._function)
+            code = getattr(self._function, "__code__", None)
+            self._file = None if code is None else Path(code.co_filename)
+        self._takes_weights: bool | None = None
+        #: Digest of a given function, which equals no other; for a file, the digest of its contents.
+        self.token = "" if self._function is None else secrets.token_hex(8)
+        self._even: mi.TensorXf | None = None
+
+    def function(self) -> Callable[..., Any]:
+        """Return the user's function, loaded. Raises ConfigError."""
+        if self._takes_weights is None:
+            check_code(self._config, {self._place: self.spec})
+            if self.spec.path is not None:
+                self._function = load_named(self.spec.path, self.spec.name, self.source, self.key)
+            assert self._function is not None
+            self._takes_weights = _takes_weights(self._function)
+        return self._function  # type: ignore[return-value]
+
+    def __call__(self, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
+        """Return the loss, of width 1, attached. Raises ConfigError for an invalid result."""
+        function, what = self.function(), "it"
+        # copies, because a function may change its arguments in place
+        given = [None if each is None else mi.TensorXf(each) for each in (image, target, weights)]
+        if not self._takes_weights:
+            self._check_even(weights)
+            given = given[:2]
+        with Guard(self.source, self.key, self._file, what):
+            value = function(*given)
+        if isinstance(value, mi.TensorXf):
+            value = value.array
+        if not isinstance(value, mi.Float):
+            raise self._wrong(f"returns {type(value).__name__}, not mi.Float (such as dr.mean(..., axis=None))")
+        if dr.width(value) != 1:
+            raise self._wrong(
+                f"returns {dr.width(value)} numbers instead of one: return a mean over pixels and channels"
+            )
+        if dr.grad_enabled(image) and not dr.grad_enabled(value):
+            raise self._wrong("returns a value without a derivative by the image: compute it from `image` with Dr.Jit")
+        return value
+
+    def attempt(self, target: mi.TensorXf, weights: mi.TensorXf | None) -> None:
+        """Call the loss once, with an image other than the target. Raises ConfigError if loss or derivative are not
+        finite.
+
+        `run.on_nonfinite` handles later values.
+        """
+        values = np.array(target)
+        pattern = 0.5 + 0.3 * np.cos(np.arange(values.size)).reshape(values.shape)
+        image = mi.TensorXf(np.ascontiguousarray(values * pattern + 0.1 * values.mean() + 1e-3, dtype=np.float32))
+        dr.enable_grad(image)
+        with dr.resume_grad():
+            value = self(image, target, weights)
+            with Guard(self.source, self.key, self._file, "its derivative"):
+                dr.backward(value)
+        loss, gradient = float(dr.detach(value)[0]), np.array(dr.grad(image))
+        if not np.isfinite(loss):
+            raise self._wrong(f"returns {loss} for a target and a darker image, not a finite number")
+        if not np.isfinite(gradient).all():
+            raise self._wrong("has a derivative that is not finite for a target and a darker image")
+
+    def _check_even(self, weights: mi.TensorXf | None) -> None:
+        if weights is None or weights is self._even:
+            return
+        kept = np.unique(np.array(weights))
+        if len(kept[kept > 0]) > 1:
+            raise self._wrong("has no argument for the weights of this view's mask: add a third argument, `weights`")
+        self._even = weights
+
+    def _wrong(self, reason: str) -> ConfigError:
+        return ConfigError(self.source, self.key, reason)
 
 
-def fitted(
-    loss: Loss,
-    image: mi.TensorXf,
-    target: mi.TensorXf,
-    weights: mi.TensorXf | None = None,
-    /,
-    across: bool = False,
-) -> mi.Float:
-    """Return the loss of s I with s = <I, T> / <I, I> (`best_scale`), for an image (H, W, C) or two halves (2, H, W,
-    C).
+def own_losses(config: Config) -> str:
+    """Return a text that names the experiment's custom losses, or "" without custom losses."""
+    own = dict.fromkeys(one.file for one in config.losses if isinstance(one, Custom))
+    handed = "function" if config.own_loss is None else _name_of(config.own_loss)
+    return ", ".join(f"`{file or handed}`" for file in own)
 
-    The result's derivative is s l(s I) + L_s ds/dI, where l is the derivative of `loss`. L_s = <l(s I), I> contains the
-    image twice. L_s is computed as the mean of <l(s I_a), I_b> and <l(s I_b), I_a>. The derivative of a quadratic loss
-    therefore contains no product of noise with itself. If both halves are the same image, the result is the exact
-    derivative. With `across`, the derivative with respect to the half I_a uses the half I_b in place of I. The
-    derivative with respect to I_b uses I_a. No path of a half then uses a dL/dI to which the path itself contributes.
-    """
-    first, second = halves_of(image)
-    factor = best_scale((first, second), target, weights, across)
-    fixed, one, other = dr.detach(factor), dr.detach(first), dr.detach(second)
-    value = loss(fixed * (0.5 * (first + second)), target, weights)
-    change = factor - fixed  # 0, with a derivative
-    parts = [loss(fixed * a + change * b, target, weights) for a, b in ((one, other), (other, one))]
-    if across:
-        value = dr.detach(value)
-        parts += [loss(fixed * (b + (a - dr.detach(a))), target, weights) for a, b in ((first, other), (second, one))]
-    for part in parts:
-        value = value + 0.5 * (part - dr.detach(part))
-    return value
+
+def _name_of(function: Callable[..., Any]) -> str:
+    return str(getattr(function, "__name__", type(function).__name__))
+
+
+def _takes_weights(function: Callable[..., Any]) -> bool:
+    """True if `function` accepts three positional arguments."""
+    try:
+        inspect.signature(function).bind(None, None, None)
+    except (TypeError, ValueError):
+        return False
+    return True

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.doctor import resident_paths
 from reslrb_cli.backend.memory import free_bytes, local_bytes
-from reslrb_cli.config.files import duration, in_words
+from reslrb_cli.config.files import in_words
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.integrators import divisors, passes_obstacle
 from reslrb_cli.config.schema import Config
@@ -40,9 +40,6 @@ FILM_IMAGES = 12
 #: Copies of a parameter: gradients, the optimiser's moments, their next values, the best values of a run.
 PARAMETER_COPIES = 9
 
-#: Further copies for a clamp: the usual size, the sums over the iterations, and their next values.
-CLAMP_COPIES = 7
-
 #: Minimum bytes per entry of a parameter: value, the optimiser's copy, gradient, and the array for updates.
 ENTRY_BYTES = 4 * 4
 
@@ -61,9 +58,6 @@ NAIVE, PATH_BYTES = ("ptracer", "walk_ad"), 48
 
 #: Bytes of thread-local memory per vertex in `trajectory`, as measured by `bench`.
 RECORD_BYTES = 60
-
-#: Light paths of a run above which the duration is mentioned, and the assumed number per second.
-MANY_PATHS, RATE = 1e11, 1e7
 
 COARSER = "use a smaller film or coarser textures"
 
@@ -108,10 +102,9 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
         images = max(images, FILM_IMAGES * allocated(4 * block), 2 * allocated(4 * block) + _replicas(block))
         targets += allocated(4 * block)
         scratch = max(scratch, integrator.scratch_bytes(plan))
-    copies = PARAMETER_COPIES + (0 if problem.config.optimizer.clamp_gradient is None else CLAMP_COPIES)
     for key in problem.selection.keys:
         size = int(dr.prod(dr.shape(problem.selection.value(key))))
-        images += copies * allocated(4 * size) + _replicas(size)
+        images += PARAMETER_COPIES * allocated(4 * size) + _replicas(size)
     guiding = integrator.preparation.guiding
     tables = 0 if guiding is None else guiding.bytes(len(problem.sensors))
     return Estimate(fixed + targets + tables, images, scratch * resident_paths(), paths)
@@ -322,14 +315,3 @@ def check_baseline(problem: Problem) -> None:
         reason = f"{kind} stores the state of all {paths} light paths of a pass, at least {in_words(needed)}, and "
         reason += f"{in_words(free)} are free; lower run.spp, set integrator.samples_per_pass, or use reslrb, which "
         raise ConfigError(config.source, "run.spp", f"{reason}keeps none")
-
-
-def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | None:
-    """Return a message line if the run's light paths take hours or more, otherwise None. Such a run is allowed."""
-    run = config.run
-    each = run.spp * sum(pixels_of(scene, sensors)) * (2 if config.adjoint == "independent" else 1)
-    paths = each * run.iterations
-    if paths < MANY_PATHS:
-        return None
-    takes = f"{duration(paths / RATE)} at {RATE / 1e6:.0f} million paths a second; --dry-run measures it"
-    return f"{each:.3g} light paths per iteration, {paths:.3g} in total: the run takes {takes}"

@@ -1,4 +1,4 @@
-"""One interface to Dr.Jit's optimisers. Each parameter has its own optimiser, with transforms, bounds and a clamp.
+"""One interface to Dr.Jit's optimisers. Each parameter has its own optimiser, with transforms and bounds.
 
 Transforms (`Transform`, `Variable`): the optimiser moves an unconstrained variable u, and the scene gets x = T(u).
 
@@ -18,20 +18,6 @@ its moments and its number of steps.
     sgd       v = momentum · v + g; p -= lr · v
 
 Parameters must be finite and within their bounds (`clamp`, `count_nonfinite`).
-
-`clamp_gradients` clamps outliers in gradients. The clamp reduces variance and adds a bias, which is measured.
-
-    m_e  running mean of |g_e| over the iterations before (of clamped gradients), decay DECAY
-    r_e = max(m_e, mean of m over the parameter's entries)
-    g_e  is clamped to [-k r_e, k r_e]
-
-Rare large values contribute to the mean of a Monte Carlo gradient. The removed part R = g - clamped g is therefore a
-bias, unless it cancels over iterations. The relative size of the bias is measured over the iterations so far.
-
-    bias = sum_e |sum of R_e| / sum_e |sum of g_e|      inner sums over the iterations so far
-
-r_e includes the mean over the parameter's entries, because an entry that few paths reach may have had only zero
-gradients. Absolute values are used, because squares of large gradients overflow.
 """
 
 from __future__ import annotations
@@ -43,12 +29,10 @@ from typing import Any
 
 import drjit as dr
 import drjit.opt as dropt
-import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
 from reslrb_cli.optimization.precondition import Smoother
-from reslrb_cli.records.metrics import Clamped
 
 Bounds = tuple[float, float] | None
 
@@ -389,55 +373,3 @@ def clamp(value: Any, bounds: tuple[float, float] | None) -> Any:
     no limit.
     """
     return value if bounds is None else dr.clip(value, bounds[0], bounds[1])
-
-
-DECAY = 0.95
-
-
-#: State of the clamp for a parameter's gradients: m, which starts at 0 (corrected as in Adam), and the sums of R and of
-#: g.
-SUMS = ("usual", "removed", "total")
-
-
-def clamp_gradients(
-    factor: float, parameters: Mapping[str, Any], iterations: Mapping[str, int], known: Mapping[str, Mapping[str, Any]]
-) -> tuple[Clamped, dict[str, int], dict[str, dict[str, Any]]]:
-    """Clamp the finite gradients of these parameters in place at `factor` (k) times their usual size.
-
-    `iterations` is the number of earlier iterations for each parameter. `known` has each parameter's earlier sums
-    (`SUMS`). Returns the clamp's effect, including the bias so far, and updated copies of `iterations` and `known`.
-    `iterations` itself is not changed.
-    """
-    after, sums = dict(iterations), {key: dict(each) for key, each in known.items()}
-    counts, sizes = {}, {}
-    for key, parameter in parameters.items():
-        g = clamped = dr.grad(parameter)
-        zero = dr.zeros(type(g), dr.shape(g))
-        before = iterations.get(key, 0)
-        m, removed, total = (known[key][name] for name in SUMS) if before else (zero, zero, zero)
-        if before:
-            # Opaque: a literal would compile a kernel each iteration.
-            usual = m * dr.opaque(mi.Float, 1 / (1 - DECAY**before))
-            limit = factor * dr.maximum(usual, dr.mean(flat(usual)))
-            clamped = dr.clip(g, -limit, limit)
-            dr.set_grad(parameter, clamped)
-        R = g - clamped
-        m = m + (dr.abs(clamped) - m) * (1 - DECAY)
-        after[key], sums[key] = before + 1, dict(zip(SUMS, (m, removed + R, total + g), strict=True))
-        counts[key] = dr.count(flat(R) != 0)
-        sizes[key] = [dr.sum(dr.abs(flat(value))) for value in (R, g, removed + R, total + g)]
-    dr.eval(counts, sizes, sums)
-    values = {key: [float(value[0]) for value in row] for key, row in sizes.items()}
-    return (
-        Clamped(
-            entries=sum(int(count[0]) for count in counts.values()),
-            share={key: _ratio(row[0], row[1]) for key, row in values.items()},
-            bias={key: _ratio(row[2], row[3]) for key, row in values.items()},
-        ),
-        after,
-        sums,
-    )
-
-
-def _ratio(part: float, whole: float) -> float:
-    return part / whole if part else 0.0

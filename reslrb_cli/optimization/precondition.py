@@ -15,7 +15,7 @@ fraction of the longer side, so l does not depend on the resolution.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
 class Smoother:
     """Smoothing operator S of one parameter, and the inverse of S, on Dr.Jit arrays of the parameter's type.
 
@@ -36,31 +35,39 @@ class Smoother:
     over the entries.
     """
 
-    operator: MapOperator | MeshOperator
-
-    @property
-    def gain(self) -> float:
-        """Mean of the diagonal of S^2."""
-        return self.operator.gain
+    gain: float
 
     def smooth(self, value: Any) -> Any:
         """Return S `value`, evaluated."""
-        return self._through(self.operator.smooth, value)
+        return _through(self.smoothed, value)
 
     def roughen(self, value: Any) -> Any:
         """Return the inverse of `smooth`."""
-        return self._through(self.operator.roughen, value)
+        return _through(self.roughened, value)
 
     def adjoint(self, gradient: Any) -> Any:
         """Return the gradient with respect to v, given the gradient with respect to S v."""
-        return self._through(self.operator.adjoint, gradient)
+        return _through(self.transposed, gradient)
 
-    def _through(self, function: Any, value: Any) -> Any:
-        array = np.array(dr.detach(value), dtype=np.float64)
-        return type(value)(function(array).astype(np.float32))
+    def smoothed(self, value: Array) -> Array:
+        """Return S `value`."""
+        raise NotImplementedError
+
+    def roughened(self, value: Array) -> Array:
+        """Return the inverse of S, times `value`."""
+        raise NotImplementedError
+
+    def transposed(self, gradient: Array) -> Array:
+        """Return the transpose of S, times `gradient`. S is symmetric, unless several vertices share a position."""
+        return self.smoothed(gradient)
 
 
-class MapOperator:
+def _through(function: Callable[[Array], Array], value: Any) -> Any:
+    array = np.array(dr.detach(value), dtype=np.float64)
+    return type(value)(function(array).astype(np.float32))
+
+
+class MapSmoother(Smoother):
     """S for textures and heightmaps (height, width, channels) with at least two texels. `length` is l."""
 
     def __init__(self, shape: tuple[int, ...], length: float) -> None:
@@ -70,14 +77,10 @@ class MapOperator:
         self.eigenvalues = 1 + texels**2 * (along[0][:, None] + along[1])[:, :, None]
         self.gain = float(np.mean(self.eigenvalues**-2.0))
 
-    def smooth(self, value: Array) -> Array:
-        """Return S `value`."""
+    def smoothed(self, value: Array) -> Array:
         return self._scaled(value, 1 / self.eigenvalues)
 
-    adjoint = smooth  # S is symmetric
-
-    def roughen(self, value: Array) -> Array:
-        """Return the inverse of `smooth`."""
+    def roughened(self, value: Array) -> Array:
         return self._scaled(value, self.eigenvalues)
 
     def _scaled(self, value: Array, factors: Array) -> Array:
@@ -85,7 +88,7 @@ class MapOperator:
         return np.asarray(scipy.fft.idctn(spectrum * factors, axes=(0, 1), norm="ortho")).reshape(value.shape)
 
 
-class MeshOperator:
+class MeshSmoother(Smoother):
     """S for the vertex positions (3 n) of a mesh with `faces` (3 m indices), computed from the mesh's graph. `length`
     is l.
 
@@ -113,18 +116,16 @@ class MeshOperator:
         self._solve = linalg.splu(self._matrix)
         self.gain = self._mean_square()
 
-    def smooth(self, value: Array) -> Array:
-        """Return S `value`."""
+    def smoothed(self, value: Array) -> Array:
         return self._spread(self._solve.solve(self._gathered(value) / self._sizes[:, None]), value)
 
-    def adjoint(self, gradient: Array) -> Array:
+    def transposed(self, gradient: Array) -> Array:
         """Return the gradient with respect to v. Vertices at one position receive equal shares of the position's
         gradient.
         """
         return self._spread(self._solve.solve(self._gathered(gradient)) / self._sizes[:, None], gradient)
 
-    def roughen(self, value: Array) -> Array:
-        """Return the inverse of `smooth`."""
+    def roughened(self, value: Array) -> Array:
         return self._spread(self._matrix @ (self._gathered(value) / self._sizes[:, None]), value)
 
     def _gathered(self, value: Array) -> Array:
@@ -144,4 +145,4 @@ class MeshOperator:
 
 def make_smoother(value: NDArray[Any], faces: NDArray[Any] | None, length: float) -> Smoother:
     """Return S for a map (height, width, channels), or for vertex positions (3 n) of a mesh with `faces`."""
-    return Smoother(MapOperator(value.shape, length) if faces is None else MeshOperator(value, faces, length))
+    return MapSmoother(value.shape, length) if faces is None else MeshSmoother(value, faces, length)

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import HEIGHTMAP, Laplacian, Thickness
+from reslrb_cli.config.parameters import HEIGHTMAP, Thickness
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
@@ -19,7 +19,7 @@ from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
-from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, mesh_cost, spans_of
+from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.decisions import Decision, MemoryPlan
 from reslrb_cli.scene.parameters import Selection
@@ -229,8 +229,7 @@ class Problem:
         if not views:
             return None
         spp = saved_spp(self, between=True)
-        images = (self.see(view, spp, 0, "held out") for view in views)
-        losses = [float(view.compare(image)[0]) for view, image in zip(views, images, strict=True)]
+        losses = [float(view.compare(to_tensor(self.render(view.sensor, spp, 0, "held out")))[0]) for view in views]
         return float(np.mean(losses))
 
     def on_samples(self, view: View) -> OnSamples | None:
@@ -258,17 +257,6 @@ class Problem:
         return render_in_passes(
             self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
-
-    def see(self, view: View, spp: int, iteration: int, purpose: str) -> mi.TensorXf:
-        """Render a view in the form that its loss needs. The form is (H, W, C), or two halves (2, H, W, C) if the loss
-        fits a scale.
-        """
-        if not view.fits:
-            return to_tensor(self.render(view.sensor, spp, iteration, purpose))
-        unit = self.samples_per_pass or 1
-        half = min(unit, spp) * max(spp // (2 * min(unit, spp)), 1)
-        images = [self.render(view.sensor, half, iteration, f"{purpose}, half {number}") for number in (1, 2)]
-        return to_tensor(np.stack(images))
 
     @functools.cached_property
     def meter(self) -> ErrorMeter:
@@ -312,9 +300,6 @@ def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost | Plate]
                 name = f"{each.opposite}.{HEIGHTMAP}"
                 own, there = ((*selection.deformation.laid_over(k), selection.array(k).shape) for k in (key, name))
                 cost = make_plate(each, own, there, name)
-            elif isinstance(each, Laplacian) and selection.kind(key) == "mesh":
-                faces = np.array(selection.params[f"{key.rpartition('.')[0]}.faces"], dtype=np.int64)
-                cost = mesh_cost(each.weight, selection.array(key), faces)
             else:
                 flat = selection.kind(key) == "bitmap"
                 spans = (Span(), Span()) if flat else spans_of(*selection.deformation.laid_over(key))

@@ -7,10 +7,8 @@ Differences are taken between neighbouring texels. The integration weights sum t
     curvature        k = Hm + sqrt(Hm² - K) in the inner texels, by central differences; positive in hollows
                      2 Hm = ((1 + hy²) hxx - 2 hx hy hxy + (1 + hx²) hyy) / w³,  K = (hxx hyy - hxy²) / w⁴,
                      w² = 1 + hx² + hy²     (do Carmo, Differential Geometry of Curves and Surfaces, 3.3)
-    slope, total     the mean over the four pairs of differences (hx below or above, hy left or right) between four
-     variation       texels, so that no chequerboard is overlooked
-    laplacian        hxx + hyy in the inner texels; of a mesh L p / A by cotangents (Pinkall and Polthier 1993), A a
-                     third of the area about a vertex, L and A those of the mesh as it begins
+    total variation  the mean over the four pairs of differences (hx below or above, hy left or right) between four
+                     texels, so that no chequerboard is overlooked
     thickness        thickness + h; between two free faces thickness + h + B g, g the other map, bilinearly where the
                      texels of h stand (`Plate`)
 """
@@ -22,9 +20,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse import coo_matrix, csr_matrix
 
-from reslrb_cli.config.parameters import Curvature, Laplacian, Regularizer, Slope, Thickness, TotalVariation
+from reslrb_cli.config.parameters import Curvature, Regularizer, Thickness, TotalVariation
 
 Array = np.ndarray[Any, Any]
 
@@ -69,15 +67,9 @@ def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
     apply to maps.
     """
     if isinstance(regularizer, Curvature):
-        limit = 1 / regularizer.radius
-        function = _inner(lambda d: _hollow(d, limit), spans)
-    elif isinstance(regularizer, Laplacian):
-        function = _inner(_flatness, spans)
-    elif isinstance(regularizer, Slope):
-        steep = float(np.tan(np.radians(regularizer.degrees)))
-        function = _between(lambda norm: _hinge(norm, steep), spans)
+        function = _hollows(1 / regularizer.radius, spans)
     elif isinstance(regularizer, TotalVariation):
-        function = _between(lambda norm: _rounded(norm, regularizer.epsilon), spans)
+        function = _variation(regularizer.epsilon, spans)
     elif isinstance(regularizer, Thickness):
         function = _thin(regularizer.least - regularizer.thickness, spans)
     else:
@@ -164,11 +156,6 @@ def _hinge(value: Array, limit: float) -> tuple[Array, Array]:
     return over**2, 2 * over
 
 
-def _rounded(norm: Array, epsilon: float) -> tuple[Array, Array]:
-    root = np.sqrt(norm**2 + epsilon**2)
-    return norm**2 / (root + epsilon), norm / root
-
-
 def _thin(lowest: float, spans: Spans) -> Cost:
     def cost(h: Array) -> tuple[float, Array]:
         area = _area(spans, h.shape, 0.5)
@@ -186,8 +173,8 @@ def _area(spans: Spans, shape: tuple[int, ...], first: float) -> Array:
     return np.asarray(high[:, None, None] * wide[None, :, None])
 
 
-def _between(of_norm: Callable[[Array], tuple[Array, Array]], spans: Spans) -> Cost:
-    """Return the integral of a function of the gradient's norm. The norm includes all channels."""
+def _variation(epsilon: float, spans: Spans) -> Cost:
+    """Return the integral of sqrt(g² + epsilon²) - epsilon, where g is the gradient's norm over all channels."""
 
     def cost(h: Array) -> tuple[float, Array]:
         dx, dy = spans[0].pitch(h.shape[1]), spans[1].pitch(h.shape[0])
@@ -198,9 +185,9 @@ def _between(of_norm: Callable[[Array], tuple[Array, Array]], spans: Spans) -> C
                 rows, columns = slice(row, row + len(along)), slice(column, column + across.shape[1])
                 gx, gy = across[rows], along[:, columns]
                 norm = np.sqrt(np.sum(gx**2 + gy**2, axis=2, keepdims=True))
-                value, slope = of_norm(norm)
-                total += float(np.sum(area * value))
-                share = area * slope / np.maximum(norm, 1e-300)
+                root = np.sqrt(norm**2 + epsilon**2)
+                total += float(np.sum(area * (norm**2 / (root + epsilon))))
+                share = area * (norm / root) / np.maximum(norm, 1e-300)
                 back_x, back_y = share * gx / dx, share * gy / dy
                 gradient[rows, 1:] += back_x
                 gradient[rows, :-1] -= back_x
@@ -221,10 +208,8 @@ _STENCILS: tuple[tuple[dict[tuple[int, int], float], int, int], ...] = (
 )
 
 
-def _inner(function: Callable[[list[Array]], tuple[Array, list[Array]]], spans: Spans) -> Cost:
-    """Return the integral of a function of a map's derivatives hx, hy, hxx, hxy and hyy. `function` returns the
-    integrand's value and derivatives.
-    """
+def _hollows(limit: float, spans: Spans) -> Cost:
+    """Return the integral of max(0, k - limit)² over the inner texels of a map."""
 
     def cost(h: Array) -> tuple[float, Array]:
         gradient = np.zeros_like(h)
@@ -242,7 +227,7 @@ def _inner(function: Callable[[list[Array]], tuple[Array, list[Array]]], spans: 
             sum(c * h[at(place)] for place, c in stencil.items()) / unit
             for (stencil, _, _), unit in zip(_STENCILS, units, strict=True)
         ]
-        value, slopes = function(derivatives)  # type: ignore[arg-type]  # sums of arrays, none of them empty
+        value, slopes = _hollow(derivatives, limit)  # type: ignore[arg-type]  # sums of arrays, none of them empty
         for (stencil, _, _), unit, slope in zip(_STENCILS, units, slopes, strict=True):
             for place, c in stencil.items():
                 gradient[at(place)] += (c / unit) * area * slope
@@ -251,14 +236,8 @@ def _inner(function: Callable[[list[Array]], tuple[Array, list[Array]]], spans: 
     return cost
 
 
-def _flatness(d: list[Array]) -> tuple[Array, list[Array]]:
-    total = d[2] + d[4]
-    none = np.zeros_like(total)
-    return total**2, [none, none, 2 * total, none, 2 * total]
-
-
 def _hollow(d: list[Array], limit: float) -> tuple[Array, list[Array]]:
-    """Return max(0, k - limit)² and its derivatives."""
+    """Return max(0, k - limit)² and its derivatives with respect to hx, hy, hxx, hxy and hyy."""
     hx, hy, hxx, hxy, hyy = d
     w = np.sqrt(1 + hx**2 + hy**2)
     sum_ = (1 + hy**2) * hxx - 2 * hx * hy * hxy + (1 + hx**2) * hyy
@@ -281,48 +260,6 @@ def _hollow(d: list[Array], limit: float) -> tuple[Array, list[Array]]:
         through(-2 * hx * hy, -2 * hxy, 0),
         through(1 + hx**2, hxx, 0),
     ]
-
-
-def mesh_laplacian(positions: Array, faces: Array) -> tuple[csr_matrix, Array]:
-    """Return the Laplacian L and inverse vertex areas 1/A for `positions` (N, 3) and `faces` (M, 3) of a mesh. At
-    vertices on the mesh's rim, and at vertices without an area, 1/A is 0.
-
-    Vertices at the same position count as one vertex. A mesh that is cut open along texture seams therefore has no rim
-    along the seams. Vertices at one position use the row and column of the first vertex at the position.
-    """
-    _, first, same = np.unique(positions, axis=0, return_index=True, return_inverse=True)
-    joined = first[same.ravel()][faces]
-    count, corners = len(positions), positions[joined]
-    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    solid = doubled > 0
-    joined, corners, doubled = joined[solid], corners[solid], doubled[solid]
-    areas = np.bincount(joined.ravel(), np.repeat(doubled / 6, 3), minlength=count)
-    rows, columns, cotangents = [], [], []
-    for k in range(3):
-        a, b, c = (corners[:, (k + n) % 3] for n in range(3))
-        rows.append(joined[:, (k + 1) % 3])
-        columns.append(joined[:, (k + 2) % 3])
-        cotangents.append(np.sum((b - a) * (c - a), axis=1) / doubled / 2)
-    i, j, cot = (np.concatenate(part) for part in (rows, columns, cotangents))
-    half = coo_matrix((cot, (i, j)), shape=(count, count)).tocsr()
-    whole = half + half.T
-    laplacian = whole - diags(np.asarray(whole.sum(axis=1)).ravel())
-    edges, times = np.unique(np.sort(np.stack([i, j], axis=1), axis=1), axis=0, return_counts=True)
-    inverse = np.where(areas > 0, 1 / np.maximum(areas, 1e-300), 0.0)
-    inverse[edges[times == 1].ravel()] = 0.0
-    return laplacian.tocsr(), inverse
-
-
-def mesh_cost(weight: float, positions: Array, faces: Array) -> Cost:
-    """Return the cost of vertex positions (3 N,): `weight` times the integral of |L p / A|²."""
-    laplacian, inverse = mesh_laplacian(np.asarray(positions, np.float64).reshape(-1, 3), faces.reshape(-1, 3))
-
-    def cost(value: Array) -> tuple[float, Array]:
-        bent = laplacian @ value.reshape(-1, 3)
-        shared = inverse[:, None] * bent
-        return float(np.sum(bent * shared)), (2 * (laplacian.T @ shared)).reshape(value.shape)
-
-    return _weighed(cost, weight)
 
 
 def spans_of(positions: Array, texcoords: Array) -> Spans:

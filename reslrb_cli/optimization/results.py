@@ -113,7 +113,6 @@ class Results:
         self._values: dict[str, dict[str, Any]] = {key: {} for key in problem.selection.keys}
         self._losses: list[float] = []
         self._iterations = 0
-        self._scales: dict[str, float] = {}
         self.images = {"initial": Images(), "final": Images()}
         self._errors: dict[str, list[float]] = {}
         self._take("initial")
@@ -121,12 +120,9 @@ class Results:
             self._values[key]["true"] = summary(true, problem.masks.get(key))
 
     def add(self, record: Record) -> None:
-        """Record one iteration. Only losses of full films are judged."""
+        """Record one iteration."""
         self._iterations += 1
-        config = self.problem.config
-        stage = config.stage(config.stage_number(record.iteration / config.run.iterations))
-        if stage.film == 1:
-            self._losses.append(record.loss)
+        self._losses.append(record.loss)
         for key, error in record.parameter_errors.items():
             self._errors.setdefault(key, []).append(error)
 
@@ -135,16 +131,10 @@ class Results:
         self._last = self.meter.errors(self.problem.selection.array)
         self._take("final")
 
-    def see(self, moment: str, view: View, image: Array, scale: float = 1.0) -> None:
-        """Record a view's saved image and the image's fitted `scale`. `moment` is `initial` or `final`. The image is as
-        in `Problem.see`.
-
-        Call this for every view in order.
-        """
+    def see(self, moment: str, view: View, image: Array) -> None:
+        """Record a view's saved image. `moment` is `initial` or `final`. Call this for every view in order."""
         if (images := self.images.get(moment)) is not None:
             loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
-            if view.fits and moment == "final":
-                self._scales[str(view.sensor)] = scale
             (images.held_out if view.held_out else images.trained).append(float(loss[0]))
 
     def _take(self, moment: str) -> None:
@@ -161,8 +151,7 @@ class Results:
             `scale` is the root mean square of the true value over these entries. `initial`, `final` and `true`
             summarise the values (`summary`).
         - `loss_trend` has loss and noise at the start and the end, or null for a short run.
-        - `image_loss` is the loss of the training views' saved images, which have less noise. `fitted_scale` is the
-            factor of the final image for each sensor. `fitted_scale` exists only with `loss.scale: fitted`.
+        - `image_loss` is the loss of the training views' saved images, which have less noise.
         - `held_out` is the mean loss of the held-out views.
         - `worse` has the keys of parameters whose final error is above the initial error.
         - `samples` has the sample counts of a step and of a rendered target. Without a rendered target, the target's
@@ -175,7 +164,7 @@ class Results:
         worse = [key for key, error in last.items() if got_worse(self._errors.get(key, []), error)]
         if self._iterations < min(run.iterations, LEAST_ITERATIONS):  # a run that continues has no result yet
             worse = []
-        found = {
+        found: dict[str, Any] = finite({
             "rmse": {"initial": self.meter.total(first), "final": self.meter.total(last)},
             "parameter_rmse": {key: _pair(key, first, last) for key in first | last},
             "relative_error": {key: _pair(key, *relative) for key in relative[0] | relative[1]},
@@ -188,10 +177,8 @@ class Results:
             "loss_trend": None if trend is None else trend.to_json(),
             "worse": worse,
             "samples": {"step": run.spp, "target": None if render is None else render.spp},
-        }
-        if self._scales:
-            found["fitted_scale"] = self._scales
-        return {name: finite(value) for name, value in found.items()}
+        })  # fmt: skip
+        return found
 
     def _about(self, key: str) -> dict[str, Any]:
         mask = self.problem.masks.get(key)

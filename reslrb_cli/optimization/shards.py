@@ -9,7 +9,7 @@ with respect to the parameters.
 
     I = sum of w_s I_s,    gradient = sum over s of w_s J_s^T dL/dI
 
-With one round, each share computes dL/dI from its own samples, as `run.adjoint` specifies. With two rounds (`others`),
+With one round, each share computes dL/dI from its own samples, as `run.adjoint` specifies. With two rounds (`auto`),
 each share evaluates dL/dI at the mean image of the other shares, (I - w_s I_s) / (1 - w_s). No path then uses a dL/dI
 to which the path itself contributes. For an L2 loss, the gradient with two rounds is the sum over all pairs of
 different shares. The gradient is unbiased. Images and gradients are added in the order of the shards, in double
@@ -33,7 +33,7 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.tables import Guiding
-from reslrb_cli.integrators.protocol import Job, whole_of
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import NONE, Refused, derivative_of, given_step, gradient_step, render_image
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of
@@ -79,7 +79,7 @@ class ShardGradient:
 
     `gradients` has the gradient of each parameter (float32). For each part, the result has the loss and the refused
     entries of dL/dI. A record of refused entries has the entry count, the first entry's flat index, and the array's
-    shape. If requested, the result also has the part's image, (H, W, C) or (2, H, W, C) with halves.
+    shape. If requested, the result also has the part's image, (H, W, C).
     """
 
     gradients: dict[str, Array]
@@ -119,13 +119,10 @@ def shard_seed(config: Config, iteration: int, sensor: int, shard: int) -> int:
 
 
 def shard_image(problem: Problem, task: Task) -> Array:
-    """Return the image of a shard of one view as float32, (H, W, C) or (2, H, W, C) with halves."""
+    """Return the image of a shard of one view as float32, (H, W, C)."""
     [part] = task.parts
     with _held(problem):
-        image = render_image(
-            problem.integrator, problem.scene, part.sensor, part.seed, task.spp, problem.config.halves == 2
-        )
-        return np.array(image)
+        return np.array(render_image(problem.integrator, problem.scene, part.sensor, part.seed, task.spp))
 
 
 def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> ShardGradient:
@@ -144,8 +141,7 @@ def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> 
             at = problem.integrator, problem.scene, part.sensor
             own: dict[str, Any] = {"params": problem.selection.params, "on_samples": problem.on_samples(view)}
             if delta is not None:
-                own |= {"spp": task.spp, "halves": config.halves == 2}
-                given_step(*at, _tensor(delta), seed=part.seed, **own)
+                given_step(*at, _tensor(delta), seed=part.seed, spp=task.spp, **own)
                 continue
             own |= config.step_options(shard=True)
             step = gradient_step(*at, scaled(view, part.scale), seed=part.seed, **own)
@@ -228,13 +224,10 @@ class Sum:
             return np.asarray((self.total - array.astype(np.float64) * weight) / (1 - weight), dtype=np.float32)
 
 
-def add_gradient(
-    problem: Problem, iteration: int, on_start: Callable[[], None], on_image: Callable[[], None]
-) -> tuple[float, list[tuple[int, Refused]]]:
+def add_gradient(problem: Problem, iteration: int) -> tuple[float, list[tuple[int, Refused]]]:
     """Set the parameters' gradients to the sum over an iteration's shards.
 
-    Returns the loss, and the refused entries of dL/dI by sensor. `on_start` is called when a step of two rounds starts.
-    `on_image` is called when the step's images and losses are known.
+    Returns the loss, and the refused entries of dL/dI by sensor.
     """
     engine, guiding = problem.engine or serially, guiding_of(problem)
     due = [] if guiding is None else _due(problem, guiding, iteration)
@@ -245,12 +238,10 @@ def add_gradient(
     loss = 0.0
     deltas: list[Array | None] = [None] * len(tasks)
     if problem.config.in_rounds:
-        on_start()
         images = list(in_order(engine(problem, shard_image, [(task,) for task in tasks])))
         for task, image in zip(tasks, images, strict=True):
             means.setdefault(task.parts[0].sensor, Sum()).add(image, task.weight)
         deltas = [_delta(problem, task, image, means, refused) for task, image in zip(tasks, images, strict=True)]
-        on_image()
         del images
     work = [(task, delta) for task, delta in zip(tasks, deltas, strict=True)]
     for task, found in zip(tasks, in_order(engine(problem, shard_gradient, work)), strict=True):
@@ -312,4 +303,4 @@ def _teach(problem: Problem, iteration: int, view: View, image: Sum) -> None:
     _, gradient = derivative_of(view.objective, _mean(image), Refused())
     sensor, own = problem.scene.sensors()[view.sensor], seed(config.run.seed, iteration, view.sensor, "image")
     job = Job(problem.scene, sensor, dr.opaque(mi.UInt32, own), config.set_spp, problem.selection.params)
-    problem.integrator.learn_now(job, whole_of(gradient))
+    problem.integrator.learn_now(job, gradient)

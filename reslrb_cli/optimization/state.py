@@ -23,7 +23,6 @@ from reslrb_cli.guiding.tables import KNOWN, Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.autotune.sampling import as_decided, decided
 from reslrb_cli.optimization.memory import in_passes
-from reslrb_cli.optimization.optimizers import SUMS
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.checkpoint import entries_below
 from reslrb_cli.records.decisions import Decision, MemoryPlan, Scaled
@@ -38,15 +37,11 @@ class State:
         some update was skipped.
     - `peak_mib` is the allocator's peak memory. `scaling` is the result of `scale: auto`.
     - `units` has the length and the gain of each parameter's variable (`Variable`). `moments` are the optimiser's
-        moments. `clamp` has the clamp's iteration count for each parameter, and `clamp_sums` has the clamp's sums.
+        moments.
     - `guiding` has the gradient count of guided emission for each sensor. `learned` has the arrays of guided emission,
         named `<sensor>/<what>`.
     - `values` are the scene's, in the optimiser's form. A file has their displayed form. In a file, `halo` has the
         complete arrays of parameters whose displayed form lacks data.
-    - `stage` is the number of the state's stage, which started after `stage_began` iterations. For a stage with its own
-        problem (`stages`), `base` has the run's values at the start of the stage.
-    - `drops` counts the reductions of the rate by a plateau. `since` is the number of iterations before the last
-        reduction.
     - `stopped` is the reason why the run ends as finished. `end` is the reason why the run fails. Without a reason, the
         field is "".
     - `first_s` is `elapsed_s` after the first iteration.
@@ -58,21 +53,14 @@ class State:
     peak_mib: float
     standstill: int
     units: dict[str, tuple[float, float]]
-    clamp: dict[str, int]
     scaling: list[Scaled] | None = None
     guiding: dict[str, int] | None = None
-    stage: int = 0
-    stage_began: int = 0
-    drops: int = 0
-    since: int = 0
     stopped: str = ""
     first_s: float = 0.0
     values: Arrays = field(default_factory=dict, metadata=entry("parameter"))
     halo: Arrays = field(default_factory=dict, metadata=entry("parameter with halo"))
     moments: Arrays = field(default_factory=dict, metadata=entry("optimizer"))
-    clamp_sums: Arrays = field(default_factory=dict, metadata=entry("clamp"))
     learned: Arrays = field(default_factory=dict, metadata=entry("guiding"))
-    base: Arrays = field(default_factory=dict, metadata=entry("base"))
     end: str = field(default="", metadata=PASSING)
     gradients: dict[str, Any] = field(default_factory=dict, metadata=PASSING)
 
@@ -88,7 +76,7 @@ def standing(problem: Problem, state: State | None = None) -> State:
 
     The function copies nothing, because no iteration changes the arrays of an earlier iteration.
     """
-    state = State(0, 0.0, 0.0, 0, {}, {}, stage=len(problem.config.run.stages)) if state is None else state
+    state = State(0, 0.0, 0.0, 0, {}) if state is None else state
     optimizer, guiding = problem.optimizer, guiding_of(problem)
     calls, learned = (None, {}) if guiding is None else guiding.state()
     values = {key: dr.detach(optimizer[key]) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
@@ -109,20 +97,16 @@ def put(problem: Problem, state: State) -> str | None:
     return wrong
 
 
-def load(problem: Problem, stored: Stored, whole: Problem) -> State:
-    """Set `problem` to the stored state and return the state. `whole` is the run's own problem.
-
-    `problem` is the problem that belongs to the stored state's stage. Raises ConfigError if the state belongs to
-    another experiment.
+def load(problem: Problem, stored: Stored) -> State:
+    """Set `problem` to the stored state and return the state. Raises ConfigError if the state belongs to another
+    experiment.
     """
-    told, optimizer, keys = stored.read(State), problem.optimizer, problem.selection.keys
+    told, optimizer = stored.read(State), problem.optimizer
     for key, (length, _) in told.units.items():
         optimizer.set_variable(key, replace(optimizer.variable(key), length=length))
     learned = dict.fromkeys(f"{number}/{name}" for number in told.guiding or () for name in KNOWN)
-    sums = {key: dict.fromkeys(SUMS, dr.detach(optimizer[key])) for key in told.clamp}
     values = _stored_values(problem, stored, "parameter")
-    base = {} if problem.scene is whole.scene else {key: expected(whole.selection.array(key).shape) for key in keys}
-    asked = replace(told, base=base, moments=optimizer.moments(), clamp_sums=sums, learned=learned)
+    asked = replace(told, moments=optimizer.moments(), learned=learned)
     state = replace(stored.fill(asked), values=values)
     wrong = put(problem, state)
     if wrong is not None:

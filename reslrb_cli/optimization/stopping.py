@@ -1,11 +1,9 @@
 """Detection of a flat loss, and the time limit of a run (`run.max_seconds`).
 
-A flat loss ends a run early (`run.stop`) or lowers its learning rate (`optimizer.schedule: plateau`). The losses are
-divided into windows of `patience` iterations, and tested at the end of each window. A loss is flat if the test shows a
-fall of less than `relative` per window (`trend.stands`). If views are held out, the held-out loss is tested. The
-held-out loss has fewer values than the training loss. All held-out values use the same samples. Windows start after the
-stages of `run.stages`, and start again after each reduction of the learning rate. A flat loss ends a `plateau` run only
-at the lowest learning rate.
+A flat loss ends a run early (`run.stop`). The losses are divided into windows of `patience` iterations, and tested at
+the end of each window. A loss is flat if the test shows a fall of less than `relative` per window (`trend.stands`). If
+views are held out, the held-out loss is tested. The held-out loss has fewer values than the training loss. All held-out
+values use the same samples.
 """
 
 from __future__ import annotations
@@ -15,24 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from reslrb_cli.config.optimizers import AnyOptimizer, StopRule
 from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.trend import SPANS, levels_of, line, stands
 from reslrb_cli.records.metrics import Record
-
-#: Factor on the learning rate at a plateau.
-FACTOR = 0.5
-
-
-def lowered(optimizer: AnyOptimizer, drops: int) -> float:
-    """Return the factor on the learning rate after `drops` reductions at a plateau. The factor is 1 with other
-    schedules.
-    """
-    if optimizer.schedule != "plateau":
-        return 1.0
-    return max(FACTOR**drops, optimizer.final_fraction)
-
 
 #: Prefix of `State.stopped` if `run.max_seconds` ended the run.
 OUT_OF_TIME = "the time is up"
@@ -71,35 +55,25 @@ class Watch:
             self._values[record.iteration] = loss
 
     def after(self, state: State, record: Record) -> State:
-        """Add the record. Return the state after the iteration, with the current decisions about stopping and the
-        learning rate.
-        """
+        """Add the record. Return the state after the iteration, with the decision about stopping."""
         self.add(record)
-        stop, optimizer, done = self.config.run.stop, self.config.optimizer, state.iteration
-        if state.stage < len(self.config.run.stages):
-            return state
-        began = max(state.stage_began, state.since)
-        if optimizer.schedule == "plateau" and lowered(optimizer, state.drops) > optimizer.final_fraction:
-            if self._stands(stop or StopRule(), began, state):
-                return replace(state, drops=state.drops + 1, since=done)
-        elif stop is not None and (said := self._stands(stop, began, state)):
-            return replace(state, stopped=said)
-        return state
+        said = self._stands(state.iteration)
+        return replace(state, stopped=said) if said else state
 
-    def _stands(self, asked: StopRule, began: int, state: State) -> str:
-        """Return a message about a flat loss in windows that start after `began` iterations. The message is "" if the
-        loss is not flat, or if the state does not end a window.
+    def _stands(self, done: int) -> str:
+        """Return a message about a flat loss after `done` iterations. The message is "" if the loss is not flat, or if
+        `done` iterations do not end a window.
         """
-        span, done = asked.patience, state.iteration
-        if (done - began) % span:
+        if (rule := self.config.run.stop) is None or done % rule.patience:
             return ""
+        span = rule.patience
         levels: list[float] = []
-        for end in range(done, began, -span)[: SPANS[-1]]:
+        for end in range(done, 0, -span)[: SPANS[-1]]:
             values = [self._values[each] for each in range(end - span, end) if each in self._values]
             if len(values) < 2:
                 break
             levels.insert(0, float(levels_of(np.array(values))))
-        if not (count := int(stands(np.array(levels), asked.relative, (done - state.stage_began) // span))):
+        if not (count := int(stands(np.array(levels), rule.relative, done // span))):
             return ""
         last = np.array(levels[-count:])
         fall, error = (float(each) / max(abs(float(np.median(last))), 1e-300) for each in line(last))

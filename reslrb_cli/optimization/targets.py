@@ -25,7 +25,7 @@ from reslrb_cli.optimization.loading import (
     render_in_passes,
 )
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.views import Array, Masked, View, Wanted, color_channels
+from reslrb_cli.optimization.views import Array, Masked, View, color_channels
 from reslrb_cli.records.images import luminance
 from reslrb_cli.scene.images import Photo, read_photo, read_weights, turned_line
 from reslrb_cli.scene.needs import scene_needs
@@ -49,13 +49,13 @@ WORDS = {
 }
 
 
-def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None, lacking: bool) -> Masked:
+def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, lacking: bool) -> Masked:
     """Find the pixels of a view that its mask excludes.
 
     `photo` is the file of the target, or None for a rendered target. `lacking` is true if only the target or only the
     image contains the light that light paths cannot find. Raises ConfigError for an invalid weights file.
     """
-    mask, sensor, found = wanted.mask, scene.sensors()[wanted.sensor], Masked()
+    mask, sensor, found = view.mask, scene.sensors()[view.sensor], Masked()
     width, height = (int(n) for n in sensor.film().crop_size())
     if lacking:
         if mask.specular:
@@ -78,7 +78,7 @@ def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None
         try:
             found.weights = read_weights(mask.file, (width, height), are_upright(config))
         except ConfigError as error:
-            raise ConfigError(config.source, f"{wanted.mask_key}.file", error.message) from None
+            raise ConfigError(config.source, f"{view.mask_key}.file", error.message) from None
         found.left_out["file"] = found.weights == 0
     return found
 
@@ -103,15 +103,15 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
     config, upright = problem.config, are_upright(problem.config)
     remarks: list[str] = []
     for view in problem.views:
-        wanted, film = view.wanted, problem.scene.sensors()[view.sensor].film()
-        if wanted.file is None:
+        film = problem.scene.sensors()[view.sensor].film()
+        if view.file is None:
             continue
         size = (int(film.crop_size()[0]), int(film.crop_size()[1]))
         try:
-            photo = read_photo(wanted.file, config.target.color_space, size, upright, nonfinite=True)
+            photo = read_photo(view.file, config.target.color_space, size, upright, nonfinite=True)
         except ConfigError as error:
-            raise ConfigError(config.source, wanted.file_key, error.message) from None
-        line = turned_line(wanted.file, upright)
+            raise ConfigError(config.source, view.file_key, error.message) from None
+        line = turned_line(view.file, upright)
         if line is not None:
             remarks.append(line)
         _see(problem, view, photo.image, photo, remarks.append)
@@ -158,7 +158,7 @@ def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
 
 def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
     """Set a view's target (H, W, C) and mask. `photo` is the file that was read, if any."""
-    wanted, config = view.wanted, problem.config
+    config = problem.config
     colors = color_channels(problem.scene.sensors()[view.sensor].film())
     if colors == 1 and image.shape[2] >= 3:
         image = luminance(image)[:, :, None].astype(np.float32)
@@ -168,12 +168,12 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
         made_of = paths_of(render.integrator or config.integrator, problem.scene, problem.sensors, problem.moves)
     # Light paths miss light that other paths have.
     lacking = (made_of == "light") != (problem.paths == "light")
-    view.masked = mask_of(config, wanted, problem.scene, photo, lacking)
+    view.masked = mask_of(config, view, problem.scene, photo, lacking)
     weights = view.masked.total(target.shape[:2])
     line = mask_line(f"view {view.sensor}", view.masked, weights)
     if not weights.any():
         advice = "switch off kinds, such as {specular: false}, or set it to none"
-        raise ConfigError(config.source, wanted.mask_key, f"leaves no pixel to compare ({line}); {advice}")
+        raise ConfigError(config.source, view.mask_key, f"leaves no pixel to compare ({line}); {advice}")
     masked = "specular" in view.masked.left_out
     if masked and problem.moves and scene_needs(problem.scene, problem.scene.sensors()[view.sensor]).has_delta_lobes:
         others = {kind: pixels for kind, pixels in view.masked.left_out.items() if kind != "specular"}
@@ -195,7 +195,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
     paths = paths_of(chosen, true_scene, problem.sensors, problem.moves)
     integrator = make_configured(config, chosen, paths)
     multiple = chosen.options().get("samples_per_pass")
-    rendered = [view for view in problem.views if view.wanted.file is None]
+    rendered = [view for view in problem.views if view.file is None]
     if rendered:
         images = "the target image" if len(rendered) == 1 else f"{len(rendered)} target images"
         say(f"rendering {images}: {render.spp} samples per pixel")

@@ -4,8 +4,8 @@
     model is target = exposure * image, with one exposure E for all channels or one for each channel. The derivative of
     a loss L(E I) with respect to E is the sum over pixels of dL/dI I / E. This sum uses the samples of the other
     derivatives. If dL/dI comes from other samples than I, the sum is as unbiased as the other derivatives.
-- `Wanted` has the settings of the views, from `views` or, for a single view, from `target`.
-- `Masked` has the masked pixels of a view, and `View` is the view itself.
+- `Masked` has the masked pixels of a view, and `View` is the view itself. Its settings come from `views` or, for a
+    single view, from `target` (`make_views`).
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ from reslrb_cli.config.parameters import Settings
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators.protocol import first_channels, halves_of, whole_of
+from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors
-from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, best_scale, fitted, l2, make_loss, weighted
-from reslrb_cli.optimization.own_code import OwnLoss
+from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, OwnLoss, l2, make_loss, weighted
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.visibility import sees_specular
@@ -84,71 +83,6 @@ class Exposure:
         else:
             total = dr.sum(each)
         dr.accum_grad(leaf, total / dr.detach(leaf))
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """Settings of the view through `sensor`: its mask and the file of its target, or None if the target is rendered.
-
-    `file_key` and `mask_key` are the places of file and mask in the configuration. `exposure` is a number, or the name
-    of a way to recover the exposure. `exposure_key` is the key of the recovered exposure. `part` is the view's weight
-    in the loss, relative to the other views.
-    """
-
-    sensor: int = 0
-    file: Path | None = None
-    file_key: str = "target.file"
-    mask: Mask = field(default_factory=Mask)
-    mask_key: str = "target.mask"
-    exposure: float | str = 1.0
-    exposure_key: str = SHARED
-    part: float = 1.0
-    held_out: bool = False
-
-
-def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
-    """Return the settings of every view. Raises ConfigError for a sensor that does not exist, or cannot be held out."""
-    sensors, target, images = choose_sensors(config, scene), config.target, {}
-    if config.scene.cameras is not None and target.render is None:
-        images = {sensor: camera.image for sensor, camera in enumerate(read_cameras(config.scene.cameras))}
-    specs, held_out, wanted = _view_specs(config, sensors), _held_out(config, scene, sensors), []
-    if held_out == set(sensors):
-        raise ConfigError(config.source, "run.held_out", "leaves no view for training")
-    for number, spec in enumerate(specs):
-        place = f"views[{number}]"
-        file_key = f"{place}.target"
-        if spec.target is None:
-            file_key = "scene.cameras"
-        elif config.views is None:
-            file_key = "target.file"
-        exposure = target.exposure if spec.exposure is None else spec.exposure
-        wanted.append(
-            Wanted(
-                spec.sensor,
-                file=images.get(spec.sensor) if spec.target is None else spec.target,
-                file_key=file_key,
-                mask=target.mask if spec.mask is None else spec.mask,
-                mask_key="target.mask" if spec.mask is None else f"{place}.mask",
-                exposure=exposure,
-                exposure_key=SHARED if spec.exposure is None else f"{SHARED}.{spec.sensor}",
-                part=spec.weight,
-                held_out=spec.sensor in held_out,
-            )
-        )
-        if spec.sensor in held_out and isinstance(exposure, str) and spec.exposure is not None:
-            reason = (
-                f"has sensor {spec.sensor}, whose own exposure no image determines; give it a number, or one "
-                "exposure to all views"
-            )
-            raise ConfigError(config.source, "run.held_out", reason)
-    trained, asked = len(wanted) - len(held_out), config.run.views_per_iteration or 1
-    if asked > trained:
-        reason = f"is {asked}; training views: {trained}"
-        raise ConfigError(config.source, "run.views_per_iteration", reason)
-    if config.drawn_views is None and config.run.shards != "auto" and config.shards > trained:
-        reason = f"is {config.shards}, above the {trained} training views of scene.cameras; list "
-        raise ConfigError(config.source, "run.shards", f"{reason}`views` for shards of a view's samples")
-    return wanted
 
 
 def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
@@ -207,8 +141,10 @@ class View:
         LookupError.
     - `weights` have the target's shape and a mean of 1. Entries that `masked` excludes have the weight 0. `weights` is
         None if all weights are equal.
-    - `fits` is true if the image is scaled to fit the target (`fitted`, with the argument `across`).
     - A `held_out` view is not trained on, and has its own loss.
+    - `file` is the file of the target, or None if the target is rendered. `file_key` and `mask_key` are the places of
+        file and mask in the configuration.
+    - `per_channel` is true if the exposure is recovered for each channel.
     - `codes` are the user's losses.
     - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`). `fixed` is None if no such
         mask is used.
@@ -221,10 +157,12 @@ class View:
     weights: mi.TensorXf | None = None
     exposure: Exposure = field(default_factory=Exposure)
     held_out: bool = False
-    wanted: Wanted = field(default_factory=Wanted)
+    per_channel: bool = False
+    file: Path | None = None
+    file_key: str = "target.file"
+    mask: Mask = field(default_factory=Mask)
+    mask_key: str = "target.mask"
     masked: Masked = field(default_factory=Masked)
-    fits: bool = False
-    across: bool = False
     codes: list[OwnLoss] = field(default_factory=list)
     fixed: Array | None = None
 
@@ -261,22 +199,18 @@ class View:
             self.weigh(weights)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
-        """Return the attached loss of an image, with width 1. Alpha is dropped, and the view's exposure is applied.
-
-        The image has the shape (H, W, C), or (2, H, W, C) for two halves of its samples. `fitted` uses the two halves.
+        """Return the attached loss of an image (H, W, C), with width 1. Alpha is dropped, and the view's exposure is
+        applied.
         """
         return self.judge(self.exposure.applied(first_channels(image, self.target.shape[2])))
 
     def judge(self, image: mi.TensorXf) -> mi.Float:
         """Return the loss of an image. The exposure is already applied, and the image has the target's channels."""
         target = self.target
-        loss = functools.partial(fitted, self.loss, across=self.across) if self.fits else self.loss
-        if not self.fits:
-            image = whole_of(image)
         if self.weights is None:
-            return loss(image, target)
+            return self.loss(image, target)
         # Excluded pixels, even with non-finite values, have neither loss nor derivative.
-        return loss(dr.select(self.weights > 0, image, target), target, self.weights)
+        return self.loss(dr.select(self.weights > 0, image, target), target, self.weights)
 
     def curvature(self, known: bool) -> Array:
         """Return the loss's curvature (H, W) in each pixel, scaled to a mean of 1. If it is not `known`, return that of
@@ -289,25 +223,6 @@ class View:
         change_of_slope = slope(lambda image: loss(image, self.target, self.weights), target + change)
         curvature = np.linalg.norm(change_of_slope, axis=2) / np.linalg.norm(change, axis=2)
         return np.asarray(curvature / curvature.mean())
-
-    def scale(self, image: mi.TensorXf) -> float:
-        """Return the factor by which `compare` multiplies an image in addition to the exposure. It is 1 unless the loss
-        is `fitted`.
-        """
-        if not self.fits:
-            return 1.0
-        exposed = self.exposure.applied(first_channels(image, self.target.shape[2]))
-        if self.weights is not None:
-            exposed = dr.select(self.weights > 0, exposed, self.target)
-        return float(best_scale(halves_of(exposed), self.target, self.weights)[0])
-
-    def exposed(self, seen: mi.TensorXf) -> tuple[Array, Array, float]:
-        """Return three results for an image in a shape that `compare` accepts. The results are the image (H, W, C), the
-        image with the exposure of its target, and the image's `scale`.
-        """
-        image, scale = np.array(whole_of(seen)), self.scale(seen)
-        exposure = Exposure(self.exposure.fixed * scale) if self.fits else self.exposure
-        return image, exposure.of_array(image), scale
 
     def kept(self, image: Array) -> Array:
         """Return an image of the target's shape with excluded pixels set to 0."""
@@ -348,42 +263,81 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
     """Return the views of an experiment, without their targets.
 
-    Raises the errors of `wanted_views`, and ConfigError for images that are too small for a loss.
+    Raises ConfigError for a sensor that does not exist, or cannot be held out, and for images that are too small for a
+    loss.
     """
-    wanted = wanted_views(config, scene)
-    views: list[View] = []
-    total = sum(one.part for one in wanted if not one.held_out)
-    for one in wanted:
-        share = 1.0 if one.held_out else one.part / total
-        width, height = (int(size) for size in scene.sensors()[one.sensor].film().crop_size())
-        parts: list[tuple[float, Loss]] = []
-        codes: list[OwnLoss] = []
-        for key, kind in loss_keys("type", config.loss):
-            if kind.type == "ssim" and min(width, height) < SSIM_SIDE:
-                reason = f"ssim needs {SSIM_SIDE}x{SSIM_SIDE} pixels, but the image has {width}x{height}"
-                raise ConfigError(config.source, key, reason)
-            if isinstance(kind, Custom):
-                codes.append(OwnLoss(config, f"{key.removesuffix('type')}file", kind))
-                parts.append((kind.weight, codes[-1]))
-            else:
-                parts.append((kind.weight, make_loss(kind.type, **kind.own_options())))
-        loss = parts[0][1] if isinstance(config.loss, LossConfig) else functools.partial(weighted, parts)
-        fits, across = config.losses[0].scale == "fitted", config.adjoint == "correlated"
-        views.append(View(one.sensor, loss, share, fits=fits, across=across, held_out=one.held_out, wanted=one,
-                          codes=codes))  # fmt: skip
+    sensors, target, images, views = choose_sensors(config, scene), config.target, {}, []
+    if config.scene.cameras is not None and target.render is None:
+        images = {sensor: camera.image for sensor, camera in enumerate(read_cameras(config.scene.cameras))}
+    specs, held_out = _view_specs(config, sensors), _held_out(config, scene, sensors)
+    _check_trained(config, len(specs) - len(held_out))
+    total = sum(spec.weight for spec in specs if spec.sensor not in held_out)
+    for number, spec in enumerate(specs):
+        place, is_held, own = f"views[{number}]", spec.sensor in held_out, spec.exposure is not None
+        exposure = target.exposure if spec.exposure is None else spec.exposure
+        if is_held and own and isinstance(exposure, str):
+            reason = f"has sensor {spec.sensor}, whose own exposure no image determines; give it a number, or one "
+            raise ConfigError(config.source, "run.held_out", f"{reason}exposure to all views")
+        key = f"{SHARED}.{spec.sensor}" if own else SHARED
+        file, file_key = spec.target, "target.file" if config.views is None else f"{place}.target"
+        if spec.target is None:
+            file, file_key = images.get(spec.sensor), "scene.cameras"
+        loss, codes = _make_losses(config, scene.sensors()[spec.sensor].film())
+        views.append(
+            View(
+                spec.sensor,
+                loss,
+                share=1.0 if is_held else spec.weight / total,
+                exposure=Exposure(key=key) if isinstance(exposure, str) else Exposure(exposure),
+                per_channel=exposure == "per_channel",
+                held_out=is_held,
+                file=file,
+                file_key=file_key,
+                mask=target.mask if spec.mask is None else spec.mask,
+                mask_key="target.mask" if spec.mask is None else f"{place}.mask",
+                codes=codes,
+            )
+        )
     return views
 
 
+def _check_trained(config: Config, trained: int) -> None:
+    """Raise ConfigError if there are too few training views."""
+    if not trained:
+        raise ConfigError(config.source, "run.held_out", "leaves no view for training")
+    asked = config.run.views_per_iteration or 1
+    if asked > trained:
+        raise ConfigError(config.source, "run.views_per_iteration", f"is {asked}; training views: {trained}")
+    if config.drawn_views is None and config.run.shards != "auto" and config.shards > trained:
+        reason = f"is {config.shards}, above the {trained} training views of scene.cameras; list "
+        raise ConfigError(config.source, "run.shards", f"{reason}`views` for shards of a view's samples")
+
+
+def _make_losses(config: Config, film: mi.Film) -> tuple[Loss, list[OwnLoss]]:
+    """Return the loss of a view, and the user's losses in it. Raises ConfigError if the film is too small."""
+    width, height = (int(size) for size in film.crop_size())
+    parts: list[tuple[float, Loss]] = []
+    codes: list[OwnLoss] = []
+    for key, kind in loss_keys("type", config.loss):
+        if kind.type == "ssim" and min(width, height) < SSIM_SIDE:
+            reason = f"ssim needs {SSIM_SIDE}x{SSIM_SIDE} pixels, but the image has {width}x{height}"
+            raise ConfigError(config.source, key, reason)
+        if isinstance(kind, Custom):
+            codes.append(OwnLoss(config, f"{key.removesuffix('type')}file", kind))
+            parts.append((kind.weight, codes[-1]))
+        else:
+            parts.append((kind.weight, make_loss(kind.type, **kind.own_options())))
+    return parts[0][1] if isinstance(config.loss, LossConfig) else functools.partial(weighted, parts), codes
+
+
 def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
-    """Give views their exposures, and let `selection` recover the unknown ones."""
+    """Let `selection` recover the unknown exposures of views."""
     for view in views:
-        kind, key = view.wanted.exposure, view.wanted.exposure_key
-        if not isinstance(kind, str):
-            view.exposure = Exposure(fixed=kind)
+        if not (key := view.exposure.key):
             continue
-        view.exposure = Exposure(key=key, values=selection.factors)
+        view.exposure.values = selection.factors
         if key not in selection.factors:  # recovered as a logarithm, starting at 1
-            each = kind == "per_channel" and color_channels(scene.sensors()[view.sensor].film()) == 3
+            each = view.per_channel and color_channels(scene.sensors()[view.sensor].film()) == 3
             one = mi.Color3f(1) if each else mi.Float(1)
             selection.add_factor(key, one + dr.opaque(mi.Float, 0), Settings(initial=1.0, transform="log"))
 

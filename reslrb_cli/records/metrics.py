@@ -1,7 +1,7 @@
 """The metrics of a run, `metrics.jsonl`: one JSON object per line, one line per iteration.
 
 A resumed run keeps the lines of the iterations that its checkpoint contains. All later lines are dropped. The tallies
-sum up non-finite values, clamped gradients and regularizers over a whole run.
+sum up non-finite values and regularizers over a whole run.
 """
 
 from __future__ import annotations
@@ -62,20 +62,6 @@ Figure = Annotated[float, WrapValidator(_nan_for_null)]
 
 
 @dataclass(frozen=True)
-class Clamped:
-    """Effect of clamping on the gradients of one iteration. `entries` is the number of changed entries. `share` and
-    `bias` hold one share for each parameter.
-
-    `share` is the share of the gradient that was removed (sum of absolute values). `bias` is the share that was removed
-    from the summed gradients of all iterations so far.
-    """
-
-    entries: int
-    share: dict[str, Figure]
-    bias: dict[str, Figure]
-
-
-@dataclass(frozen=True)
 class Regularized:
     """Weighted regularizer costs of an iteration, by parameter and type. The loss does not include these costs.
 
@@ -92,15 +78,13 @@ class Record(Line):
 
     - `step_ms` is the wall time of the step: image, loss and gradient of every sensor, without the optimiser's update.
     - `codegen_ms` is the part of `step_ms` for generating and compiling kernels.
-    - `primal_ms` and `adjoint_ms` are the times of image and gradient, or None if one kernel computes both.
     - `elapsed_s` is the time in steps and updates since the start. Writing files and computing `parameter_errors` do
         not count.
     - `peak_mib` is the peak memory of the allocator since the start.
     - `nonfinite` is the number of non-finite entries in the loss, in dL/dI, and in the gradients.
     - `nonfinite_by_parameter` is the number of non-finite entries in gradients and updates, for each parameter with
         such entries.
-    - `grad_norm` is the norm of the gradient before clamping, without non-finite entries.
-    - `clamped` is None if gradients are not clamped.
+    - `grad_norm` is the norm of the gradient without non-finite entries.
     - `held_out` is the loss of the held-out views. `held_out` is None without held-out views, or if the iteration did
         not compute the loss.
     - `regularized` is None without regularizers.
@@ -115,8 +99,6 @@ class Record(Line):
     iteration: int
     loss: Figure
     step_ms: float
-    primal_ms: float | None
-    adjoint_ms: float | None
     codegen_ms: float
     elapsed_s: float
     peak_mib: float
@@ -127,7 +109,6 @@ class Record(Line):
     parameter_rmse: float | None
     parameter_errors: dict[str, Figure] = field(default_factory=dict)
     nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
-    clamped: Clamped | None = None
     held_out: float | None = None
     regularized: Regularized | None = None
 
@@ -256,31 +237,6 @@ class NonFiniteTally(_Tally):
         parameters = ", ".join(f"{key} {count}" for key, count in self.by_parameter.items())
         where = f" ({parameters})" if parameters else ""
         return f"{self.values} values not finite{where} in {self.iterations} iterations"
-
-
-@dataclass
-class ClampTally(_Tally):
-    """Number of iterations with clamped gradients, number of clamped entries, and the bias over the run by
-    parameter.
-    """
-
-    iterations: int = 0
-    entries: int = 0
-    bias: dict[str, float] = field(default_factory=dict)
-
-    def add(self, record: Record) -> None:
-        """Count one iteration."""
-        if record.clamped is not None:
-            self.iterations += record.clamped.entries > 0
-            self.entries += record.clamped.entries
-            self.bias |= record.clamped.bias
-
-    def __str__(self) -> str:
-        """Return the words for the last line of a run. The result is empty if nothing was clamped."""
-        if not self.iterations:
-            return ""
-        shares = ", ".join(f"{100 * value:.2g} % of that of {key}" for key, value in self.bias.items())
-        return f"{self.entries} entries of gradients clamped in {self.iterations} iterations: a bias of {shares}"
 
 
 @dataclass

@@ -29,10 +29,8 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import explained
-from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.results import WINDOW, Best, Images, Least, Results
-from reslrb_cli.optimization.stages import Stages
+from reslrb_cli.optimization.results import Best, Images, Least, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
 from reslrb_cli.optimization.stopping import Watch
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
@@ -41,7 +39,7 @@ from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
 from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest
-from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, RegularizedTally
+from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
@@ -141,7 +139,6 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgr
     `say` is called with lines about slow steps, `warn` with warnings. Raises ConfigError and UnsupportedScene.
     """
     problem = assemble(config, say, DecisionCache(), to_run=True)
-    warn_of_border(problem, warn)
     missing = check_missing(problem, warn)
     if missing:  # the check moves geometry, possibly beyond the bounding sphere of the lamps at infinity
         problem = problem.afresh(problem.values())
@@ -210,24 +207,22 @@ class RunProgress:
     """
 
     def __init__(self, problem: Problem, variant: str) -> None:
-        self._settled, self.stages = settled_of(problem, variant), Stages(problem)
-        self.problem = problem = self.stages.whole
+        self._settled, self.problem = settled_of(problem, variant), problem
         self.state, self.results = standing(problem), Results(problem)
         self.certainty = Certainty(problem)
         self.best = Best(any(view.held_out for view in problem.views))
-        self.nonfinite, self.clamped, self.regularized = NonFiniteTally(), ClampTally(), RegularizedTally()
+        self.nonfinite, self.regularized = NonFiniteTally(), RegularizedTally()
         self.last: Record | None = None
         self.watch = Watch(problem.config)
         self._shared: SharedTime | None = None
         self._spent: Callable[[], SharedTime] | None = None
 
     def compute_with(self, engine: Callable[..., Any], spent: Callable[[], SharedTime] | None = None) -> None:
-        """Let `engine` (`shards.Engine`) compute the shards of a run without stages.
+        """Let `engine` (`shards.Engine`) compute the shards of a step.
 
         `spent` returns the time that the engine has spent on shards so far.
         """
         self.problem = replace(self.problem, engine=engine)
-        self.stages = Stages(self.problem)
         self._spent = spent
 
     @property
@@ -251,33 +246,14 @@ class RunProgress:
 
     def add(self, state: State, record: Record) -> None:
         """Add one iteration, with the `state` after it."""
-        if self._is_whole(self.state) and self._is_whole(state):  # the iteration starts with the values of `self.state`
-            self.best.see(record, self.state.values)
+        self.best.see(record, self.state.values)  # the iteration starts with the values of `self.state`
         self._take(record)
-        if self._is_whole(state):
-            self.certainty.see(self.state, state)
+        self.certainty.see(self.state, state)
         self.state = state
-
-    def _is_whole(self, state: State) -> bool:
-        """True if the state belongs to the run's own problem. Losses on films of another size cannot be compared."""
-        return self.stages.is_whole(state.stage)
-
-    def _recent_losses(self, records: Sequence[Record]) -> list[float]:
-        """Return the last losses of the run's own problem, as far as the current number of iterations tells."""
-        if not self._is_whole(self.state):
-            return []
-        config, recent = self.problem.config, records[-WINDOW:]
-        stages = [config.stage_number(max(each.iteration - 1, 0) / config.run.iterations) for each in recent]
-        return [each.loss for each, stage in zip(recent, stages, strict=True) if self.stages.is_whole(stage)]
 
     def values(self) -> dict[str, Array]:
         """Return the newest values, in the form of `Problem.values`."""
-        return self.stages.values(self.state)
-
-    def bring(self) -> Problem:
-        """Set the run's own problem to the newest values and return it."""
-        self.stages.bring(self.state)
-        return self.problem
+        return self.shown(self.state.values)
 
     def go_on(self) -> None:
         """Clear the stop of an earlier process, because the stopping criteria may have changed."""
@@ -286,17 +262,15 @@ class RunProgress:
 
     def stand(self) -> None:
         """Reset the problem to `state` if an iteration was interrupted."""
-        now = self.stages.at(self.state.stage)
-        if now.optimizer.stands_at is not self.state:
-            put(now, self.state)
+        if self.problem.optimizer.stands_at is not self.state:
+            put(self.problem, self.state)
 
     def _take(self, record: Record) -> None:
         self.last = record
-        if self.problem.config.optimizer.schedule == "plateau" or self.problem.config.run.max_seconds is not None:
+        if self.problem.config.run.max_seconds is not None:
             self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
         self.results.add(record)
         self.nonfinite.add(record)
-        self.clamped.add(record)
         self.regularized.add(record)
 
     def best_values(self) -> dict[str, Array]:
@@ -319,15 +293,12 @@ class RunProgress:
         """Save the state after the last complete iteration in `folder`, and return the iteration count. Raises
         OSError.
         """
-        save_checkpoint(folder, self.done, *self._entries(self.state.on_file(self.stages.at(self.state.stage))))
+        save_checkpoint(folder, self.done, *self._entries(self.state))
         return self.done
 
     def save_begun(self, folder: Path) -> None:
         """Save the state at the start of the current iteration, for `inspect --nonfinite`. Raises OSError."""
-        begun = self.stages.begun
-        assert begun is not None, "an iteration is at work"
-        found = self._entries(begun.on_file(self.stages.now))
-        save_checkpoint(folder, begun.iteration, *found, name=NONFINITE_FILE_NAME)
+        save_checkpoint(folder, self.done, *self._entries(self.state), name=NONFINITE_FILE_NAME)
 
     def _entries(self, state: State) -> tuple[Arrays, dict[str, Any]]:
         """Return the arrays and the other values that a checkpoint stores for `state`, in the form of
@@ -337,7 +308,7 @@ class RunProgress:
             self.results.images["initial"], self.certainty.noted, self.best.least, self.shared,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
         )  # fmt: skip
-        return entries(self._settled, state, met)
+        return entries(self._settled, state.on_file(self.problem), met)
 
     def restore(self, stored: Stored, records: Sequence[Record]) -> None:
         """Restore the state from a checkpoint and the records of all iterations before it.
@@ -345,7 +316,7 @@ class RunProgress:
         Raises a ConfigError that names the file if the content does not fit the run.
         """
         problem, met = self.problem, stored.read(SavedResults)
-        self.state = load(self.stages.at(stored.read(State).stage), stored, problem)
+        self.state = load(problem, stored)
         squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
         wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
         kept = {key: each[0] for key, each in squares.items() if each is not None}
@@ -354,7 +325,7 @@ class RunProgress:
         for record in records:
             self._take(record)
             self.watch.add(record)
-        self.best.recent.extend(self._recent_losses(records))
+        self.best.recent.extend(record.loss for record in records)
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.restore(met.certainty, met.squares, met.last_steps)

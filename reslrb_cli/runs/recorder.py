@@ -168,7 +168,7 @@ class Recording:
 
     def _iterations(self) -> Iterator[tuple[State, Record]]:
         course = self.course
-        yield from iterate(course.stages, course.state, self._on_nonfinite, watch=course.watch)
+        yield from iterate(course.problem, course.state, self._on_nonfinite, watch=course.watch)
         if course.state.stopped:
             logger.info(f"stopped after {self.done} iterations: {course.state.stopped}")
 
@@ -244,7 +244,7 @@ class Recording:
 
     def _write_parameters(self) -> None:
         """Write the last values and, if there are any, the best values."""
-        write_parameters(self.folder.parameters, self.course.bring().values())
+        write_parameters(self.folder.parameters, self.course.problem.values())
         best = self.course.best_values()
         if best:
             write_parameters(self.folder.parameters / "best", best)
@@ -329,7 +329,6 @@ class Recording:
             "error_maps": self.error_maps,
             **({"seen": self.seen} if self.seen else {}),
             "nonfinite": self.course.nonfinite.to_json(),
-            "clamped": self.course.clamped.to_json(),
             **({"regularized": self.course.regularized.to_json()} if self.course.regularized.iterations else {}),
             "best": finite(self.course.best.to_json()),
         }
@@ -337,7 +336,6 @@ class Recording:
     def _ended(self) -> dict[str, Any]:
         """Return the results with the final values."""
         course, results = self.course, self.course.results
-        course.bring()
         results.end()
         stopped = {"stopped": course.state.stopped} if course.state.stopped else {}
         return {**results.to_json(), **stopped}
@@ -360,14 +358,13 @@ class Recording:
 
     def _write_images(self, name: str) -> None:
         spp = saved_spp(self.problem, between=False)
-        self.course.bring()
         if name == "final":
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:
-            seen = self.problem.see(view, spp, self.done, "saved image")
-            image, exposed, scale = view.exposed(seen)
+            image = self.problem.render(view.sensor, spp, self.done, "saved image")
+            exposed = view.exposure.of_array(image)
             self._write_image(name, view.sensor, exposed)
-            self.course.results.see(name, view, np.array(seen), scale)
+            self.course.results.see(name, view, image)
             if name == "final":
                 suffix = self._image_name("", view.sensor)
                 towards = self.problem.image_gradient(view, image)

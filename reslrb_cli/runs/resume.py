@@ -14,7 +14,6 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.optimization.state import load as load_state
 from reslrb_cli.optimization.stopping import OUT_OF_TIME
@@ -190,10 +189,8 @@ def problem_before_nonfinite(run: Path, say: Say) -> tuple[Problem, int]:
     set_variant(settled.variant)
     config = loads(settled.config, run / "config.yaml")
     _check_files(settled.files, config, run)
-    stages = Stages(assemble(config, say, settled=stored))
-    state = load_state(stages.at(stored.read(State).stage), stored, stages.whole)
-    problem, state = stages.enter(state)
-    return problem, state.iteration
+    problem = assemble(config, say, settled=stored)
+    return problem, load_state(problem, stored).iteration
 
 
 def _read_state(folder: RunFolder, said: list[str]) -> Stored:

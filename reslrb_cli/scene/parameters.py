@@ -75,10 +75,10 @@ class Selection:
         for number, each in enumerate(self.specs[key].regularizers):
             at = f"regularizers[{number}].type"
             if not kind:
-                raise place.fail(at, f"`{key}` has no surface; heightmaps, bitmaps and vertex_positions have one")
+                raise place.fail(at, f"`{key}` has no surface; heightmaps and bitmaps have one")
             if each.type not in REGULARIZERS[kind]:
-                would = ", ".join(REGULARIZERS[kind])
-                raise place.fail(at, f"{each.type} is not defined for `{key}`, a {kind}; use {would}")
+                would = f"use {', '.join(REGULARIZERS[kind])}" if REGULARIZERS[kind] else "remove it"
+                raise place.fail(at, f"{each.type} is not defined for `{key}`, a {kind}; {would}")
             if each.type in seen:
                 raise place.fail(at, f"{each.type} is given twice; give it once, with the sum of the weights")
             seen.add(each.type)

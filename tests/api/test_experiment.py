@@ -132,7 +132,6 @@ def test_every_copy_keeps_the_own_loss_and_the_permission(folder: Path) -> None:
         "with_code": load("tiny.yaml").with_loss(np.mean).with_code(),
         "with_loss": load("tiny.yaml").with_code().with_loss(np.mean),
         "with_integrator": with_integrator(given, alone, "here", {}),
-        "a stage": given.without_stages(),
         "exposures": given.with_exposures_fixed(),
         "model_copy": given.model_copy(update={"variant": "auto"}),
         "copy": copy.copy(given),

@@ -121,7 +121,7 @@ def test_measuring_does_not_change_the_run(experiment):
         problem = assemble(load("box.yaml", [target, *settings]))
         assert not np.any(np.array(problem.optimizer.gradient(KEY)))
         value = problem.selection.array(KEY).copy()
-        loss, *_ = loop.gradient(problem, 0, loop.Split())
+        loss, *_ = loop.gradient(problem, 0)
         dr.eval(loss)
         return value, float(loss[0]), problem
 
@@ -295,7 +295,7 @@ def test_counted_memory_of_a_path_matches_its_stored_state(experiment, monkeypat
     settings = [f"integrator={{max_depth: 4, estimator: {estimator}}}", f"parameters[0].initial={value}"]
     for adjoint in ("correlated", "independent"):
         problem = assemble(load("box.yaml", [*settings, f"run.adjoint={adjoint}"]))
-        loop.gradient(problem, 0, loop.Split())
+        loop.gradient(problem, 0)
         sensor = problem.scene.sensors()[0]
         plan = problem.integrator.plan(problem.scene, sensor, problem.selection.params)
         counted, kept = sum(entry_bytes(problem.integrator.estimator.kept(plan))), sum(entry_bytes(states.pop()))

@@ -379,18 +379,6 @@ def test_a_budget_chooses_possible_passes(experiment: Path) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_long_run_is_announced(experiment: Path) -> None:
-    config = load(experiment / "tiny.yaml", ["run.iterations=1000000", "run.spp=65536"])
-    problem = assemble_scene(config)
-    line = room.outlook(config, problem.scene, problem.sensors)
-    assert line is not None
-    assert line.startswith(
-        "4.19e+06 light paths per iteration, 4.19e+12 in total: the run takes 4.9 days at 10 million"
-    )
-    assert room.outlook(load(experiment / "tiny.yaml"), problem.scene, problem.sensors) is None
-
-
-@pytest.mark.usefixtures("llvm")
 def test_fitting_steps_are_not_refused(experiment: Path, little: int) -> None:
     config = load(experiment / "tiny.yaml", ["scene.size=[4000, 4000]", "parameters[0].resolution=[8000, 8000]"])
     announced.check_announced(config)  # the check allocates nothing

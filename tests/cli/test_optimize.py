@@ -198,7 +198,7 @@ def test_later_iterations_compile_nothing(experiment):
     misses, clock = [], StepClock()
     for iteration in range(4):
         with clock.step() as step:
-            dr.eval(loop.gradient(problem, iteration, loop.Split()))
+            dr.eval(loop.gradient(problem, iteration))
         with clock.step() as update:
             problem.optimizer.step(0.9**iteration)
             problem.apply()

@@ -359,11 +359,14 @@ def test_the_suggested_override_is_valid(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", REMOVED)
 def test_removed_settings_are_refused_with_a_replacement(name: str, tmp_path: Path) -> None:
     place, _, value = name.partition(": ")
-    lists = {"views.": "views[0].", "stages.": "run.stages[0].", "render.": "target.render.", "mask.": "target.mask."}
+    lists = {
+        "views.": "views[0].", "render.": "target.render.", "mask.": "target.mask.",
+        "regularizers.": "parameters[0].regularizers[0].",
+    }  # fmt: skip
     for short, whole in lists.items():
         place = whole + place.removeprefix(short) if place.startswith(short) else place
-    sections = ("views=[{sensor: 0}]", "run.stages=[{until: 0.5}]", "fabrication.thickness=9")
-    line = line_of(tmp_path, GOOD, (*sections, f"{place}={value or 1}"))
+    there = ("views=[{sensor: 0}]", "fabrication.thickness=9", "parameters[0].regularizers=[{type: total_variation}]")
+    line = line_of(tmp_path, GOOD, (*there, f"{place}={value or 1}"))
     assert line.startswith(f"--set {place}={value or 1}: {place}: ")
     assert line.endswith(f"was removed; {REMOVED[name]}")
 

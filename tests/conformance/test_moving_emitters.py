@@ -1,8 +1,7 @@
-"""Emitters that move, and moving light at the film's border."""
+"""Emitters that move."""
 
 from __future__ import annotations
 
-import types
 from functools import partial
 from typing import Any
 
@@ -10,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.moving import SIZE, Moving, camera, flat
+from conformance.moving import Moving, flat
 from conformance.moving_lamps import CASES, PIVOT, LampCase, mesh, over_floor, smooth_weights, surface
 from conformance.operations import count, tracking
 from measure.faults import Fault
@@ -18,12 +17,11 @@ from measure.test_mutations import plant
 from turns import a_few
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.integrators.protocol import Job, StepIntegrator
+from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import diffuse, load, rgb, transform
-from reslrb_cli.optimization.moving import border_share, warn_of_border
 from reslrb_cli.records.measurements import Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -233,7 +231,6 @@ REFUSED = {
 @pytest.mark.parametrize("name", list(REFUSED))
 def test_refused_with_a_reason(name: str):
     light, key, reason = REFUSED[name]
-    import drjit as dr
 
     scene = load(tiles(1, light) if name != "cutoff" else over_floor(light))
     params = mi.traverse(scene)
@@ -286,85 +283,3 @@ def test_faces_of_a_mesh_match_those_that_mitsuba_samples():
     normal, corner = lamp.shape.face_normal(face), lamp.shape.vertex_position(lamp.shape.face_indices(face)[0])
     assert np.abs(np.array((ps.p - corner).x * normal.x + (ps.p - corner).y * normal.y + (ps.p - corner).z * normal.z)
                   ).max() < 1e-5  # fmt: skip
-
-
-# Light that moves at the film's border is measured, and a warning is given.
-
-RADIUS = 2.0  # radius of Mitsuba's gaussian filter, pixels
-
-
-def moving(scale: float, film: dict[str, Any] | None = None, **things: Any) -> Moving:
-    """Return a scene with a parallel lamp straight above a floor. The lamp lights a square of this size, and the camera
-    sees the floor up to 1.73.
-    """
-    lamp = surface("rectangle", "directionalarea")
-    down = mi.ScalarTransform4f().translate([0, 4, 0]) @ mi.ScalarTransform4f().rotate([1, 0, 0], 90)
-    lamp["to_world"] = down @ mi.ScalarTransform4f().scale(scale)
-    scene = over_floor(lamp, **things)
-    scene["camera"] = scene["camera"] | {"film": camera(**(film or {}))["film"]}
-
-    def place(params: mi.SceneParameters, latents: dict[str, Any]) -> None:
-        shift = mi.AffineTransform4f().translate(mi.Vector3f(latents["x"], 0, 0))
-        params["light.to_world"] = shift @ mi.AffineTransform4f((down @ mi.ScalarTransform4f().scale(scale)).matrix)
-
-    return Moving(scene, {"x": 0.0}, place)
-
-
-def tracked(case: Moving) -> None:
-    """Make the lamp's position track derivatives."""
-    x = dr.opaque(mi.Float, 0)
-    dr.enable_grad(x)
-    case.set({"x": x})
-
-
-def share(case: Moving) -> float:
-    """Return the measured share of moving light at the film's border."""
-    ours = integrator("reslrb", 2, estimator="stack")
-    return border_share(ours, Job(case.loaded, case.loaded.sensors()[0], dr.opaque(mi.UInt32, 3), 64, case.params))
-
-
-def test_light_that_covers_the_film_counts_at_its_border():
-    case = moving(3)
-    tracked(case)
-    assert share(case) == pytest.approx(1 - (1 - 2 * RADIUS / SIZE) ** 2, rel=0.03)
-
-
-def test_light_within_the_film_does_not_count():
-    case = moving(1)
-    tracked(case)
-    assert share(case) == 0
-
-
-def test_resting_objects_do_not_count():
-    case = moving(1, sun={"type": "directional", "direction": [0, -1, 0]})
-    tracked(case)
-    assert share(case) == 0
-
-
-def test_nothing_moves():
-    assert share(moving(3)) == 0
-
-
-def test_a_crop_window_has_its_own_border():
-    crop = {"crop_offset_x": 8, "crop_offset_y": 8, "crop_width": 16, "crop_height": 16}
-    case = moving(3, crop)
-    tracked(case)
-    assert share(case) == pytest.approx(1 - (1 - 4 * RADIUS / SIZE) ** 2, rel=0.03)
-
-
-@pytest.mark.parametrize(("scale", "lines"), [(3, 1), (1, 0)])
-def test_a_run_is_warned_once_per_view(scale: float, lines: int):
-    case, said = moving(scale), []
-    tracked(case)
-    problem: Any = types.SimpleNamespace(
-        integrator=integrator("reslrb", 2, estimator="stack"), scene=case.loaded, sensors=[0],
-        config=types.SimpleNamespace(run=types.SimpleNamespace(seed=1)),
-        selection=types.SimpleNamespace(params=case.params))  # fmt: skip
-    warn_of_border(problem, said.append)
-    assert len(said) == lines
-    assert all(line.startswith("view 0: 2") and "% of the moving light" in line for line in said)
-
-
-def test_other_integrators_are_not_checked():
-    problem: Any = types.SimpleNamespace(integrator=integrator("ptracer", 2))
-    warn_of_border(problem, pytest.fail)

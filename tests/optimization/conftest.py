@@ -25,19 +25,17 @@ def steps(monkeypatch, request):
     non-finite entries are refused. `steps.loss(call)` returns a number that is added to the loss.
     """
     calls = []
-    state = types.SimpleNamespace(calls=calls, problem=None, has_image=False, spoil=lambda call, key: 1.0)
+    state = types.SimpleNamespace(calls=calls, problem=None, spoil=lambda call, key: 1.0)
     state.loss = lambda call: 0.0
     state.derivative = lambda call: dr.zeros(dr.llvm.ad.TensorXf, (2, 2, 3))
 
-    def gradient_step(integrator, scene, sensor, objective, *, seed, spp, adjoint, params, on_image, on_samples):
+    def gradient_step(integrator, scene, sensor, objective, *, seed, spp, adjoint, params, on_samples):
         number = len(calls)
         calls.append(types.SimpleNamespace(sensor=sensor, seed=seed, spp=spp, adjoint=adjoint))
         factors = {key: state.spoil(number, key) for key in params}
         image = sum((dr.replace_grad(dr.detach(value), value * factors[key]) for key, value in params.items()), 0.0)
         image = image / len(params)
         loss = objective(image)
-        if state.has_image:
-            on_image()
         dr.backward(loss)
         refused = Refused()
         refused.take(state.derivative(number))

@@ -126,7 +126,7 @@ def operations(problem: Problem) -> list[int]:
     clock = StepClock()
     for iteration in range(2):
         with clock.step():
-            loss, squares, *_ = loop.gradient(problem, iteration, loop.Split())
+            loss, squares, *_ = loop.gradient(problem, iteration)
             dr.eval(loss, squares)
         problem.apply()
     return [kernel["operation_count"] for kernel in clock.history if kernel["type"] == dr.KernelType.JIT]

@@ -16,7 +16,6 @@ from kit import POSTER_BSDF, area, diffuse, ref, scene, sensor, shape
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import iterate
-from reslrb_cli.optimization.stages import Stages
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
@@ -94,7 +93,7 @@ def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     problem.truth.clear()  # no verdict uses the truth
     certainty = Certainty(problem)
     state = standing(problem)
-    for after, record in iterate(Stages(problem), state):
+    for after, record in iterate(problem, state):
         certainty.see(state, after)
         state, last = after, record
     before = {key: value.copy() for key, value in problem.values().items()}

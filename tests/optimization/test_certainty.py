@@ -141,8 +141,8 @@ def test_verdicts_of_twenty_runs(folder, seed):
 
 
 #: A texture that its regularizer keeps far from the result of the images alone.
-HELD = Toy("a texture that is held even", {POSTER: f"{COLOR}, regularizers: [{{type: laplacian, weight: 1.0e-5}}]"},
-           {POSTER: SETTLED}, ("run.spp=160", "run.iterations=80",
+EVEN = f"{COLOR}, regularizers: [{{type: total_variation, epsilon: 10, weight: 0.06}}]"
+HELD = Toy("a texture that is held even", {POSTER: EVEN}, {POSTER: SETTLED}, ("run.spp=160", "run.iterations=80",
                                "optimizer={type: adam, learning_rate: 0.02, schedule: cosine}"))  # fmt: skip
 
 

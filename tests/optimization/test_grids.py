@@ -142,7 +142,7 @@ def test_a_run_on_a_grid_is_exported_and_continued(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 5")  # writes the file
     sets = ["parameters=[{heightmap: {mesh: back, resolution: [4, 4], grid: 5}, "
-            "regularizers: [{type: laplacian, weight: 1e-3}, {type: thickness, thickness: 0.05, least: 0.1}]}]",
+            "regularizers: [{type: total_variation, weight: 1e-3}, {type: thickness, thickness: 0.05, least: 0.1}]}]",
             "target={render: {spp: 4}}", "scene.size=[8,8]", "run.spp=4", "run.final_spp=4",
             "optimizer={type: sgd, learning_rate: 0.003}"]  # fmt: skip
 

@@ -605,7 +605,7 @@ def test_a_run_learns_as_often_as_planned(
 
     monkeypatch.setattr(Guiding, "due", due)
     for iteration in range(iterations):
-        loop.gradient(problem, iteration, loop.Split())
+        loop.gradient(problem, iteration)
     assert sum(learned) == pytest.approx(iterations * lessons(problem))
     size = sizes(problem, 1.0)
     few = sum(problem.selection.array(key).size for key in problem.selection.keys) < FEW_ENTRIES

@@ -235,7 +235,6 @@ def test_a_single_loss_is_written_unchanged_and_a_list_is_read_back(tmp_path):
     [
         ("{type: l2, weight: 2}", "loss.weight", "needs a list of losses"),
         ("[]", "loss", "at least one entry"),
-        ("[{type: l2, scale: fitted}, {type: l1}]", "loss[1].scale", "must be the same in all entries"),
         ("[{type: l2}, {type: l3}]", "loss[1].type", "l1"),
         ("[{type: l2, weight: 0}]", "loss[0].weight", "above 0"),
         ("[{type: l2, sigma: 1}]", "loss[0].sigma", "unknown key"),

@@ -349,7 +349,7 @@ def test_functions_and_permission_survive_a_change_of_integrator(experiment: Pat
     handed = load("tiny.yaml").with_loss(np.mean).with_code()
     other = with_integrator(handed, {"type": "prb"}, "--integrators", {})
     assert (other.own_loss, other.allows_code) == (np.mean, True)
-    assert handed.with_exposures_fixed().without_stages().own_loss is np.mean
+    assert handed.with_exposures_fixed().own_loss is np.mean
 
 
 @pytest.mark.long

@@ -11,21 +11,17 @@ import pytest
 
 from reslrb_cli.config.parameters import (
     Curvature,
-    Laplacian,
     ParameterSpec,
-    Slope,
     Thickness,
     TotalVariation,
 )
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.regularizers import Span, make_cost, make_plate, mesh_cost, spans_of
+from reslrb_cli.optimization.regularizers import Span, make_cost, make_plate, spans_of
 
 ALL = {
     "curvature": Curvature(radius=50, weight=2),
-    "slope": Slope(degrees=5),
     "thickness": Thickness(thickness=0.3, least=0.4),
     "total_variation": TotalVariation(),
-    "laplacian": Laplacian(),
 }
 WIDE, HIGH = 10.0, 7.0
 WHOLE = Span(WIDE), Span(HIGH)
@@ -37,11 +33,25 @@ def waves(n, depth=0.3):
     return (depth * np.sin(5 * x + 0.4) * np.cos(4 * y + 1.3))[:, :, None]
 
 
+def sheet(n):
+    """Return positions of a flat grid of n x n vertices from edge to edge, and texture coordinates at the texels'
+    centres.
+    """
+    x, y = np.meshgrid(np.linspace(0, WIDE, n), np.linspace(0, HIGH, n))
+    u = (np.arange(n) + 0.5) / n
+    uv = np.stack(np.meshgrid(u, u), axis=-1).reshape(-1, 2)
+    return np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3), uv
+
+
+def test_the_weights_of_texels_add_up_to_the_surface():
+    assert sum(spans_of(*sheet(97))[0].weights(97, 0.5, 96.5)) == pytest.approx(WIDE)
+
+
 @pytest.mark.parametrize("name", ALL)
 def test_derivatives_match_finite_differences(name):
     rng = np.random.default_rng(3)
     cost = make_cost(ALL[name], (Span(10, 0.02, 0.97), Span(7)))
-    heights = rng.normal(size=(9, 11, 3 if name in ("total_variation", "laplacian") else 1))
+    heights = rng.normal(size=(9, 11, 3 if name == "total_variation" else 1))
     value, gradient = cost(heights)
     assert value > 0
     for _ in range(3):
@@ -58,7 +68,7 @@ def test_refining_a_map_keeps_its_cost(name):
 
 
 def test_lengths_are_in_scene_units():
-    """A ball of radius 5, seen from below, is a hollow of curvature 1/5. A ramp of slope 2 has a slope of 2."""
+    """A ball of radius 5, seen from below, is a hollow of curvature 1/5. A ramp of slope 2 varies by 2 per length."""
     n = 64
     x, y = np.meshgrid(*[((np.arange(n) + 0.5) / n - 0.5) * 2] * 2)
     bowl = (5 - np.sqrt(25 - x**2 - y**2))[:, :, None]
@@ -69,42 +79,8 @@ def test_lengths_are_in_scene_units():
     assert make_cost(Curvature(radius=10), spans)(-bowl)[0] == 0  # a hill does not limit a tool
     assert make_cost(Curvature(radius=4.9), spans)(bowl)[0] == 0
     ramp = 2 * x[:, :, None]
-    assert make_cost(Slope(degrees=45), spans)(ramp)[0] == pytest.approx(4 * 1.0, rel=1e-6)
-    assert make_cost(Slope(degrees=64), spans)(ramp)[0] == 0
     assert make_cost(TotalVariation(), spans)(ramp)[0] == pytest.approx(8, rel=1e-3)
-    assert make_cost(Laplacian(), spans)(x[:, :, None] ** 2)[0] == pytest.approx(4 * 4, rel=1e-6)
     assert make_cost(Thickness(thickness=1, least=1.5), spans)(0 * ramp)[0] == pytest.approx(4 * 0.25)
-
-
-def sheet(n, depth=0.3):
-    """Return positions and faces of a grid of n x n vertices from edge to edge, and texture coordinates at the texels'
-    centres.
-    """
-    x, y = np.meshgrid(np.linspace(0, WIDE, n), np.linspace(0, HIGH, n))
-    z = depth * np.sin(6 * x / WIDE + 0.4) * np.cos(5 * y / HIGH + 1.3)
-    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    lower, upper = [corner, corner + 1, corner + n + 1], [corner, corner + n + 1, corner + n]
-    faces = np.concatenate([np.stack(lower, 1), np.stack(upper, 1)])
-    u = (np.arange(n) + 0.5) / n
-    uv = np.stack(np.meshgrid(u, u), axis=-1).reshape(-1, 2)
-    return np.stack([x, y, z], axis=-1).reshape(-1, 3), faces, uv
-
-
-def test_a_mesh_costs_the_same_as_its_map():
-    flat, faces, uv = sheet(97, depth=0)
-    bent = sheet(97)[0]
-    found = mesh_cost(1, flat, faces)(bent.ravel())[0]
-    spans = spans_of(flat, uv)
-    assert sum(spans[0].weights(97, 0.5, 96.5)) == pytest.approx(WIDE)
-    assert found == pytest.approx(make_cost(Laplacian(), spans)(bent[:, 2].reshape(97, 97, 1))[0], rel=0.06)
-    inner = mesh_cost(1, *sheet(49, depth=0)[:2])(sheet(49)[0].ravel())[0]
-    assert inner == pytest.approx(found, rel=0.06)  # the cost leaves out the rim
-    rng = np.random.default_rng(0)
-    small, faces, _ = sheet(6)
-    cost, way = mesh_cost(3, small, faces), rng.normal(size=small.size)
-    at = small.ravel() + 0.1 * rng.normal(size=small.size)
-    slope = (cost(at + 1e-5 * way)[0] - cost(at - 1e-5 * way)[0]) / 2e-5
-    assert np.sum(cost(at)[1] * way) == pytest.approx(slope, rel=1e-5)
 
 
 def test_a_plate_keeps_a_tenth_of_its_least_thickness():
@@ -134,7 +110,7 @@ def regularized(tmp_path, listed, head=HEAD, sets=()):
 
 
 def test_cost_and_gradient_are_added_once_per_step(tmp_path):
-    listed = "[{type: laplacian, weight: 3}, {type: thickness, thickness: 0.05, least: 0.1}]"
+    listed = "[{type: total_variation, weight: 3}, {type: thickness, thickness: 0.05, least: 0.1}]"
     problem = regularized(tmp_path, listed)
     key = problem.selection.keys[0]
     problem.optimizer.set_value(key, type(problem.optimizer[key])(waves(8, 0.02).astype(np.float32)))
@@ -161,22 +137,6 @@ def test_heights_never_cross_the_back_and_are_counted(tmp_path):
     assert problem.held() == {key: 3}
 
 
-def test_vertices_of_a_scene_have_a_laplacian(tmp_path):
-    """The Laplacian of a flat face is zero. The gradient pulls a vertex that stands out back."""
-    problem = regularized(tmp_path, "[{type: laplacian}]", "key: face.vertex_positions")
-    key = "face.vertex_positions"
-    flat = np.array(problem.selection.array(key), np.float64)
-    cost = problem.regularizers[key]["laplacian"]
-    points = flat.reshape(-1, 3)
-    middle = int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))
-    up = int(np.argmin(np.ptp(points, axis=0)))  # axis of the flat face's normal
-    points = points.copy()
-    points[middle, up] += 0.01
-    rest, (value, gradient) = cost(flat)[0], cost(points.ravel())
-    assert value > 1e3 * max(rest, 1e-12)
-    assert gradient.reshape(-1, 3)[middle, up] > 0
-
-
 def test_a_bitmap_is_measured_in_its_texture_coordinates(tmp_path):
     import mitsuba as mi
 
@@ -191,17 +151,17 @@ def test_a_bitmap_is_measured_in_its_texture_coordinates(tmp_path):
         <string name="filename" value="ramp.exr"/></texture></bsdf></shape></scene>""")
     costs = []
     for size in (8, 32):
-        listed = [{"type": "total_variation"}, {"type": "laplacian"}]
+        listed = [{"type": "total_variation"}]
         spec = ParameterSpec(key="*.reflectance.data", resolution=(size, size), regularizers=listed)
         selection = select_parameters(load_scene(tmp_path / "s.xml"), [spec], "c.yaml")
         [(key, made)] = make_regularizers(selection).items()
         costs.append(made["total_variation"](np.asarray(selection.array(key), np.float64))[0])
-        assert made["laplacian"](np.ones((size, size, 3)))[0] == 0
+        assert made["total_variation"](np.ones((size, size, 3)))[0] == 0
     slope = 3**0.5 * 0.8 / 7 * 8
     assert costs[0] == pytest.approx(slope, rel=2e-3)
     assert costs[1] == pytest.approx(slope, rel=0.15)  # resampling makes the rim flat
     bad = ParameterSpec(key="*.reflectance.data", regularizers=[{"type": "curvature", "radius": 1.0}])
-    with pytest.raises(ConfigError, match="a bitmap; use total_variation, laplacian"):
+    with pytest.raises(ConfigError, match="a bitmap; use total_variation"):
         select_parameters(load_scene(tmp_path / "s.xml"), [bad], "c.yaml")
 
 
@@ -225,10 +185,9 @@ def test_a_run_records_it(tmp_path, spp):
 
 
 REFUSED = {
-    "a colour": ("key: '*.reflectance.value'", "[{type: laplacian}]", "has no surface; heightmaps"),
-    "a motion": ("motion: {of: face}", "[{type: laplacian}]", "has no surface"),
-    "a mesh": ("key: face.vertex_positions", "[{type: slope, degrees: 3}]", "a mesh; use laplacian"),
-    "twice": (HEAD, "[{type: laplacian}, {type: laplacian}]", "regularizers[1].type: laplacian is given twice"),
+    "a colour": ("key: '*.reflectance.value'", "[{type: total_variation}]", "has no surface; heightmaps"),
+    "a motion": ("motion: {of: face}", "[{type: total_variation}]", "has no surface"),
+    "twice": (HEAD, "[{type: total_variation}, {type: total_variation}]", "regularizers[1].type: total_variation is"),
     "unknown": (HEAD, "[{type: smooth}]", "regularizers[0].type"),
     "no radius": (HEAD, "[{type: curvature}]", "regularizers[0].radius: missing"),
     "through": (
@@ -255,9 +214,9 @@ def facing(high=9, wide=11, there=(6, 7), **settings):
     """Return the plate between a heightmap of a face and a heightmap of a back. The back's columns run the other
     way.
     """
-    own = sheet(24)[0], sheet(24)[2], (high, wide, 1)
+    own = sheet(24)[0], sheet(24)[1], (high, wide, 1)
     below = sheet(24)[0] * [1, 1, 0] - [0, 0, 0.5]
-    other = below, sheet(24)[2] * [-1, 1] + [1, 0], (*there, 1)
+    other = below, sheet(24)[1] * [-1, 1] + [1, 0], (*there, 1)
     return make_plate(Thickness(thickness=0.5, least=0.4, opposite="back", **settings), own, other, "back.heightmap")
 
 

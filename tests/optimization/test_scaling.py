@@ -241,6 +241,6 @@ def test_only_gradient_descent_uses_curvature():
 
 
 def test_parameters_that_cannot_be_smoothed_are_refused_with_a_location():
-    config = load(CONFIG, [*TINY, "parameters=[{key: lamp.intensity.value, precondition: {laplacian: 0.1}}]"])
+    config = load(CONFIG, [*TINY, "parameters=[{key: lamp.intensity.value, precondition: 0.1}]"])
     with pytest.raises(ConfigError, match=r"parameters\[0\].precondition: smooths textures, heightmaps and vertices"):
         assemble(config)

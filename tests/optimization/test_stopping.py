@@ -1,4 +1,4 @@
-"""Losses that stand still: runs that end early, and plateaus."""
+"""Losses that stand still: runs that end early."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.state import State
-from reslrb_cli.optimization.stopping import Watch, lowered
+from reslrb_cli.optimization.stopping import Watch
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.metrics import Record
 
@@ -30,14 +30,11 @@ def config(tmp_path: Path, *sets: str) -> Config:
 
 def follow(given: Config, losses: np.ndarray, held_out: dict[int, float] | None = None) -> list[State]:
     """Return the states after each iteration, until the run stops."""
-    watch, state, states = Watch(given), State(0, 0.0, 0.0, 0, {}, {}), []
+    watch, state, states = Watch(given), State(0, 0.0, 0.0, 0, {}), []
     for number, loss in enumerate(losses):
         seen = None if held_out is None else held_out.get(number)
-        record = Record(number, float(loss), 0, 0, 0, 0, 0, 0, 4, 1, 0, 0, None, held_out=seen)
-        stage = max(given.stage_number(number / given.run.iterations), state.stage)  # as `Stages.enter` does
-        began = state.stage_began if stage == state.stage else number
-        kept = {"drops": state.drops, "since": state.since, "stage": stage, "stage_began": began}
-        state = watch.after(State(number + 1, 0.0, 0.0, 0, {}, {}, **kept), record)
+        record = Record(number, float(loss), 0, 0, 0, 0, 4, 1, 0, 0, None, held_out=seen)
+        state = watch.after(State(number + 1, 0.0, 0.0, 0, {}), record)
         states.append(state)
         if state.stopped:
             break
@@ -88,44 +85,6 @@ def test_held_out_views_decide_if_there_are_any(tmp_path: Path) -> None:
     assert len(follow(given, np.ones(400), {number: falling[number] for number in standing})) == 400
 
 
-def test_a_run_in_stages_is_judged_in_the_last_stage(tmp_path: Path) -> None:
-    """The first window begins with the first iteration of the last stage."""
-    given = config(tmp_path, STOP, "run.stages=[{until: 0.25, film: 0.5}]")
-    assert len(follow(given, np.ones(400))) == 160
-    losses = np.concatenate([np.ones(100), 0.9 ** np.arange(300)])
-    assert len(follow(given, losses)) == 400
-
-
-@pytest.mark.parametrize("iterations", [200, 800])
-def test_a_resumed_run_keeps_the_start_of_its_last_stage(iterations: int, tmp_path: Path) -> None:
-    """With another number of iterations, the last stage would have begun elsewhere, after 50 or 200 iterations."""
-    stages = "run.stages=[{until: 0.25, film: 0.5}]"
-    *_, before = follow(config(tmp_path, STOP, stages), np.ones(130))
-    watch = Watch(config(tmp_path, STOP, stages, f"run.iterations={iterations}"))
-    for number in range(200):
-        record = Record(number, 1.0, 0, 0, 0, 0, 0, 0, 4, 1, 0, 0, None)
-        if number < before.iteration:
-            watch.add(record)
-            continue
-        before = watch.after(replace(before, iteration=number + 1), record)
-        if before.stopped:
-            break
-    assert before.iteration == 160
-
-
-def test_a_plateau_lowers_the_rate_before_a_run_stops(tmp_path: Path) -> None:
-    plateau = "optimizer={schedule: plateau, final_fraction: 0.2}"
-    states = follow(config(tmp_path, plateau, "run.stop={patience: 10}"), np.ones(400))
-    drops = [state.drops for state in states]
-    assert [drops.index(number) + 1 for number in (1, 2, 3)] == [30, 60, 90]
-    assert [lowered(config(tmp_path, plateau).optimizer, number) for number in range(5)] == [1, 0.5, 0.25, 0.2, 0.2]
-    assert len(states) == 120, "three windows of 10 at the least rate"
-    drops = [state.drops for state in follow(config(tmp_path, plateau), np.ones(400))]
-    assert [drops.index(number) + 1 for number in (1, 2, 3)] == [60, 120, 180], "by windows of 20 without `run.stop`"
-    assert len(drops) == 400
-    assert lowered(config(tmp_path).optimizer, 3) == 1
-
-
 @pytest.mark.parametrize(
     ("setting", "key", "words"),
     [
@@ -148,7 +107,7 @@ def test_incompatible_settings(tmp_path: Path) -> None:
 def test_unused_options_are_not_written(tmp_path: Path) -> None:
     written = config(tmp_path).model_dump()
     assert "stop" not in written["run"]
-    asked = config(tmp_path, STOP, "optimizer={schedule: plateau}")
+    asked = config(tmp_path, STOP, "optimizer={schedule: cosine}")
     assert loads(dump(asked), tmp_path / "config.yaml") == asked
 
 
@@ -204,15 +163,6 @@ def test_a_run_at_its_time_limit_continues_with_more_time(experiment: Path, caps
     results = manifest("runs/tiny")["results"]
     assert results["iterations"] > 1
     assert results["elapsed_s"] < limit + 0.5
-
-
-@pytest.mark.parametrize(
-    ("more", "line"),
-    [("run.stages=[{until: 0.5, film: 0.5}]", "run.max_seconds: cannot be combined with run.stages")],
-)  # fmt: skip
-def test_iteration_counts_are_incompatible_with_a_time_limit(tmp_path: Path, more: str, line: str) -> None:
-    with pytest.raises(ConfigError, match=line):
-        config(tmp_path, "run.max_seconds=5", more)
 
 
 def test_measuring_before_the_first_iteration_counts_in_the_time(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from reslrb_cli.optimization.results import got_worse
 from reslrb_cli.optimization.trend import Change, find_trend, window
 from reslrb_cli.optimization.uncertainty import posterior
 from reslrb_cli.optimization.uncertainty.curvature import ParameterDirection, smooth
-from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured, alone, joint
+from reslrb_cli.optimization.uncertainty.posterior import Entries, LastSteps, Measured, Posterior, alone, joint
 from reslrb_cli.optimization.uncertainty.verdicts import (
     ParameterVerdict,
     judge,
@@ -141,7 +141,7 @@ def test_offsets_of_the_model_are_as_wide_as_stated(iterations, target):
     runs = 4000
     fixed = target**2 * noise if target else None
     offset, gradient = simulate(H, response, scale, noise, 5, rates, runs, np.random.default_rng(3), fixed)
-    found = [joint(H, response, scale, noise, unit, 5, rates, fixed) for unit in np.eye(3)]
+    found = [joint(Entries(response, scale, unit, 5, rates), H, noise, fixed) for unit in np.eye(3)]
     assert bool(target) is bool(np.all(found[0].of_target > 0))
     to_go = gradient @ np.array([each.to_go for each in found])  # the estimate is linear in the gradient
     left = offset - to_go
@@ -171,8 +171,8 @@ def test_the_last_steps_locate_the_values(last):
         end = H @ offset + random.normal(size=2) * sd / np.sqrt(few)
         pull = np.mean(gradients, axis=0) + H @ (offset - np.mean(values, axis=0))
         mean = (few * end + last * pull) / (few + last)
-        given = mean, np.full(2, few + last), rates[:-last]
-        found = joint(H, response, scale, noise, *given, None, offset - values[0])
+        entries = Entries(response, scale, mean, np.full(2, few + last), rates[:-last], offset - values[0])
+        found = joint(entries, H, noise)
         z.append((offset - found.to_go) / found.error)
     assert np.abs(np.mean(z, axis=0)).max() * np.sqrt(runs) < 4, np.mean(z, axis=0)
     assert np.abs(np.std(z, axis=0) - 1).max() * np.sqrt(2 * runs) < 4, np.std(z, axis=0)
@@ -181,32 +181,36 @@ def test_the_last_steps_locate_the_values(last):
 def test_unforeseen_gradients_are_believed():
     """According to the model, nothing of the start is left. A pull of ten standard errors contradicts the model."""
     H, few = np.diag([2.0, 3.0]), 4
-    given = np.full(2, 0.2), np.ones(2), np.diag([0.01, 0.01])
-    foreseen = joint(H, *given, np.array([0.02, 0.0]), few, [1.0] * 100)
+
+    def of(gradient: list[float]) -> Posterior:
+        entries = Entries(np.full(2, 0.2), np.ones(2), np.array(gradient), few, [1.0] * 100)
+        return joint(entries, H, np.diag([0.01, 0.01]))
+
+    foreseen = of([0.02, 0.0])
     assert np.abs(foreseen.to_go).max() < 0.02
-    found = joint(H, *given, np.array([0.5, 0.0]), few, [1.0] * 100)
+    found = of([0.5, 0.0])
     assert found.to_go[0] == pytest.approx(0.25, rel=0.02)
     assert found.error[0] == pytest.approx(0.05 / 2, rel=0.02)
     assert found.error[1] == pytest.approx(foreseen.error[1], rel=1e-6)
-    far = joint(H, *given, np.array([50.0, 0.0]), few, [1.0] * 100)  # farther than any parameter at the start
+    far = of([50.0, 0.0])  # farther than any parameter at the start
     assert far.to_go[0] < 26
 
 
 def test_marginal_equals_joint_without_shared_parts():
     H, rates = np.array([0.5, 2.0]), [1.0] * 40
-    given = np.array([0.03, 0.05]), np.array([2.0, 0.3])
     noise, gradient = np.array([0.2, 0.5]), np.array([0.1, -0.4])
+    entries = Entries(np.array([0.03, 0.05]), np.array([2.0, 0.3]), gradient, 4, rates)
     for fixed in (np.zeros(2), np.array([0.3, 2.0])):
-        each = alone(H, *given, noise, gradient, 4, rates, fixed)
-        both = joint(np.diag(H), *given, np.diag(noise), gradient, 4, rates, np.diag(fixed))
+        each = alone(entries, H, noise, fixed)
+        both = joint(entries, np.diag(H), np.diag(noise), np.diag(fixed))
         for name in ("to_go", "error", "of_target"):
             np.testing.assert_allclose(getattr(each, name), getattr(both, name), rtol=1e-5)
 
 
 def test_noise_of_the_target_remains_after_convergence():
     """The spread H^-1 b remains, because all gradients at the end contain the target's noise b."""
-    found = joint(np.array([[4.0]]), np.array([0.1]), np.ones(1), np.array([[1e-8]]), np.zeros(1), 9, [1.0] * 300,
-                  np.array([[0.04]]))  # fmt: skip
+    entries = Entries(np.array([0.1]), np.ones(1), np.zeros(1), 9, [1.0] * 300)
+    found = joint(entries, np.array([[4.0]]), np.array([[1e-8]]), np.array([[0.04]]))
     assert found.spread == pytest.approx([0.2 / 4], rel=1e-3)
     assert found.of_target == pytest.approx([0.2 / 4], rel=1e-3)
 
@@ -214,19 +218,19 @@ def test_noise_of_the_target_remains_after_convergence():
 def test_a_value_unknown_to_the_view_stays():
     """Two lamps light the view alike. Their sum is known, and their difference is as uncertain as at the start."""
     H = np.full((2, 2), 5.0)
-    found = joint(H, np.full(2, 0.1), np.ones(2), np.eye(2) * 1e-4, np.zeros(2), 5, [1.0] * 200)
+    entries = Entries(np.full(2, 0.1), np.ones(2), np.zeros(2), 5, [1.0] * 200)
+    found = joint(entries, H, np.eye(2) * 1e-4)
     assert found.error == pytest.approx(np.full(2, np.sqrt(0.5)), rel=0.02)
     total, difference = (np.sqrt(v @ found.covariance @ v) for v in (np.array([1, 1]), np.array([1, -1])))
     assert total < 0.02
     assert difference == pytest.approx(np.sqrt(2), rel=0.02)
-    known = alone(np.full(2, 5.0), np.full(2, 0.1), np.ones(2), np.full(2, 1e-4), np.zeros(2), 5, [1.0] * 200)
+    known = alone(entries, np.full(2, 5.0), np.full(2, 1e-4))
     assert known.error[0] < 0.02
 
 
 def test_an_entry_that_no_step_moves_stays():
-    found = joint(
-        np.diag([2.0, 0.0]), np.array([0.1, 0.0]), np.array([1.0, 7.0]), np.eye(2), np.zeros(2), 5, [1.0] * 50
-    )
+    entries = Entries(np.array([0.1, 0.0]), np.array([1.0, 7.0]), np.zeros(2), 5, [1.0] * 50)
+    found = joint(entries, np.diag([2.0, 0.0]), np.eye(2))
     assert found.error[1] == pytest.approx(7, rel=1e-3)
     assert found.error[0] < 0.5
 

@@ -16,20 +16,20 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Origin, read_lines
-from reslrb_cli.records.metrics import Clamped, MetricsWriter, Record, cut_back, finite, read_records
+from reslrb_cli.records.metrics import MetricsWriter, Record, Regularized, cut_back, finite, read_records
 
 # metrics.jsonl: its keys, values without a number, and lines that a crash cut short.
 
 KEYS = [
-    "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
+    "iteration", "loss", "step_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
     "grad_norm", "nonfinite", "parameter_rmse", "parameter_errors", "nonfinite_by_parameter",
-    "clamped", "held_out", "regularized",
+    "held_out", "regularized",
 ]  # fmt: skip
 
 
 def make_record(**changes):
     values = {
-        "iteration": 0, "loss": 0.5, "step_ms": 3.0, "primal_ms": None, "adjoint_ms": None, "codegen_ms": 1.0,
+        "iteration": 0, "loss": 0.5, "step_ms": 3.0, "codegen_ms": 1.0,
         "elapsed_s": 0.1, "peak_mib": 2.0, "spp": 16, "lr": 0.02, "grad_norm": 1.0, "nonfinite": 0,
         "parameter_rmse": None,
     }  # fmt: skip
@@ -117,10 +117,10 @@ def test_non_finite_values_and_bad_lines_are_reported_on_reading(tmp_path):
 # The part of `metrics.jsonl` from which a run resumes.
 
 RECORD = Record(
-    iteration=0, loss=0.1 + 0.2, step_ms=1.5, primal_ms=None, adjoint_ms=None, codegen_ms=0.0, elapsed_s=1 / 3,
+    iteration=0, loss=0.1 + 0.2, step_ms=1.5, codegen_ms=0.0, elapsed_s=1 / 3,
     peak_mib=3.0, spp=4, lr=0.02, grad_norm=math.nan, nonfinite=2, parameter_rmse=None,
-    parameter_errors={"a": 0.1}, nonfinite_by_parameter={"a": 2}, clamped=Clamped(3, {"a": 0.5}, {"a": 1e-3}),
-    held_out=0.7,
+    parameter_errors={"a": 0.1}, nonfinite_by_parameter={"a": 2},
+    held_out=0.7, regularized=Regularized({"a": {"thickness": 0.5}}, {"a": 3}),
 )  # fmt: skip
 
 
@@ -141,7 +141,7 @@ def test_records_survive_a_round_trip(tmp_path: Path) -> None:
     found, size = read_records(tmp_path, 3)
     assert list(map(text, found)) == list(map(text, records[:3]))
     assert math.isnan(found[0].grad_norm)
-    assert isinstance(found[0].clamped, Clamped)
+    assert isinstance(found[0].regularized, Regularized)
     cut_back(tmp_path, size)
     assert (tmp_path / "metrics.jsonl").read_text().splitlines() == list(map(text, records[:3]))
 

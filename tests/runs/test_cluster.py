@@ -37,8 +37,7 @@ worker = pytest.importorskip("reslrb_cli.cluster.worker", reason="pip install re
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
 SETS = ["run.iterations=3", "run.spp=8", "run.measuring=0", "run.certainty=false"]
-#: Experiments by name: two rounds and one round, guided emission, views, exposures, motion, passes, and a loss in
-#: halves.
+#: Experiments by name: two rounds and one round, guided emission, views, exposures, motion, and passes.
 CASES = {
     "guided, scaled": ["run.shards=4", "integrator.guiding=on", "optimizer.scale=auto", "run.views_per_iteration=2"],
     "views": ["run.shards=3", "run.adjoint=batched", "integrator.guiding=on"],
@@ -46,7 +45,6 @@ CASES = {
     "motion": ["run.shards=6", f"parameters[2]={MOTION}"],
     "pixels": ["run.shards=2", "run.spp=16", "integrator={estimator: stack, paths: both, pixels: measured}"],
     "passes": ["run.shards=2", "integrator.samples_per_pass=1", "run.spp=6"],
-    "halves": ["run.shards=6", "loss.scale=fitted"],
 }
 VIEWS = "views=[{sensor: 0}, {sensor: 1, weight: 2}, {sensor: 2}]"
 
@@ -73,7 +71,7 @@ def both(folder: Path, *sets: str) -> tuple[dict[str, np.ndarray], RunProgress]:
 def end(course: RunProgress, after: Callable[[int], object] = lambda iteration: None) -> dict[str, np.ndarray]:
     """Return the parameter values after the iterations, and the learned tables."""
     with one_thread():
-        for state, _ in iterate(course.stages, course.state):
+        for state, _ in iterate(course.problem, course.state):
             after(state.iteration)
         guiding = guiding_of(course.problem)
         return course.problem.values() | ({} if guiding is None else guiding.state()[1])
@@ -300,7 +298,7 @@ def test_failing_workers_are_restarted(
     longest, before = 0.0, time.monotonic()
 
     with beside(experiment, workers, 8) as (course, found):
-        for state, _ in iterate(course.stages, course.state):
+        for state, _ in iterate(course.problem, course.state):
             longest, before = max(longest, time.monotonic() - before), time.monotonic()
             course.state = state
             if state.iteration == 2:
@@ -325,7 +323,7 @@ def test_a_very_slow_worker_is_not_waited_for(experiment: Path) -> None:
     with beside(experiment, 3, 30, "run.spp=16384") as (course, found):
         times: list[float] = []
         before = time.monotonic()
-        for state, _ in iterate(course.stages, course.state):
+        for state, _ in iterate(course.problem, course.state):
             times.append(time.monotonic() - before)
             before = time.monotonic()
             course.state = state
@@ -356,7 +354,7 @@ def test_thirty_kills_lose_nothing(experiment: Path) -> None:
                 return
 
     with beside(experiment, 3, 200) as (course, found):
-        for state, _ in iterate(course.stages, course.state):
+        for state, _ in iterate(course.problem, course.state):
             course.state = state
             if state.iteration in moments:
                 pids = sorted(found.client.run(os.getpid, on_error="ignore").values())
@@ -381,7 +379,7 @@ def test_memory_does_not_grow(experiment: Path) -> None:
     with engine.engine_at(course, Place(2), threads=1) as local:
         course.compute_with(local)
         with one_thread():
-            for state, _ in iterate(course.stages, course.state):
+            for state, _ in iterate(course.problem, course.state):
                 if state.iteration in (200, 2000):
                     pids = [os.getpid(), *sorted(local.crew.client.run(os.getpid).values())]
                     sizes[state.iteration] = [psutil.Process(pid).memory_info().rss for pid in pids]

@@ -32,7 +32,7 @@ from runs.going_on import (
 )
 from turns import a_few
 
-from reslrb_cli.cli import main, progress
+from reslrb_cli.cli import main
 from reslrb_cli.guiding.tables import Learned
 from reslrb_cli.optimization import loop, optimizers
 from reslrb_cli.records.checkpoint import STATE_FILE, read_state
@@ -61,16 +61,12 @@ CASES: dict[str, list[str]] = {
     "cosine": ["optimizer.schedule=cosine"],
     "exponential": ["optimizer.schedule=exponential"],
     "sgd": ["optimizer.type=sgd", "optimizer.learning_rate=0.5"],
-    "momentum, clamp": ["optimizer={type: sgd, momentum: 0.8, learning_rate: 0.1, clamp_gradient: 2}"],
-    "clamp": ["optimizer.clamp_gradient=1.5"],
+    "momentum": ["optimizer={type: sgd, momentum: 0.8, learning_rate: 0.1}"],
     "log": ["parameters[1].transform=log", "parameters[1].bounds=[0.1, 20]"],
     "sigmoid, momentum": ["parameters[0].transform=sigmoid", "optimizer={type: sgd, momentum: 0.8}"],
     "softplus": ["parameters[1].transform=softplus", "parameters[1].bounds=[0.1, 20]"],
     "scale auto": ["optimizer.scale=auto"],
-    "scale auto, sigmoid, clamp": [
-        "optimizer={scale: auto, clamp_gradient: 3, schedule: cosine}",
-        "parameters[0].transform=sigmoid",
-    ],
+    "scale auto, sigmoid": ["optimizer={scale: auto, schedule: cosine}", "parameters[0].transform=sigmoid"],
     "views": [VIEWS, "run.views_per_iteration=1"],
     "held out": [VIEWS, "run.views_per_iteration=1", "run.held_out=[2]", "optimizer.scale=auto"],
     "exposure": [
@@ -88,41 +84,17 @@ CASES: dict[str, list[str]] = {
     "gather": [*BATCHED, "integrator.estimator=gather"],
     "guided": [*BATCHED, "integrator.guiding=on", "integrator.estimator=stack"],
     "pixels": [*BATCHED, "run.spp=16", "integrator={estimator: stack, paths: both, pixels: measured}"],
-    "shards": ["run.spp=8", "run.adjoint=others", "run.shards=4", "integrator.guiding=on", "optimizer.scale=auto"],
+    "shards": ["run.spp=8", "run.shards=4", "integrator.guiding=on", "optimizer.scale=auto"],
     "shards of views": [*BATCHED, VIEWS, "run.shards=2"],
     "passes": [*BATCHED, "integrator.samples_per_pass=1"],
     "budget": [*BATCHED, "run.memory_budget=8"],
-    "stages": [
-        "run.stages=[{until: 0.2, resolution: 0.5, film: 0.5}, {until: 0.3, film: 0.5}, {until: 0.8}]",
-        "optimizer.scale=auto",
-    ],
-    "plateau": [
-        "optimizer={type: sgd, schedule: plateau, learning_rate: 0.5}",
-        "run.stop={patience: 5, relative: 0.9}",
-    ],
-    "held out, plateau": [
-        VIEWS,
-        "run.held_out=[2]",
-        "run.iterations=66",
-        "run.checkpoint_every={iterations: 6}",
-        "optimizer.schedule=plateau",
-        "run.stop={patience: 20, relative: 0.9}",
-        "run.spp=2",
-    ],
     "a list of losses": ["loss=[{type: l1}, {type: l2, weight: 0.5}]"],
     "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
 }
-FEW = ("pixels", "scale auto, sigmoid, clamp", "held out", "shards", "stages", "plateau")
+FEW = ("pixels", "scale auto, sigmoid", "held out", "shards")
 #: The number of iterations after which a run is killed, and the number in its newest state at that time. Certainty
 #: makes its notes at four fifths of the iterations, which must come before this state.
-KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20), "held out, plateau": (63, 60)}
-
-
-#: Each stage takes a fifth of the run.
-FIVE_STAGES = (
-    "run.stages=[{until: 0.2, resolution: 0.25, film: 0.25}, {until: 0.4, resolution: 0.5, film: 0.5},"
-    " {until: 0.6, resolution: 0.5}, {until: 0.8}]"
-)
+KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20)}
 
 
 @pytest.fixture
@@ -147,42 +119,6 @@ def test_a_killed_run_resumes_to_the_same_end(case: str, experiment: Path, monke
     assert manifest["status"] == "finished"
     [resumed] = manifest["resumed"]
     assert (resumed["iteration"], resumed["changed"]) == (newest, {})
-
-
-def test_a_run_killed_in_five_stages_resumes_to_the_same_end(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run is killed in the middle of a stage, and at the moment at which the next stage begins. A run is resumed
-    from each state.
-    """
-    settings = ["run.checkpoint_every={iterations: 1}", "run.certainty=false", FIVE_STAGES]
-    sets = [word for setting in settings for word in ("--set", setting)]
-    whole, left = run_and_kill(monkeypatch, 2, *ITERATIONS[:2], *sets)
-    show = progress.Progress.show
-    for at in (7, 8, 13, 16):  # 8 is the first iteration of the third stage
-        life = Path(shutil.move(left, f"runs/until{at}"))
-
-        def copying(self: progress.Progress, record: Any, at: int = at, life: Path = life) -> None:
-            show(self, record)
-            if record.iteration == at and not left.exists():
-                shutil.copytree(life, left)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(progress.Progress, "show", copying)
-            assert optimize("--resume", str(life), "--quiet") == 0
-        assert differences(whole, life) == []
-    assert optimize("--resume", str(left), "--quiet") == 0
-    assert differences(whole, left) == []
-
-
-def test_fewer_iterations_end_a_coarse_stage_at_once(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run is killed in its coarse stage, at an iteration after the end of this stage in the shorter run. Losses and
-    values of the coarse stage do not count as best.
-    """
-    sets = ["--set", "run.stages=[{until: 0.4, resolution: 0.5}]", "--set", "run.checkpoint_every={iterations: 1}"]
-    _, left = run_and_kill(monkeypatch, 20, "--set", "run.iterations=60", *sets, *ITERATIONS[4:])
-    assert optimize("--resume", str(left), "--quiet", "--set", "run.iterations=22") == 0
-    assert json.loads((left / "manifest.json").read_text())["results"]["best"] is None
-    assert optimize("--resume", str(left), "--quiet", "--set", "run.iterations=40") == 0
-    assert json.loads((left / "manifest.json").read_text())["results"]["best"]["iteration"] > 20
 
 
 def test_a_run_with_wrong_tables_resumes(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,7 +164,7 @@ def _another_seed(run_seed, iteration, view, purpose):
 @pytest.mark.parametrize(
     "fault",
     a_few(
-        ["no moments", "no clamp", "another seed", "no best", "no squares", "no last steps", "metrics not cut back"],
+        ["no moments", "another seed", "no best", "no squares", "no last steps", "metrics not cut back"],
         ["no moments"],
     ),
 )
@@ -236,7 +172,11 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
     """Each planted fault drops a part of the state, changes seeds, or keeps surplus metrics."""
     from reslrb_cli.runs import prepare, resume
 
-    load, restore = prepare.load, prepare.RunProgress.restore
+    restore = prepare.RunProgress.restore
+
+    def without_best(self, stored, records):
+        restore(self, stored, records)
+        self.best.recent.clear()
 
     def without_squares(self, stored, records):
         restore(self, stored, records)
@@ -248,14 +188,13 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
 
     # A state in the last fifth of the run has all parts. With falling losses, the best of the run comes after this
     # state.
-    sets = ["--set", "optimizer.clamp_gradient=1.5", "--set", "run.checkpoint_every={iterations: 15}"]
+    sets = ["--set", "run.checkpoint_every={iterations: 15}"]
     begun = FALLING if fault != "no last steps" else []  # only small parameters have last steps
     whole, left = run_and_kill(monkeypatch, 17, *ITERATIONS, *sets, *begun)
     places = {
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
-        "no clamp": (prepare, "load", lambda *given: replace(load(*given), clamp={}, clamp_sums={})),
         "another seed": (loop, "seed", _another_seed),
-        "no best": (prepare, "WINDOW", 1),
+        "no best": (prepare.RunProgress, "restore", without_best),
         "no squares": (prepare.RunProgress, "restore", without_squares),
         "no last steps": (prepare.RunProgress, "restore", without_steps),
         "metrics not cut back": (resume, "cut_back", lambda folder, records, size: None),
@@ -381,34 +320,6 @@ def test_a_repeatedly_killed_run_reaches_the_same_end(tmp_path: Path, kills: int
     assert differences(tmp_path / "runs/whole", run) == []
     assert [record["iteration"] for record in records_of(run)] == list(range(iterations))
     assert read_manifest(run)["status"] == "finished"  # type: ignore[index]
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
-@pytest.mark.long
-def test_a_run_killed_in_each_stage_reaches_the_same_end(tmp_path: Path) -> None:
-    tiny.write_experiment(tmp_path)
-    of_each, chance = 80, random.Random(7)
-    sets = [*SETS, "--set", f"run.iterations={5 * of_each}", "--set", FIVE_STAGES]
-    assert end(start(tmp_path, "tiny.yaml", *sets, "--set", "run.name=whole")) == (0, "")
-    run, killed = tmp_path / "runs/tiny", []
-    process = start(tmp_path, "tiny.yaml", *sets)
-    for stage in range(5):
-        until = of_each * stage + chance.randrange(5, of_each // 2)
-        while count(run) < until and process.poll() is None:
-            time.sleep(0.001)
-        process.kill()
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
-        killed.append(read_state(run / "checkpoint" / STATE_FILE)[1]["stage"])
-        process = start(tmp_path, "--resume", str(run), "--quiet")
-    assert end(process) == (0, "")
-    assert killed == [0, 1, 2, 3, 4]
-    assert differences(tmp_path / "runs/whole", run) == []
-    assert left_over(run) == []
-    manifest = read_manifest(run)
-    assert manifest is not None
-    assert (manifest["status"], len(manifest["resumed"])) == ("finished", 5)
 
 
 SIZES = [8, 48, 96, 128, 160, 256, 512]

@@ -99,7 +99,7 @@ def make(folder, cameras, run="", say=None):
 def test_images_of_the_cameras_are_the_targets(folder):
     assert write_nerf(folder).name == "transforms.json"
     problem = make(folder, "transforms.json")
-    assert [view.wanted.file.name for view in problem.views] == ["a.exr", "b.exr"]
+    assert [view.file.name for view in problem.views] == ["a.exr", "b.exr"]
     assert all(np.array(view.target).max() == 0.5 for view in problem.views)
     problem = make(folder, "transforms.json", "held_out: [b], ")
     assert [view.sensor for view in problem.trained] == [0]

@@ -172,15 +172,15 @@ LEARNING_SHARE, LEARNINGS = 0.4, 2
 
 
 def sets_of(config: Config) -> int:
-    """Return the number of sets in which a step's samples are traced. Each set has one dL/dI, or is one half."""
-    return (config.run.batches if config.adjoint == "batched" else 1) * config.halves * config.shares
+    """Return the number of sets in which a step's samples are traced. Each set has one dL/dI."""
+    return (config.run.batches if config.adjoint == "batched" else 1) * config.shares
 
 
 def lessons(problem: Problem) -> float:
     """Return how often tables of guided emission learn per iteration, as the mean over the run."""
     run, sensors = problem.config.run, len(problem.trained)
     each = run.batches - 1 if problem.config.adjoint == "batched" else 1
-    each = each * problem.config.halves if problem.config.shards == 1 else 1  # of shards, once a step
+    each = each if problem.config.shards == 1 else 1  # of shards, once a step
     gradients = run.iterations * each * len(problem.drawn(0)) / sensors
     return learnings(max(round(gradients), 1)) * sensors / run.iterations
 

@@ -295,7 +295,7 @@ class LossCurvature:
     def _target_noises(self) -> list[list[TargetNoise]]:
         config, trained = self.problem.config, self.problem.trained
         render = config.target.render
-        if render is None or all(view.wanted.file is not None for view in trained):
+        if render is None or all(view.file is not None for view in trained):
             return []
         chosen = render.integrator or config.integrator
         paths = paths_of(chosen, self.problem.scene, self.problem.sensors, self.problem.moves)
@@ -314,7 +314,7 @@ class LossCurvature:
         scaled to the target's noise, are then added to the target. All sample counts are multiples of `multiple`.
         """
         true = np.array(view.target, dtype=np.float64)
-        if view.wanted.file is not None:
+        if view.file is not None:
             return [TargetNoise(np.zeros_like(true), np.zeros_like(true), 1)] * REPLICAS
         run, unit = self.problem.config.run, multiple or 1
         again, few = spp <= AGAIN * run.spp, max(self.spp // unit, 1) * unit

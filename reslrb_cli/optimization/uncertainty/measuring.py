@@ -109,8 +109,7 @@ class Certainty:
     def see(self, before: State, state: State) -> None:
         """Record data of the iteration that leads from `before` to `state`. This costs almost nothing."""
         planned, iterations = self.problem.config.run.iterations, state.iteration
-        is_last = state.stage == before.stage == len(self.problem.config.run.stages)
-        if is_last and 0 < self._seen < iterations:
+        if 0 < self._seen < iterations:
             for key, initial in self._initial.items():
                 if initial.size <= MOST_ENTRIES:
                     self._add_step(key, before, state)
@@ -224,7 +223,7 @@ class Certainty:
 
     def _target_noise(self) -> str:
         """Return `target_noise` of `CertaintyRecord`, which states whether the spreads include the targets' noise."""
-        read = [view.wanted.file is not None for view in self.problem.trained]
+        read = [view.file is not None for view in self.problem.trained]
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
     def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:

@@ -193,26 +193,39 @@ class Posterior:
         return np.hypot(self.to_go, self.error)
 
 
-def joint(
-    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
-    rates: Sequence[float] | Array, fixed: Array | None = None, came: Array | float = 0.0,
-) -> Posterior:  # fmt: skip
-    """Return the joint offset of M entries.
+@dataclass(frozen=True)
+class Entries:
+    """M entries at the end of a run.
 
-    `curvature` is H (M, M), and `noise` the covariance of one gradient (M, M). `gradient` is the mean of `samples`
-    gradients. `samples` is one count for all entries, or one count for each of the M entries. If the counts differ, the
-    smaller sample set is part of the larger sample set. Three arguments are (M,). `response` is the diagonal of P.
-    `scale` is the standard deviation of the offset at the start. `came` is the known movement in the last iterations,
-    which `rates` does not contain. `rates` are the eta of all iterations. `fixed` is the matrix B (M, M) of the noise
-    that all gradients have in common, or None. The computation expresses each entry in units of the entry's scale.
-    Matrices of entries with different units are therefore well-conditioned.
+    - `response` (M,) is the diagonal of P, and `scale` (M,) is the standard deviation of the offset at the start.
+    - `gradient` (M,) is the mean of `samples` gradients. `samples` is one count for all entries, or one count for each
+        entry. If the counts differ, the smaller sample set is part of the larger sample set.
+    - `rates` are the eta of all iterations. `came` (M,) is the known movement in the last iterations, which `rates`
+        does not contain.
     """
+
+    response: Array
+    scale: Array
+    gradient: Array
+    samples: int | Array
+    rates: Sequence[float] | Array
+    came: Array | float = 0.0
+
+
+def joint(entries: Entries, curvature: Array, noise: Array, fixed: Array | None = None) -> Posterior:
+    """Return the joint offset of all entries.
+
+    `curvature` is H (M, M), and `noise` the covariance of one gradient (M, M). `fixed` is the matrix B (M, M) of the
+    noise that all gradients have in common, or None. The computation expresses each entry in units of the entry's
+    scale. Matrices of entries with different units are therefore well-conditioned.
+    """
+    scale, gradient = entries.scale, entries.gradient
     units = np.outer(scale, scale)
     H, Sigma = _positive(curvature * units), _positive(noise * units)
-    C, D = _after(H, response / scale**2, Sigma, rates)
+    C, D = _after(H, entries.response / scale**2, Sigma, entries.rates)
     B = np.zeros_like(H) if fixed is None else _positive(fixed * units)
-    counts = np.broadcast_to(np.asarray(samples, dtype=np.float64), scale.shape)
-    m, driven = came / scale, D @ B @ D.T
+    counts = np.broadcast_to(np.asarray(entries.samples, dtype=np.float64), scale.shape)
+    m, driven = entries.came / scale, D @ B @ D.T
     E, pulled = C + driven, H @ D @ B
     beside = B - pulled - pulled.T + Sigma / np.maximum.outer(counts, counts)
     surprise = gradient * scale - H @ m
@@ -241,24 +254,23 @@ def _unforeseen(H: Array, E: Array, beside: Array, surprise: Array) -> Array:
     return np.asarray((vectors * more) @ vectors.T)
 
 
-def alone(
-    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int | Array,
-    rates: Sequence[float] | Array, fixed: Array | float = 0.0, came: Array | float = 0.0,
-) -> Posterior:  # fmt: skip
-    """Return the offset of each entry, as if all other entries were known. All arrays are (M,). `joint` explains the
-    arguments. The function does not correct the model's covariance C, even if gradients contradict the model.
+def alone(entries: Entries, curvature: Array, noise: Array, fixed: Array | float = 0.0) -> Posterior:
+    """Return the offset of each entry, as if all other entries were known. `curvature`, `noise` and `fixed` are the
+    diagonals (M,) of the matrices in `joint`. The function does not correct the model's covariance C, even if gradients
+    contradict the model.
     """
+    response, came = entries.response, entries.came
     h = np.maximum(curvature, 0.0)
-    C, D = scale**2, np.zeros_like(h)
-    for rate in rates:
+    C, D = entries.scale**2, np.zeros_like(h)
+    for rate in entries.rates:
         left = np.clip(1 - rate * response * h, 0, 1)
         C = left**2 * C + (rate * response) ** 2 * noise
         D = left * D + _driven(rate * response, h)
     E = C + D**2 * fixed
-    seen = h**2 * E - 2 * h * D * fixed + fixed + np.maximum(noise / samples, 1e-300)
+    seen = h**2 * E - 2 * h * D * fixed + fixed + np.maximum(noise / entries.samples, 1e-300)
     shared = E * h - D * fixed
     gain = shared / seen
-    return Posterior(came + gain * (gradient - h * came), E - gain * shared, D * np.sqrt(fixed))
+    return Posterior(came + gain * (entries.gradient - h * came), E - gain * shared, D * np.sqrt(fixed))
 
 
 def _driven(step: Array, curvature: Array) -> Array:

@@ -39,7 +39,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reslrb_cli.optimization.uncertainty.curvature import MARGIN, ParameterDirection, smooth
-from reslrb_cli.optimization.uncertainty.posterior import SURE, Measured, alone, joint
+from reslrb_cli.optimization.uncertainty.posterior import SURE, Entries, Measured, alone, joint
 from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.records.measurements import INCOMPLETE
 from reslrb_cli.statistics import Array, rms
@@ -223,9 +223,10 @@ def judge_together(
     few, rates = samples.shape[1], _eta(measured, {directions[place].key for place in at.tolist()})
     counts = few + steps[at]
     gradient[at] = (few * gradient[at] + steps[at] * (pull[at] + H @ mean[at])) / counts
-    given = gradient[at], counts, rates[: iterations - int(steps.max())]
-    posterior, whole = (joint(H, response[at], scale[at], Sigma, *given, each, came[at]) for each in (None, B))
-    single = alone(np.diag(H), response[at], scale[at], noise[at], *given, np.maximum(np.diag(B), 0.0), came[at])
+    until = rates[: iterations - int(steps.max())]
+    entries = Entries(response[at], scale[at], gradient[at], counts, until, came[at])
+    posterior, whole = (joint(entries, H, Sigma, each) for each in (None, B))
+    single = alone(entries, np.diag(H), noise[at], np.maximum(np.diag(B), 0.0))
     result.to_go[at], result.error[at], result.alone[at] = posterior.to_go, posterior.error, single.spread
     result.spread[at], result.of_target[at] = whole.spread, whole.of_target
     assert posterior.covariance is not None
@@ -336,8 +337,8 @@ def _large(
         h[touched] = smooth(diagonal[touched], own.noise[touched])
         if fixed is not None:
             B[touched] = smooth(fixed[touched], own.noise[touched], MARGIN)
-        given = (h, own.response, prior, own.noise, own.mean, len(own.gradients), own.steps)
-        known, whole = alone(*given), alone(*given, B)
+        entries = Entries(own.response, prior, own.mean, len(own.gradients), own.steps)
+        known, whole = (alone(entries, h, own.noise, each) for each in (0.0, B))
         to_go, error, of_target = own.within(known.to_go), known.error, whole.of_target
         of_run = np.where(touched, np.hypot(to_go, error), prior)
         spread = np.where(touched, np.hypot(own.within(whole.to_go), whole.error), prior)

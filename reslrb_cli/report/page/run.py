@@ -31,22 +31,16 @@ from reslrb_cli.report.sources import ShownRun
 WARM_UP = 5
 
 
-def step_ms(records: Sequence[Mapping[str, Any]], name: str = "step_ms") -> float | None:
-    """Return the median milliseconds of a step, or of the part `name`. The first steps do not count. Return None if
-    unknown.
-    """
-    known = [record[name] for record in records[WARM_UP:] or records if record.get(name) is not None]
+def step_ms(records: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the median milliseconds of a step. The first steps do not count. Return None if unknown."""
+    known = [record["step_ms"] for record in records[WARM_UP:] or records if record.get("step_ms") is not None]
     return statistics.median(known) if known else None
 
 
 def step_words(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the time of a step in words, with the times of image and gradient if they were measured separately."""
+    """Return the time of a step in words."""
     step = step_ms(records)
-    if step is None:
-        return ""
-    named = (("primal_ms", "up to image and loss"), ("adjoint_ms", "for the gradient"))
-    parts = [f"{duration(ms / 1e3)} {what}" for name, what in named if (ms := step_ms(records, name)) is not None]
-    return f"{duration(step / 1e3)} (median){': ' if parts else ''}{', '.join(parts)}"
+    return "" if step is None else f"{duration(step / 1e3)} (median)"
 
 
 def _wall(manifest: Mapping[str, Any]) -> str:
@@ -138,7 +132,6 @@ def record_parts(run: ShownRun) -> dict[str, Markup]:
     results, manifest = run.results, run.manifest
     parts: dict[str, Callable[[], Markup]] = {
         "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
-        "Clamped gradients": lambda: lay_out("run.clamped", results.get("clamped") or {}),
         "Regularizers": lambda: lay_out("run.regularized", results.get("regularized") or {}),
         "Run": lambda: lay_out("run.run", run, step_words(run.records), _wall(manifest)),
         "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
