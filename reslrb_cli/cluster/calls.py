@@ -17,6 +17,7 @@ from time import monotonic
 from typing import Any
 
 from distributed import CancelledError, Client, KilledWorker, as_completed
+from distributed.client import ClosedClientError
 from distributed.comm import CommClosedError
 from distributed.scheduler import NoWorkerError
 
@@ -92,13 +93,14 @@ def _explained() -> Iterator[None]:
     try:
         yield
     except KilledWorker as error:
-        last = f"the last one at {error.last_worker.address}"
-        raise MachineError(
-            f"--cluster: {error.allowed_failures + 1} workers ended during the same call, {last}"
-        ) from None
+        count, last = error.allowed_failures + 1, error.last_worker.address
+        text = (
+            f"the same call ended {count} workers, the last one at {last}; their warnings or their memory limit say why"
+        )
+        raise MachineError(f"--cluster: {text}") from None
     except (NoWorkerError, TimeoutError):
         raise MachineError(f"--cluster: no worker within {NOBODY_S} s") from None
-    except (CancelledError, CommClosedError):
+    except (CancelledError, CommClosedError, ClosedClientError):
         raise MachineError("--cluster: the scheduler has ended; --resume continues the run") from None
     except MachineError as error:
         raise MachineError(f"--cluster: {error}") from None

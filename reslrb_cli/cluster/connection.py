@@ -133,7 +133,9 @@ def connected(place: Place) -> Iterator[tuple[Client, Path]]:
                 heartbeat_interval="2s",
             )  # fmt: skip
         except (OSError, RuntimeError, TimeoutError) as error:
-            raise MachineError(f"--cluster: {_why_not(place, error)}") from None
+            where, said = place.address or "this machine", one_line(str(error.__cause__ or error), 200)
+            refused = f"the scheduler at {where} cannot be reached, or refuses this certificate: {said}"
+            raise MachineError(f"--cluster: {refused}") from None
         stack.callback(_close, client)
         yield client, folder
 
@@ -199,12 +201,6 @@ def _certificates() -> object:
         if "\n" not in file and not os.access(file, os.R_OK):
             raise ConfigError("--cluster", f"distributed.comm.tls.{name}", f"{file} cannot be read")
     return security
-
-
-def _why_not(place: Place, error: Exception) -> str:
-    """Describe why a client could not connect."""
-    said = one_line(str(error.__cause__ or error), 200)
-    return f"the scheduler at {place.address or 'this machine'} cannot be reached, or refuses this certificate: {said}"
 
 
 def _close(client: Client) -> None:

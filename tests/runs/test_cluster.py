@@ -15,6 +15,7 @@ from collections.abc import Callable
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -275,21 +276,21 @@ def beside(folder: Path, workers: int, iterations: int, *sets: str):
     }
 
 
-def hang() -> None:
+def hang(dask_worker: Any) -> None:
     """Make the worker that runs this function stop answering."""
-    spoil(lambda: threading.Event().wait())
+    spoil(dask_worker, lambda: threading.Event().wait())
 
 
-def run_full() -> None:
+def run_full(dask_worker: Any) -> None:
     """Make the worker's next call fail as on a full disk."""
 
     def fail() -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    spoil(fail)
+    spoil(dask_worker, fail)
 
 
-def take_memory() -> None:
+def take_memory(dask_worker: Any) -> None:
     """Make the worker's next call take 3 GiB, 1.5 times the memory that the worker may use."""
 
     def fill() -> None:
@@ -297,15 +298,15 @@ def take_memory() -> None:
         time.sleep(60)
         del taken
 
-    spoil(fill)
+    spoil(dask_worker, fill)
 
 
-def spoil(act: Callable[[], object]) -> None:
+def spoil(dask_worker: Any, act: Callable[[], object]) -> None:
     class Spoilt:
         def __getattr__(self, name: str) -> None:
             act()
 
-    workload = worker.get_worker().plugins["reslrb"]
+    workload = dask_worker.plugins["reslrb"]
     workload._loaded = workload._loaded._replace(state=Spoilt())
 
 
@@ -313,7 +314,7 @@ def spoil(act: Callable[[], object]) -> None:
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("fault", [hang, run_full, take_memory])
 def test_failing_workers_are_restarted(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch, fault: Callable[[], None], workers: int
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, fault: Callable[[Any], None], workers: int
 ) -> None:
     """One worker fails in the middle of a run. The run ends with the same result, and no iteration takes longer than a
     minute.
@@ -326,8 +327,10 @@ def test_failing_workers_are_restarted(
             longest, before = max(longest, time.monotonic() - before), time.monotonic()
             course.state = state
             if state.iteration == 2:
+                before_fault = {*client.run(os.getpid).values()}
                 client.run(fault, workers=[*client.scheduler_info()["workers"]][:1])
             if state.iteration == 6:
+                assert not before_fault <= {*client.run(os.getpid, on_error="ignore").values()}
                 break
     assert longest < 60
 
