@@ -17,7 +17,6 @@ from time import monotonic
 from typing import Any
 
 from distributed import CancelledError, Client, KilledWorker, as_completed
-from distributed.client import ClosedClientError
 from distributed.comm import CommClosedError
 from distributed.scheduler import NoWorkerError
 
@@ -42,7 +41,7 @@ class Workers:
         self._client, self._key, self._context_of = client, workload.key, context_of
         self._spent = SharedTime((where,))
         client.subscribe_topic(TOPIC, lambda event: logger.warning(f"--cluster: {event[1]}"))
-        with _explained():
+        with self._explained():
             client.wait_for_workers(1, timeout=NOBODY_S)
             client.register_plugin(workload)
             loads = [()] * len(client.scheduler_info(n_workers=-1)["workers"])
@@ -58,7 +57,7 @@ class Workers:
         """
         begin, times = monotonic(), dict[str, WorkerTime]()
         context = b"" if self._context_of is None else pickle.dumps(self._context_of(state))
-        with _explained():
+        with self._explained():
             for place, (value, worker, seconds) in self._answers(function, work, context):
                 times[worker] = times.get(worker, WorkerTime()) + WorkerTime(1, seconds)
                 yield place, value
@@ -78,6 +77,24 @@ class Workers:
             yield places[future], future.result()
             future.release()
 
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Raise failures of workers and of the scheduler as MachineError."""
+        try:
+            yield
+        except KilledWorker as error:
+            count, last = error.allowed_failures + 1, error.last_worker.address
+            text = f"the same call ended {count} workers, the last one at {last}; see their warnings and memory limits"
+            raise MachineError(f"--cluster: {text}") from None
+        except (NoWorkerError, TimeoutError):
+            raise MachineError(f"--cluster: no worker within {NOBODY_S} s") from None
+        except MachineError as error:
+            raise MachineError(f"--cluster: {error}") from None
+        except Exception as error:
+            if isinstance(error, CancelledError | CommClosedError) or self._client.status != "running":
+                raise MachineError("--cluster: the scheduler has ended; --resume continues the run") from None
+            raise
+
     def spent(self) -> SharedTime:
         """Return the times so far."""
         return self._spent
@@ -85,22 +102,3 @@ class Workers:
 
 def _load(state: object) -> None:
     """Call that only lets a worker load the workload."""
-
-
-@contextlib.contextmanager
-def _explained() -> Iterator[None]:
-    """Raise failures of workers and of the scheduler as MachineError."""
-    try:
-        yield
-    except KilledWorker as error:
-        count, last = error.allowed_failures + 1, error.last_worker.address
-        text = (
-            f"the same call ended {count} workers, the last one at {last}; their warnings or their memory limit say why"
-        )
-        raise MachineError(f"--cluster: {text}") from None
-    except (NoWorkerError, TimeoutError):
-        raise MachineError(f"--cluster: no worker within {NOBODY_S} s") from None
-    except (CancelledError, CommClosedError, ClosedClientError):
-        raise MachineError("--cluster: the scheduler has ended; --resume continues the run") from None
-    except MachineError as error:
-        raise MachineError(f"--cluster: {error}") from None

@@ -35,6 +35,7 @@ from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.runs.prepare import RunProgress, prepare
 
 worker = pytest.importorskip("reslrb_cli.cluster.worker", reason="pip install reslrb[cluster]", exc_type=ImportError)
+checks = pytest.importorskip("reslrb_cli.cluster.checks", reason="pip install reslrb[cluster]", exc_type=ImportError)
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
 SETS = ["run.iterations=3", "run.spp=8", "run.measuring=0", "run.certainty=false"]
@@ -239,9 +240,6 @@ def test_a_worker_reports_missing_requirements(me: SimpleNamespace, monkeypatch:
 
 
 def test_a_worker_ends_if_its_machine_fails(me: SimpleNamespace) -> None:
-    def fail(state: str) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     with pytest.raises(SystemExit):
         uppercase(me, worker.Workload({}, reads))
     workload = worker.Workload({"a": b"one"}, reads)
@@ -283,11 +281,7 @@ def hang(dask_worker: Any) -> None:
 
 def run_full(dask_worker: Any) -> None:
     """Make the worker's next call fail as on a full disk."""
-
-    def fail() -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    spoil(dask_worker, fail)
+    spoil(dask_worker, lambda: fail(None))
 
 
 def take_memory(dask_worker: Any) -> None:
@@ -333,6 +327,21 @@ def test_failing_workers_are_restarted(
                 assert not before_fault <= {*client.run(os.getpid, on_error="ignore").values()}
                 break
     assert longest < 60
+
+
+def fail(state: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("llvm")
+def test_a_call_that_ends_every_worker_ends_the_run(caplog: pytest.LogCaptureFixture) -> None:
+    ended = pytest.raises(MachineError, match="--cluster: the same call ended 4 workers, the last one at tls://")
+    with checks.cases_at(Place(1), "llvm_ad_rgb", threads=1) as run, ended:
+        list(run(None, fail, [()]))
+    warnings = [record.message for record in caplog.records if record.name == "reslrb_cli.cluster.calls"]
+    assert len(warnings) == 4
+    assert all("No space left on device; it is restarted" in warning for warning in warnings)
 
 
 @pytest.mark.long
