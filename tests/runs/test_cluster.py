@@ -408,7 +408,7 @@ RUN = ["optimize", "tiny.yaml", *tiny.settings(*SETS, "run.shards=4", "views=[{s
 
 
 def reslrb(net, host: int, *words: object, **variables: str):
-    """Start a command on one core: two renderings of a target on several threads sometimes differ in their last bits."""
+    """Start a command on one core: renderings of a target on several threads sometimes differ in their last bits."""
     return net.start(host, [sys.executable, "-m", "reslrb_cli", *words], core=0, **variables)
 
 
