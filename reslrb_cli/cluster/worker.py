@@ -32,7 +32,7 @@ from reslrb_cli.records.manifest import versions
 ALLOW_CODE = "RESLRB_ALLOW_CODE"
 
 #: dask's topic for the reason why a worker ends its process, and the seconds to send the reason.
-TOPIC, SEND_S = "reslrb", 0.5
+TOPIC, SEND_S = "reslrb", 2.0
 
 #: Time limit of a call, in seconds: `COLD_S` while kernels are compiled. Afterwards, `CALL_S`, plus a multiple of the
 #: longest call of the same function, plus the time to load the experiment.
