@@ -11,7 +11,6 @@ The scene is one file, without includes.
 
 from __future__ import annotations
 
-import hashlib
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -53,14 +52,6 @@ class Bundle:
             except OSError as error:
                 raise ConfigError(path, "", f"cannot be sent to workers: {error.strerror}") from None
         return self._names[path]
-
-    def digest(self) -> str:
-        """Return a digest of all files."""
-        found = hashlib.blake2b(digest_size=16)
-        for name, data in sorted(self.files.items()):
-            found.update(f"{name} {len(data)}\n".encode())
-            found.update(data)
-        return found.hexdigest()
 
 
 def bundle_of(config: Config, values: Values) -> Bundle:

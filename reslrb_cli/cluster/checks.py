@@ -1,4 +1,4 @@
-"""Samples of `gradcheck`, and cases of its suite, on workers (`crew.Crew`).
+"""Samples of `gradcheck`, and cases of its suite, on workers (`calls.Workers`).
 
 A sample depends on the experiment's files, on the steps of finite differences, and on its seed. Only the process of
 `gradcheck` chooses the steps. A case depends only on its name.
@@ -14,13 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.bundle import CONFIG_FILE, Bundle, Values, bundle_of, read_bundle
+from reslrb_cli.cluster.calls import Workers
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.cluster.crew import Crew
-from reslrb_cli.cluster.worker import Anywhere, Opening
+from reslrb_cli.cluster.worker import Workload, set_threads
 from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
@@ -37,8 +35,11 @@ class Steps:
     """The step sizes of finite differences, for each parameter and each kind of paths (`sampling.steps_of`)."""
 
     steps: Mapping[str, Sequence[Step]]
-    #: Only values of this process: NumPy may write numbers differently elsewhere.
-    digest: str
+
+    @staticmethod
+    def of(participants: Participants) -> Steps:
+        """Return the steps that this process has chosen."""
+        return Steps(steps_of(participants, participants.directions))
 
     def take(self, participants: Participants) -> None:
         """Set these steps."""
@@ -49,7 +50,7 @@ class Steps:
 
 
 def participants_in(
-    folder: Path, threads: int, variant: str, allows_code: bool, settings: Mapping[str, Any]
+    folder: Path, threads: int | None, variant: str, allows_code: bool, settings: Mapping[str, Any]
 ) -> tuple[Participants, dict[str, float]]:
     """Return the participants of the experiment in `folder`. `settings` holds further `CheckSettings`. No kernels are
     warm.
@@ -59,22 +60,17 @@ def participants_in(
     config, initial = _read(folder)
     told = {**settings, "integrators": listed, "initial": initial}
     participants = Participants(CheckSettings(config.with_code(allows_code), **told))
-    _with_threads(threads)
+    set_threads(threads)
     return participants, {}
 
 
-def nothing_in(folder: Path, threads: int, variant: str) -> tuple[Stop, dict[str, float]]:
+def nothing_in(folder: Path, threads: int | None, variant: str) -> tuple[Stop, dict[str, float]]:
     """Return the argument that a case needs besides its name. The argument is a `stop` function that always returns
     False.
     """
     set_variant(variant)
-    _with_threads(threads)
+    set_threads(threads)
     return lambda: False, {}
-
-
-def _with_threads(threads: int) -> None:
-    dr.sync_thread()
-    dr.set_thread_count(threads)
 
 
 def _read(folder: Path) -> tuple[Config, Values | None]:
@@ -107,29 +103,11 @@ def check_shareable(settings: CheckSettings) -> None:
 @contextlib.contextmanager
 def samples_at(
     settings: CheckSettings, participants: Participants, place: Place, variant: str, threads: int | None = None
-) -> Iterator[Callable[..., Any]]:
-    """Take samples of `participants` on the workers at a place, as a `sampling.Engine`. Raises as `Crew.start` does."""
-    opening, bundle = _opening_of(settings, participants, variant, own=place.address is None)
-    with _crew_at(place, opening, bundle.files, threads) as crew:
-
-        def take(
-            participants: Participants, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
-        ) -> Iterator[tuple[int, Any]]:
-            kind, of, _ = work[0]
-            chosen = steps_of(participants, participants.directions)
-            steps = Steps(chosen, repr(chosen))
-            return crew.run(function, work, steps, cold=f"{kind} {of}")
-
-        yield take
-
-
-def _opening_of(settings: CheckSettings, participants: Participants, variant: str, own: bool) -> tuple[Opening, Bundle]:
-    """Return the data from which every worker builds equal participants. `own` is true if the workers belong to this
-    command.
-    """
+) -> Iterator[Workers]:
+    """Take samples of `participants` on the workers at a place, as a `sampling.Engine`. Raises as `Workers` does."""
     config = settings.config
-    built_in = config.scene.file == small.FILE
     values = {key: participants.selection.array(key) for key in participants.selection.keys}
+    built_in = config.scene.file == small.FILE
     bundle = Bundle({CONFIG_FILE: dump(config).encode()}) if built_in else bundle_of(config, values)
     sent = {
         "integrators": [_with_file(case, lambda file: bundle.add(Path(file))) for case in settings.integrators],
@@ -138,26 +116,16 @@ def _opening_of(settings: CheckSettings, participants: Participants, variant: st
         "spp": settings.spp,
         "named": settings.named,
     }
-    asks = config.allows_code and not own
-    return Opening(bundle.digest(), participants_in, (variant, config.allows_code, sent), asks_for_code=asks), bundle
-
-
-@contextlib.contextmanager
-def cases_at(place: Place, variant: str, threads: int | None = None) -> Iterator[Callable[..., Any]]:
-    """Run cases (`extreme.case_records`) on the workers at a place, as `shards.serially` does in this process. Raises
-    as `Crew.start` does.
-    """
-    with _crew_at(place, Opening(Bundle().digest(), nothing_in, (variant,)), {}, threads) as crew:
-
-        def run(stop: Stop, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
-            return crew.run(function, work, Anywhere(), cold="of the suite")
-
-        yield run
-
-
-@contextlib.contextmanager
-def _crew_at(place: Place, opening: Opening, files: Mapping[str, bytes], threads: int | None) -> Iterator[Crew]:
+    arguments, asks = (variant, config.allows_code, sent), config.allows_code and place.address is not None
+    workload = Workload(bundle.files, participants_in, arguments, threads or place.threads, asks)
     with connected(place) as (client, _):
-        crew = Crew(client, opening, files, threads)
-        crew.start()
-        yield crew
+        yield Workers(client, workload, str(place), Steps.of)
+
+
+@contextlib.contextmanager
+def cases_at(place: Place, variant: str, threads: int | None = None) -> Iterator[Workers]:
+    """Run cases (`extreme.case_records`) on the workers at a place, as `shards.serially` does in this process. Raises
+    as `Workers` does.
+    """
+    with connected(place) as (client, _):
+        yield Workers(client, Workload({}, nothing_in, (variant,), threads or place.threads), str(place))

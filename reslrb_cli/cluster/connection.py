@@ -31,15 +31,15 @@ logger = logging.getLogger(__name__)
 MOST_WORKERS = 1024
 _ADDRESS = re.compile(r"tls://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
 
-#: dask's settings. A task is given up after this many dead workers. A worker counts as lost after this silence, which
-#: must outlast its longest compilation. A connection is given up after 30 silent seconds. Large arguments need no
-#: warning.
+#: Seconds without any worker before the run ends.
+NOBODY_S = 60
+
+#: dask's settings. A call fails after 60 seconds without any worker. A connection is given up after 30 silent seconds.
+#: Large arguments need no warning.
 SETTINGS = {
-    "distributed.scheduler.allowed-failures": 3,
-    "distributed.scheduler.worker-ttl": "30 minutes",
+    "distributed.scheduler.no-workers-timeout": NOBODY_S,
     "distributed.comm.timeouts.connect": "30s",
     "distributed.comm.timeouts.tcp": "30s",
-    "distributed.admin.tick.limit": "1h",
     "distributed.admin.large-graph-warning-threshold": "1TB",
     # Nobody reads this history.
     "distributed.admin.log-length": 100,
@@ -89,6 +89,12 @@ class Place:
     def __str__(self) -> str:
         return self.address or f"local:{self.workers}"
 
+    @property
+    def threads(self) -> int | None:
+        """The share of the cores of each worker of this machine. None for other workers."""
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(cores // self.workers, 1) if self.workers else None
+
     def check(self) -> None:
         """Raise ConfigError if certificates are missing, and MachineError if the scheduler does not answer."""
         if self.address is not None:
@@ -127,7 +133,9 @@ def connected(place: Place) -> Iterator[tuple[Client, Path]]:
                 heartbeat_interval="2s",
             )  # fmt: skip
         except (OSError, RuntimeError, TimeoutError) as error:
-            raise MachineError(f"--cluster: {_why_not(place, error)}") from None
+            where, said = place.address or "this machine", one_line(str(error.__cause__ or error), 200)
+            refused = f"the scheduler at {where} cannot be reached, or refuses this certificate: {said}"
+            raise MachineError(f"--cluster: {refused}") from None
         stack.callback(_close, client)
         yield client, folder
 
@@ -193,12 +201,6 @@ def _certificates() -> object:
         if "\n" not in file and not os.access(file, os.R_OK):
             raise ConfigError("--cluster", f"distributed.comm.tls.{name}", f"{file} cannot be read")
     return security
-
-
-def _why_not(place: Place, error: Exception) -> str:
-    """Describe why a client could not connect."""
-    said = one_line(str(error.__cause__ or error), 200)
-    return f"the scheduler at {place.address or 'this machine'} cannot be reached, or refuses this certificate: {said}"
 
 
 def _close(client: Client) -> None:

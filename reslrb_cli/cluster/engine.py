@@ -10,9 +10,8 @@ The module imports dask, so it is imported only for `--cluster`.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,10 @@ import drjit as dr
 import numpy as np
 
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.cluster.bundle import Bundle, bundle_of, read_bundle
+from reslrb_cli.cluster.bundle import bundle_of, read_bundle
+from reslrb_cli.cluster.calls import Workers
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.cluster.crew import Crew
-from reslrb_cli.cluster.worker import Opening
+from reslrb_cli.cluster.worker import Workload, set_threads
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.memory import fit_memory
@@ -33,7 +32,6 @@ from reslrb_cli.optimization.shards import Task, make_tasks, shard_gradient, sha
 from reslrb_cli.optimization.state import Settled, begin_as, decide_as, guiding_of, restore_tables
 from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.records.checkpoint import STATE_FILE, write_archive
-from reslrb_cli.records.clock import SharedTime, WorkerTime
 from reslrb_cli.records.tree import Stored, like, to_array
 from reslrb_cli.runs.prepare import RunProgress, digests
 
@@ -47,11 +45,8 @@ TARGETS_FILE = "targets.npz"
 class Standing:
     """Parameters and tables of a step. The values are those of the optimiser. The tables are the guide's learned state
     (`Guiding.state`).
-
-    `digest` covers both.
     """
 
-    digest: str
     values: dict[str, Array]
     calls: dict[str, int]
     learned: dict[str, Array]
@@ -63,7 +58,7 @@ class Standing:
         calls, learned = ({}, {}) if guiding is None else guiding.state()
         keys = problem.optimizer.keys()
         values = {key: to_array(problem.optimizer[key]) for key in keys}
-        return Standing(_digest(repr(calls), values, learned), values, dict(calls), learned)
+        return Standing(values, dict(calls), learned)
 
     def take(self, problem: Problem) -> None:
         """Set the parameters and tables of a problem."""
@@ -75,19 +70,10 @@ class Standing:
         problem.apply()
 
 
-def _digest(text: str, *mappings: Mapping[str, Array]) -> str:
-    found = hashlib.blake2b(text.encode(), digest_size=16)
-    for mapping in mappings:
-        for key, array in mapping.items():
-            found.update(f"{key} {array.dtype} {array.shape}".encode())
-            found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
-
-
 # --- on a worker ------------------------------------------------------------------------------------------------------
 
 
-def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, dict[str, float]]:
+def assembled(folder: Path, threads: int | None, allows_code: bool) -> tuple[Problem, dict[str, float]]:
     """Load the run's problem with targets and decisions from the experiment's files, and compile the problem's kernels.
 
     Also returns the time of each shard function after compilation, in seconds.
@@ -100,8 +86,7 @@ def assembled(folder: Path, threads: int, allows_code: bool) -> tuple[Problem, d
         begin_as(problem, stored)
         problem = decide_as(fit_memory(problem), stored)
         set_targets(problem.views, dict(targets))
-    dr.sync_thread()
-    dr.set_thread_count(threads)
+    set_threads(threads)
     return problem, _warmed(problem)
 
 
@@ -126,59 +111,32 @@ def _warmed(problem: Problem) -> dict[str, float]:
 # --- in the process that runs `optimize` ------------------------------------------------------------------------------
 
 
-def opening_of(course: RunProgress, folder: Path, own: bool) -> tuple[Opening, Bundle]:
+def workload_of(course: RunProgress, folder: Path, threads: int | None, own: bool) -> Workload:
     """Return the data that workers need for a run. `own`: the workers belong to this run. `folder` is for temporary
     files.
 
     Raises OSError. Raises ConfigError if a file has changed since the run began.
     """
     config, selection = course.problem.config, course.problem.selection
-    bundle, here = bundle_of(config, {key: selection.array(key) for key in selection.keys}), digests(config)
+    files = bundle_of(config, {key: selection.array(key) for key in selection.keys}).files
+    here = digests(config)
     for key, digest in course.files.items():
         if here.get(key) != digest:
             raise ConfigError(config.source, key, "has changed since the run began; restore it, or start a new run")
     course.save(folder)
     write_archive(folder / TARGETS_FILE, target_arrays(course.problem.views))
-    for name in (STATE_FILE, TARGETS_FILE):
-        bundle.files[name] = (folder / name).read_bytes()
+    files |= {name: (folder / name).read_bytes() for name in (STATE_FILE, TARGETS_FILE)}
     allows_code = config.allows_code
-    return Opening(bundle.digest(), assembled, (allows_code,), asks_for_code=allows_code and not own), bundle
-
-
-class Engine:
-    """Computes shards on workers (`shards.Engine`). `where` names the workers' place."""
-
-    def __init__(self, crew: Crew, where: str) -> None:
-        self.crew, self.where = crew, where
-
-    def __call__(
-        self, problem: Problem, function: Callable[..., Any], work: Sequence[tuple[Any, ...]]
-    ) -> Iterator[tuple[int, Any]]:
-        """Yield the index and the result of each call as soon as the answer arrives. Raises the errors of calls."""
-        return self.crew.run(function, work, self.standing(problem))
-
-    @staticmethod
-    def standing(problem: Problem) -> Standing:
-        """Return the parameters and tables that are sent to each worker before a round."""
-        return Standing.of(problem)
-
-    def spent(self) -> SharedTime:
-        """Return the times so far."""
-        rounds, workers = self.crew.spent, self.crew.by_worker.items()
-        by_worker = {name: WorkerTime(one.calls, one.computing + one.standing, one.again) for name, one in workers}
-        computing = rounds.computing + rounds.standing
-        return SharedTime((self.where,), rounds.wall, computing, rounds.waiting, by_worker)
+    return Workload(files, assembled, (allows_code,), threads, asks_for_code=allows_code and not own)
 
 
 @contextlib.contextmanager
-def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> Iterator[Engine]:
+def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> Iterator[Workers]:
     """Load a run's experiment on the workers at `place`, and provide the workers as an `Engine`. Each worker has
-    `threads` threads. If `threads` is None, each worker gets its share of the cores.
+    `threads` threads. If `threads` is None, each worker of this machine gets its share of the cores.
 
     Raises MachineError if there are no usable workers.
     """
     with connected(place) as (client, folder):
-        opening, bundle = opening_of(course, folder, own=place.address is None)
-        crew = Crew(client, opening, bundle.files, threads)
-        crew.start()
-        yield Engine(crew, str(place))
+        workload = workload_of(course, folder, threads or place.threads, own=place.address is None)
+        yield Workers(client, workload, str(place), Standing.of)

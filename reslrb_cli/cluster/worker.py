@@ -1,145 +1,182 @@
-"""The workers' side: a worker loads an `Opening`, sets the `Context` of a round of calls, and executes calls.
+"""The workers' side: a worker loads a `Workload` in its first call, and computes calls.
 
-An opening contains files, which are sent once, and a function that builds a state from them. The worker keeps this
-state. A call is a function of the state and its context. Its value must be serialisable.
+A call is a function of the state that the worker has loaded, and of its arguments. Its value must be serialisable.
+
+If the machine of a worker fails, or a call takes too long, the worker ends its process. dask then repeats the call, on
+another worker if there is one, and restarts the worker.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import pickle
+import secrets
+import shutil
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
-from distributed import get_worker
+import drjit as dr
+from distributed import Worker, WorkerPlugin, get_worker
 
 from reslrb_cli.cluster.bundle import unpack
-from reslrb_cli.errors import (
-    ConfigError,
-    MachineError,
-    ReslrbError,
-    describe,
-    is_machine_fault,
-    is_out_of_memory,
-    one_line,
-)
+from reslrb_cli.errors import ConfigError, MachineError, ReslrbError, describe, is_machine_fault, is_out_of_memory
 from reslrb_cli.records.manifest import versions
+
+#: Environment variable of a worker: 1 allows users' own code there, if the experiment's user allows it, too.
+ALLOW_CODE = "RESLRB_ALLOW_CODE"
+
+#: dask's topic for the reason why a worker ends its process, and the seconds to send the reason.
+TOPIC, SEND_S = "reslrb", 2.0
+
+#: Time limit of a call, in seconds: `COLD_S` while kernels are compiled. Afterwards, `CALL_S`, plus a multiple of the
+#: longest call of the same function, plus the time to load the experiment.
+COLD_S, CALL_S, TIMES = 900.0, 10.0, 10.0
 
 
 class Context(Protocol):
-    """The context that all workers set in their state before a call."""
-
-    @property
-    def digest(self) -> str:
-        """A digest of the context."""
+    """The part of a worker's state that changes from round to round, such as the parameters of a step."""
 
     def take(self, state: Any) -> None:
         """Set this context in a worker's state."""
 
 
-@dataclass(frozen=True)
-class Anywhere:
-    """The `Context` of calls that depend only on their arguments."""
+class Answer(NamedTuple):
+    """The value of a call, the worker's name, and the seconds of the computation."""
 
-    digest: str = "anywhere"
-
-    def take(self, state: Any) -> None:
-        """Leave the state unchanged."""
-
-
-@dataclass(frozen=True)
-class Opening:
-    """The data from which a worker builds its state. `function(folder, threads, *arguments)` builds the state from the
-    files in a folder.
-
-    The function returns the state. The function also returns the seconds per call, by name, for each function with
-    compiled kernels. `digest` is the digest of the files. `asks_for_code` is true if users' own code must run and the
-    workers do not belong to this run.
-    """
-
-    digest: str
-    function: Callable[..., tuple[Any, dict[str, float]]]
-    arguments: tuple[Any, ...] = ()
-    asks_for_code: bool = False
-    versions: Mapping[str, str] = field(default_factory=versions)
-
-
-@dataclass
-class _WorkerState:
-    """The state of a worker, and the digest of its context."""
-
-    opening: str
     value: Any
-    stands: str = ""
-
-
-_state: _WorkerState | None = None
-
-#: Environment variable of a worker: 1 allows users' own code there, if the experiment's user allows it, too.
-ALLOW_CODE = "RESLRB_ALLOW_CODE"
-
-
-@dataclass(frozen=True)
-class Reply:
-    """A worker's answer; `worker` is its address."""
-
     worker: str
-
-
-@dataclass(frozen=True)
-class Answer(Reply):
-    """The value of a call, and the seconds of its computation."""
-
-    value: Any
     seconds: float
 
 
-@dataclass(frozen=True)
-class Lacks(Reply):
-    """The data that a worker lacks: the opening's `files`, the `opening` itself, or the `context`."""
+class _Loaded(NamedTuple):
+    """The state of a worker, the time to load it, and the longest call of each function with compiled kernels."""
 
-    what: str
+    state: Any
+    loading_s: float
+    longest: dict[str, float]
 
 
-@dataclass(frozen=True)
-class Fault(Reply):
-    """A failure of a worker's machine. `memory` is True if no memory is left. `stays` is True if a restart of the
-    worker does not help.
+@dataclass(eq=False)
+class Workload(WorkerPlugin):
+    """The data from which every worker builds an equal state. dask sends it to each worker once.
+
+    `function(folder, threads, *arguments)` builds the state from `files`, which are in `folder`. It also returns the
+    seconds per call, by name, for each function with compiled kernels. If `threads` is None, a worker uses all cores
+    that it may use. `asks_for_code` is true if users' own code must run and the workers do not belong to this run.
     """
 
-    text: str
-    memory: bool = False
-    stays: bool = False
+    files: Mapping[str, bytes]
+    function: Callable[..., tuple[Any, dict[str, float]]]
+    arguments: tuple[Any, ...] = ()
+    threads: int | None = None
+    asks_for_code: bool = False
+    versions: Mapping[str, str] = field(default_factory=versions)
+    key: str = field(default_factory=lambda: secrets.token_hex(8))
+
+    name = "reslrb"  # a new workload replaces the workers' previous one
+    _loaded: _Loaded | None = field(default=None, init=False)
+    _context: bytes = field(default=b"", init=False)
+
+    def setup(self, worker: Worker) -> None:
+        """Raise MachineError if this worker cannot take part."""
+        here = versions()
+        for name, version in self.versions.items():
+            if here.get(name) != version:
+                wrong = f"has {name} {here.get(name)}, but the run has {version}: install the same version"
+                raise MachineError(f"{_name(worker)} {wrong}")
+        if self.asks_for_code and os.environ.get(ALLOW_CODE) != "1":
+            wrong = f"does not run users' own code: start it with {ALLOW_CODE}=1 in its environment"
+            raise MachineError(f"{_name(worker)} {wrong}")
+
+    def teardown(self, worker: Worker) -> None:
+        """Remove the files."""
+        shutil.rmtree(self._folder(worker), ignore_errors=True)
+
+    def _folder(self, worker: Worker) -> Path:
+        return Path(worker.local_directory) / f"reslrb-{self.key}"  # dask removes it with the worker
+
+    def call(self, worker: Worker, context: bytes, function: Callable[..., Any], arguments: Sequence[Any]) -> Answer:
+        """Call `function` with the state in `context` (a pickled `Context`, or empty) and `arguments`."""
+        loaded, name = self._loaded or self._load(worker), function.__name__
+        state, loading_s, longest = loaded
+        limit_s = CALL_S + TIMES * longest[name] + loading_s if name in longest else COLD_S
+        begin = time.perf_counter()
+        with _guarded(worker, limit_s):
+            if context not in (b"", self._context):
+                self._context = b""
+                pickle.loads(context).take(state)
+                self._context = context
+            value = function(state, *arguments)
+        seconds = time.perf_counter() - begin
+        if name in longest:
+            longest[name] = max(longest[name], seconds)
+        return Answer(value, _name(worker), seconds)
+
+    def _load(self, worker: Worker) -> _Loaded:
+        self.setup(worker)
+        begin = time.perf_counter()
+        _take_device(worker.name)
+        logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has reported it already
+        try:
+            with _guarded(worker, COLD_S):
+                unpack(self.files, self._folder(worker))
+                state, longest = self.function(self._folder(worker), self.threads, *self.arguments)
+        except Exception as error:
+            raise MachineError(f"{_name(worker)} cannot load the experiment: {describe(error)}") from None
+        self._loaded = _Loaded(state, time.perf_counter() - begin, longest)
+        return self._loaded
 
 
-def open_state(opening: Opening, files: Mapping[str, bytes] | None, threads: int) -> Reply:
-    """Load an opening in this worker."""
-    global _state
-    begin, me = time.perf_counter(), get_worker().address
-    here = versions()
-    for name, version in opening.versions.items():
-        if here.get(name) != version:
-            return Fault(
-                me, f"has {name} {here.get(name)}, but the run has {version}: install the same version", stays=True
-            )
-    if opening.asks_for_code and os.environ.get(ALLOW_CODE) != "1":
-        return Fault(me, f"does not run users' own code: start it with {ALLOW_CODE}=1 in its environment", stays=True)
-    folder = Path(get_worker().local_directory) / f"reslrb-{opening.digest}"  # dask removes it with the worker
-    if files is None and not folder.is_dir():
-        return Lacks(me, "files")
-    _state = None
-    _take_device(get_worker().name)
-    logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has reported it already
+def perform(key: str, context: bytes, function: Callable[..., Any], arguments: Sequence[Any]) -> Answer:
+    """Compute a call of the workload with this key."""
+    worker = get_worker()
+    workload = worker.plugins.get(Workload.name)
+    if not isinstance(workload, Workload) or workload.key != key:
+        raise MachineError(f"{_name(worker)} lacks the experiment; another run may use it")
     try:
-        unpack(files or {}, folder)
-        value, seconds = opening.function(folder, threads, *opening.arguments)
-    except Exception as error:  # the run could load it, so the fault is on this machine
-        return Fault(me, f"cannot: {describe(error)}", is_out_of_memory(error))
-    _state = _WorkerState(opening.digest, value)
-    return Answer(me, seconds, time.perf_counter() - begin)
+        return workload.call(worker, context, function, arguments)
+    except ConfigError as error:  # cannot be sent to another process
+        raise ReslrbError(str(error)) from None
+
+
+@contextmanager
+def _guarded(worker: Worker, seconds: float) -> Iterator[None]:
+    """End this process if the block takes longer, or if the machine fails in it."""
+    timer = threading.Timer(seconds, _end, (worker, f"did not finish a call within {seconds:.0f} s"))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    except Exception as error:
+        if is_out_of_memory(error) or isinstance(error, OSError) or is_machine_fault(error):
+            _end(worker, f"failed: {describe(error)}")
+        raise
+    finally:
+        timer.cancel()
+
+
+def _end(worker: Worker, reason: str) -> None:
+    """Report the reason, and end this process. dask's nanny starts another one."""
+    worker.log_event(TOPIC, f"{_name(worker)} {reason}; it is restarted")
+    time.sleep(SEND_S)
+    os._exit(1)
+
+
+def set_threads(threads: int | None) -> None:
+    """Set the thread count of this process. None keeps Dr.Jit's choice, all cores that the process may use."""
+    if threads is not None:
+        dr.sync_thread()
+        dr.set_thread_count(threads)
+
+
+def _name(worker: Worker) -> str:
+    return f"worker {worker.name} ({worker.address.rpartition(':')[0].removeprefix('tls://')})"
 
 
 def _take_device(name: object) -> None:
@@ -148,51 +185,3 @@ def _take_device(name: object) -> None:
     found = listed.split(",") if listed else [str(k) for k, _ in enumerate(Path("/proc/driver/nvidia/gpus").glob("*"))]
     if isinstance(name, int) and len(found) > 1:
         os.environ["CUDA_VISIBLE_DEVICES"] = found[name % len(found)]
-
-
-def stand(opening: str, context: Context) -> Reply:
-    """Set the context of the state."""
-    begin, me = time.perf_counter(), get_worker().address
-    if _state is None or _state.opening != opening:
-        return Lacks(me, "opening")
-    if _state.stands != context.digest:
-        _state.stands = ""
-        try:
-            context.take(_state.value)
-        except Exception as error:
-            return _fault(error)
-        _state.stands = context.digest
-    return Answer(me, None, time.perf_counter() - begin)
-
-
-def perform(opening: str, context: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Reply:
-    """Set `context`, call `function` with the state and `arguments`, and return the function's value."""
-    begin, me = time.perf_counter(), get_worker().address
-    if _state is None or _state.opening != opening:
-        return Lacks(me, "opening")
-    if _state.stands != context:
-        return Lacks(me, "context")
-    try:
-        return Answer(me, function(_state.value, *arguments), time.perf_counter() - begin)
-    except Exception as error:
-        return _fault(error)
-
-
-def _fault(error: Exception) -> Fault:
-    """Return the failure of a worker's machine. Raises other errors of a call in a form that can be sent to another
-    process.
-    """
-    me = get_worker().address
-    if is_out_of_memory(error):
-        return Fault(me, one_line(str(error)), memory=True)
-    if isinstance(error, MachineError | OSError) or is_machine_fault(error):
-        return Fault(me, one_line(str(error)))
-    if isinstance(error, ConfigError):
-        raise ReslrbError(str(error)) from None
-    raise error
-
-
-def whereabouts() -> tuple[str, tuple[int, ...]]:
-    """Return this process's machine, and the cores that it may use."""
-    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-    return os.uname().nodename, tuple(sorted(cores))

@@ -70,18 +70,13 @@ class StepClock:
 
 @dataclass(frozen=True)
 class WorkerTime:
-    """Work of one worker: the calls that it answered and the seconds that it computed.
-
-    `again` counts the worker's calls that other workers also received, because the worker did not answer for a long
-    time.
-    """
+    """Work of one worker: the calls that it answered and the seconds that it computed."""
 
     calls: int = 0
     computing_s: float = 0.0
-    again: int = 0
 
     def __add__(self, other: WorkerTime) -> WorkerTime:
-        return WorkerTime(self.calls + other.calls, self.computing_s + other.computing_s, self.again + other.again)
+        return WorkerTime(self.calls + other.calls, self.computing_s + other.computing_s)
 
 
 @dataclass(frozen=True)

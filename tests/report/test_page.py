@@ -218,7 +218,7 @@ def test_scaling_memory_and_run_are_tables(tmp_path):
     assert "None" not in everything
 
 
-SHARED = SharedTime(("local:2",), 4.0, 2.5, 0.5, {"worker 0 (here)": WorkerTime(10, 3.0, 1)}) + SharedTime(
+SHARED = SharedTime(("local:2",), 4.0, 2.5, 0.5, {"worker 0 (here)": WorkerTime(10, 3.0)}) + SharedTime(
     ("tls://there:1",), 2.0, 1.5, 0.25, {"worker 0 (here)": WorkerTime(1, 0.5)}
 )
 
@@ -230,7 +230,7 @@ def test_times_of_workers_are_reported_by_part_and_worker(tmp_path):
     assert page.row("Workers", "computing, the mean of the workers")[1] == "4 s"
     assert page.row("Workers", "waiting for the worker that had most")[1] == "750 ms"
     assert page.row("Workers", "sending and handing out")[1:] == ["1.25 s", f"{100 * 1.25 / max(elapsed, 6):.3g} %"]
-    assert page.row("Workers", "worker 0 (here)")[1:] == ["11", "3.5 s", "1"]
+    assert page.row("Workers", "worker 0 (here)")[1:] == ["11", "3.5 s"]
     assert "Workers" not in page_of(make_run(tmp_path / "alone")).sections
     damaged = page_of(make_run(tmp_path / "damaged", shared={"wall_s": "long"}))
     assert "cannot be shown" in damaged.sections["Workers"]
