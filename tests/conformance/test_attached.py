@@ -19,10 +19,8 @@ from turns import taking_turns
 from reslrb_cli import register
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.protocol import StepIntegrator
-from reslrb_cli.measure.comparison import Family, compare_expectations
-from reslrb_cli.measure.gradients import integrator, relative, seeds
+from reslrb_cli.measure.gradients import integrator, relative
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
-from reslrb_cli.records.measurements import Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -33,8 +31,6 @@ pytestmark = pytest.mark.usefixtures("llvm")
 # two references differ. A fault of our walk shows where the distance of `stack` from `ptracer` is larger than that
 # difference.
 
-#: Error of Mitsuba's own light tracer, relative to the entries, over many seeds (`measure.gradcheck`).
-STOCK_ROUNDING = 1e-3
 #: Limit for twice the distance of the two references. A larger distance is a fault of the walk that `stack` and
 #: `walk_ad` share.
 FARTHEST = 1e-3
@@ -92,32 +88,6 @@ def test_equal_seeds(name: str):
     check(BY_NAME[name])
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", [case.name for case in CASES if case.stock])
-def test_means_over_seeds_agree_with_ptracer(name: str):
-    """The tests of gradcheck compare the means. They would find a fault for which the distances at one seed are too
-    coarse.
-    """
-    case, many = BY_NAME[name], seeds(8)
-    moving = case.moving()
-    ours, stock = (
-        [moving.gradient(tracer(case, integrator), seed, case.spp) for seed in many]
-        for integrator in ("reslrb", "ptracer")
-    )
-    naive = moving.gradient(tracer(case, "walk_ad"), many[0], case.spp)
-    for key in ours[0]:
-        mine, theirs = (np.stack([gradient[key] for gradient in side]) for side in (ours, stock))
-        # An entry is a sum of terms that may cancel, and these terms are as large as the largest entry. The error from
-        # rounding and from the references' distance follows the size of the terms, not of the entry. `apart` is the
-        # distance of naive AD of our walk from stock.
-        apart = relative(naive[key], theirs[0])
-        assert apart <= FARTHEST / 2
-        floor = max(case.limit, apart) * float(np.abs(theirs.mean(0)).max())
-        found = compare_expectations(mine, theirs, Family(30, 3000), rounding=STOCK_ROUNDING, bias=floor)
-        print(name, key, found)
-        assert found.verdict is not Verdict.FAILS
-
-
 def deep(depth: int, stack_size: int, **options: Any) -> dict[str, np.ndarray]:
     """Return the gradient through long paths, with a stack of size `stack_size`."""
     moving = Moving(enclosed(albedo=0.95), DEEP)
@@ -141,20 +111,6 @@ def test_a_small_stack_equals_a_large_one(depth: int, sizes: tuple[int, ...], op
             # Rounding causes 4e-7 with vectors of 16 lanes, and 1.7e-5 with vectors of 8 lanes.
             assert relative(value, expected[key]) < 1e-4, f"{key}, {size} places"
             assert value.any()
-
-
-@pytest.mark.long
-def test_normalization_of_the_filter_has_an_effect():
-    """Without this effect, none of these tests would show whether the normalization is attached or detached."""
-    case = BY_NAME["slab"]
-    moving = case.moving()
-    attached, detached = (
-        moving.gradient(integrator("reslrb", case.depth, estimator="stack", filter_normalization=kind))
-        for kind in ("attached", "detached")
-    )
-    assert relative(attached["slab.vertex_positions"], detached["slab.vertex_positions"]) > 1e-3
-    naive = moving.gradient(integrator("walk_ad", case.depth, attached=True))
-    assert relative(attached["slab.vertex_positions"], naive["slab.vertex_positions"]) < case.limit
 
 
 def test_enough_faults():
@@ -280,15 +236,6 @@ def test_as_a_plugin(normalization: str):
     dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
     assert np.abs(tangent).max() > 0
     assert abs(np.sum(tangent * weights) - dr.grad(amplitude)[0]) < ROUNDING * np.linalg.norm(tangent)
-
-
-@pytest.mark.long  # naive AD in forward mode compiles for a minute
-@pytest.mark.parametrize("normalization", ["attached", "detached"])
-def test_as_a_plugin_every_pixel_is_that_of_naive_ad(normalization: str):
-    script = Script(normalization)
-    ours, naive = script.tangent(type="reslrb", estimator="stack"), script.tangent(type="walk_ad", attached=True)
-    assert np.abs(naive).max() > 0
-    assert relative(ours, naive) < ROUNDING
 
 
 def test_a_moving_lamp_is_refused():

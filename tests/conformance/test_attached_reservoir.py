@@ -172,31 +172,6 @@ def test_a_single_lamp_moves(name: str):
         assert relative(ours[key], value) < SPECULAR
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("options", [{}, {"capacity": 3}], ids=str)
-def test_a_single_lamp_moves_within_walls(options: dict[str, Any]):
-    """Within walls, a path has several connections, and some of them are selected. The gradients of a moving lamp then
-    agree in expectation. A point light shines in all directions, and 16 seeds would leave noise of a tenth.
-    """
-    [lamp] = [case for case in LAMPS if case.name == "spot_bounces"]
-    moving = lamp.moving()
-    exact, ours = (
-        np.array([
-            np.concatenate(list(
-                moving.gradient(integrator("reslrb", 5, estimator=estimator, hide_emitters=True, **own), seed, 256)
-                .values()
-            ))
-            for seed in seeds(16)
-        ])
-        for estimator, own in (("stack", {}), ("reservoir", options))
-    )  # fmt: skip
-    along = (ours - exact) @ exact.mean(0) / np.square(exact.mean(0)).sum()
-    error = along.std(ddof=1) / 4
-    print(options, f"bias {along.mean():.2%} +- {error:.2%}")
-    assert abs(along.mean()) < 4 * error
-    assert error < 0.01
-
-
 @pytest.mark.parametrize("name", ["bounces", pytest.param("rough_slab", marks=pytest.mark.long)])
 def test_two_kernels_equal_one(name: str):
     """If dL/dI is known beforehand, chain and replay are one kernel. Otherwise, the kept state goes through memory.
@@ -336,20 +311,6 @@ def test_both_agree(name: str):
     assert np.abs(followed.mean(0)).min() > 0
     assert found.z_max < found.z_max_limit
     assert found.z_rms < found.z_rms_limit
-
-
-@pytest.mark.long
-def test_a_corner_that_does_not_move():
-    """With `follow`, turning directions sweep over the corner. With `auto`, directions do not. Only the gradients with
-    `auto` agree with finite differences.
-    """
-    scene = SCENES["bounce_corner"]
-    right = compare_with_differences(scene, count=4)
-    # The finite differences use only the image, which is the same for both kinds of sampling.
-    wrong = replace(right, ours=gradients(scene, "follow", len(right.ours), first=0))
-    print(f"auto: {right}; follow: {wrong}")
-    assert right.error < 4 * right.standard_error < 0.6
-    assert wrong.error > 8 * wrong.standard_error
 
 
 @pytest.mark.long

@@ -14,7 +14,7 @@ from turns import a_few
 import reslrb_cli
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.guiding.tables import EVERY
-from reslrb_cli.integrators.step import known_step, render_image
+from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import SIZE, diffuse, rgb, texture, transform
 
@@ -116,16 +116,6 @@ def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) 
     result = compare(*found, block=None)
     print(estimator, adjoint, result)
     assert result
-
-
-@pytest.mark.long
-def test_an_image_alone_has_the_unguided_mean() -> None:
-    scene, ours, plain = guided("envmap", 3)
-    images = [
-        np.stack([np.array(render_image(each, scene.scene, 0, seed, SPP), np.float64) for seed in seeds(24, block)])
-        for block, each in enumerate((ours, plain))
-    ]
-    assert compare(*images)
 
 
 @pytest.mark.parametrize("name", a_few(["two_emitters", "mask_texture_in_view"], ["two_emitters"]))

@@ -76,11 +76,3 @@ def test_naive_ad_grows(case: Case):
         print(name, peaks, "reslrb", ours)
         assert peaks[16] > 2.5 * peaks[4], name
         assert ours[16] < 0.25 * peaks[16], name
-
-
-@pytest.mark.long
-def test_naive_ad_grows_linearly(case: Case):
-    peaks = {depth: peak(case, "ptracer", depth) for depth in (4, 8, 16, 32)}
-    print(peaks)
-    slopes = [(peaks[2 * depth] - peaks[depth]) / depth for depth in (4, 8, 16)]
-    assert max(slopes) < 1.5 * min(slopes)

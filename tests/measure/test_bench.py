@@ -99,12 +99,6 @@ def test_l2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_budget_too_small_for_anything_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    assert call("--budget", "0", "--max-depth", "4", "--integrators", "reslrb:stack") == 1
-    assert "not measured: depth 2, 4: the budget was spent; allow more with --budget" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("llvm")
 def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     args = ["--max-depth", "4", "--integrators", "ptracer", "--memory-limit", "100MiB", "--json", str(file)]
@@ -129,15 +123,6 @@ def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureF
     printed = capsys.readouterr()
     assert "depth 2, trajectory: UnsupportedScene: trajectory: Dr.Jit cannot reverse" in printed.out
     assert printed.err.count("toWorld") == 1  # both mend the scene, one line is shown
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("limit", ["200MiB", "420MiB"])
-def test_an_end_at_a_low_limit_is_attributed_to_memory(limit: str, tmp_path: Path) -> None:
-    file = tmp_path / "bench.json"
-    args = ["--max-depth", "2", "--integrators", "reslrb:stack", "--memory-limit", limit, "--json", str(file)]
-    assert call(*SMALL, *args) in (0, 4)  # memory use depends on the number of cores
-    assert read(file)[0]["status"] in ("ok", "out_of_memory")
 
 
 @pytest.mark.usefixtures("llvm")

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from cli.tiny import KEY, reslrb, settings
+from cli.tiny import KEY
 
 import reslrb_cli as rl
 from reslrb_cli.config.loader import load
@@ -235,25 +235,3 @@ def test_decisions_of_another_experiment_are_not_used(folder: Path, files: tuple
         assert not is_known(), file
         restore()
     assert is_known()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("command", [
-    ("gradcheck", "--seeds", "3", "--estimators", "stack"),
-    ("bench", "--max-depth", "2", "--rounds", "3", "--integrators", "reslrb:stack"),
-    ("convergence", "--rounds", "3", "--integrators", "reslrb:stack"),
-])  # fmt: skip
-def test_measurements_of_another_experiment_are_not_continued(folder: Path, command: tuple[str, ...]) -> None:
-    name, *options = command
-    words = [name, "photo.yaml", *options, *settings("loss={type: l2}"), "--json"]
-    result = reslrb(*words, "first.jsonl")
-    assert result.exit_code in (0, 1), result.output  # the check can fail with so few samples
-    for file, place in OF_PHOTO.items():
-        if place == "loss.file":
-            continue
-        restore = change(folder / file)
-        result = reslrb(*words, "first.jsonl")
-        advice = "remove the file, or use another one"
-        said = f"--json: first.jsonl belongs to another measurement: {place} has changed; {advice}"
-        assert (result.exit_code, result.stderr.splitlines()[-1]) == (2, said), file
-        restore()

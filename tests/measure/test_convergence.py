@@ -159,24 +159,6 @@ def test_a_sweep_of_samples(tmp_path: Path) -> None:
     assert spps["case reslrb:stack, 16 spp"] == 16
 
 
-def test_lines_of_json(tmp_path: Path) -> None:
-    _, results, _ = play(tmp_path, Stage(case_reslrb_event=Pretence(bias=0.4)), plan())
-    common = ["kind", "label", "integrator", "estimator", "capacity", "adjoint", "spp"]
-    common += ["paths", "light_share", "parameter"]
-    point = json.loads(results.points[0].to_json())
-    assert list(point) == [*common, "steps", "elapsed_s", "relative_rmse", "reference_rmse", "repeats"]
-    assert (point["kind"], point["spp"], point["parameter"], point["adjoint"]) == ("point", 4, "a", None)
-    method = json.loads(of(results, "reslrb:event").to_json())
-    assert method["kind"] == "method"
-    assert list(method)[: len(common)] == common
-    assert set(method["slope"]) == set(method["efficiency"]) == {"value", "low", "high"}
-    assert list(method["seconds_to"]) == ["0.1", "0.03", "0.01"]
-    assert method["seconds_to"] == {"0.1": None, "0.03": None, "0.01": None}  # no target can be reached
-    assert method["bias_z"] > 0
-    assert [json.loads(r.to_json())["kind"] for r in results.references] == ["reference"] * 3
-    assert {r.parameter for r in results.methods} == {*SHAPES, "all"}
-
-
 # Errors, slopes, efficiencies and times from samples of a known distribution.
 
 REPETITIONS = 200
@@ -402,49 +384,6 @@ def test_unbiased_methods(tmp_path: Path, scene: str, size: tuple[int, int], spp
         slope = line["slope"]
         assert abs(slope["value"] + 0.5) < wider * (slope["high"] - slope["value"]), line
     assert {line["biased"] for line in found if line["parameter"] != "all"} == {False}
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.long
-def test_effect_of_correlated_samples_on_the_loss(tmp_path: Path) -> None:
-    cases = ",".join(f"reslrb:stack(adjoint={adjoint})" for adjoint in ("correlated", "independent", "batched"))
-    args = ["--objective", "loss", "--set=run.spp=4", "--integrators", cases, "--rounds", "32"]
-    found = [line for line in methods(tmp_path, "cornell_floor", (64, 64), *args) if line["parameter"] == "all"]
-    assert {line["adjoint"]: line["biased"] for line in found} == {
-        "correlated": True,
-        "independent": False,
-        "batched": False,
-    }
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.long
-def test_the_intervals_have_their_coverage_on_a_scene(tmp_path: Path) -> None:
-    """200 repetitions use the noise of real steps, and all steps together give the true value. No time is measured."""
-    from reslrb_cli.measure.convergence.setup import Sampler, survey
-    from reslrb_cli.optimization.assemble import assemble_scene
-
-    write_experiment(tmp_path)
-    config = load(tmp_path / "tiny.yaml")
-    _, arrays = survey(assemble_scene(config), "fixed", camera=False, named=False, budget_s=None)
-    sampler = Sampler(config, "known", arrays)
-    repetitions, steps, rows, per_row = 200, 24, 12, 4
-    taken = steps + rows * per_row
-    pool = np.stack([sampler.step(seed, 16, 0)[0] for seed in range(repetitions * taken)]).astype(np.float64)
-    everything = ReferenceMean(pool)
-    truth = everything.signal / pool.var(0, ddof=1).sum()
-    covered = {"efficiency": 0, "slope": 0}
-    for part in pool.reshape(repetitions, taken, -1):
-        reference = ReferenceMean(part[steps:].reshape(rows, per_row, -1).mean(1))
-        samples = MethodSamples(part[:steps], np.arange(steps) // 2, np.ones(steps // 2), reference)
-        efficiency, slope = samples.efficiency(), samples.slope()
-        assert efficiency is not None
-        assert slope is not None
-        covered["efficiency"] += efficiency.exponential().low <= truth <= efficiency.exponential().high
-        covered["slope"] += slope.interval().low <= -0.5 <= slope.interval().high
-    least, most = (stats.binom.ppf(p, repetitions, 0.95) for p in (0.0005, 0.9995))
-    print(covered)
-    assert all(least <= count <= most for count in covered.values()), covered
 
 
 # Facts that are found before any measurement: references, dL/dI, and the border of the film.

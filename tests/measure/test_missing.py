@@ -283,11 +283,6 @@ def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
 ERROR, STANDARD_ERROR = 5e-3, 1e-3
 
 
-@pytest.mark.usefixtures("_quiet")
-def test_enough():
-    assert len(SCENES) >= 16
-
-
 #: Scenes without the rooms, in which bouncing light is too noisy for these limits.
 STEADY = [name for name in SCENES if name not in {room.name for room in ROOMS}]
 
