@@ -8,9 +8,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from conformance.drawing import SPP, guided, learn, sample
 from conformance.gradient_cases import CASES
-from conformance.operations import LARGE, even_table, nothing_is_compiled_without
-from conformance.test_guiding import SPP, guided, learn, sample
+from conformance.operations import LARGE, even_table
 from conformance.test_kernels import Kernels
 
 from reslrb_cli.guiding.collect import KEEP, Onward
@@ -512,11 +512,6 @@ def test_state_of_other_cells_is_refused_without_effect(name: str, wrong: Any) -
 
 
 # The cost of guided emission per step: nothing if it is off, and no new compilation of a kernel when it learns.
-
-
-@pytest.mark.usefixtures("llvm")
-def test_without_a_guide_its_code_is_not_compiled() -> None:
-    nothing_is_compiled_without("grid", *guided("two_emitters", 0))
 
 
 @pytest.mark.usefixtures("llvm")
