@@ -10,10 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.attached_cases import CASES, FAULTS, AttachedCase, AttachedFault
+from conformance.attached_cases import CASES, FAULTS, AttachedCase
 from conformance.moving import WHITE, Moving, Place, beam, camera, enclosed, flat, rippled, sheet, under_glass
+from measure.faults import Fault, plant, planted
 from measure.moving_light import SCENES
-from measure.test_mutations import plant
 from turns import taking_turns
 
 from reslrb_cli import register
@@ -113,30 +113,17 @@ def test_a_small_stack_equals_a_large_one(depth: int, sizes: tuple[int, ...], op
             assert value.any()
 
 
-def test_enough_faults():
-    assert len(FAULTS) >= 10
-    assert {fault.case for fault in FAULTS} <= set(BY_NAME)
-
-
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_the_faults_apply_to_the_code(fault: AttachedFault, monkeypatch: pytest.MonkeyPatch):
-    plant(fault, monkeypatch)
-
-
-@pytest.mark.parametrize(
-    "fault", [pytest.param(f, id=f.name, marks=() if f.quick else pytest.mark.long) for f in FAULTS]
-)
-def test_fault(fault: AttachedFault, monkeypatch: pytest.MonkeyPatch):
+@planted(FAULTS)
+def test_fault(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
     with pytest.raises(AssertionError):
-        check(replace(BY_NAME[fault.case], stock=fault.stock))
+        check(replace(BY_NAME[fault.check], stock=fault.stock))
 
 
 # Forward mode with moving light, against the gradient at equal seeds: <weights, J v> = <J^T weights, v>.
 
 ROUNDING = 3e-5
 QUICK = ("slab", "bounce")
-SAMPLING = ("follow", "stay")
 
 
 def distance(name: str, sampling: str) -> float:
@@ -150,52 +137,26 @@ def distance(name: str, sampling: str) -> float:
     return float(np.abs(tangents - gradient[:3]).max() / np.abs(gradient).max())
 
 
-@taking_turns("name", QUICK, "sampling", SAMPLING)
+@taking_turns("name", (*QUICK, "rough_surface", "mirror", "sphere_lens", "moved_receiver", "rough_surface_alpha"),
+              "sampling", ("follow", "stay"), QUICK)  # fmt: skip
 def test_forward_against_backward(name: str, sampling: str):
-    assert_forward_is_backward(name, sampling)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("sampling", SAMPLING)
-@pytest.mark.parametrize("name", ["rough_surface", "mirror", "sphere_lens", "moved_receiver", "rough_surface_alpha"])
-def test_forward_against_backward_in_other_scenes(name: str, sampling: str):
-    assert_forward_is_backward(name, sampling)
-
-
-def assert_forward_is_backward(name: str, sampling: str) -> None:
-    """Assert that forward mode and the gradient agree up to rounding."""
     found = distance(name, sampling)
     print(name, sampling, found)
     assert found < ROUNDING
 
 
-@dataclass(frozen=True)
-class Fault:
-    """Fault in the form that `plant` takes."""
-
-    right: str
-    wrong: str
-    where: str = "integrators.forward:TangentSplat._attached"
-
-
-FORWARD_FAULTS = {
-    "slab": Fault("dr.set_grad(ray.d, d_direction)", "pass"),
-    "mirror": Fault(" + dk * C", ""),
-    "rough_surface": Fault("dP * c + P * dc", "P * dc"),
-}
+ATTACHED = "integrators.forward:TangentSplat._attached"
+FORWARD_FAULTS = [
+    Fault("direction", "slab", ATTACHED, "dr.set_grad(ray.d, d_direction)", "pass", quick=True),
+    Fault("film_position", "mirror", ATTACHED, " + dk * C", ""),
+    Fault("prefix", "rough_surface", ATTACHED, "dP * c + P * dc", "P * dc"),
+]
 
 
-@pytest.mark.parametrize("fault", FORWARD_FAULTS.values(), ids=FORWARD_FAULTS)
-def test_the_faults_apply_to_the_forward_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+@planted(FORWARD_FAULTS)
+def test_fault_of_forward_mode(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n == "slab" else pytest.mark.long) for n in FORWARD_FAULTS]
-)
-def test_fault_of_forward_mode(name: str, monkeypatch: pytest.MonkeyPatch):
-    plant(FORWARD_FAULTS[name], monkeypatch)
-    assert distance(name, "stay") > 30 * ROUNDING
+    assert distance(fault.check, "stay") > 30 * ROUNDING
 
 
 class Script:

@@ -11,8 +11,8 @@ import pytest
 from conformance.attached_cases import CASES
 from conformance.moving_lamps import CASES as LAMPS
 from measure.differenced import AttachedScene, compare_with_differences
+from measure.faults import Fault, plant, planted
 from measure.moving_light import SCENES, moved, point, room, shelf, smooth_texture, wall
-from measure.test_mutations import plant
 
 from reslrb_cli.estimators import chain
 from reslrb_cli.integrators.differentiated import stays
@@ -185,24 +185,17 @@ def test_two_kernels_equal_one(name: str):
     assert relative(apart, whole) < 1e-5
 
 
-@dataclass(frozen=True)
-class Fault:
-    where: str
-    right: str
-    wrong: str
-
-
 SELECTION, REPLAY = "estimators.chain:ChainSelection", "estimators.chain:ChainReplay"
-FAULTS = {
-    "no_G": Fault(f"{SELECTION}.vertex",
-                  "row_times(row, J) + before for row, before in zip(jacobian.log_c",
-                  "row_times(row, J) for row, before in zip(jacobian.log_c"),
-    "factors_passed_stay": Fault(f"{REPLAY}.vertex", "ahead = row - sum", "ahead = row + 0 * sum"),
-    "no_inverse": Fault(f"{REPLAY}.vertex", "row_times(ahead, inverse)", "ahead"),
-    "film_position_stays": Fault("estimators.chain:KeptConnection.of", "[*by_u, *A]", "[*(0 * by_u), *A]"),
-    "own_vertex_left_out": Fault(f"{REPLAY}._differentiate", "own_part + later", "later"),
-    "rays_left_out": Fault(f"{REPLAY}._differentiate", "moved + dr.dot(by_s", "0 * moved + dr.dot(by_s"),
-}  # fmt: skip
+FAULTS = [
+    Fault("no_G", "two", f"{SELECTION}.vertex",
+          "row_times(row, J) + before for row, before in zip(jacobian.log_c",
+          "row_times(row, J) for row, before in zip(jacobian.log_c"),
+    Fault("factors_passed_stay", "both", f"{REPLAY}.vertex", "ahead = row - sum", "ahead = row + 0 * sum"),
+    Fault("no_inverse", "slab", f"{REPLAY}.vertex", "row_times(ahead, inverse)", "ahead"),
+    Fault("film_position_stays", "slab", "estimators.chain:KeptConnection.of", "[*by_u, *A]", "[*(0 * by_u), *A]"),
+    Fault("own_vertex_left_out", "receiver", f"{REPLAY}._differentiate", "own_part + later", "later", quick=True),
+    Fault("rays_left_out", "slab", f"{REPLAY}._differentiate", "moved + dr.dot(by_s", "0 * moved + dr.dot(by_s"),
+]  # fmt: skip
 
 
 def distance(name: str) -> float:
@@ -217,25 +210,15 @@ def distance(name: str) -> float:
     return max(relative(ours[key], value) for key, value in exact.items())
 
 
-@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
-def test_the_faults_apply_to_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+@planted(FAULTS)
+def test_fault(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
-
-
-#: The faults that the default suite plants.
-QUICK = ("own_vertex_left_out",)
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.long) for n in FAULTS])
-def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
-    plant(FAULTS[name], monkeypatch)
-    if name == "no_G":  # specular factors hardly change
+    if fault.check == "two":  # specular factors hardly change
         assert abs(bias(TWO, "stay", 6).value) > 0.1
-        return
-    if name == "factors_passed_stay":  # the remainder is divided by the damping, of either sign
+    elif fault.check == "both":  # the remainder is divided by the damping, of either sign
         assert bias(BOTH, "stay", 6).noise > 5
-        return
-    assert distance("receiver" if name == "own_vertex_left_out" else "slab") > 10 * SPECULAR
+    else:
+        assert distance(fault.check) > 10 * SPECULAR
 
 
 # `attached_sampling`: light that follows a surface, and light that continues to the same place.  Both are right, and

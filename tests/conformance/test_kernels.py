@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
-from turns import a_few, taking_turns
+from turns import taking_turns
 
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.scene.load import load_scene
@@ -64,32 +64,13 @@ def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
         assert not found, f"step {seed} compiled kernels of {[k['operation_count'] for k in found]} operations"
 
 
-#: The cases that also run with independent samples. With `-m long`, all cases do.
-INDEPENDENT = ("texture", "passes", "glass", "mask", "area_texture", "envmap", "visible_lamp")
-#: The cases that the default suite runs of these.
-FEW = ("texture", "passes", "glass", "mask", "envmap")
-#: The other cases that the default suite runs. Each has objects of a kind that the remaining cases do not have.
-CORRELATED = ("thin_lens", "principled", "two_emitters")
+#: The cases of the default suite. Each has objects of a kind that the others do not have.
+FEW = ("texture", "passes", "glass", "mask", "envmap", "thin_lens", "principled", "two_emitters")
 
 
-@taking_turns("name", INDEPENDENT, "adjoint", ("independent", "correlated"), FEW)
+@taking_turns("name", [case.name for case in CASES], "adjoint", ("independent", "correlated"), FEW)
 def test_second_step_compiles_nothing(name: str, adjoint: str):
-    case_compiles_nothing(name, adjoint)
-
-
-@pytest.mark.parametrize("name", a_few([case.name for case in CASES if case.name not in INDEPENDENT], CORRELATED))
-def test_second_step_of_other_cases_compiles_nothing(name: str):
-    case_compiles_nothing(name, "correlated")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [case.name for case in CASES if case.name not in INDEPENDENT])
-def test_independent_second_step_of_other_cases_compiles_nothing(name: str):
-    case_compiles_nothing(name, "independent")
-
-
-def case_compiles_nothing(name: str, adjoint: str) -> None:
-    """Assert that steps of a gradient case compile nothing. Their dL/dI changes with the image."""
+    """The steps' dL/dI changes with the image."""
     case = next(case for case in CASES if case.name == name)
     scene = Case(case.scene(), case.keys)
     ours = integrator("reslrb", **case.both | case.options)

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from measure.faults import Fault
-from measure.test_mutations import plant
+from measure.faults import Fault, plant
 from turns import a_few
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -423,7 +422,7 @@ def test_a_fault_is_found(name: str, monkeypatch: pytest.MonkeyPatch):
     where, right, wrong, ways = FAULTS[name]
     case = SHOWN.get(name, "small")
     assert all(one.holds for one in as_it_stands(case).values())
-    plant(Fault(name, "", where, right, wrong, frozenset()), monkeypatch)
+    plant(Fault(name, "", where, right, wrong), monkeypatch)
     result = compared(CASES[case])
     assert {way for way, one in result.items() if not one.holds} == set(ways)
 
@@ -469,5 +468,5 @@ def test_a_walk_back_that_forgets_is_found(name: str, monkeypatch: pytest.Monkey
     where, right, wrong, stack_size = WALKS_BACK[name]
     options = {"type": "reslrb", "estimator": "stack", "stack_size": stack_size}
     np.testing.assert_allclose(gradient(**options), by_naive_ad(), rtol=1e-4)
-    plant(Fault(name, "", f"estimators.camera:{where}", right, wrong, frozenset()), monkeypatch)
+    plant(Fault(name, "", f"estimators.camera:{where}", right, wrong), monkeypatch)
     assert np.abs(gradient(**options) / by_naive_ad() - 1).max() > 0.01

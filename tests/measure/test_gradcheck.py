@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,13 +13,11 @@ import pytest
 from conformance.gradient_cases import CASES
 from measure.faults import checked
 from measure.faults import room as room_moving
-from measure.test_statistics import NAMES, Pretended
 from turns import a_few
 
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import forward
-from reslrb_cli.measure import resume_store, sampling
 from reslrb_cli.measure.gradcheck import CheckResult, Gradcheck
 from reslrb_cli.measure.gradients import (
     Case,
@@ -43,8 +40,8 @@ from reslrb_cli.measure.references import (
     ptracer_gradient,
     ptracer_image,
 )
-from reslrb_cli.measure.resume_store import VERSION, Earlier
-from reslrb_cli.measure.sampling import FEWEST, KIND, Sampling, settings
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.measure.sampling import KIND, settings
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
 from reslrb_cli.measure.scenes.small import room as corner
@@ -592,100 +589,3 @@ def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path, m
     monkeypatch.setattr(Participants, "choose_steps", None)
     same, _ = check_again(6, tmp_path / "d.npz", Earlier(KIND, Path("g.jsonl"), *read_samples(tmp_path / "c.npz")))
     assert [record.to_json() for record in same] == [record.to_json() for record in more]
-
-
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
-        ({"spp": 8}, "spp is None there, 8 here"),
-        ({"integrators": parse_estimators("event")}, "estimators is ['reslrb:stack'] there"),
-        ({"config": loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["run.seed=3"])}, "run.seed is 0 there, 3 here"),
-    ],
-)
-def test_only_the_same_measurement_is_continued(change: dict[str, Any], line: str) -> None:
-    what = CheckSettings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
-    head = {"version": VERSION, "kind": KIND, "settings": settings(what, "llvm_ad_rgb", "")}
-    with pytest.raises(ConfigError) as caught:
-        Earlier(KIND, Path("g.jsonl"), head, {}).check(settings(replace(what, **change), "llvm_ad_rgb", ""))
-    assert f"--json: g.jsonl belongs to another measurement: {line}" in str(caught.value)
-
-
-def test_samples_of_other_code_are_not_continued(monkeypatch: pytest.MonkeyPatch) -> None:
-    what = CheckSettings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
-    now = settings(what, "llvm_ad_rgb", "")
-    earlier = Earlier(KIND, Path("g.jsonl"), {"version": VERSION, "kind": KIND, "settings": now}, {})
-    earlier.check(settings(what, "llvm_ad_rgb", ""))
-    read_bytes = Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", lambda path: read_bytes(path) + b" " * (path.name == "stack.py"))
-    changed = {"versions": resume_store.program.__wrapped__()}
-    with pytest.raises(
-        ConfigError, match=r"another measurement: versions\.code is \w+ there, \w+ here; remove the file"
-    ):
-        earlier.check(now | changed)
-
-
-class Directed(Pretended):
-    """Participants that record the seeds of the requested gradients."""
-
-    seeds: dict[str, list[int]] = {}  # noqa: RUF012 (looked at by the test)
-
-    def __init__(self, settings: Any) -> None:
-        super().__init__(settings)
-        Directed.seeds = {}
-
-    def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
-        if kind == "gradient":
-            Directed.seeds.setdefault(of, []).append(seed)
-        return super().sample(kind, of, seed)
-
-    def choose_steps(self, key: str) -> None:
-        super().choose_steps(key)
-        self.directions[key] = [replace(self.directions[key][0], step=0.01, truncation=0.5)]
-
-
-def sampled(budget_s: float, earlier: Earlier | None = None, seeds: int | None = None) -> tuple[Sampling, float]:
-    clock = [0.0]
-    listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
-    what: Any = SimpleNamespace(budget_s=budget_s, seeds=seeds, integrators=listed, clock=clock, spent_s=0.0)
-    made = Sampling(what, lambda: clock[0], earlier)
-    made.expect(NAMES)
-    for name in NAMES:
-        made.take(name, lambda: False, lambda line: None)
-    return made, clock[0]
-
-
-def again(made: Sampling) -> Earlier:
-    kept = made.kept({})
-    assert kept is not None
-    return Earlier(KIND, Path("g.jsonl"), *kept)
-
-
-def test_a_second_budget_adds_new_seeds_and_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sampling, "Participants", Directed)
-    first, _ = sampled(60.0)
-    before = {name: len(first.of(name)) for name in NAMES if len(first._samples.get(name, ())) > 0}
-    firsts = dict(Directed.seeds)
-    second, seconds = sampled(90.0, again(first))
-    assert seconds <= 90.0
-    assert all(len(second.of(name)) > before.get(name, 0) for name in NAMES)
-    for label, seeds in Directed.seeds.items():
-        assert not set(seeds) & set(firsts.get(label, ()))
-    # The step of finite differences is the step of the first session. It is not chosen again.
-    assert second.participants.directions["a"][0].step == 0.01
-    assert second.participants.directions["a"][0].truncation == 0.5
-    assert ("differences", "a") not in before or ("choose", "a") not in second.participants.known
-
-
-@pytest.mark.parametrize("budget_s", [12.0, 30.0])
-def test_a_too_small_budget_names_the_time_of_the_fewest_seeds(
-    budget_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sampling, "Participants", Directed)
-    made, _ = sampled(budget_s)
-    assert any(len(made._samples.get(name, ())) < FEWEST for name in NAMES)
-    needed_s = made.needed_s()
-    assert needed_s is not None
-    assert needed_s > budget_s
-    enough, seconds = sampled(1.3 * needed_s)
-    assert {name: len(enough._samples[name]) >= FEWEST for name in NAMES} == dict.fromkeys(NAMES, True)
-    assert seconds <= 1.3 * needed_s
