@@ -121,7 +121,6 @@ CASES = [
     # ---- What a walk may do, through smooth glass ----
     AttachedCase("slab", under_glass, SLAB, quick=True),
     AttachedCase("slab_9", under_glass, SLAB, depth=9),
-    AttachedCase("slab_16", under_glass, SLAB, depth=16),
     AttachedCase("texture_beside", lambda: under_glass(receiver=textured()),
                  SLAB | {"receiver.bsdf.reflectance.data": None}, depth=6),
     AttachedCase("bounces", lambda: enclosed(receiver=textured()),
@@ -129,7 +128,6 @@ CASES = [
                          "shell.bsdf.reflectance.value": None}, depth=7),
     AttachedCase("bounces_4", enclosed, SLAB, depth=4),
     AttachedCase("normal_map", lambda: enclosed(receiver=mapped()), SLAB, depth=6, stock=False, quick=True),
-    AttachedCase("bounces_16", lambda: enclosed(albedo=0.9), SLAB, depth=16),
     AttachedCase("two_lenses", two_lenses, SLAB | {"x": 0.0, "size": 1.0}, move_ball, depth=9),
     AttachedCase("roulette", lambda: enclosed(albedo=0.9), SLAB, depth=10, stock=False, both={"rr_depth": 2}),
     AttachedCase("stack_of_2", lambda: enclosed(albedo=0.9), SLAB, depth=6, stock=False, ours={"stack_size": 2},
@@ -151,7 +149,6 @@ CASES = [
     AttachedCase("rough_mirror", lambda: mirrored({"type": "roughconductor", "alpha": 0.15, "material": "Al"}),
                  {"mirror.vertex_positions": None}, limit=ROUGH),
     AttachedCase("rough_slab", lambda: enclosed(rough()), SLAB, depth=5, limit=ROUGH, quick=True),
-    AttachedCase("rough_slab_9", lambda: enclosed(rough()), SLAB, depth=9, limit=ROUGH),
     AttachedCase("roughness_and_index", lambda: enclosed(rough(0.2)),
                  SLAB | {"slab.bsdf.alpha.value": None, "slab.bsdf.eta": None}, limit=ROUGH, depth=6),
     AttachedCase("roughness_alone", lambda: under_glass(rough(0.2)),

@@ -16,6 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import pytest
+from kit import diffuse, ref, scene, sensor, shape
 from measure.faults import room
 
 from reslrb_cli.cli import main
@@ -195,17 +196,12 @@ def test_ctrl_c_keeps_finished_measurements(tmp_path: Path) -> None:
     assert "reslrb:stack" in output
 
 
-MASKED = """<scene version="3.0.0">
-    <sensor type="perspective">
-        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm"><integer name="width" value="8"/> <integer name="height" value="8"/>
-            <rfilter type="box"/></film>
-    </sensor>
-    <bsdf type="mask" id="veil"><float name="opacity" value="0.5"/> <bsdf type="diffuse"/></bsdf>
-    <shape type="rectangle"><ref id="veil"/></shape>
-    <emitter type="point"><point name="position" x="0" y="1" z="3"/></emitter>
-</scene>
-"""
+MASKED = scene(
+    sensor(),
+    f'<bsdf type="mask" id="veil"><float name="opacity" value="0.5"/> {diffuse("0.5")}</bsdf>',
+    shape("rectangle", "", ref("veil")),
+    '<emitter type="point"><point name="position" x="0" y="1" z="3"/></emitter>',
+)
 
 
 # What `bench` measures if parameters move light: all capable integrators take steps, and memory stays constant.

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kit import area, diffuse, scene, sensor, shape
 
 from reslrb_cli.cli import main
 from reslrb_cli.errors import ExitCode
@@ -19,44 +20,21 @@ pytestmark = pytest.mark.usefixtures("llvm")
 FILE = Path(__file__).with_name("own_replay.py")
 
 #: A floor of two materials that a texture mixes, a wall beside it, and two lamps.
-SCENE = """<scene version="3.0.0">
-    <sensor type="perspective" id="camera">
-        <float name="fov" value="60"/>
-        <transform name="to_world"><lookat origin="0, 1.2, 3.2" target="0, 0.6, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film>
-    </sensor>
-    <shape type="rectangle" id="floor">
-        <transform name="to_world"><scale value="1.5"/><rotate x="1" angle="-90"/></transform>
-        <bsdf type="blendbsdf" id="mixed">
-            <texture type="checkerboard" name="weight">
-                <float name="color0" value="0.3"/><float name="color1" value="0.7"/>
-            </texture>
-            <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.6, 0.3"/></bsdf>
-            <bsdf type="roughconductor"><float name="alpha" value="0.5"/></bsdf>
-        </bsdf>
-    </shape>
-    <shape type="rectangle" id="wall">
-        <transform name="to_world"><scale value="1.5"/><translate y="1.5" z="-1.5"/></transform>
-        <bsdf type="diffuse" id="paint"><rgb name="reflectance" value="0.5, 0.7, 0.6"/></bsdf>
-    </shape>
-    <shape type="rectangle" id="left">
-        <transform name="to_world">
-            <scale value="1.5"/><rotate y="1" angle="90"/><translate x="-1.5" y="1.5"/>
-        </transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0.7, 0.7, 0.7"/></bsdf>
-    </shape>
-    <shape type="rectangle" id="lamp">
-        <transform name="to_world"><scale value="0.5"/><rotate x="1" angle="90"/><translate y="2.6"/></transform>
-        <emitter type="area"><rgb name="radiance" value="6, 5, 4"/></emitter>
-    </shape>
-    <shape type="rectangle" id="small">
-        <transform name="to_world">
-            <scale value="0.2"/><rotate y="1" angle="-90"/><translate x="1.4" y="0.8"/>
-        </transform>
-        <emitter type="area"><rgb name="radiance" value="9, 9, 12"/></emitter>
-    </shape>
-</scene>
-"""
+SCENE = scene(
+    sensor("0, 1.2, 3.2", "0, 0.6, 0", size=16, fov=60, id="camera", rfilter="gaussian", pixels="rgba"),
+    shape("rectangle", "floor", '<bsdf type="blendbsdf" id="mixed"><texture type="checkerboard" name="weight">'
+          '<float name="color0" value="0.3"/><float name="color1" value="0.7"/></texture>', diffuse("0.8, 0.6, 0.3"),
+          '<bsdf type="roughconductor"><float name="alpha" value="0.5"/></bsdf></bsdf>',
+          place='<scale value="1.5"/><rotate x="1" angle="-90"/>'),
+    shape("rectangle", "wall", diffuse("0.5, 0.7, 0.6", "paint"),
+          place='<scale value="1.5"/><translate y="1.5" z="-1.5"/>'),
+    shape("rectangle", "left", diffuse("0.7, 0.7, 0.7"),
+          place='<scale value="1.5"/><rotate y="1" angle="90"/><translate x="-1.5" y="1.5"/>'),
+    shape("rectangle", "lamp", area("6, 5, 4"),
+          place='<scale value="0.5"/><rotate x="1" angle="90"/><translate y="2.6"/>'),
+    shape("rectangle", "small", area("9, 9, 12"),
+          place='<scale value="0.2"/><rotate y="1" angle="-90"/><translate x="1.4" y="0.8"/>'),
+)  # fmt: skip
 
 CONFIG = """
 scene: {file: scene.xml}
@@ -182,31 +160,15 @@ def test_correct_integrators_of_mitsuba_hold(capsys: pytest.CaptureFixture[str])
 
 #: A scene with an object that moves in view, over a floor below a lamp. The objects are given by the corners of
 #: triangles.
-MOVING_SCENE = """<scene version="3.0.0">
-    <sensor type="perspective">
-        <float name="fov" value="45"/>
-        <transform name="to_world"><lookat origin="0, 2.5, 4" target="0, 0.4, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="16"/><integer name="height" value="16"/><rfilter type="gaussian"/>
-        </film>
-    </sensor>
-    <shape type="rectangle">
-        <transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/></transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.6, 0.3"/></bsdf>
-    </shape>
-    <shape type="obj" id="thing">
-        <string name="filename" value="thing.obj"/><boolean name="face_normals" value="true"/>
-        <transform name="to_world"><scale value="0.4"/><rotate x="1" angle="-60"/><translate y="0.8"/></transform>
-        <bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.1, 0.3, 0.6"/></bsdf></bsdf>
-    </shape>
-    <shape type="rectangle">
-        <transform name="to_world">
-            <scale value="0.5"/><rotate x="1" angle="90"/><translate x="0.5" y="3.5"/>
-        </transform>
-        <emitter type="area"><rgb name="radiance" value="6, 5, 4"/></emitter>
-    </shape>
-</scene>
-"""
+MOVING_SCENE = scene(
+    sensor("0, 2.5, 4", "0, 0.4, 0", size=16, fov=45, rfilter="gaussian", pixels="rgba"),
+    shape("rectangle", "", diffuse("0.8, 0.6, 0.3"), place='<scale value="4"/><rotate x="1" angle="-90"/>'),
+    shape("obj", "thing", '<string name="filename" value="thing.obj"/><boolean name="face_normals" value="true"/>',
+          '<bsdf type="twosided">', diffuse("0.1, 0.3, 0.6"), "</bsdf>",
+          place='<scale value="0.4"/><rotate x="1" angle="-60"/><translate y="0.8"/>'),
+    shape("rectangle", "", area("6, 5, 4"),
+          place='<scale value="0.5"/><rotate x="1" angle="90"/><translate x="0.5" y="3.5"/>'),
+)  # fmt: skip
 SHEET = ["1 2 3", "1 3 4"]
 BOX = ["1 3 2", "1 4 3", "5 6 7", "5 7 8", "1 2 6", "1 6 5", "2 3 7", "2 7 6", "3 4 8", "3 8 7", "4 1 5", "4 5 8"]
 MOVING = """
