@@ -231,8 +231,6 @@ CASES = [
 ]  # fmt: skip
 
 #: Cases in which the default suite compares the exact estimators with naive AD (test_gradients.py).
-AT_EQUAL_SEEDS = ("texture", "roulette", "roughplastic", "bumpmap", "glass", "mesh_attribute", "mask_texture_in_view",
-                  "visible_lamp")  # fmt: skip
+AT_EQUAL_SEEDS = ("texture", "roulette", "bumpmap", "glass", "mask_texture_in_view", "visible_lamp")
 #: Cases in which the default suite compares the reservoir with stock integrators and with finite differences.
-IN_EXPECTATION = ("texture", "roughconductor", "plastic", "blend", "mirror", "glass", "mask", "thin_glass",
-                  "directional", "constant", "envmap")  # fmt: skip
+IN_EXPECTATION = ("texture", "roughconductor", "plastic", "blend", "mirror", "glass", "mask", "constant", "envmap")

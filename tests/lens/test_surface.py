@@ -35,8 +35,8 @@ SETTINGS = {
     "mirror, tilted receiver": replace(MIRROR, tilt=(-15.0, 20.0)),
 }
 FEW = {
-    "lens", "lens, point light", "lens, tilted receiver", "lens, round", "lens, looked at through the receiver",
-    "mirror", "mirror, point light",
+    "lens, point light", "lens, tilted receiver", "lens, round", "lens, looked at through the receiver",
+    "mirror, point light",
 }  # fmt: skip
 
 

@@ -309,6 +309,7 @@ def beam(only: tuple[float, float, float], seeds: int = 2) -> Differenced:
 
 
 @pytest.mark.usefixtures("_quiet")
+@pytest.mark.long
 def test_a_bending_slab():
     found = beam((0, 1, 0), 4)
     assert found.error < ERROR, found

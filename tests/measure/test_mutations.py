@@ -7,7 +7,14 @@ from collections.abc import Iterable
 from functools import cache
 
 import pytest
-from conformance import attached_cases, test_attached, test_attached_reservoir, test_moving_emitters, test_small_lamps
+from conformance import (
+    attached_cases,
+    test_attached,
+    test_attached_reservoir,
+    test_moving_emitters,
+    test_small_lamps,
+    test_weights,
+)
 from measure.faults import CHECKS, FAULTS, Fault, plant, planted
 
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
@@ -26,7 +33,7 @@ def test_the_faults_apply_to_the_code(monkeypatch: pytest.MonkeyPatch):
     """
     assert {fault.check for fault in FAULTS} == set(CHECKS)
     others = [attached_cases.FAULTS, test_attached.FORWARD_FAULTS, test_attached_reservoir.FAULTS,
-              test_moving_emitters.FAULTS, test_small_lamps.FAULTS]  # fmt: skip
+              test_moving_emitters.FAULTS, test_small_lamps.FAULTS, test_weights.FAULTS]  # fmt: skip
     for fault in (*FAULTS, *(fault for faults in others for fault in faults)):
         with monkeypatch.context() as patch:
             plant(fault, patch)

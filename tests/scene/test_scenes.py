@@ -148,6 +148,7 @@ def test_mixed_room_has_light_that_each_side_misses():
     assert image["direct"][caustic].mean() < 0.1 * image["light"][caustic].mean()
 
 
+@pytest.mark.long
 def test_the_target_of_the_mixed_room_is_its_image():
     """Blocks of 16 pixels are compared with an image of light and camera paths. That integrator shares no code with the
     one that made the target.
