@@ -12,7 +12,7 @@ from conformance.attached_cases import CASES
 from conformance.moving_lamps import CASES as LAMPS
 from measure.differenced import AttachedScene, compare_with_differences
 from measure.faults import Fault, plant, planted
-from measure.moving_light import SCENES, moved, point, room, shelf, smooth_texture, wall
+from measure.moving_light import SCENES, moved, point, room, shelf, wall
 
 from reslrb_cli.estimators import chain
 from reslrb_cli.integrators.differentiated import stays
@@ -238,13 +238,6 @@ def lit_wall(bsdf: dict[str, Any] = WHITE) -> dict[str, Any]:
     return {name: thing for name, thing in scene.items() if name not in ("top", "bottom")} | {"floor": floor}
 
 
-def ball() -> dict[str, Any]:
-    """Return a scene with a point light and a camera inside a ball."""
-    scene = lit_wall()
-    shell = {"type": "sphere", "center": [0, 1, 0], "radius": 2.0, "flip_normals": True, "bsdf": WHITE}
-    return {name: scene[name] for name in ("type", "camera", "lamp")} | {"shell": shell}
-
-
 def tilted(scene: Any) -> list[Move]:
     return [Pose("floor.to_world", ("ty", "rx", "rz"))]
 
@@ -253,24 +246,16 @@ def pushed(scene: Any) -> list[Move]:
     return [Pose("wall.to_world", ("tx", "ry", "rz"), (1, 1, 0))]
 
 
-def grown(scene: Any) -> list[Move]:
-    return [Pose("shell.to_world", ("s", "tx"), (0, 1, 0))]
-
-
 def rough(name: str) -> AttachedScene:
     return replace(SCENES[name], spp=64, options=dict(SCENES[name].options))
 
 
 AGREEING = {
     "bounce": replace(SCENES["bounce"], spp=64),
-    "bounce_texture": AttachedScene("", "", lambda: room(wall=wall(smooth_texture()["bsdf"])), moved, spp=64,
-                                    options={"max_depth": 5}),
     "rough_mirror": rough("rough_mirror"),
     "rough_surface": rough("rough_surface"),
     "moved_floor": AttachedScene("", "", lit_wall, tilted, options={"max_depth": 3}),
     "moved_wall": AttachedScene("", "", lit_wall, pushed, options={"max_depth": 3}),
-    "moved_shell": AttachedScene("", "", ball, grown, options={"max_depth": 4}),
-    "brushed_floor": AttachedScene("", "", lambda: lit_wall(BRUSHED), tilted, spp=256, options={"max_depth": 3}),
 }  # fmt: skip
 QUICK_SAMPLING = ("bounce", "moved_floor", "moved_wall")
 #: The scenes that the default suite runs, because they need few seeds: light reflects off a moving object, and is

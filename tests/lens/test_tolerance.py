@@ -233,18 +233,6 @@ def test_a_wide_light_is_the_mean_of_rotated_ones(folder: Path) -> None:
     assert wide.sum() == pytest.approx(planned.sum(), rel=0.05)
 
 
-def test_meshes_move_like_shapes(folder: Path) -> None:
-    made = bench(folder)
-    by = mi.ScalarTransform4f().translate([1, 2, 3])
-    values = made.moved(["face", "back"], by)
-    before, after = (np.array(v).reshape(-1, 3) for v in (made.params["face.vertex_positions"],
-                                                         values["face.vertex_positions"]))  # fmt: skip
-    assert after - before == pytest.approx(np.broadcast_to([1.0, 2, 3], before.shape), abs=1e-4)
-    moved, there = (np.ravel(matrix @ mi.Point3f(0)) for matrix in (values["back.to_world"],
-                                                                   made.params["back.to_world"]))  # fmt: skip
-    assert moved - there == pytest.approx([1, 2, 3], abs=1e-4)
-
-
 def test_a_tool_ball_touches_the_vertices_of_the_face(folder: Path) -> None:
     made = bench(folder)
     before = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)

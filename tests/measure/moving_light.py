@@ -102,16 +102,6 @@ def sphere_lens(radius: float = 0.8, y: float = 1.95, cutoff: float = 18, bsdf: 
                    lens={"type": "sphere", "center": [0, y, 0], "radius": radius, "bsdf": bsdf})  # fmt: skip
 
 
-def smooth_texture() -> dict:
-    """Return a receiver with a smooth texture."""
-    at = np.linspace(0, 2 * np.pi, 65)
-    x, y = np.meshgrid(at, at)
-    texels = np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * x + y), 0.5 + 0.3 * np.sin(4 * y)], -1)
-    floor = setting()["floor"]
-    floor["to_world"] = transform(rotate=([1, 0, 0], -90), scale=3)
-    return floor | {"bsdf": {"type": "diffuse", "reflectance": bitmap(texels, "bilinear")}}
-
-
 GLASS_SCENES = [
     AttachedScene("slab", "a glass slab with waves under a spot light", slab, waving, spp=256),
     AttachedScene("slab_beam", "the same under parallel light with a hard edge", lambda: slab(lamp=beam()), waving,

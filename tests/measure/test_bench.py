@@ -232,13 +232,6 @@ def test_memory_of_stack_does_not_grow_with_depth():
     assert deep < 1.1 * shallow  # sizes are so small that allocator rounding shows
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.long
-def test_memory_of_naive_ad_grows_with_depth():
-    shallow, deep = peaks("ptracer")
-    assert deep > 2 * shallow > 4 * peak("reslrb:stack", 4)
-
-
 # How the end of a process is interpreted, and what kernels report about thread-local memory.
 
 FIRST = {"memory_limit": None}

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from measure.pretended_steps import Pretended
 
-from reslrb_cli.cli import main
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.bench import Bench, BenchResult
@@ -370,26 +369,6 @@ def test_default_values() -> None:
     assert usual_values("spp", config) == [1, 2, 4, 8, 16]
     assert usual_values("spp", loads(CONFIG, Path("x.yaml"), ["run.spp=2"])) == [1, 2, 4, 8]
     assert usual_values("film", config) == [32, 64, 128, 256]
-
-
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (("--sweep", "film", "--max-depth", "4"), "--max-depth: needs --sweep depth; use --set integrator.max"),
-        (("--values", "2", "--max-depth", "4"), "--max-depth: has no effect with --values"),
-        (("--sweep", "size"), "'size' is not one of 'depth', 'spp', 'film', 'texture'"),
-        (("--sweep", "spp", "--values", "4,4"), "`4,4` has a number twice"),
-        (("--sweep", "spp", "--integrators", "ptracer(max_depth=3)"), "all share one max_depth"),
-    ],
-)
-def test_bad_input_is_one_located_line(args: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["bench", *args], prog_name="reslrb")
-    assert ended.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert line in printed.err
-    assert len(printed.err.splitlines()) == 1
 
 
 # A `bench` that continues an earlier one: which measurements count, which are repeated, and what is refused.

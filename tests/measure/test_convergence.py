@@ -4,7 +4,6 @@ scenes.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,10 @@ from cli.tiny import KEY, write_experiment
 from measure.pretended_steps import SHAPES, Pretence, Stage, of, plan, play
 from scipy import stats
 
-from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement
 from reslrb_cli.measure.convergence.setup import Role, Sampler, survey
-from reslrb_cli.measure.convergence.statistics import GROUPS, MethodSamples, ReferenceMean
+from reslrb_cli.measure.convergence.statistics import MethodSamples, ReferenceMean
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import BenchStatus
@@ -335,56 +333,6 @@ def test_too_few_steps_have_no_intervals() -> None:
 
 # `convergence` on the scenes of the shipped configurations, with fixed seeds and a step count that does not depend on
 # time.
-
-ROOT = Path(__file__).resolve().parents[2]
-OURS = "reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack"
-#: Without roulette, because naive AD does not differentiate roulette correctly.
-PTRACER = "ptracer(rr_depth=1000000)"
-#: Probability that all slopes of a scene are within their intervals, which are widened for the number of slopes.
-CONFIDENCE = 0.99
-
-
-def methods(folder: Path, scene: str, size: tuple[int, int], *args: str) -> list[dict]:
-    """Run `convergence` on a film of this size. Return all methods' lines."""
-    file = folder / "c.jsonl"
-    film = [f"--set=scene.options.resx={size[0]}", f"--set=scene.options.resy={size[1]}"]
-    with pytest.raises(SystemExit) as ended:
-        main(["convergence", str(ROOT / f"configs/{scene}.yaml"), *film, *args, "--json", str(file)])
-    assert not ended.value.code
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
-    for line in lines:
-        if line["kind"] == "reference" and line["bias_z"] is not None:
-            assert line["biased"] is not True, line
-    return [line for line in lines if line["kind"] == "method"]
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("scene", "size", "spp", "rounds", "cases"),
-    [
-        ("cornell_floor", (64, 64), 8, 32, f"{PTRACER},prb,{OURS}"),
-        ("grey_room", (64, 48), 32, 24, f"prb,{OURS}"),
-        ("caustic_slab", (64, 64), 16, 32, f"{PTRACER},{OURS}"),
-    ],
-)
-def test_unbiased_methods(tmp_path: Path, scene: str, size: tuple[int, int], spp: int, rounds: int, cases: str) -> None:
-    """Slopes are -1/2 within their intervals, and no method deviates from an independent reference."""
-    args = [f"--set=run.spp={spp}", "--integrators", cases, "--rounds", str(rounds)]
-    found = methods(tmp_path, scene, size, *args)
-    assert {line["label"] for line in found} == set(cases.split(","))
-    keys = {line["parameter"] for line in found}
-    count = len({line["label"] for line in found}) * max(len(keys) - 1, 1)
-    # The 95 % intervals use Student's t. The degrees of freedom are the number of groups of steps minus one.
-    for line in found:
-        freedom = next(groups for steps, groups in GROUPS.items() if line["steps"] >= steps) - 1
-        wider = stats.t.isf((1 - CONFIDENCE) / 2 / count, freedom) / stats.t.isf(0.025, freedom)
-        assert line["biased"] is not True, line
-        assert abs(line["bias_z"]) < line["bias_z_limit"], line
-        slope = line["slope"]
-        assert abs(slope["value"] + 0.5) < wider * (slope["high"] - slope["value"]), line
-    assert {line["biased"] for line in found if line["parameter"] != "all"} == {False}
-
 
 # Facts that are found before any measurement: references, dL/dI, and the border of the film.
 

@@ -11,7 +11,6 @@ import pytest
 from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.convergence.setup import MOST_REFERENCE_STEPS, MOST_STEPS, Role
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import read_samples, write_samples
@@ -236,19 +235,3 @@ def test_the_budget_is_kept_and_used(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4, cold_s=2.0))
     play(tmp_path, stage, plan(rounds=None, budget_s=100.0))
     assert 88 < stage.now < 100
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("reslrb:stack(max_depth=3)", "all share one max_depth; use --set integrator.max_depth=3"),
-        ("reslrb:stack(adjoint=batched)", "has no effect if dL/dI is known; change --objective"),
-        ("reslrb:auto", "`auto` is for whole runs; use `stack`"),
-        ("path", "integrator.type: must be one of"),
-    ],
-)
-def test_wrong_lists_are_located(text: str, line: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        plan(text).check()
-    assert str(caught.value).startswith("--integrators")
-    assert line in str(caught.value)

@@ -234,12 +234,7 @@ def test_estimators_have_the_options_of_the_configuration():
         "reslrb:reservoir(capacity=4)", "reslrb:gather", "reslrb:event", "reslrb:stack"
     ]  # fmt: skip
     assert [case.options for case in parse_estimators("event(capacity=2)")] == [{"estimator": "event", "capacity": 2}]
-    for text, message in (
-        ("", "is not an estimator"),
-        ("stack,stack", "given twice"),
-        ("stack(max_depth=3)", "--set integrator.max_depth=3"),
-        ("stack(adjoint=independent)", "--set run.adjoint=independent"),
-    ):
+    for text, message in (("stack,stack", "given twice"), ("stack(max_depth=3)", "--set integrator.max_depth=3")):
         with pytest.raises(ConfigError, match=message):
             parse_estimators(text)
 

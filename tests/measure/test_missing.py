@@ -248,23 +248,6 @@ def test_the_command_and_more_seeds(
 
 
 @pytest.mark.usefixtures("_quiet")
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--missing"], "--missing: needs a CONFIG"),
-        (["CONFIG", "--missing", "--estimators", "stack"], "--estimators: has no effect with --missing"),
-        (["CONFIG", "--missing", "--markdown", "a.md"], "--markdown was removed; `reslrb report FILE"),
-        (["CONFIG", "--directions", "2"], "--directions: needs --missing"),
-    ],
-)
-def test_incompatible_options(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    config = tmp_path / "lamp.yaml"
-    config.write_text(LAMP.format(folder=Path(__file__).parent))
-    assert call(*[str(config) if argument == "CONFIG" else argument for argument in arguments]) == 2
-    assert message in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("_quiet")
 def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
     """Without a segment to the floor, all images are black, including the target. The earlier check for black targets
     is disabled here.

@@ -25,7 +25,6 @@ from reslrb_cli.measure.comparison import (
     z_scores,
 )
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
-from reslrb_cli.report.tables import cells, failure_line, gradcheck_columns
 
 # Statistics of the conformance tests: they hold for equal expectations, and detect a small bias.
 
@@ -266,16 +265,3 @@ def test_a_record_survives_a_round_trip() -> None:
     assert json.loads(record().to_json())["holds"] is False
     assert record_of(GradcheckRecord, json.loads(json.dumps(asdict(found)))) == found
     assert record_of(GradcheckRecord, {"case": "a", "colour": 3}) is None
-
-
-def test_the_table_and_the_line_of_a_failure():
-    table = gradcheck_columns([record()])
-    assert table.head().split() == ["parameter", "integrator", "reference", "seeds", "rel.", "L2", "z", "rms", "max",
-                                    "|z|", "cosine", "variance", "detectable", "verdict"]  # fmt: skip
-    told = table.line(cells(record())).split()
-    assert told == ["floor.data", "reslrb:stack", "ptracer", "16", "3.1e-02", "3.20", ">",
-                    "1.50", "9.1", ">", "5.2", "2.0%", "fails"]  # fmt: skip
-    assert failure_line(record()) == (
-        "a.yaml: floor.data: reslrb:stack against ptracer: z rms 3.2, limit 1.5; max |z| 9.1, limit 5.2; "
-        "the means differ by 3.12%"
-    )

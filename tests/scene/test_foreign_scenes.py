@@ -462,9 +462,3 @@ def test_missing_options_of_a_hair_are_no_parameters() -> None:
     infos = {info.key.rpartition(".")[2]: info for info in list_parameters(mi.traverse(scene), values=True)}
     assert (infos["sigma_a"].obstacle, infos["sigma_a"].value) == ("is not in the scene file", None)
     assert infos["eumelanin"].obstacle is None
-
-
-def test_a_black_body_of_an_endless_range_takes_no_time(tmp_path: Path) -> None:
-    light = """<spectrum type="blackbody" name="radiance"><float name="temperature" value="4000"/>
-    <float name="wavelength_max" value="1e30"/></spectrum>"""
-    assert np.isfinite(value(load_scene(write_spectrum(tmp_path, light=light)), "sky.radiance.value")).all()

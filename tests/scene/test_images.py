@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.errors import ConfigError, OutOfMemory
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene import images
 from reslrb_cli.scene.images import decode_srgb, orientation_of, read_bitmap, read_image
 from reslrb_cli.scene.proposal import open_photograph, write_smaller
@@ -103,19 +103,6 @@ def test_a_hole_within_a_jpeg_is_refused(tmp_path):
     assert "is damaged or truncated (Corrupt JPEG data" in refused(path)
 
 
-def test_messages_of_libjpeg_are_read_without_standard_error(tmp_path, monkeypatch):
-    import mitsuba as mi
-
-    path = tmp_path / "a.jpg"
-    mi.Bitmap((255 * picture()).astype(np.uint8)).write(str(path))
-
-    def closed(_number):
-        raise OSError(9, "Bad file descriptor")
-
-    monkeypatch.setattr(images.os, "dup", closed)
-    assert read_image(path).shape == (96, 128, 3)
-
-
 def png(width, height, data=b""):
     """Return a PNG file whose header gives the size `width` x `height`."""
 
@@ -197,19 +184,6 @@ def test_only_regular_files_are_read(tmp_path, kind):
     assert refused(path).startswith(
         "is not a readable image" if kind == "sparse" else "is a pipe, a socket or a device, not a regular"
     )
-
-
-def test_a_failed_allocation_is_no_damage(tmp_path, monkeypatch):
-    class Full:
-        def Bitmap(self, _path):
-            raise MemoryError("std::bad_alloc")
-
-    path = tmp_path / "a.png"
-    path.write_bytes(png(2, 2, bytes(14)))
-    assert read_bitmap(path).width() == 2
-    monkeypatch.setattr(images, "mi", Full())
-    with pytest.raises((MemoryError, OutOfMemory)):
-        read_bitmap(path)
 
 
 @pytest.mark.parametrize("width", [7, 8, 40, 300])
