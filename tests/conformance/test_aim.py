@@ -18,13 +18,12 @@ pytestmark = pytest.mark.usefixtures("llvm")
 # test_drawing.py compares means of whole steps.
 
 
-@pytest.fixture
-def everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def _everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Aiming also in scenes without glossy surfaces."""
     aim_everywhere(monkeypatch)
 
 
-@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("size", [(1, 1), (9, 7), (160, 90), (1000, 3), (1920, 1080)])
 def test_blocks_partition_the_film_with_the_densities_of_their_slots(size: tuple[int, int]) -> None:
     import mitsuba as mi
@@ -53,7 +52,6 @@ def test_blocks_partition_the_film_with_the_densities_of_their_slots(size: tuple
     assert nothing.max() < 2.5
 
 
-@pytest.mark.usefixtures("everywhere")
 def test_paths_are_aimed_at_recorded_contributions() -> None:
     _, ours, _ = guided("roughplastic", 2)
     tables = ours.preparation.guiding
@@ -64,7 +62,6 @@ def test_paths_are_aimed_at_recorded_contributions() -> None:
         assert np.corrcoef(density, row)[0, 1] > 0.99
 
 
-@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("purpose", Purpose)
 def test_paths_of_a_gradient_are_aimed_at_its_dl_di(purpose: Purpose) -> None:
     import mitsuba as mi
@@ -83,7 +80,6 @@ def test_paths_of_a_gradient_are_aimed_at_its_dl_di(purpose: Purpose) -> None:
     assert known.min() > 0.85 * AIM_UNIFORM
 
 
-@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("size", [(9, 7), (1000, 30)])
 def test_means_of_blocks(size: tuple[int, int]) -> None:
     import mitsuba as mi
@@ -103,7 +99,6 @@ def test_means_of_blocks(size: tuple[int, int]) -> None:
     assert (film.root_means(mi.TensorXf(0 * np.ones_like(image))) == 0).all()
 
 
-@pytest.mark.usefixtures("everywhere")
 def test_only_scenes_with_glossy_surfaces_use_aiming(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(context, "worthwhile", aim.worthwhile)
     for name, expected in (("roughplastic", True), ("texture", False), ("thin_lens", False), ("bumpmap", False)):

@@ -122,14 +122,3 @@ def test_zero_texels_come_and_go():
     assert not kernels.new(lambda: step(3, zero))
     assert not kernels.new(lambda: step(4, initial))
     assert not kernels.new(lambda: step(5, zero))
-
-
-def test_image_seeds_compile_nothing():
-    from reslrb_cli.integrators.step import render_image
-
-    case = next(case for case in CASES if case.name == "texture")
-    scene = Case(case.scene(), case.keys)
-    ours = integrator("reslrb")
-    kernels = Kernels()
-    kernels.new(lambda: np.array(render_image(ours, scene.scene, 0, 1, 16)))
-    assert not kernels.new(lambda: np.array(render_image(ours, scene.scene, 0, 2, 16)))

@@ -251,30 +251,6 @@ def test_mi_render_adds_to_existing_gradients(case: Case):
     assert (sums[1] > sums[0]).mean() > 0.9
 
 
-def test_several_sensors_accumulate(llvm: str):
-    """Two views of one scene add up their gradients. The sum equals the sum of each view's own gradient."""
-    import drjit as dr
-    import mitsuba as mi
-
-    from reslrb_cli.integrators.step import gradient_step
-
-    other = camera() | {
-        "to_world": mi.ScalarTransform4f().look_at(origin=[0.2, 1.2, 4], target=[0, 0, 0], up=[0, 1, 0])
-    }
-    both, second = Case(_textured(other=other), (FLOOR,)), Case(_textured(camera=other), (FLOOR,))
-    ours = integrator("reslrb")
-    leaf = mi.TensorXf(dr.detach(both.params[FLOOR]))
-    dr.enable_grad(leaf)
-    both.params[FLOOR] = mi.TensorXf(leaf)
-    both.params.update()
-    for sensor in (0, 1):
-        gradient_step(ours, both.scene, sensor, both.objective, seed=5 + sensor, spp=32)
-    total = np.array(dr.grad(leaf)).ravel()
-    both.set(both.initial)
-    first_alone, second_alone = both.gradient(ours, 5, 32), second.gradient(ours, 6, 32)
-    assert relative(total, first_alone + second_alone) < 1e-5
-
-
 def test_one_latent_for_several_sensors(llvm: str):
     """Propagation for one view must not remove the edges above the parameters. The next view needs these edges."""
     import drjit as dr
@@ -323,24 +299,6 @@ def test_an_emitter_without_samples_is_refused():
     case = Case(scene, (FLOOR,))
     with pytest.raises(UnsupportedScene, match=r"cannot sample the rays of emitter spot: .*sample_spectrum"):
         case.gradient(integrator("reslrb"), 1, 4)
-
-
-def test_correlated_and_independent(case: Case):
-    """Both agree in expectation for a linear objective. A nonlinear objective shows which samples determine delta."""
-    import drjit as dr
-
-    ours = integrator("reslrb")
-
-    def square(image: Any) -> Any:
-        return dr.sum(dr.square(image[:, :, :3]), axis=None)
-
-    def total(adjoint: str, objective: Any, spp: int, block: int) -> np.ndarray:
-        steps = [case.gradient(ours, seed, spp, objective, adjoint=adjoint) for seed in seeds(16, block)]
-        return np.stack(steps).sum(1, keepdims=True)
-
-    assert compare(total("correlated", None, 64, 0), total("independent", None, 64, 1), block=None)
-    correlated, independent = total("correlated", square, 4, 0), total("independent", square, 4, 0)
-    assert correlated.mean() > 1.1 * independent.mean()  # a pixel's noise is correlated with its own derivative
 
 
 def test_the_same_seed_gives_the_same_step(case: Case):

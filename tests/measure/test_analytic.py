@@ -165,20 +165,12 @@ MOTIONS: dict[str, Callable[[], KnownMotion]] = {
 }
 
 
-@pytest.fixture
-def _quiet(llvm: str) -> None:
-    import mitsuba as mi
-
-    mi.set_log_level(mi.LogLevel.Error)
-
-
 def gradients(motion: KnownMotion, count: int = 8, spp: int = 128) -> np.ndarray:
     case = motion.scene.case()
     case.weigh(motion.weights)
     return case.gradients(integrator("reslrb", **motion.scene.options, estimator="stack"), seeds(count), spp)
 
 
-@pytest.mark.usefixtures("_quiet")
 @pytest.mark.parametrize("name", MOTIONS)
 def test_derivatives(name: str):
     motion = MOTIONS[name]()
@@ -194,7 +186,6 @@ def test_derivatives(name: str):
     assert error < 4e-3, "too noisy to see a fault"
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_a_surface_that_does_not_refract(monkeypatch: pytest.MonkeyPatch):
     right = Segment.next_ray
     monkeypatch.setattr(Segment, "next_ray", lambda self, attached=False: dr.detach(right(self, attached)))
@@ -203,7 +194,6 @@ def test_a_surface_that_does_not_refract(monkeypatch: pytest.MonkeyPatch):
     assert abs(ours.mean() / motion.derivatives[0] - 1) > 0.1
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_the_focus_of_a_ball_depends_on_its_index():
     for ior in (1.4, 1.8):
         across, along, grown = ball_lens(ior=ior, radius=2.0, offset=0.02).derivatives

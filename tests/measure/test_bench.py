@@ -47,7 +47,6 @@ def read(path: Path) -> list[dict]:
     return lines[1:]
 
 
-@pytest.mark.usefixtures("llvm")
 def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     names = "ptracer,reslrb:stack"
@@ -84,7 +83,6 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ]
 
 
-@pytest.mark.usefixtures("llvm")
 def test_l2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The L2 objective works, and a cold step finds no compiled kernels. It does not use the folder in
     `DRJIT_CACHE_DIR`.
@@ -98,7 +96,6 @@ def test_l2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not (tmp_path / "kernels").exists()
 
 
-@pytest.mark.usefixtures("llvm")
 def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     args = ["--max-depth", "4", "--integrators", "ptracer", "--memory-limit", "100MiB", "--json", str(file)]
@@ -110,7 +107,6 @@ def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert "depth 2, ptracer: " in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     (tmp_path / "scene.xml").write_text(MASKED.replace("to_world", "toWorld"))
@@ -125,7 +121,6 @@ def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureF
     assert printed.err.count("toWorld") == 1  # both mend the scene, one line is shown
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("args", "line"),
     [
@@ -150,7 +145,6 @@ def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: py
     assert line in error
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
 def test_a_second_signal_leaves_no_processes_or_files(tmp_path: Path) -> None:
     folder = tmp_path / "temporary"
@@ -173,7 +167,6 @@ def test_a_second_signal_leaves_no_processes_or_files(tmp_path: Path) -> None:
     assert list(folder.iterdir()) == []
 
 
-@pytest.mark.usefixtures("llvm")
 def test_ctrl_c_keeps_finished_measurements(tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "bench", *SMALL, "--max-depth", "1024"]
@@ -224,7 +217,6 @@ def peaks(name: str) -> list[float]:
     return [peak(name, depth) for depth in (4, 16)]
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.long
 def test_memory_of_stack_does_not_grow_with_depth():
     shallow, deep = peaks("reslrb:stack")
@@ -318,7 +310,6 @@ def test_scratch_bytes_of_a_kernel(ir: str, expected: int) -> None:
     assert scratch_bytes([{}, {"ir": io.StringIO(ir)}, {"ir": ""}]) == expected
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(("entries", "expected"), [(0, 0), (5, 40), (9, 72)])
 def test_scratch_bytes_of_a_real_kernel(entries: int, expected: int) -> None:
     import drjit as dr

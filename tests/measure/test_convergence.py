@@ -353,7 +353,6 @@ def asked(what: Any, objective: str = "fixed", camera: bool = False, named: bool
     return survey(what, objective, camera=camera, named=named, budget_s=0.1)
 
 
-@pytest.mark.usefixtures("llvm")
 def test_facts(tmp_path: Path) -> None:
     facts, arrays = asked(problem(tmp_path))
     assert (facts["keys"], facts["shapes"]) == ([KEY], {KEY: [4, 4, 3]})
@@ -363,14 +362,12 @@ def test_facts(tmp_path: Path) -> None:
     assert arrays["mask"].all()
 
 
-@pytest.mark.usefixtures("llvm")
 def test_the_loss_has_several_images(tmp_path: Path) -> None:
     _, arrays = asked(problem(tmp_path), "loss")
     assert arrays["adjoints"].shape == (IMAGES, 8, 8, 3)
     assert len({adjoint.tobytes() for adjoint in arrays["adjoints"]}) == IMAGES
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("camera", "change", "masked"),
     [(True, GAUSSIAN, True), (False, GAUSSIAN, False), (True, ("box", "box"), False)],
@@ -390,7 +387,6 @@ def test_the_border_is_left_out_with_camera_paths(
     assert (facts["shapes"], set(arrays)) == ({"image": [8, 8, 3]}, {"mask"})
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_method_that_is_never_right_is_reported(tmp_path: Path) -> None:
     facts, arrays = asked(problem(tmp_path, ("area", "directionalarea"), GAUSSIAN), camera=True, named=False)
     assert list(facts["without"]) == ["prb"]
@@ -399,7 +395,6 @@ def test_a_method_that_is_never_right_is_reported(tmp_path: Path) -> None:
     assert arrays["mask"].all()  # prb takes no part
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("mode", ["known", "loss", "image"])
 def test_steps_are_repeatable_and_the_border_does_not_count(tmp_path: Path, mode: str) -> None:
     what = problem(tmp_path, GAUSSIAN, overrides=("run.adjoint=independent",))

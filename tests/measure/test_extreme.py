@@ -16,13 +16,6 @@ from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 FEW = ("no_connection", "nan_loss", "black_lamp")
 
 
-@pytest.fixture(autouse=True)
-def _quiet(llvm: str) -> None:
-    import mitsuba as mi
-
-    mi.set_log_level(mi.LogLevel.Error)
-
-
 def failures(records: Iterable[GradcheckRecord]) -> list[str]:
     """Return the failing records as JSON, one line each."""
     return [record.to_json() for record in records if record.holds is False]

@@ -115,7 +115,6 @@ def test_written_files(tmp_path: Path) -> None:
     assert "about 5.9 GiB at 1024 spp" in said
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.long
 def test_compared_methods_have_one_expectation(config: Config) -> None:
     """The comparison disables every part of our method that naive AD lacks."""
@@ -136,7 +135,6 @@ def test_compared_methods_have_one_expectation(config: Config) -> None:
     assert figures.verdict is Verdict.HOLDS, figures
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_process_ends_at_its_limit() -> None:
     """The process loads the scene, but its memory limit is too small for the paths that naive AD stores at this sample
     count.
@@ -221,7 +219,6 @@ def test_a_difference_at_equal_seeds_fails() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("llvm")
 def test_a_small_box() -> None:
     plan = figure5.Plan(spp=16, reference_spp=256, seeds=16)
     record, _ = figure5.measure(load(BOX, SMALL_ROOM), plan, print)
@@ -235,7 +232,6 @@ def test_invalid_comparisons_are_refused() -> None:
             figure5.measure(load(BOX, [wrong]), figure5.Plan(), print)
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("text", [None, "<scene version='3.0.0'></scene>"])
 def test_too_little_memory_is_one_line(text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if text is not None:

@@ -67,7 +67,6 @@ def failures(results: list[CheckResult]) -> set[tuple[str | None, str]]:
     return {(record.estimator, record.reference.value) for record in found}
 
 
-@pytest.mark.usefixtures("llvm")
 def test_it_holds():
     results = check("integrator.rr_depth=2")
     assert failures(results) == set()
@@ -89,7 +88,6 @@ def test_it_holds():
     assert maps[0].z.shape == (4, 4)
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     "drawn",
     a_few(["guiding=on", "sequence=low_discrepancy", "paths=both,pixels=measured"],
@@ -102,7 +100,6 @@ def test_differently_sampled_paths_agree_with_naive_ad_in_expectation(drawn: str
     assert kinds == {Kind.EXPECTATION}
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("guiding", a_few(["on", "auto"], ["auto"]))
 def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch: pytest.MonkeyPatch):
     """Runs with guiding, or with `auto`, are compared with unguided steps. The comparison also covers a table by which
@@ -127,7 +124,6 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
     assert guiding == "on" or found == {("stack", "unguided")}
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
     """Only the reservoir is wrong, by a fifth. All of its references fail, and no reference of the other estimator
     fails.
@@ -140,7 +136,6 @@ def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
     assert found == {("reservoir", name) for name in ("walk_ad", "ptracer", "finite_difference", "forward_mode")}
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_slightly_wrong_derivative(monkeypatch: pytest.MonkeyPatch):
     from reslrb_cli.estimators import stack
 
@@ -150,13 +145,11 @@ def test_a_slightly_wrong_derivative(monkeypatch: pytest.MonkeyPatch):
     assert found == {("stack", name) for name in ("walk_ad", "finite_difference", "forward_mode")}
 
 
-@pytest.mark.usefixtures("llvm")
 def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(forward.TangentSplat, "survived", lambda self, state, weight: state)
     assert failures(check("integrator.rr_depth=1", estimators="stack")) == {("stack", "forward_mode")}
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.MonkeyPatch):
     """Connections are too strong by 30 %. The image and the gradient differ from the stock reference, and agree with
     naive AD and finite differences.
@@ -174,7 +167,6 @@ def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.
     assert failures(check(estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
 
 
-@pytest.mark.usefixtures("llvm")
 def test_rows_are_printed_as_they_are_measured():
     """The first row is available before the last estimator takes a step, and later rows reuse the measurements of
     earlier rows.
@@ -195,7 +187,6 @@ def test_rows_are_printed_as_they_are_measured():
     ]
 
 
-@pytest.mark.usefixtures("llvm")
 def test_unmeasured_comparisons_are_named():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     ticks = iter(range(10_000))
@@ -211,7 +202,6 @@ def test_unmeasured_comparisons_are_named():
     )
 
 
-@pytest.mark.usefixtures("llvm")
 def test_an_interrupt_compares_the_finished_samples():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     asked = iter(range(10_000))
@@ -225,7 +215,6 @@ def test_an_interrupt_compares_the_finished_samples():
     assert list(fresh.run(lambda: True, lambda line: None)) == []
 
 
-@pytest.mark.usefixtures("llvm")
 def test_estimators_have_the_options_of_the_configuration():
     config = loads(
         small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["integrator.estimator=reservoir", "integrator.capacity=4"]
@@ -239,7 +228,6 @@ def test_estimators_have_the_options_of_the_configuration():
             parse_estimators(text)
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("case", a_few(CASES, IN_EXPECTATION))
 def test_references_match_the_conformance_tests(case):
     """The rules permit the reference of each case. Where a case has only differences, the rules refuse `ptracer`, and
@@ -256,7 +244,6 @@ def test_references_match_the_conformance_tests(case):
             assert reasons[case.reference](at, key) is None
 
 
-@pytest.mark.usefixtures("llvm")
 def test_references_refuse_unsupported_parameters():
     scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0, 0)}), ["floor.brdf_0.reflectance.value"])
     [key], sensor = scene.keys, scene.scene.sensors()[0]
@@ -275,7 +262,6 @@ def test_references_refuse_unsupported_parameters():
     )
 
 
-@pytest.mark.usefixtures("llvm")
 def test_ptracer_is_no_reference_with_cutting_clip_planes():
     lens = {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 4.0}
 
@@ -289,7 +275,6 @@ def test_ptracer_is_no_reference_with_cutting_clip_planes():
     assert "before the sensor's near clip" in why(near_clip=4.0)
 
 
-@pytest.mark.usefixtures("llvm")
 def test_path_loses_light_reflected_by_masks():
     """The scene has a lamp and a mask of opacity 0.4. The stock `path` renders 0.4 of the correct image. `prb` and ours
     render all of it.
@@ -305,7 +290,6 @@ def test_path_loses_light_reflected_by_masks():
     assert abs(path / ours - 0.4) < 0.02
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_wide_filter_has_no_weights_along_the_border():
     sensor = Case(room(camera=camera("gaussian")), []).scene.sensors()[0]
     inside = interior((16, 16, 3), sensor)
@@ -314,7 +298,6 @@ def test_a_wide_filter_has_no_weights_along_the_border():
     assert interior((16, 16, 3), Case(room(), []).scene.sensors()[0]).all()
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("dark", [True, False])
 def test_images_are_compared_without_the_border(dark):
     case = Case(room(camera=camera("gaussian")), [])
@@ -326,7 +309,6 @@ def test_images_are_compared_without_the_border(dark):
     np.testing.assert_allclose(image[inside], case.image(integrators["walk_ad"], 1, 16)[inside], rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_step_has_the_stated_truncation_error():
     """The image is cubic in the albedo, so that differences have an error of h^2 times the third derivative."""
     key = "side.brdf_0.reflectance.value"
@@ -343,7 +325,6 @@ def test_a_step_has_the_stated_truncation_error():
             assert chosen.truncation < 1e-3 * abs(exact)
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_step_lost_in_rounding_is_not_used():
     """Rounding of the scene is equal for all seeds and grows as the step shrinks, so this error is not truncation."""
 
@@ -356,7 +337,6 @@ def test_a_step_lost_in_rounding_is_not_used():
     assert chosen.step == 0.01
 
 
-@pytest.mark.usefixtures("llvm")
 def test_directions_stay_within_the_bounds():
     key = "floor.brdf_0.reflectance.value"
     scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0.5, 1)}), [key])
@@ -374,7 +354,6 @@ def test_directions_stay_within_the_bounds():
 WAYS = "stack,stack(paths=both,light_share=0.25),stack(paths=camera)"
 
 
-@pytest.mark.usefixtures("llvm")
 def test_paths_are_compared_with_their_naive_ad_at_equal_seeds():
     results = check("scene.options.size=8", estimators=WAYS, seeds=4)
     records = [result.record for result in results]
@@ -396,7 +375,6 @@ def test_paths_are_compared_with_their_naive_ad_at_equal_seeds():
     assert (found.paths, found.light_share) == ("light", None)
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_wrong_weight_of_camera_paths_is_found(monkeypatch: pytest.MonkeyPatch):
     """Beside camera paths, light paths keep their full weight. Naive AD has the same fault, but `path` does not."""
     monkeypatch.setattr("reslrb_cli.transport.walk.weight_of_connection", lambda *_: mi.Float(1))
@@ -405,13 +383,11 @@ def test_a_wrong_weight_of_camera_paths_is_found(monkeypatch: pytest.MonkeyPatch
     assert (None, Reference.PATH) in failed
 
 
-@pytest.mark.usefixtures("llvm")
 def test_camera_paths_have_one_estimator():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, "integrator.paths=camera"])
     assert [case.label for case in all_estimators(config)] == ["reslrb:stack"]
 
 
-@pytest.mark.usefixtures("llvm")
 def test_moving_light_has_only_light_paths():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
     with pytest.raises(ConfigError, match="only light paths have derivatives of moving light"):
@@ -424,7 +400,6 @@ def _lit(view: str, **more: Any) -> Situation:
     return Situation.of(made.scene, made.scene.sensors()[0], made.params, 4, False, paths=view)
 
 
-@pytest.mark.usefixtures("llvm")
 def test_references_depend_on_the_paths():
     mirror = {"wall": {"type": "twosided", "bsdf": {"type": "conductor"}}}
     assert prb_image(_lit("light", **mirror)) is not None
@@ -447,7 +422,6 @@ def test_references_depend_on_the_paths():
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_moving_lamp():
     records = checked(room_moving("lamp_over_floor.xml", "lamp.position"), "stack", 4)
     of = {record.reference: record for record in records if record.parameter is not None}
@@ -460,7 +434,6 @@ def test_a_moving_lamp():
     assert Reference.FORWARD_MODE not in of
 
 
-@pytest.mark.usefixtures("llvm")
 def test_participants():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
     some = Gradcheck(CheckSettings(config, all_estimators(config), 0, 3, named=False))
@@ -477,7 +450,6 @@ def test_participants():
     assert len(Gradcheck(CheckSettings(asked, all_estimators(asked), 0, 3, named=False)).participants.listed) == 4
 
 
-@pytest.mark.usefixtures("llvm")
 def test_derivatives_of_the_film():
     """The filter's normalisation is differentiated for comparison with differences, and detached for `ptracer`. Naive
     AD is compared with the option `follow`.
@@ -493,7 +465,6 @@ def test_derivatives_of_the_film():
     assert parts.forward_mode
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("name", a_few(["caustic_heightmap", "lens_pose"], ["caustic_heightmap"]))
 def test_forward_mode_of_functions(name: str):
     """Heights and motions are not scene parameters. Tangents must reach the scene's parameters, from which gradients
@@ -510,7 +481,6 @@ def test_forward_mode_of_functions(name: str):
         np.testing.assert_allclose(parts.sample("tangents", key, 1), along, rtol=1e-3, atol=1e-4 * np.abs(along).max())
 
 
-@pytest.mark.usefixtures("llvm")
 def test_references_of_moving_scenes():
     scene = corner(camera=camera("gaussian"), ball={"type": "sphere", "radius": 0.3, "bsdf": diffuse(0.5, 0.5, 0.5)},
                    lamp=lamp(radiance=1.0))  # fmt: skip
@@ -529,7 +499,6 @@ def test_references_of_moving_scenes():
     assert "moving light" in (prb_gradient(at("ball.to_world"), "ball.to_world") or "")
 
 
-@pytest.mark.usefixtures("llvm")
 def test_smooth_directions():
     """Neighbouring entries move alike, because even a very small step would otherwise fold a mesh."""
     points = np.stack(np.meshgrid(np.linspace(0, 1, 50), [0.0], np.linspace(0, 1, 50)), -1).reshape(-1)

@@ -40,13 +40,6 @@ HALF, EDGE, HEIGHT, TILT, IOR, SLAB = 0.6, 0.2, 1.4, 0.5, 1.5, 0.3
 SPP, SEEDS = 64, 24
 
 
-@pytest.fixture
-def _quiet(llvm: str) -> None:
-    import mitsuba as mi
-
-    mi.set_log_level(mi.LogLevel.Error)
-
-
 def missing(case: Case, along: list[Direction], options: dict, count: int = SEEDS) -> Missing:
     found = Missing.of(case, integrator("walk_ad", **options), along, SPP)
     tracer = integrator("reslrb", **options, estimator="stack")
@@ -110,7 +103,6 @@ def slab_share() -> float:
     return float(abs(border / (inside + border)))
 
 
-@pytest.mark.usefixtures("_quiet")
 @pytest.mark.long
 def test_a_texture_has_a_complete_derivative():
     """Colours are complete, because nothing moves."""
@@ -125,7 +117,6 @@ def test_a_texture_has_a_complete_derivative():
     assert "nothing is missing" in record.line()
 
 
-@pytest.mark.usefixtures("_quiet")
 @pytest.mark.parametrize(
     ("scene", "known"),
     [
@@ -143,7 +134,6 @@ def test_known_shares(scene: Callable[[], AttachedScene], known: float):
     assert abs(found - known) < 4 * error + 1e-9
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_a_fault_is_found(monkeypatch: pytest.MonkeyPatch):
     """The check finds a gradient that also lacks the light's shift to other positions."""
     right = AdjointImage.lookup
@@ -152,7 +142,6 @@ def test_a_fault_is_found(monkeypatch: pytest.MonkeyPatch):
     assert abs(found - EDGE / HALF) > 10 * error
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_steps_lost_in_rounding():
     """Rounding that is equal for all seeds shows as a change of the extrapolation."""
 
@@ -168,7 +157,6 @@ def test_steps_lost_in_rounding():
     assert 0.005 < found.directions[0].step < 0.05
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_a_part_lost_in_noise_has_no_share():
     random = np.random.default_rng(0)
     found = Missing([Direction(np.ones(2), "both")] * 2)
@@ -180,7 +168,6 @@ def test_a_part_lost_in_noise_has_no_share():
     assert line == "lamp.position: 16 seeds cannot distinguish the derivative from 0"
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_errors_are_correct():
     """Over many simulated measurements, the deviation from the known share is about as large as the stated error."""
     random, z = np.random.default_rng(1), []
@@ -213,7 +200,6 @@ run: {{iterations: 3, spp: 16}}
 """
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_the_command_and_more_seeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -247,7 +233,6 @@ def test_the_command_and_more_seeds(
     assert "belongs to another measurement: directions is 2 there, None here" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
     """Without a segment to the floor, all images are black, including the target. The earlier check for black targets
     is disabled here.
@@ -270,7 +255,6 @@ ERROR, STANDARD_ERROR = 5e-3, 1e-3
 STEADY = [name for name in SCENES if name not in {room.name for room in ROOMS}]
 
 
-@pytest.mark.usefixtures("_quiet")
 @pytest.mark.long
 @pytest.mark.parametrize("name", STEADY)
 def test_every_scene(name: str):
@@ -291,7 +275,6 @@ def beam(only: tuple[float, float, float], seeds: int = 2) -> Differenced:
     return compare_with_differences(replace(SCENES["slab_beam"], moves=moves), count=seeds)
 
 
-@pytest.mark.usefixtures("_quiet")
 @pytest.mark.long
 def test_a_bending_slab():
     found = beam((0, 1, 0), 4)
@@ -299,14 +282,12 @@ def test_a_bending_slab():
     assert found.standard_error < STANDARD_ERROR, found
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_a_moving_receiver():
     found = compare_with_differences(replace(SCENES["moved_receiver"], spp=16), count=3)
     assert found.error < ERROR, found
     assert found.standard_error < STANDARD_ERROR, found
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_slopes_of_the_shading_correction_without_its_jumps(monkeypatch: pytest.MonkeyPatch):
     """Faces slide through the light. Within each face the shading correction has a slope, and at the face's edges the
     correction jumps back.
@@ -323,7 +304,6 @@ def test_slopes_of_the_shading_correction_without_its_jumps(monkeypatch: pytest.
     assert beam(slides).error > 2 * ERROR
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_a_ray_that_does_not_follow_its_surface(monkeypatch: pytest.MonkeyPatch):
     right = Segment.next_ray
     monkeypatch.setattr(Segment, "next_ray", lambda self, attached=False: dr.detach(right(self, attached)))

@@ -20,13 +20,6 @@ from measure.faults import CHECKS, FAULTS, Fault, plant, planted
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
 
-@pytest.fixture(autouse=True)
-def _quiet(llvm: str) -> None:
-    import mitsuba as mi
-
-    mi.set_log_level(mi.LogLevel.Error)
-
-
 def test_the_faults_apply_to_the_code(monkeypatch: pytest.MonkeyPatch):
     """All faults are planted, also those that only the long suite checks. A change of the code that invalidates a fault
     therefore fails at once.

@@ -15,8 +15,6 @@ from reslrb_cli.cli import main
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.own import _over
 
-pytestmark = pytest.mark.usefixtures("llvm")
-
 FILE = Path(__file__).with_name("own_replay.py")
 
 #: A floor of two materials that a texture mixes.
