@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -47,8 +49,6 @@ def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
     right = guide.Table.of
 
     def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
-        import mitsuba as mi
-
         table = right(grid, counts, *survival)
         weights = change(grid, counts, np.array(table.weights, np.float64))
         return replace(table, weights=mi.Float(weights.astype(np.float32)))
@@ -71,8 +71,6 @@ def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
     right = guide.Table.of
 
     def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
-        import mitsuba as mi
-
         table = right(grid, counts, *survival)
         return replace(table, edges=mi.Float(np.sqrt(np.array(table.edges))))
 
@@ -88,8 +86,6 @@ def with_its_own_weight(patch: pytest.MonkeyPatch) -> None:
     """The weight depends on the path's own numbers, as if the path had contributed to its table. Such a table samples
     expensive paths more often.
     """
-    import drjit as dr
-
     _redraw(patch, lambda drawn: replace(drawn, weight=drawn.weight * dr.minimum(1, 0.5 + drawn.direction.x)))
 
 
@@ -119,8 +115,6 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     right = Reslrb._replay
 
     def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
-        import drjit as dr
-
         tables = self.preparation.guiding
         assert tables is not None
         [samples] = trace.samples

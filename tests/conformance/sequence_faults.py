@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 
 
@@ -21,8 +23,6 @@ def scrambled_once(patch: pytest.MonkeyPatch) -> None:
     right = samples.Points
 
     def wrong(seed: Any, *rest: Any) -> Any:
-        import mitsuba as mi
-
         return right(mi.UInt32(7), *rest)
 
     patch.setattr(samples, "Points", wrong)
@@ -52,9 +52,6 @@ def _renumbered(
     from reslrb_cli.transport import sobol
 
     def next_1d(self: Any, independent: Any = None) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         if self.net is not None:
             net, self.net = self.net, None
             return net.stratified(self.lane, independent)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.drawing import aim_everywhere, guided
@@ -26,8 +27,6 @@ def _everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 7), (160, 90), (1000, 3), (1920, 1080)])
 def test_blocks_partition_the_film_with_the_densities_of_their_slots(size: tuple[int, int]) -> None:
-    import mitsuba as mi
-
     film, random = Blocks.of(size), np.random.default_rng(3)
     areas = film.areas()
     wanted = random.lognormal(0, 2, film.count) * areas
@@ -64,8 +63,6 @@ def test_paths_are_aimed_at_recorded_contributions() -> None:
 
 @pytest.mark.parametrize("purpose", Purpose)
 def test_paths_of_a_gradient_are_aimed_at_its_dl_di(purpose: Purpose) -> None:
-    import mitsuba as mi
-
     _, ours, _ = guided("roughplastic", 2)
     tables = ours.preparation.guiding
     film = tables.films[0]
@@ -82,8 +79,6 @@ def test_paths_of_a_gradient_are_aimed_at_its_dl_di(purpose: Purpose) -> None:
 
 @pytest.mark.parametrize("size", [(9, 7), (1000, 30)])
 def test_means_of_blocks(size: tuple[int, int]) -> None:
-    import mitsuba as mi
-
     film = Blocks.of(size)
     image = np.random.default_rng(3).normal(size=(size[1], size[0], 3)).astype(np.float32)
     across, down = np.meshgrid(*(np.arange(n, dtype=np.float32) + np.float32(0.5) for n in size))

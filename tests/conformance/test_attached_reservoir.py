@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.attached_cases import CASES
@@ -307,9 +309,6 @@ def test_finite_differences_agree_if_auto_stays(name: str):
     ids=str,
 )
 def test_the_choice_of_auto(bsdf: dict[str, Any], sampling: str, max_depth: int, expected: tuple[bool, bool]):
-    import drjit as dr
-    import mitsuba as mi
-
     case = AttachedScene("", "", lambda: lit_wall(bsdf), tilted).case()
     tracer = integrator("reslrb", max_depth, estimator="stack", attached_sampling=sampling)
     leaves = case.leaves()

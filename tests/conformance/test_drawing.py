@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 from agreement import compare
@@ -130,8 +131,6 @@ def without_weight(patch: pytest.MonkeyPatch) -> None:
 
 def of_another_cell(patch: pytest.MonkeyPatch) -> None:
     """Compute the weight of surviving paths from a probability that differs from the survival probability."""
-    import drjit as dr
-
     from reslrb_cli.transport import walk
 
     right = dr.rcp
@@ -143,8 +142,6 @@ def without_factor(patch: pytest.MonkeyPatch) -> None:
     right = Pending.factor
 
     def wrong(self: Pending, *rest: Any) -> Any:
-        import drjit as dr
-
         r = right(self, *rest)
         return dr.select(self.distance > 0, r, dr.maximum(r, 1))
 

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import Agreement, compare
@@ -159,8 +161,6 @@ def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
     """Return the image's derivative along the first of the random parameter directions. The derivative comes from
     `mi.render`, as for Mitsuba's users.
     """
-    import drjit as dr
-    import mitsuba as mi
 
     def tangent() -> Any:
         image = mi.render(scene.scene, scene.params, integrator=integrator, seed=seed, seed_grad=seed + 1, spp=spp)
@@ -384,8 +384,6 @@ def test_endless_paths_are_refused() -> None:
 @pytest.mark.parametrize("name", a_few(["ptracer", "trajectory", "walk_ad", "reservoir", "gather", "stack"],
                                        ["ptracer", "trajectory", "reservoir", "stack"]))  # fmt: skip
 def test_a_known_adjoint_gives_the_image_and_gradient_of_a_correlated_step(name: str) -> None:
-    import drjit as dr
-
     named = BY_NAME["texture"]
     case = Case(named.scene(), named.keys)
     chosen = integrator("reslrb", estimator=name) if name in ("reservoir", "gather", "stack") else integrator(name)
@@ -428,8 +426,6 @@ def case_of_two() -> Case:
 @pytest.fixture(scope="module")
 def reference(case_of_two: Case) -> tuple:
     """Target, and gradients of the L2 loss. For these gradients, delta is taken from the mean image of many samples."""
-    import mitsuba as mi
-
     tracer = integrator("reslrb")
     mean = np.mean([render_image(tracer, case_of_two.scene, 0, 50_000 + i, 1024) for i in range(8)], axis=0)
     target = mi.TensorXf((mean * np.random.default_rng(3).uniform(0.7, 1.2, mean.shape)).astype(np.float32))
@@ -445,8 +441,6 @@ def reference(case_of_two: Case) -> tuple:
 
 def l2(target):
     """Return the mean square difference from the target, as a function of the image."""
-    import drjit as dr
-
     return lambda image: dr.mean(dr.square(image - target), axis=None)
 
 

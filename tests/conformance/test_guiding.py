@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare
@@ -26,9 +28,6 @@ LANES = 2**14
 
 def test_renders_of_a_script_learn_from_each_other() -> None:
     """The renders are forward and backward passes of `mi.render`. The tables are kept in the integrator."""
-    import drjit as dr
-    import mitsuba as mi
-
     reslrb_cli.register()
     scene = Case(BY_NAME["two_emitters"].scene(), BY_NAME["two_emitters"].keys)
     plugin = mi.load_dict({"type": "reslrb", "estimator": "stack", "max_depth": 4, "guiding": "on"})
@@ -60,8 +59,6 @@ def drawn_evenly() -> Any:
     """Compare weighted sums over the numbers' intervals with sums of uniform numbers. The grid has three emitters and a
     table of large contrasts.
     """
-    import mitsuba as mi
-
     from reslrb_cli.guiding import tables as guiding
     from reslrb_cli.transport.guide import Guide, Table, make_grid
 
@@ -148,8 +145,6 @@ def place(x: float) -> Any:
 
 def chamber() -> dict[str, Any]:
     """Return a closed room under a sky, with two openings in its ceiling. A shutter covers the opening on the right."""
-    import mitsuba as mi
-
     grey = {"type": "twosided", "bsdf": diffuse(0.6, 0.6, 0.6)}
     scene: dict[str, Any] = {
         "type": "scene",
@@ -180,8 +175,6 @@ def chamber() -> dict[str, Any]:
 
 def slide(scene: Case, x: float) -> None:
     """Move the shutter to the horizontal position `x`."""
-    import mitsuba as mi
-
     scene.params["shutter.to_world"] = mi.Transform4f(place(x).matrix)
     scene.params.update()
 

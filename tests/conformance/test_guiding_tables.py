@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.drawing import SPP, guided, learn, sample
@@ -90,8 +91,6 @@ def test_roulette_ignores_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
     """Roulette must not end paths only because they are drawn often. With weights scaled to a hundredth, the image
     changes only by this factor.
     """
-    import mitsuba as mi
-
     from reslrb_cli.transport import guide
 
     right, factor = guide.Table.of, [1.0]
@@ -167,8 +166,6 @@ def test_cells_are_sampled_by_weight(weights: list[float]) -> None:
     """With three lanes for each slot, a cell is sampled exactly three times as often as it has slots. The probability p
     is the cell's share of slots, without rounding.
     """
-    import mitsuba as mi
-
     grid = make_grid([True, True, False, True], weights, 10)
     counts = apportion(grid, np.random.default_rng(4).gamma(0.1, size=grid.cells) * grid.measures())
     table, lanes = Table.of(grid, counts), 3 * grid.slots

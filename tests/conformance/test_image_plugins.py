@@ -343,8 +343,6 @@ def test_real_room(hide_emitters):
 @pytest.mark.usefixtures("samples")
 def test_a_mirrored_mesh():
     """The faces of a mirrored mesh wind opposite to its normals. `ptracer` renders this mesh black."""
-    import mitsuba as mi
-
     look = mi.ScalarTransform4f().look_at([0, 2, 5], [0, 0.5, 0], [0, 1, 0])
     down = mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 90)
     mirrored = mi.ScalarTransform4f().translate([0, 0.6, 0]).scale([-0.5, 0.5, 0.5])

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
@@ -36,8 +38,6 @@ class Kernels:
 
     def new(self, step: Callable[[], Any]) -> list[dict]:
         """Return the kernels of `step` that no earlier step launched."""
-        import drjit as dr
-
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             step()
@@ -76,8 +76,6 @@ def test_second_step_compiles_nothing(name: str, adjoint: str):
     ours = integrator("reslrb", **case.both | case.options)
 
     def loss(image: Any) -> Any:
-        import drjit as dr
-
         return dr.sum(dr.square(image[:, :, :3] - scene.weights), axis=None)
 
     steps_compile_nothing(scene, lambda seed: scene.gradient(ours, seed, 16, loss, adjoint=adjoint))
@@ -85,9 +83,6 @@ def test_second_step_compiles_nothing(name: str, adjoint: str):
 
 @taking_turns("name", list(SHIPPED), "adjoint", ("correlated", "independent"), ("caustic_slab", "furnace"))
 def test_second_step_compiles_nothing_on_shipped_scenes(name: str, adjoint: str):
-    import drjit as dr
-    import mitsuba as mi
-
     loaded = load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": 16, "resy": 16, "spp": 4})
     found = list(mi.traverse(loaded).keys())
     keys = SHIPPED[name] or [key for key in found if "reflectance" in key or "radiance" in key][:2]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 
 from reslrb_cli.measure.gradients import Case, integrator
@@ -27,9 +29,6 @@ def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **
     """Return the maximum number of bytes that the allocator gave out during a second step, beyond the number before
     this step.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     backend = dr.backend_v(mi.Float)
     # rr_depth exceeds every depth, so that there is no roulette
     tracer = integrator(name, max_depth, 1000, **({"estimator": estimator} if estimator else {}))

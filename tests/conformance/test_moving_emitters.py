@@ -232,8 +232,6 @@ REFUSED = {
 @pytest.mark.parametrize("name", list(REFUSED))
 def test_refused_with_a_reason(name: str):
     light, key, reason = REFUSED[name]
-    import drjit as dr
-
     scene = load(tiles(1, light) if name != "cutoff" else over_floor(light))
     params = mi.traverse(scene)
     assert key in params

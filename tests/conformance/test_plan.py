@@ -66,9 +66,6 @@ def with_veil() -> dict:
 
 def step(case: Case, ours: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return image and gradient of one step with known dL/dI."""
-    import drjit as dr
-    import mitsuba as mi
-
     with tracking(case.params, case.keys):
         leaves = [case.params[key] for key in case.keys]
         for leaf in leaves:

@@ -9,6 +9,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare
@@ -120,8 +122,6 @@ def _facing() -> Any:
 
 def test_defaults_match_ptracer():
     ours, stock = plugin("reslrb", -1, 5), str(plugin("ptracer", -1, 5))
-    import mitsuba as mi
-
     default = mi.load_dict({"type": "reslrb"})
     assert (default.max_depth, default.rr_depth, default.hide_emitters) == (ours.max_depth, ours.rr_depth, False)
     assert default.samples_per_pass is None
@@ -144,16 +144,12 @@ def test_defaults_match_ptracer():
     ids=str,
 )
 def test_wrong_options_raise(options: dict[str, Any]):
-    import mitsuba as mi
-
     with pytest.raises((ValueError, RuntimeError, TypeError)):
         mi.load_dict({"type": "reslrb", **options})
 
 
 @pytest.mark.parametrize("name", ["estimator", "weight"])
 def test_walk_ad_has_no_estimators(name: str):
-    import mitsuba as mi
-
     with pytest.raises(RuntimeError):
         mi.load_dict({"type": "walk_ad", name: "all"})
 
@@ -202,8 +198,6 @@ def test_a_step_accepts_numpy_numbers(case: Case):
 
 
 def test_mi_render_with_samples_out_of_range_raises(case: Case):
-    import mitsuba as mi
-
     with pytest.raises(RuntimeError) as error:
         mi.render(case.scene, integrator=plugin("reslrb"), spp=-1)
     assert '"spp" must be 0 (the sensor\'s own sample count) or more, not -1' in str(error.value.__cause__)
@@ -215,9 +209,6 @@ def test_mi_render_backward_through_a_latent_variable(case: Case):
     """The parameters are a function of a latent variable. Gradients reach this variable, and agree with the gradients
     of our own step.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     ours, key, steps = plugin("reslrb"), FLOOR, []
     for seed in seeds(12):
         latent = mi.Float(0.8)
@@ -236,9 +227,6 @@ def test_mi_render_backward_through_a_latent_variable(case: Case):
 
 
 def test_mi_render_adds_to_existing_gradients(case: Case):
-    import drjit as dr
-    import mitsuba as mi
-
     ours, leaf = plugin("reslrb"), mi.TensorXf(case.params[FLOOR])
     dr.enable_grad(leaf)
     sums = []
@@ -253,9 +241,6 @@ def test_mi_render_adds_to_existing_gradients(case: Case):
 
 def test_one_latent_for_several_sensors(llvm: str):
     """Propagation for one view must not remove the edges above the parameters. The next view needs these edges."""
-    import drjit as dr
-    import mitsuba as mi
-
     from reslrb_cli.integrators.step import gradient_step
 
     scene = Case(_textured(other=camera()), (FLOOR,))
@@ -280,8 +265,6 @@ def test_one_latent_for_several_sensors(llvm: str):
     ("name", "options"), [("reslrb", {"estimator": "event"}), ("reslrb", {"estimator": "stack"}), ("walk_ad", {})]
 )
 def test_moving_scenes_are_refused_with_a_reason(name: str, options: dict[str, str], key: str):
-    import drjit as dr
-
     from reslrb_cli.integrators.step import gradient_step
 
     case = Case(_textured(), (FLOOR,))  # its sensor has a box filter
@@ -309,8 +292,6 @@ def test_the_same_seed_gives_the_same_step(case: Case):
 
 
 def test_step_returns_image_and_loss(case: Case):
-    import drjit as dr
-
     from reslrb_cli import step
 
     for adjoint in ("correlated", "independent"):

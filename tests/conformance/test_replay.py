@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES, FLOOR, floor
@@ -54,24 +56,15 @@ class Recording(ReservoirSelection):
     """
 
     def start(self, product: Any) -> Kept:
-        import mitsuba as mi
-
         return Kept(super().start(product), mi.UInt32(0), mi.Point3f(0))
 
     def wants(self, state: Kept, vertex: Any) -> Any:
-        import mitsuba as mi
-
         return mi.Bool(True)
 
     def concerned(self, state: Any) -> Any:
-        import mitsuba as mi
-
         return mi.Bool(True)
 
     def vertex(self, state: Kept, vertex: Any, connection: Any, scattering: Any, numbers: list[Any]) -> Kept:
-        import drjit as dr
-        import mitsuba as mi
-
         [slot] = state.state.slots
         before = replace(state.state, slots=[replace(slot, last=mi.UInt32(NONE))])
         after = super().vertex(before, vertex, connection, scattering, numbers)
@@ -89,16 +82,12 @@ class Rewalk(Hooks):
         self.samples, self.kept, self.emission = samples, kept, emission
 
     def start(self, product: Any) -> list[Any]:
-        import mitsuba as mi
-
         return [mi.Spectrum(self.emission), mi.Spectrum(0), mi.Point3f(0), mi.Point2f(0), mi.UInt32(0)]
 
     def goes_on(self, state: Any, vertex: Any) -> Any:
         return vertex.depth < self.kept.I
 
     def vertex(self, state: Any, vertex: Any, connection: Any, scattering: Any, numbers: list[Any]) -> Any:
-        import drjit as dr
-
         here = vertex.active & (vertex.depth == self.kept.I)
         found = [state[0] * connection.c * self.samples.scale, vertex.si.p, connection.u, vertex.depth]
         latest = [dr.select(here, new, old) for new, old in zip(found, state[1:], strict=True)]
@@ -107,8 +96,6 @@ class Rewalk(Hooks):
 
 @pytest.mark.parametrize("name", a_few(NAMES, FEW))
 def test_a_replay_visits_the_same_vertices(name: str):
-    import drjit as dr
-    import mitsuba as mi
     import numpy as np
 
     case = BY_NAME[name]
@@ -175,8 +162,6 @@ def spoilt(case: Case, bad: float) -> tuple:
     """Return two sets of weights of a linear objective. In one channel of each of some pixels, the first set has `bad`
     and the second set has 0.
     """
-    import mitsuba as mi
-
     weights = np.array(case.weights)
     with_bad, with_zero = weights.copy(), weights.copy()
     for channel, (row, column) in enumerate(PIXELS):
@@ -187,8 +172,6 @@ def spoilt(case: Case, bad: float) -> tuple:
 
 def linear(weights):
     """Return the objective sum(image * weights)."""
-    import drjit as dr
-
     return lambda image: dr.sum((first_channels(image, 3) * weights).array)
 
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare
@@ -64,9 +66,6 @@ def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -
 
 def evenly(guiding: str) -> Any:
     """Compare counts of the numbers with the expected counts. The numbers come from two passes with a few lanes."""
-    import drjit as dr
-    import mitsuba as mi
-
     from reslrb_cli.integrators.protocol import Job
     from reslrb_cli.transport.sobol import Net
 
@@ -114,8 +113,6 @@ def test_later_steps_compile_nothing() -> None:
 
 
 def test_the_plugin_has_the_option() -> None:
-    import mitsuba as mi
-
     reslrb_cli.register()
     plugin = mi.load_dict({"type": "reslrb", "max_depth": 4, **LOW_DISCREPANCY})
     scene = Case(BY_NAME["point"].scene(), [])
@@ -131,9 +128,6 @@ COORDINATES = 10
 
 def coordinates(seed: int, width: int) -> np.ndarray:
     """Return all coordinates of a pass's points, (COORDINATES, width), without the stratified coordinate."""
-    import drjit as dr
-    import mitsuba as mi
-
     from reslrb_cli.transport.sobol import Points
 
     points = Points(dr.opaque(mi.UInt32, seed), width, None)
@@ -142,9 +136,6 @@ def coordinates(seed: int, width: int) -> np.ndarray:
 
 def test_points_match_sobol() -> None:
     """The first 2^15 points are the same as SciPy's first 2^15 points, in another order."""
-    import drjit as dr
-    import mitsuba as mi
-
     from reslrb_cli.transport.sobol import point
 
     count = 2**15
@@ -176,15 +167,11 @@ def fills(points: np.ndarray, k: int) -> bool:
 
 def unnested(point: Any, shift: Any, key: Any) -> Any:
     """Return a scramble in which sums carry from later digits to earlier digits."""
-    import drjit as dr
-
     return dr.brev(dr.brev(point) * (key | 1) + shift)
 
 
 def independent(point: Any, shift: Any, key: Any) -> Any:
     """Return points that are unrelated to one another."""
-    import mitsuba as mi
-
     return mi.sample_tea_32(point, shift)[0]
 
 
@@ -208,9 +195,6 @@ def test_scrambles_differ() -> None:
 
 @pytest.mark.parametrize("width", [1, 1000, 3 * 2**24 + 1])
 def test_the_first_number_is_stratified(width: int) -> None:
-    import drjit as dr
-    import mitsuba as mi
-
     from reslrb_cli.transport.sobol import Net
 
     net, some = Net.of(width), np.unique(np.linspace(0, width - 1, 1000).astype(np.int64))

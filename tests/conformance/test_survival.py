@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare
@@ -87,8 +89,6 @@ def test_a_lost_weight_of_learned_roulette_is_found_with_moving_light(monkeypatc
 
 
 def test_cells_are_indexed_by_position_and_octant() -> None:
-    import mitsuba as mi
-
     random = np.random.default_rng(2)
     o = random.uniform(-3, 4, (3, 1000)).astype(np.float32)
     d = random.normal(size=(3, 1000)).astype(np.float32)
@@ -105,8 +105,6 @@ def test_cells_are_indexed_by_position_and_octant() -> None:
 
 def test_the_probability_is_bounded_on_both_sides() -> None:
     """The bounds also hold for NaN, which gets the lower bound."""
-    import mitsuba as mi
-
     throughput = mi.Float([0.0, 1e-30, 0.1, 0.5, 1e30, np.inf, np.nan])
     for chance, expected in (
         (1.0, [LEAST, LEAST, LEAST, 0.5, 1, 1, LEAST]),
@@ -227,9 +225,6 @@ def test_later_contributions_are_collected_at_the_ray_of_the_bounce() -> None:
     """The numbers of rays and later vertices, and the squared contributions, equal sums in NumPy over the paths of the
     same seed.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     from reslrb_cli.transport.walk import Hooks, walk
 
     class Keeping(Hooks):

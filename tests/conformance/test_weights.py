@@ -8,6 +8,8 @@ from functools import cache, partial
 from itertools import product
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from measure.faults import Fault, plant, planted
@@ -20,8 +22,6 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 
 def place(*translate: float, scale: Any = 1, rotate: Any = None) -> Any:
-    import mitsuba as mi
-
     result = mi.ScalarTransform4f().translate(list(translate))
     return (result if rotate is None else result.rotate(*rotate)).scale(scale)
 
@@ -31,8 +31,6 @@ def turned(axis: list[float], angle: float) -> Any:
 
 
 def looking(origin: Any, target: Any) -> Any:
-    import mitsuba as mi
-
     return mi.ScalarTransform4f().look_at(list(origin), list(target), [0, 1, 0])
 
 
@@ -41,15 +39,11 @@ def rgb(*value: float) -> dict[str, Any]:
 
 
 def texels(height: int, width: int) -> dict[str, Any]:
-    import mitsuba as mi
-
     data = np.random.default_rng(3).uniform(0.4, 20, (height, width, 3)).astype(np.float32)
     return {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
 
 
 def bitmap(height: int, width: int, channels: int = 3) -> Any:
-    import mitsuba as mi
-
     return mi.Bitmap(np.random.default_rng(4).random((height, width, channels)).astype(np.float32) ** 3 + 0.01)
 
 
@@ -80,8 +74,6 @@ def sheet(at: Any, bsdf: Any = WHITE, emitter: Any = None, leaning: float = 0, s
     """Return a mesh of two faces that faces down. If `leaning` is above 0, the vertex normals lean outwards by
     `leaning`.
     """
-    import mitsuba as mi
-
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
     if emitter is not None:
@@ -100,8 +92,6 @@ def sheet(at: Any, bsdf: Any = WHITE, emitter: Any = None, leaning: float = 0, s
 
 def room(lights: dict[str, Any], sensor: Any = None, film: Any = None, walls: Any = WHITE, **things: Any) -> Any:
     """Return the scene. The floor and the back wall have the BSDF `walls`. The left wall is white."""
-    import mitsuba as mi
-
     size = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = {"type": "perspective", "fov": 50.0, "near_clip": 0.1, "to_world": looking([0.5, 2.2, 7], [0, 1.8, 0])}
     return mi.load_dict({
@@ -224,9 +214,6 @@ CASES |= {f"only_{name}": Case(partial(lambda name: room(lights(name), walls=HAL
 
 def prepared(case: Case) -> Any:
     """Return samples of light paths together with their camera paths, or samples of camera paths only."""
-    import drjit as dr
-    import mitsuba as mi
-
     from reslrb_cli.integrators.protocol import Job
     from reslrb_cli.integrators.reslrb import Reslrb
 
@@ -256,7 +243,6 @@ def prepared(case: Case) -> Any:
 
 def found(samples: Any) -> dict[str, Any]:
     """Return the paths that each way has found."""
-    import drjit as dr
     from conformance.path_densities import CameraNotes, Emission, LightNotes, paths_of
 
     from reslrb_cli.transport.camera import camera_walk
@@ -351,7 +337,6 @@ def test_the_density_of_rays_matches_the_sampled_ones(name: str):
     """The weight of a ray determines its density. The weight is the light along the ray, times the cosine at a lamp,
     divided by the density.
     """
-    import drjit as dr
     from conformance.path_densities import Densities, Emission, cosine
 
     from reslrb_cli.transport.emission import sample_emission
@@ -446,9 +431,6 @@ def gradient(**options: Any) -> np.ndarray:
     """Return the derivatives by all colours of a room, estimated with camera paths. All integrators use the same camera
     paths.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     from reslrb_cli.integrators.step import gradient_step, make_integrator
 
     scene = room(lights("rectangle", "constant"), walls=HALF)

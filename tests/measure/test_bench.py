@@ -312,9 +312,6 @@ def test_scratch_bytes_of_a_kernel(ir: str, expected: int) -> None:
 
 @pytest.mark.parametrize(("entries", "expected"), [(0, 0), (5, 40), (9, 72)])
 def test_scratch_bytes_of_a_real_kernel(entries: int, expected: int) -> None:
-    import drjit as dr
-    import mitsuba as mi
-
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         index = dr.opaque(mi.UInt32, 1, 64) % max(entries, 1)

@@ -358,8 +358,6 @@ def write(folder: Path, text: str, name: str = "scene.xml") -> Path:
 
 def keys(file: Path, **options: object) -> list[str]:
     """Return the keys of a scene in their order."""
-    import mitsuba as mi
-
     return list(mi.traverse(load_scene(file, options)).properties)
 
 
@@ -393,7 +391,6 @@ def test_a_script_sees_the_names_of_the_command_line(tmp_path):
     """A script gets the same keys as the command line. The file is of an older version that `mi.load_file` refuses.
     Requested textures of 8 bits are floats.
     """
-    import mitsuba as mi
     import numpy as np
 
     mi.Bitmap(np.full((4, 4, 3), 99, np.uint8)).write(str(tmp_path / "8bit.png"))

@@ -75,8 +75,6 @@ def test_everything(make_scene):
 
 @pytest.mark.parametrize("flat", [True, False])
 def test_shading_normals(make_scene, tmp_path, flat):
-    import mitsuba as mi
-
     mesh = mi.Mesh("m", 3, 1, has_vertex_normals=True)
     params = mi.traverse(mesh)
     params["vertex_positions"] = [0, 0, 0, 1, 0, 0, 0, 1, 0]
@@ -88,8 +86,6 @@ def test_shading_normals(make_scene, tmp_path, flat):
 
 
 def test_nested_bsdfs_and_groups_are_seen(make_scene, tmp_path):
-    import mitsuba as mi
-
     mi.load_dict({"type": "cube"}).write_ply(str(tmp_path / "cube.ply"))
     group = {"type": "shapegroup", "cube": {"type": "ply", "filename": str(tmp_path / "cube.ply"), "bsdf": GLASS}}
     scene = make_scene(group=group, copy={"type": "instance", "group": {"type": "ref", "id": "group"}})
@@ -100,8 +96,6 @@ def test_nested_bsdfs_and_groups_are_seen(make_scene, tmp_path):
 
 
 def test_view(make_scene):
-    import mitsuba as mi
-
     far = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 9], up=[0, 1, 0])
     scene = make_scene(sky={"type": "constant"})
     view = look(scene, scene.sensors()[0])
@@ -185,8 +179,6 @@ def test_summary_of_an_unrenderable_scene(make_scene):
 
 
 def test_fractions_refer_to_the_crop_window(make_scene):
-    import mitsuba as mi
-
     film = {"type": "hdrfilm", "width": 16, "height": 12, "crop_offset_x": 7, "crop_offset_y": 5, "crop_width": 2,
             "crop_height": 2}  # fmt: skip
     to_world = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0])
@@ -269,8 +261,6 @@ def test_a_blocked_remedy_is_not_named(make_scene, paths):
 
 @pytest.mark.parametrize(("bsdf", "same"), [("hair", False), ("pplastic", True), ("principled", True)])
 def test_asymmetric_materials_are_refused_for_light_paths(make_scene, bsdf, same):
-    import mitsuba as mi
-
     scene = make_scene(plane={"type": "rectangle", "bsdf": {"type": bsdf}})
     material = next(shape for shape in scene.shapes() if shape.id() == "plane").bsdf()
     light, view = (mi.Vector3f(mi.ScalarVector3f(way)) for way in ([0.36, 0.48, 0.8], [-0.64, 0.48, 0.6]))
@@ -329,8 +319,6 @@ def test_an_open_floor_in_full(make_scene):
 
 
 def test_texels_are_visible_through_as_many_surfaces_as_pixels(make_scene):
-    import mitsuba as mi
-
     place = mi.ScalarTransform4f()
     for count, is_seen in ((12, True), (CROSSINGS, False)):
         veil = {"type": "rectangle", "bsdf": {"type": "null"}}
@@ -340,8 +328,6 @@ def test_texels_are_visible_through_as_many_surfaces_as_pixels(make_scene):
 
 
 def test_proposals_see_through_eight_panes(make_scene):
-    import mitsuba as mi
-
     pane = {"type": "rectangle", "bsdf": {"type": "thindielectric"}}
     places = [mi.ScalarTransform4f().translate([0, 0, 0.2 + 0.1 * number]).scale(9) for number in range(8)]
     panes = {f"pane_{number}": pane | {"to_world": place} for number, place in enumerate(places)}
@@ -350,8 +336,6 @@ def test_proposals_see_through_eight_panes(make_scene):
 
 
 def test_crop_window_and_orientation(make_scene):
-    import mitsuba as mi
-
     # The lower left quarter of the film. The film's rows run downwards, and the texture's rows run upwards, with v.
     film = {"type": "hdrfilm", "width": 16, "height": 16, "crop_offset_x": 0, "crop_offset_y": 8, "crop_width": 8,
             "crop_height": 8}  # fmt: skip
@@ -393,8 +377,6 @@ def test_excluded_pixels_show_nothing(make_scene):
 
 
 def test_hidden_texels_and_occluders(make_scene):
-    import mitsuba as mi
-
     half = mi.ScalarTransform4f().translate([0.5, 0, 0.01]).scale([0.5, 1, 1])
     expected = np.ones((4, 6), dtype=bool)
     expected[:, 3:] = False
@@ -406,8 +388,6 @@ def test_hidden_texels_and_occluders(make_scene):
 
 
 def test_nested_shared_and_repeated(make_scene):
-    import mitsuba as mi
-
     values = mi.TensorXf(np.full((4, 6, 3), 0.5, np.float32))
     scale = mi.ScalarTransform4f().scale([3, 2, 1])
     texture = {"type": "bitmap", "raw": True, "data": values, "to_uv": scale}
@@ -416,8 +396,6 @@ def test_nested_shared_and_repeated(make_scene):
 
 
 def test_emission_does_not_affect_visibility(make_scene):
-    import mitsuba as mi
-
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
     scene = make_scene(sky=sky)
     assert visible_texels(scene, scene.sensors(), "sky.data").all()
