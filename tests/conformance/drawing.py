@@ -15,6 +15,8 @@ from conformance.gradient_cases import CASES
 
 from reslrb_cli.guiding.tables import Guiding, Learned, Purpose
 from reslrb_cli.integrators import context
+from reslrb_cli.integrators import reslrb as lt
+from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.transport.guide import Table
@@ -138,9 +140,6 @@ def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
 
 def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) -> None:
     """Let the replay use the table that `other` makes from its own table."""
-    from reslrb_cli.integrators import reslrb as lt
-    from reslrb_cli.integrators.reslrb import Reslrb
-
     right = Reslrb._replay
 
     def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:

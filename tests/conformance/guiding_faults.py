@@ -10,6 +10,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from reslrb_cli.guiding.collect import hear
+from reslrb_cli.guiding.tables import Purpose
+from reslrb_cli.integrators import reslrb
+from reslrb_cli.integrators import reslrb as lt
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.transport import guide
+
 
 def hole(patch: pytest.MonkeyPatch) -> None:
     """The hundredth of cells with the most slots is never sampled. The cell with the fewest slots gets their slots."""
@@ -44,8 +51,6 @@ def of_the_neighbour(patch: pytest.MonkeyPatch) -> None:
 
 
 def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
-    from reslrb_cli.transport import guide
-
     right = guide.Table.of
 
     def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
@@ -58,16 +63,12 @@ def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
 
 def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
     """The lanes share the slots as if there were twice as many lanes."""
-    from reslrb_cli.transport import guide
-
     right = guide.Guide.of
     patch.setattr(guide.Guide, "of", staticmethod(lambda table, width: right(table, 2 * width)))
 
 
 def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
     """The number that selects the emitter lies in an interval for emitters with other shares."""
-    from reslrb_cli.transport import guide
-
     right = guide.Table.of
 
     def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
@@ -90,16 +91,12 @@ def with_its_own_weight(patch: pytest.MonkeyPatch) -> None:
 
 
 def _redraw(patch: pytest.MonkeyPatch, change: Any) -> None:
-    from reslrb_cli.transport import guide
-
     right = guide.Guide.draw
     patch.setattr(guide.Guide, "draw", lambda self, *given: change(right(self, *given)))
 
 
 def same_numbers(patch: pytest.MonkeyPatch) -> None:
     """The tables learn from the same random numbers that the step uses."""
-    from reslrb_cli.integrators import reslrb
-
     patch.setattr(reslrb, "learning_seed", lambda seed: seed)
 
 
@@ -107,11 +104,6 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     """The tables learn from an image's samples before these samples are replayed. The replay therefore uses another
     table.
     """
-    from reslrb_cli.guiding.collect import hear
-    from reslrb_cli.guiding.tables import Purpose
-    from reslrb_cli.integrators import reslrb as lt
-    from reslrb_cli.integrators.reslrb import Reslrb
-
     right = Reslrb._replay
 
     def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:

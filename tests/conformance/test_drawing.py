@@ -38,8 +38,9 @@ from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.guiding import tables
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.transport import aim
+from reslrb_cli.transport import aim, walk
 from reslrb_cli.transport.aim import Aim, Pending
+from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import Blocks
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -124,15 +125,11 @@ def test_every_kind_of_step_has_the_plain_mean(way: str, estimator: str, adjoint
 
 def without_weight(patch: pytest.MonkeyPatch) -> None:
     """Do not raise the weight of paths that survive roulette."""
-    from reslrb_cli.transport.factors import Product
-
     patch.setattr(Product, "scaled", lambda self, scale: self)
 
 
 def of_another_cell(patch: pytest.MonkeyPatch) -> None:
     """Compute the weight of surviving paths from a probability that differs from the survival probability."""
-    from reslrb_cli.transport import walk
-
     right = dr.rcp
     patch.setattr(walk.dr, "rcp", lambda q: right(dr.clip(1.1 * q, 0, 1)))
 
@@ -183,8 +180,6 @@ def with_delta_lobes(patch: pytest.MonkeyPatch) -> None:
 
 def from_everywhere(patch: pytest.MonkeyPatch) -> None:
     """The share of aimed paths is `SHARE` everywhere, even on glass, from which no paths are aimed."""
-    from reslrb_cli.transport import walk
-
     patch.setattr(walk, "choose", lambda *args: _with_share(aim.choose(*args)))
 
 

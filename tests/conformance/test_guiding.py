@@ -13,9 +13,14 @@ from conformance.drawing import BY_NAME, SPP, guided, strength
 from conformance.guiding_faults import FAULTS, learned_in_its_midst, same_numbers
 
 import reslrb_cli
-from reslrb_cli.guiding.tables import EVERY
+from reslrb_cli.estimators import base
+from reslrb_cli.guiding import collect
+from reslrb_cli.guiding import tables as guiding
+from reslrb_cli.guiding.tables import EVERY, Guiding
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import SIZE, diffuse, rgb, texture, transform
+from reslrb_cli.transport import plan
+from reslrb_cli.transport.guide import Guide, Table, make_grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -59,9 +64,6 @@ def drawn_evenly() -> Any:
     """Compare weighted sums over the numbers' intervals with sums of uniform numbers. The grid has three emitters and a
     table of large contrasts.
     """
-    from reslrb_cli.guiding import tables as guiding
-    from reslrb_cli.transport.guide import Guide, Table, make_grid
-
     grid = make_grid([True] * 4, [1.0, 2.0, 0.5])
     density = np.random.default_rng(3).gamma(0.05, size=grid.cells)
     guide = Guide.of(Table.of(grid, guiding.apportion(grid, density)), LANES)
@@ -99,9 +101,6 @@ def test_tables_use_their_own_random_numbers_and_change_between_steps(
 
 def learns_apart(patch: pytest.MonkeyPatch) -> bool:
     """Return True if the walks of each of two steps use one table, and learning uses seeds that no other walk has."""
-    from reslrb_cli.estimators import base
-    from reslrb_cli.guiding import collect
-
     walks: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
     right, tables = base.walk, []  # held, so that no other table reuses an address
 
@@ -246,8 +245,6 @@ def test_tables_that_update_too_late_are_too_wrong(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.long
 def test_tables_that_stop_learning_stay_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.guiding.tables import Guiding
-
     right = Guiding.due
 
     def due(self: Guiding, number: int) -> bool:
@@ -259,8 +256,6 @@ def test_tables_that_stop_learning_stay_wrong(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.long
 def test_tables_without_a_uniform_share_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.transport import plan
-
     monkeypatch.setattr(plan, "GUIDE_UNIFORM", 0.02)
     monkeypatch.setattr(plan, "SLOTS_PER_CELL", 64)
     assert not holds(errors(32))

@@ -15,9 +15,10 @@ from conformance.operations import LARGE, even_table
 from conformance.test_kernels import Kernels
 
 from reslrb_cli.guiding.collect import KEEP, Onward
-from reslrb_cli.guiding.tables import BLUR, FINE, Guiding, Learned, _blurred, grid_for, learnings, most_cells
+from reslrb_cli.guiding.tables import BLUR, FINE, Guiding, Learned, Purpose, _blurred, grid_for, learnings, most_cells
 from reslrb_cli.integrators import freezing
 from reslrb_cli.measure.gradients import Case, integrator, relative
+from reslrb_cli.transport import guide
 from reslrb_cli.transport.guide import Guide, Table, apportion, make_grid
 from reslrb_cli.transport.plan import GUIDE_UNIFORM, Grid
 from reslrb_cli.transport.roulette import CELLS
@@ -91,8 +92,6 @@ def test_roulette_ignores_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
     """Roulette must not end paths only because they are drawn often. With weights scaled to a hundredth, the image
     changes only by this factor.
     """
-    from reslrb_cli.transport import guide
-
     right, factor = guide.Table.of, [1.0]
 
     def weighed(grid: Grid, counts: np.ndarray, *rest: Any) -> Table:
@@ -115,8 +114,6 @@ def heard(*rows: Any) -> np.ndarray:
 
 
 def test_no_group_dominates_and_non_finite_values_are_dropped() -> None:
-    from reslrb_cli.guiding.tables import Learned, Purpose
-
     draws, first, other = np.ones(SMALL.cells), np.zeros(SMALL.cells), np.zeros(SMALL.cells)
     first[:16], other[16:] = 1, 1
     quiet = Learned.nothing(SMALL).with_more(SMALL, heard(first, 1e-12 * other, 0, 1), draws)
@@ -189,8 +186,6 @@ def test_cells_are_as_fine_as_the_paths_allow() -> None:
     """A few paths give no information about single cells. With many paths, one cell's contributions reach only its
     direct neighbours.
     """
-    from reslrb_cli.guiding.tables import FINE, Learned
-
     grid = GRIDS["one"]
     loud = np.zeros(grid.cells, np.float32)
     loud[np.ravel_multi_index([size // 2 for size in grid.shape], grid.shape)] = 1
@@ -207,8 +202,6 @@ def test_cells_are_as_fine_as_the_paths_allow() -> None:
 
 
 def test_old_samples_count_little() -> None:
-    from reslrb_cli.guiding.tables import Learned, Purpose
-
     draws, before, now = np.ones(SMALL.cells), np.zeros(SMALL.cells), np.zeros(SMALL.cells)
     before[:16], now[16:] = 1, 1
     learned = Learned.nothing(SMALL).with_more(SMALL, heard(before, 1), draws)
@@ -218,8 +211,6 @@ def test_old_samples_count_little() -> None:
 
 
 def test_tables_of_any_number_of_sensors_use_64_mib() -> None:
-    from reslrb_cli.guiding.tables import Guiding, grid_for
-
     for emitters, sensors in ((1, 1), (1, 3), (2, 1), (3, 2), (3000, 1), (3, 1000)):
         guiding = Guiding()
         guiding.grid = grid_for([True] * 4, [1.0] * emitters, sensors)

@@ -24,6 +24,8 @@ from reslrb_cli.measure.gradients import integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import diffuse, load, rgb, transform
 from reslrb_cli.optimization.moving import border_share, warn_of_border
 from reslrb_cli.records.measurements import Verdict
+from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.transport.lamps import drawn_face, sums_of_areas
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -270,9 +272,6 @@ def test_fault(fault: Fault, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_faces_of_a_mesh_match_those_that_mitsuba_samples():
-    from reslrb_cli.scene.graph import SceneGraph
-    from reslrb_cli.transport.lamps import drawn_face, sums_of_areas
-
     scene = load(over_floor(mesh()))
     [lamp] = SceneGraph.of(scene).find_lamps(scene)
     [areas] = sums_of_areas([lamp])

@@ -19,9 +19,9 @@ from conformance.scenes import plugin
 
 from reslrb_cli import step
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.integrators.step import render_image
+from reslrb_cli.integrators.step import gradient_step, make_integrator, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.scenes.small import camera, lamp, rgb, room
+from reslrb_cli.measure.scenes.small import camera, lamp, rgb, room, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 ROOT = Path(__file__).resolve().parents[2]
@@ -115,8 +115,6 @@ def shown(llvm: str) -> Case:
 
 
 def _facing() -> Any:
-    from reslrb_cli.measure.scenes.small import transform
-
     return transform(translate=[0.2, -0.1, 1.2], rotate=([0, 1, 0], 15), scale=0.4)
 
 
@@ -155,8 +153,6 @@ def test_walk_ad_has_no_estimators(name: str):
 
 
 def test_unknown_options_of_an_integrator_are_refused():
-    from reslrb_cli.integrators.step import make_integrator
-
     for type in ("reslrb", "ptracer", "prb"):
         with pytest.raises(ValueError, match=f"{type} has no option colour"):
             make_integrator(type, colour=3)
@@ -241,8 +237,6 @@ def test_mi_render_adds_to_existing_gradients(case: Case):
 
 def test_one_latent_for_several_sensors(llvm: str):
     """Propagation for one view must not remove the edges above the parameters. The next view needs these edges."""
-    from reslrb_cli.integrators.step import gradient_step
-
     scene = Case(_textured(other=camera()), (FLOOR,))
     for name in ("reslrb", "walk_ad", "ptracer", "prb"):
         tracer, sums = integrator(name), []
@@ -265,8 +259,6 @@ def test_one_latent_for_several_sensors(llvm: str):
     ("name", "options"), [("reslrb", {"estimator": "event"}), ("reslrb", {"estimator": "stack"}), ("walk_ad", {})]
 )
 def test_moving_scenes_are_refused_with_a_reason(name: str, options: dict[str, str], key: str):
-    from reslrb_cli.integrators.step import gradient_step
-
     case = Case(_textured(), (FLOOR,))  # its sensor has a box filter
     dr.enable_grad(case.params[key])
     case.params.update()
@@ -292,8 +284,6 @@ def test_the_same_seed_gives_the_same_step(case: Case):
 
 
 def test_step_returns_image_and_loss(case: Case):
-    from reslrb_cli import step
-
     for adjoint in ("correlated", "independent"):
         result = step(integrator("reslrb"), case.scene, 0, case.objective, seed=9, spp=16, adjoint=adjoint)
         image = np.array(result.image)

@@ -17,7 +17,10 @@ from conformance.test_kernels import steps_compile_nothing
 from scipy.stats import qmc
 
 import reslrb_cli
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.transport import sobol
+from reslrb_cli.transport.sobol import Net, Points
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -66,9 +69,6 @@ def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -
 
 def evenly(guiding: str) -> Any:
     """Compare counts of the numbers with the expected counts. The numbers come from two passes with a few lanes."""
-    from reslrb_cli.integrators.protocol import Job
-    from reslrb_cli.transport.sobol import Net
-
     case = Case(BY_NAME["two_emitters"].scene(), [])
     ours = integrator("reslrb", guiding=guiding, samples_per_pass=1, **LOW_DISCREPANCY)
     rows = []
@@ -128,8 +128,6 @@ COORDINATES = 10
 
 def coordinates(seed: int, width: int) -> np.ndarray:
     """Return all coordinates of a pass's points, (COORDINATES, width), without the stratified coordinate."""
-    from reslrb_cli.transport.sobol import Points
-
     points = Points(dr.opaque(mi.UInt32, seed), width, None)
     return np.stack([np.array(points.next_1d(), np.float64) for _ in range(COORDINATES)])
 
@@ -177,8 +175,6 @@ def independent(point: Any, shift: Any, key: Any) -> Any:
 
 @pytest.mark.parametrize("scramble", [unnested, independent])
 def test_another_scramble_is_found(scramble: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.transport import sobol
-
     monkeypatch.setattr(sobol, "scrambled", scramble)
     assert not fills(coordinates(1, 2**8), 8)
 
@@ -195,8 +191,6 @@ def test_scrambles_differ() -> None:
 
 @pytest.mark.parametrize("width", [1, 1000, 3 * 2**24 + 1])
 def test_the_first_number_is_stratified(width: int) -> None:
-    from reslrb_cli.transport.sobol import Net
-
     net, some = Net.of(width), np.unique(np.linspace(0, width - 1, 1000).astype(np.int64))
     for jitter in (0.0, 0.5, float(dr.one_minus_epsilon(mi.Float))):
         numbers = np.array(net.stratified(mi.UInt32(some), mi.Float(jitter)), np.float64)

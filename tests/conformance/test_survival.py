@@ -14,11 +14,14 @@ from agreement import compare
 from conformance.attached_cases import CASES as MOVING
 from conformance.drawing import SPP, by_harsh_table, guided, harsh
 
-from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked
+from reslrb_cli.estimators.attached import AttachedSweep
+from reslrb_cli.guiding import collect
+from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked, hear
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.transport.roulette import BITS, CELLS, LEAST, SHAPE, Survival
+from reslrb_cli.transport.walk import Hooks, walk
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -74,8 +77,6 @@ def moving_means_hold(estimator: str, table: str, rr_depth: int, count: int, spp
 
 def test_a_lost_weight_of_learned_roulette_is_found_with_moving_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """The fault applies the weights of learned roulette only together with roulette on throughput."""
-    from reslrb_cli.estimators.attached import AttachedSweep
-
     right = AttachedSweep.survived
 
     def survived(self: AttachedSweep, state: Any, weight: Any) -> Any:
@@ -176,8 +177,6 @@ def test_learned_state_does_not_depend_on_the_unit_of_light() -> None:
 
 def walk_of(scene: Case, ours: Any, seed: int) -> Walked:
     """Return the data of one walk, from which a table would learn."""
-    from reslrb_cli.guiding.collect import hear
-
     leaves = scene.leaves()
     job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(seed), SPP, scene.params)
     samples = ours.passes(job, Purpose.BOTH)[0]
@@ -210,8 +209,6 @@ def test_collected_values_do_not_depend_on_roulette(fault: str | None, monkeypat
     """The collected values do not contain the weights of roulette. Otherwise, a table would learn from its own
     weights.
     """
-    from reslrb_cli.guiding import collect
-
     if fault is not None:
         right = collect.Trail.survives
         power = {"square": 3.0, "length": 0.0}[fault]
@@ -225,7 +222,6 @@ def test_later_contributions_are_collected_at_the_ray_of_the_bounce() -> None:
     """The numbers of rays and later vertices, and the squared contributions, equal sums in NumPy over the paths of the
     same seed.
     """
-    from reslrb_cli.transport.walk import Hooks, walk
 
     class Keeping(Hooks):
         """Records for each path the ray that leaves the first vertex, its throughput, and the contribution of the
@@ -269,8 +265,6 @@ def test_vertices_beyond_the_capacity_are_summed(monkeypatch: pytest.MonkeyPatch
     """The result is the same if one vertex or both vertices fit into the storage. In walks of two bounces, rays leave
     only the first vertex.
     """
-    from reslrb_cli.guiding import collect
-
     scene, ours, _ = guided("two_emitters", 1, max_depth=3)
     found = []
     for places in (32, 1):

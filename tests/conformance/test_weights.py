@@ -12,8 +12,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from conformance.path_densities import CameraNotes, Densities, Emission, LightNotes, cosine, emitter_number, paths_of
 from measure.faults import Fault, plant, planted
 from turns import a_few
+
+from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.integrators.step import gradient_step, make_integrator
+from reslrb_cli.transport.camera import camera_walk
+from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.walk import walk
+from reslrb_cli.transport.weights import leave_emitter
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -214,9 +223,6 @@ CASES |= {f"only_{name}": Case(partial(lambda name: room(lights(name), walls=HAL
 
 def prepared(case: Case) -> Any:
     """Return samples of light paths together with their camera paths, or samples of camera paths only."""
-    from reslrb_cli.integrators.protocol import Job
-    from reslrb_cli.integrators.reslrb import Reslrb
-
     names = ("paths", "max_depth", "light_share", "rr_depth", "hide_emitters")
     options = {name: getattr(case, name) for name in names} | {"estimator": "stack"}
     scene, params = case.scene(), None
@@ -243,11 +249,6 @@ def prepared(case: Case) -> Any:
 
 def found(samples: Any) -> dict[str, Any]:
     """Return the paths that each way has found."""
-    from conformance.path_densities import CameraNotes, Emission, LightNotes, paths_of
-
-    from reslrb_cli.transport.camera import camera_walk
-    from reslrb_cli.transport.walk import walk
-
     with dr.suspend_grad():
         camera = CameraNotes(samples.camera or samples)
         camera_walk(camera.samples, camera)
@@ -281,8 +282,6 @@ TOLERANCE = 1e-3
 
 def compared(case: Case) -> dict[str, Comparison]:
     """Return for each way the comparison of a case's weights with its densities."""
-    from conformance.path_densities import Densities, emitter_number
-
     samples = prepared(case)
     densities, result = Densities(samples, samples.camera or samples, CUTOFF, FOV), {}
     for way, paths in found(samples).items():
@@ -337,11 +336,6 @@ def test_the_density_of_rays_matches_the_sampled_ones(name: str):
     """The weight of a ray determines its density. The weight is the light along the ray, times the cosine at a lamp,
     divided by the density.
     """
-    from conformance.path_densities import Densities, Emission, cosine
-
-    from reslrb_cli.transport.emission import sample_emission
-    from reslrb_cli.transport.weights import leave_emitter
-
     samples = prepared(CASES[name])
     densities = Densities(samples, samples.camera, CUTOFF, FOV)
     with dr.suspend_grad():
@@ -431,8 +425,6 @@ def gradient(**options: Any) -> np.ndarray:
     """Return the derivatives by all colours of a room, estimated with camera paths. All integrators use the same camera
     paths.
     """
-    from reslrb_cli.integrators.step import gradient_step, make_integrator
-
     scene = room(lights("rectangle", "constant"), walls=HALF)
     params = mi.traverse(scene)
     params.keep([key for key in params.keys() if key.endswith(("reflectance.value", "radiance.value"))])  # noqa: SIM118

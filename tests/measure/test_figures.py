@@ -12,7 +12,7 @@ from make_figures import write_panels
 
 from paper import figure1, figure5
 from paper.figures import main
-from paper.gradients import OWN, Kind, fall, relative_noise, sample
+from paper.gradients import OWN, Kind, comparable, fall, relative_noise, sample
 from paper.page import FIGURES
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
@@ -118,8 +118,6 @@ def test_written_files(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_compared_methods_have_one_expectation(config: Config) -> None:
     """The comparison disables every part of our method that naive AD lacks."""
-    from paper.gradients import comparable
-
     y, x = np.mgrid[0:16, 0:16] / 16
     adjoint = np.repeat((np.sin(5 * x) * np.cos(4 * y) + 1.5)[:, :, None], 3, 2).astype(np.float32)
     options = comparable(config, OWN).integrator.options()

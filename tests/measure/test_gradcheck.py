@@ -17,6 +17,8 @@ from turns import a_few
 
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.estimators import reservoir, stack
+from reslrb_cli.guiding import tables
 from reslrb_cli.integrators import forward
 from reslrb_cli.measure.gradcheck import CheckResult, Gradcheck
 from reslrb_cli.measure.gradients import (
@@ -49,6 +51,8 @@ from reslrb_cli.records.measurement_files import read_samples, write_samples
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
 from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior
+from reslrb_cli.transport import walk as segment
+from reslrb_cli.transport.roulette import CELLS, Survival
 
 # Gradcheck on a small Cornell box: the current code passes, and planted faults are found and named.
 
@@ -105,9 +109,7 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
     """Runs with guiding, or with `auto`, are compared with unguided steps. The comparison also covers a table by which
     half of all paths end at each vertex.
     """
-    from reslrb_cli.guiding import tables
     from reslrb_cli.transport import walk
-    from reslrb_cli.transport.roulette import CELLS, Survival
 
     of, play = Survival.of, walk.play
     monkeypatch.setattr(tables.Survival, "of", staticmethod(lambda box, chances: of(box, np.zeros(CELLS))))
@@ -128,8 +130,6 @@ def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
     """Only the reservoir is wrong, by a fifth. All of its references fail, and no reference of the other estimator
     fails.
     """
-    from reslrb_cli.estimators import reservoir
-
     right = reservoir.slot_adjoint
     monkeypatch.setattr(reservoir, "slot_adjoint", lambda p, W, *rest: right(p, W * 1.2, *rest))
     found = failures(check(estimators="reservoir,stack", seeds=16))
@@ -137,8 +137,6 @@ def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_slightly_wrong_derivative(monkeypatch: pytest.MonkeyPatch):
-    from reslrb_cli.estimators import stack
-
     right = stack.push
     monkeypatch.setattr(stack, "push", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.001))
     found = failures(check(estimators="stack,gather"))
@@ -154,8 +152,6 @@ def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.
     """Connections are too strong by 30 %. The image and the gradient differ from the stock reference, and agree with
     naive AD and finite differences.
     """
-    from reslrb_cli.transport import walk as segment
-
     right = segment.connect
 
     def connect(*arguments):

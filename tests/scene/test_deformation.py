@@ -11,6 +11,7 @@ import pytest
 
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene.deformation import _corners, _Lookup
 from reslrb_cli.scene.parameters import select_parameters, set_values
 
 WORDS = ["translation", "rotation", "scale"]
@@ -146,8 +147,6 @@ def test_a_heightmap_displaces_along_the_initial_normals(scene):
 
 
 def test_a_heightmap_is_bilinear_and_clamped_outside(scene):
-    from reslrb_cli.scene.deformation import _corners
-
     texels = np.array([[0, 1, 3], [10, 20, 40]], np.float32)
     u, v = [0.0, 1 / 6, 0.5, 0.4, 5 / 6, 1.0, 0.5], [0.25, 0.25, 0.25, 0.5, 0.75, 0.9, -2.0]
     indices, weights = _corners(mi.Point2f(u, v), 3, 2)
@@ -219,8 +218,6 @@ def test_gradients_reach_the_moving_parameters(scene):
 
 def test_a_non_finite_gradient_is_not_lost(llvm):
     """Atomic sums would drop the non-finite gradient of a vertex that shares its texels with no other vertex."""
-    from reslrb_cli.scene.deformation import _Lookup
-
     texels = mi.Float(np.zeros(64, np.float32))
     dr.enable_grad(texels)
     first = mi.UInt32(np.arange(0, 64, 2, dtype=np.uint32))
