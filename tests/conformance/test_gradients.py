@@ -303,9 +303,8 @@ def differences(case: ZeroCase, scene: Case, along: np.ndarray, count: int, bloc
     ])  # fmt: skip
 
 
-#: The cases of the default suite: zeros of texels, lamps, blends and mirrors once, and one case whose derivative is
-#: lost.
-QUICK_ZERO = ("texel_zero_in_one_channel", "lamp_texture_zero_in_all", "blend_1", "mirror_zero")
+#: The cases of the default suite: zeros of texels, lamps and mirrors once.
+QUICK_ZERO = ("texel_zero_in_one_channel", "lamp_texture_zero_in_all", "mirror_zero")
 
 
 def parameters() -> list:

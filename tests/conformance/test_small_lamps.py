@@ -15,6 +15,7 @@ from conformance.moving_lamps import over_floor, smooth_weights
 from conformance.operations import count, with_change
 from conformance.test_kernels import Kernels
 from measure.faults import Fault, plant, planted
+from turns import a_few
 
 from reslrb_cli.measure.extreme.suite import Exact, ExtremeCase, Stock, run_case
 from reslrb_cli.measure.gradients import Case, integrator, relative
@@ -175,7 +176,7 @@ def radiance_gradient(key: str, moves: bool, size: float) -> np.ndarray:
     return moving.gradient(integrator("reslrb", 1, estimator="stack"), 1, 64)[key]
 
 
-@pytest.mark.parametrize("size", [0.4, 0.01])
+@pytest.mark.parametrize("size", a_few([0.4, 0.01], ["0.01"]))
 def test_radiance_counts_once_if_its_lamp_moves_too(size: float):
     """Primary rays and the points that follow the moving lamp must not both count the radiance."""
     key = "light.emitter.radiance.value"

@@ -35,7 +35,7 @@ SETTINGS = {
     "mirror, tilted receiver": replace(MIRROR, tilt=(-15.0, 20.0)),
 }
 FEW = {
-    "lens, point light", "lens, tilted receiver", "lens, round", "lens, looked at through the receiver",
+    "lens, tilted receiver", "lens, round", "lens, looked at through the receiver",
     "mirror, point light",
 }  # fmt: skip
 

@@ -214,6 +214,7 @@ def test_a_lens_rotates_with_both_faces_about_the_middle_of_its_front(folder: Pa
     assert turned[corner, 2] - points[corner, 2] == pytest.approx(-np.sin(np.radians(1)) * points[corner, 0], abs=0.01)
 
 
+@pytest.mark.long
 def test_a_wide_light_is_the_mean_of_rotated_ones(folder: Path) -> None:
     made, angles = bench(folder), []
     turned = made.turned
@@ -268,6 +269,7 @@ def test_the_command_reports_all_figures(folder: Path) -> None:
     assert "needs a folder as output" in f"{result.output}{result.exception}"
 
 
+@pytest.mark.long
 def test_the_page_of_a_run_has_the_figures_for_the_maker(
     tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -146,6 +146,7 @@ def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: py
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
+@pytest.mark.long
 def test_a_second_signal_leaves_no_processes_or_files(tmp_path: Path) -> None:
     folder = tmp_path / "temporary"
     folder.mkdir()

@@ -12,6 +12,7 @@ import pytest
 from cli.tiny import KEY, write_experiment
 from measure.pretended_steps import SHAPES, Pretence, Stage, of, plan, play
 from scipy import stats
+from turns import a_few
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement
@@ -370,7 +371,11 @@ def test_the_loss_has_several_images(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("camera", "change", "masked"),
-    [(True, GAUSSIAN, True), (False, GAUSSIAN, False), (True, ("box", "box"), False)],
+    [
+        (True, GAUSSIAN, True),
+        (False, GAUSSIAN, False),
+        pytest.param(True, ("box", "box"), False, marks=pytest.mark.long),
+    ],
 )
 def test_the_border_is_left_out_with_camera_paths(
     tmp_path: Path, camera: bool, change: tuple[str, str], masked: bool
@@ -395,7 +400,7 @@ def test_a_method_that_is_never_right_is_reported(tmp_path: Path) -> None:
     assert arrays["mask"].all()  # prb takes no part
 
 
-@pytest.mark.parametrize("mode", ["known", "loss", "image"])
+@pytest.mark.parametrize("mode", a_few(["known", "loss", "image"], ["known", "image"]))
 def test_steps_are_repeatable_and_the_border_does_not_count(tmp_path: Path, mode: str) -> None:
     what = problem(tmp_path, GAUSSIAN, overrides=("run.adjoint=independent",))
     _, arrays = asked(what, "image" if mode == "image" else "loss", camera=True)
