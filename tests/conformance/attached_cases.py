@@ -25,6 +25,7 @@ from conformance.moving import (
     turned,
     under_glass,
 )
+from measure.faults import Fault
 
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb
 
@@ -120,7 +121,6 @@ CASES = [
     # ---- What a walk may do, through smooth glass ----
     AttachedCase("slab", under_glass, SLAB, quick=True),
     AttachedCase("slab_9", under_glass, SLAB, depth=9),
-    AttachedCase("slab_16", under_glass, SLAB, depth=16),
     AttachedCase("texture_beside", lambda: under_glass(receiver=textured()),
                  SLAB | {"receiver.bsdf.reflectance.data": None}, depth=6),
     AttachedCase("bounces", lambda: enclosed(receiver=textured()),
@@ -128,7 +128,6 @@ CASES = [
                          "shell.bsdf.reflectance.value": None}, depth=7),
     AttachedCase("bounces_4", enclosed, SLAB, depth=4),
     AttachedCase("normal_map", lambda: enclosed(receiver=mapped()), SLAB, depth=6, stock=False, quick=True),
-    AttachedCase("bounces_16", lambda: enclosed(albedo=0.9), SLAB, depth=16),
     AttachedCase("two_lenses", two_lenses, SLAB | {"x": 0.0, "size": 1.0}, move_ball, depth=9),
     AttachedCase("roulette", lambda: enclosed(albedo=0.9), SLAB, depth=10, stock=False, both={"rr_depth": 2}),
     AttachedCase("stack_of_2", lambda: enclosed(albedo=0.9), SLAB, depth=6, stock=False, ours={"stack_size": 2},
@@ -150,7 +149,6 @@ CASES = [
     AttachedCase("rough_mirror", lambda: mirrored({"type": "roughconductor", "alpha": 0.15, "material": "Al"}),
                  {"mirror.vertex_positions": None}, limit=ROUGH),
     AttachedCase("rough_slab", lambda: enclosed(rough()), SLAB, depth=5, limit=ROUGH, quick=True),
-    AttachedCase("rough_slab_9", lambda: enclosed(rough()), SLAB, depth=9, limit=ROUGH),
     AttachedCase("roughness_and_index", lambda: enclosed(rough(0.2)),
                  SLAB | {"slab.bsdf.alpha.value": None, "slab.bsdf.eta": None}, limit=ROUGH, depth=6),
     AttachedCase("roughness_alone", lambda: under_glass(rough(0.2)),
@@ -172,63 +170,46 @@ CASES = [
 # Faults that break attached derivatives, and the case of attached_cases.py that must find each fault.
 
 
-@dataclass(frozen=True)
-class AttachedFault:
-    """Fault that replaces `right` by `wrong` in the source of the function `where`. `case` then fails.
-
-    If `stock` is true, naive AD of our walk shares the fault, so that only `ptracer` can find it. If `quick` is true,
-    the fault is part of the default suite.
-    """
-
-    name: str
-    case: str
-    where: str
-    right: str
-    wrong: str
-    stock: bool = False
-    quick: bool = False
-
-
 BACK = "estimators.attached:AttachedFrame.differentiate"
 FAULTS = [
     # ---- The walk back: naive AD of our walk is right ----
-    AttachedFault("sign_of_adjoint_of_origin", "slab", BACK,
+    Fault("sign_of_adjoint_of_origin", "slab", BACK,
                   "scattered, dr.grad(ray.o),", "scattered, -dr.grad(ray.o),", quick=True),
-    AttachedFault("direction_has_no_adjoint", "slab", BACK, " + dr.dot(following.d, adjoint.direction)", ""),
-    AttachedFault("prefix_missing", "bounces", BACK, "dr.dot(P, reached * (own + later))",
+    Fault("direction_has_no_adjoint", "slab", BACK, " + dr.dot(following.d, adjoint.direction)", ""),
+    Fault("prefix_missing", "bounces", BACK, "dr.dot(P, reached * (own + later))",
                   "dr.sum(reached * (own + later))"),
-    AttachedFault("own_contribution_not_carried", "bounces", BACK, "dr.detach(own + later)", "dr.detach(later)"),
-    AttachedFault("roulette_weight_missing", "stack_of_2", BACK, " * self.roulette", ""),
-    AttachedFault("normalization_the_other_way", "slab", BACK,
+    Fault("own_contribution_not_carried", "bounces", BACK, "dr.detach(own + later)", "dr.detach(later)"),
+    Fault("roulette_weight_missing", "stack_of_2", BACK, " * self.roulette", ""),
+    Fault("normalization_the_other_way", "slab", BACK,
                   "plan.attached_normalization)", "not plan.attached_normalization)"),
-    AttachedFault("film_position_does_not_move", "slab", BACK,
+    Fault("film_position_does_not_move", "slab", BACK,
                   "p.adjoint.lookup(there.u,", "p.adjoint.lookup(dr.detach(there.u),"),
-    AttachedFault("connection_without_geometry", "slab", BACK,
+    Fault("connection_without_geometry", "slab", BACK,
                   "there.f * there.weight", "there.f * dr.detach(there.weight)"),
-    AttachedFault("rows_of_the_filter_detached", "slab", "transport.film:AdjointImage._filtered",
+    Fault("rows_of_the_filter_detached", "slab", "transport.film:AdjointImage._filtered",
                   "weights_x[x] * weights_y[y]", "weights_x[x] * dr.detach(weights_y[y])"),
-    AttachedFault("blocks_begin_anew", "stack_of_2", "estimators.stack:walk_back",
+    Fault("blocks_begin_anew", "stack_of_2", "estimators.stack:walk_back",
                   "again(left), left, bottom, adjoint)", "again(left), left, bottom, adjoint.zero())"),
-    AttachedFault("blocks_without_their_last_vertex", "stack_of_2", "estimators.stack:walk_back",
+    Fault("blocks_without_their_last_vertex", "stack_of_2", "estimators.stack:walk_back",
                   "again(left), left, bottom", "again(left), left - 1, bottom"),
-    AttachedFault("emission_not_differentiated", "bounces", "estimators.attached:differentiate_start",
+    Fault("emission_not_differentiated", "bounces", "estimators.attached:differentiate_start",
                   "concerns_emission(plan)", "plan.moving_emission"),
-    AttachedFault("pushed_from_the_second_vertex", "mirror", "estimators.attached:begins",
+    Fault("pushed_from_the_second_vertex", "mirror", "estimators.attached:begins",
                   "plan.moves(vertex.si.shape) | ", ""),
-    AttachedFault("another_point_of_the_lens", "thin_lens", "estimators.attached:AttachedSweep.vertex",
+    Fault("another_point_of_the_lens", "thin_lens", "estimators.attached:AttachedSweep.vertex",
                   "aperture=[connection.sample]", "aperture=[mi.Point2f(0.5)]"),
     # ---- The segment: naive AD shares the fault, `ptracer` does not ----
-    AttachedFault("next_ray_detached", "slab", "transport.walk:Segment.next_ray",
+    Fault("next_ray_detached", "slab", "transport.walk:Segment.next_ray",
                   "return ray if attached else dr.detach(ray)", "return dr.detach(ray)", stock=True),
-    AttachedFault("hit_point_detached", "slab", "transport.walk:find_vertex",
+    Fault("hit_point_detached", "slab", "transport.walk:find_vertex",
                   "pi.compute_surface_interaction(ray,", "pi.compute_surface_interaction(dr.detach(ray, False),",
                   stock=True),
-    AttachedFault("shading_normals_detached", "slab", "transport.bsdf:shading_correction",
+    Fault("shading_normals_detached", "slab", "transport.bsdf:shading_correction",
                   "dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n))",
                   "dr.detach(dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)))", stock=True, quick=True),
-    AttachedFault("importance_detached", "slab", "transport.connection:connect",
+    Fault("importance_detached", "slab", "transport.connection:connect",
                   "Connection(importance * correction", "Connection(dr.detach(importance) * correction", stock=True),
-    AttachedFault("density_of_rough_glass_detached", "rough_slab", "transport.bsdf:scatter",
+    Fault("density_of_rough_glass_detached", "rough_slab", "transport.bsdf:scatter",
                   "sample = (staying if plan.stays else following)(plan, si, bsdf, active, sample)",
                   "sample.weight = dr.detach(sample.weight)", stock=True),
 ]  # fmt: skip

@@ -5,8 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
+
+from reslrb_cli.guiding.collect import hear
+from reslrb_cli.guiding.tables import Purpose
+from reslrb_cli.integrators import reslrb
+from reslrb_cli.integrators import reslrb as lt
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.transport import guide
 
 
 def hole(patch: pytest.MonkeyPatch) -> None:
@@ -42,13 +51,9 @@ def of_the_neighbour(patch: pytest.MonkeyPatch) -> None:
 
 
 def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
-    from reslrb_cli.transport import guide
-
     right = guide.Table.of
 
     def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
-        import mitsuba as mi
-
         table = right(grid, counts, *survival)
         weights = change(grid, counts, np.array(table.weights, np.float64))
         return replace(table, weights=mi.Float(weights.astype(np.float32)))
@@ -58,21 +63,15 @@ def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
 
 def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
     """The lanes share the slots as if there were twice as many lanes."""
-    from reslrb_cli.transport import guide
-
     right = guide.Guide.of
     patch.setattr(guide.Guide, "of", staticmethod(lambda table, width: right(table, 2 * width)))
 
 
 def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
     """The number that selects the emitter lies in an interval for emitters with other shares."""
-    from reslrb_cli.transport import guide
-
     right = guide.Table.of
 
     def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
-        import mitsuba as mi
-
         table = right(grid, counts, *survival)
         return replace(table, edges=mi.Float(np.sqrt(np.array(table.edges))))
 
@@ -88,22 +87,16 @@ def with_its_own_weight(patch: pytest.MonkeyPatch) -> None:
     """The weight depends on the path's own numbers, as if the path had contributed to its table. Such a table samples
     expensive paths more often.
     """
-    import drjit as dr
-
     _redraw(patch, lambda drawn: replace(drawn, weight=drawn.weight * dr.minimum(1, 0.5 + drawn.direction.x)))
 
 
 def _redraw(patch: pytest.MonkeyPatch, change: Any) -> None:
-    from reslrb_cli.transport import guide
-
     right = guide.Guide.draw
     patch.setattr(guide.Guide, "draw", lambda self, *given: change(right(self, *given)))
 
 
 def same_numbers(patch: pytest.MonkeyPatch) -> None:
     """The tables learn from the same random numbers that the step uses."""
-    from reslrb_cli.integrators import reslrb
-
     patch.setattr(reslrb, "learning_seed", lambda seed: seed)
 
 
@@ -111,16 +104,9 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     """The tables learn from an image's samples before these samples are replayed. The replay therefore uses another
     table.
     """
-    from reslrb_cli.guiding.collect import hear
-    from reslrb_cli.guiding.tables import Purpose
-    from reslrb_cli.integrators import reslrb as lt
-    from reslrb_cli.integrators.reslrb import Reslrb
-
     right = Reslrb._replay
 
     def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
-        import drjit as dr
-
         tables = self.preparation.guiding
         assert tables is not None
         [samples] = trace.samples

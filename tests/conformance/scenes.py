@@ -6,6 +6,8 @@ object and, above them, the background behind the stage.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import mitsuba as mi
@@ -146,3 +148,27 @@ def difference_from_ptracer(
     assert theirs.mean() > 1e-3, "no pixel to compare"
     colors = 3 if ours.shape[-1] >= 3 else 1
     return float(np.abs(ours - theirs)[..., :colors].mean() / theirs[..., :colors].mean())
+
+
+@dataclass(frozen=True)
+class ImageCase:
+    """A scene whose image is compared with the image of `path`, and with `ptracer` at equal seeds if `stock`.
+
+    `options` go to both integrators. The comparison with `path` takes `spp` samples, and leaves out a `border` of this
+    many pixels.
+    """
+
+    name: str
+    scene: Callable[[], Any]
+    stock: bool = False
+    options: dict[str, Any] = field(default_factory=dict)
+    spp: int = 256
+    border: int = 0
+
+    def check(self) -> None:
+        """Assert that all images agree."""
+        scene = self.scene()
+        result = agreement(scene, spp=self.spp, border=self.border, **self.options)
+        assert result, result
+        if self.stock:
+            assert difference_from_ptracer(scene, **self.options) < SAME

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import pytest
+
+from reslrb_cli.integrators import reslrb
+from reslrb_cli.transport import samples, sobol
+from reslrb_cli.transport.samples import Samples
 
 
 def never_scrambled(patch: pytest.MonkeyPatch) -> None:
     """In every pass, the points are the points of the sequence itself, without a scramble."""
-    from reslrb_cli.transport import sobol
-
     patch.setattr(sobol, "scrambled", lambda point, shift, key: point)
 
 
 def scrambled_once(patch: pytest.MonkeyPatch) -> None:
     """Every pass has the same scramble."""
-    from reslrb_cli.transport import samples
-
     right = samples.Points
 
     def wrong(seed: Any, *rest: Any) -> Any:
-        import mitsuba as mi
-
         return right(mi.UInt32(7), *rest)
 
     patch.setattr(samples, "Points", wrong)
@@ -30,8 +30,6 @@ def scrambled_once(patch: pytest.MonkeyPatch) -> None:
 
 def not_shifted(patch: pytest.MonkeyPatch) -> None:
     """The digits are permuted, but the permutation does not move the first point."""
-    from reslrb_cli.transport import sobol
-
     right = sobol.scrambled
     patch.setattr(sobol, "scrambled", lambda point, shift, key: right(point, shift * 0, key))
 
@@ -49,12 +47,7 @@ def used_twice(patch: pytest.MonkeyPatch) -> None:
 def _renumbered(
     patch: pytest.MonkeyPatch, scramble: Any = lambda number: number, coordinate: Any = lambda number: number
 ) -> None:
-    from reslrb_cli.transport import sobol
-
     def next_1d(self: Any, independent: Any = None) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         if self.net is not None:
             net, self.net = self.net, None
             return net.stratified(self.lane, independent)
@@ -68,32 +61,24 @@ def _renumbered(
 
 def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
     """The lanes share the first number as if there were twice as many lanes."""
-    from reslrb_cli.transport import sobol
-
     right = sobol.Net.of
     patch.setattr(sobol.Net, "of", staticmethod(lambda width: right(2 * width)))
 
 
 def without_jitter(patch: pytest.MonkeyPatch) -> None:
     """The first number is always at the start of its stratum."""
-    from reslrb_cli.transport import sobol
-
     right = sobol.Net.stratified
     patch.setattr(sobol.Net, "stratified", lambda self, lane, jitter: right(self, lane, jitter * 0))
 
 
 def squeezed(patch: pytest.MonkeyPatch) -> None:
     """The range of the numbers ends below 1."""
-    from reslrb_cli.transport import sobol
-
     right = sobol._float
     patch.setattr(sobol, "_float", lambda digits: right(digits) * 0.96)
 
 
 def of_emission_again(patch: pytest.MonkeyPatch) -> None:
     """The first vertices use the same coordinates as emission."""
-    from reslrb_cli.transport.samples import Samples
-
     right = Samples._points
 
     def wrong(self: Any, *numbers: Any) -> Any:
@@ -106,8 +91,6 @@ def of_emission_again(patch: pytest.MonkeyPatch) -> None:
 
 def shared_by_passes(patch: pytest.MonkeyPatch) -> None:
     """All passes of an image have the seed of the first pass."""
-    from reslrb_cli.integrators import reslrb
-
     right = reslrb.passes
 
     def wrong(*given: Any) -> Any:
@@ -121,8 +104,6 @@ def shared_by_passes(patch: pytest.MonkeyPatch) -> None:
 
 def swapped_in_replays(patch: pytest.MonkeyPatch) -> None:
     """Every second walk uses the numbers of its first vertices in reverse order."""
-    from reslrb_cli.transport.samples import Samples
-
     right, calls = Samples.early_numbers, [0]
 
     def wrong(self: Any) -> Any:

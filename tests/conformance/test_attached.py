@@ -10,19 +10,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.attached_cases import CASES, FAULTS, AttachedCase, AttachedFault
+from conformance.attached_cases import CASES, FAULTS, AttachedCase
 from conformance.moving import WHITE, Moving, Place, beam, camera, enclosed, flat, rippled, sheet, under_glass
+from measure.faults import Fault, plant, planted
 from measure.moving_light import SCENES
-from measure.test_mutations import plant
 from turns import taking_turns
 
 from reslrb_cli import register
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.protocol import StepIntegrator
-from reslrb_cli.measure.comparison import Family, compare_expectations
-from reslrb_cli.measure.gradients import integrator, relative, seeds
+from reslrb_cli.measure.gradients import integrator, relative
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
-from reslrb_cli.records.measurements import Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -33,8 +31,6 @@ pytestmark = pytest.mark.usefixtures("llvm")
 # two references differ. A fault of our walk shows where the distance of `stack` from `ptracer` is larger than that
 # difference.
 
-#: Error of Mitsuba's own light tracer, relative to the entries, over many seeds (`measure.gradcheck`).
-STOCK_ROUNDING = 1e-3
 #: Limit for twice the distance of the two references. A larger distance is a fault of the walk that `stack` and
 #: `walk_ad` share.
 FARTHEST = 1e-3
@@ -92,32 +88,6 @@ def test_equal_seeds(name: str):
     check(BY_NAME[name])
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", [case.name for case in CASES if case.stock])
-def test_means_over_seeds_agree_with_ptracer(name: str):
-    """The tests of gradcheck compare the means. They would find a fault for which the distances at one seed are too
-    coarse.
-    """
-    case, many = BY_NAME[name], seeds(8)
-    moving = case.moving()
-    ours, stock = (
-        [moving.gradient(tracer(case, integrator), seed, case.spp) for seed in many]
-        for integrator in ("reslrb", "ptracer")
-    )
-    naive = moving.gradient(tracer(case, "walk_ad"), many[0], case.spp)
-    for key in ours[0]:
-        mine, theirs = (np.stack([gradient[key] for gradient in side]) for side in (ours, stock))
-        # An entry is a sum of terms that may cancel, and these terms are as large as the largest entry. The error from
-        # rounding and from the references' distance follows the size of the terms, not of the entry. `apart` is the
-        # distance of naive AD of our walk from stock.
-        apart = relative(naive[key], theirs[0])
-        assert apart <= FARTHEST / 2
-        floor = max(case.limit, apart) * float(np.abs(theirs.mean(0)).max())
-        found = compare_expectations(mine, theirs, Family(30, 3000), rounding=STOCK_ROUNDING, bias=floor)
-        print(name, key, found)
-        assert found.verdict is not Verdict.FAILS
-
-
 def deep(depth: int, stack_size: int, **options: Any) -> dict[str, np.ndarray]:
     """Return the gradient through long paths, with a stack of size `stack_size`."""
     moving = Moving(enclosed(albedo=0.95), DEEP)
@@ -143,44 +113,17 @@ def test_a_small_stack_equals_a_large_one(depth: int, sizes: tuple[int, ...], op
             assert value.any()
 
 
-@pytest.mark.long
-def test_normalization_of_the_filter_has_an_effect():
-    """Without this effect, none of these tests would show whether the normalization is attached or detached."""
-    case = BY_NAME["slab"]
-    moving = case.moving()
-    attached, detached = (
-        moving.gradient(integrator("reslrb", case.depth, estimator="stack", filter_normalization=kind))
-        for kind in ("attached", "detached")
-    )
-    assert relative(attached["slab.vertex_positions"], detached["slab.vertex_positions"]) > 1e-3
-    naive = moving.gradient(integrator("walk_ad", case.depth, attached=True))
-    assert relative(attached["slab.vertex_positions"], naive["slab.vertex_positions"]) < case.limit
-
-
-def test_enough_faults():
-    assert len(FAULTS) >= 10
-    assert {fault.case for fault in FAULTS} <= set(BY_NAME)
-
-
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_the_faults_apply_to_the_code(fault: AttachedFault, monkeypatch: pytest.MonkeyPatch):
-    plant(fault, monkeypatch)
-
-
-@pytest.mark.parametrize(
-    "fault", [pytest.param(f, id=f.name, marks=() if f.quick else pytest.mark.long) for f in FAULTS]
-)
-def test_fault(fault: AttachedFault, monkeypatch: pytest.MonkeyPatch):
+@planted(FAULTS)
+def test_fault(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
     with pytest.raises(AssertionError):
-        check(replace(BY_NAME[fault.case], stock=fault.stock))
+        check(replace(BY_NAME[fault.check], stock=fault.stock))
 
 
 # Forward mode with moving light, against the gradient at equal seeds: <weights, J v> = <J^T weights, v>.
 
 ROUNDING = 3e-5
 QUICK = ("slab", "bounce")
-SAMPLING = ("follow", "stay")
 
 
 def distance(name: str, sampling: str) -> float:
@@ -194,52 +137,26 @@ def distance(name: str, sampling: str) -> float:
     return float(np.abs(tangents - gradient[:3]).max() / np.abs(gradient).max())
 
 
-@taking_turns("name", QUICK, "sampling", SAMPLING)
+@taking_turns("name", (*QUICK, "rough_surface", "mirror", "sphere_lens", "moved_receiver", "rough_surface_alpha"),
+              "sampling", ("follow", "stay"), QUICK)  # fmt: skip
 def test_forward_against_backward(name: str, sampling: str):
-    assert_forward_is_backward(name, sampling)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("sampling", SAMPLING)
-@pytest.mark.parametrize("name", ["rough_surface", "mirror", "sphere_lens", "moved_receiver", "rough_surface_alpha"])
-def test_forward_against_backward_in_other_scenes(name: str, sampling: str):
-    assert_forward_is_backward(name, sampling)
-
-
-def assert_forward_is_backward(name: str, sampling: str) -> None:
-    """Assert that forward mode and the gradient agree up to rounding."""
     found = distance(name, sampling)
     print(name, sampling, found)
     assert found < ROUNDING
 
 
-@dataclass(frozen=True)
-class Fault:
-    """Fault in the form that `plant` takes."""
-
-    right: str
-    wrong: str
-    where: str = "integrators.forward:TangentSplat._attached"
-
-
-FORWARD_FAULTS = {
-    "slab": Fault("dr.set_grad(ray.d, d_direction)", "pass"),
-    "mirror": Fault(" + dk * C", ""),
-    "rough_surface": Fault("dP * c + P * dc", "P * dc"),
-}
+ATTACHED = "integrators.forward:TangentSplat._attached"
+FORWARD_FAULTS = [
+    Fault("direction", "slab", ATTACHED, "dr.set_grad(ray.d, d_direction)", "pass", quick=True),
+    Fault("film_position", "mirror", ATTACHED, " + dk * C", ""),
+    Fault("prefix", "rough_surface", ATTACHED, "dP * c + P * dc", "P * dc"),
+]
 
 
-@pytest.mark.parametrize("fault", FORWARD_FAULTS.values(), ids=FORWARD_FAULTS)
-def test_the_faults_apply_to_the_forward_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+@planted(FORWARD_FAULTS)
+def test_fault_of_forward_mode(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n == "slab" else pytest.mark.long) for n in FORWARD_FAULTS]
-)
-def test_fault_of_forward_mode(name: str, monkeypatch: pytest.MonkeyPatch):
-    plant(FORWARD_FAULTS[name], monkeypatch)
-    assert distance(name, "stay") > 30 * ROUNDING
+    assert distance(fault.check, "stay") > 30 * ROUNDING
 
 
 class Script:
@@ -280,15 +197,6 @@ def test_as_a_plugin(normalization: str):
     dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
     assert np.abs(tangent).max() > 0
     assert abs(np.sum(tangent * weights) - dr.grad(amplitude)[0]) < ROUNDING * np.linalg.norm(tangent)
-
-
-@pytest.mark.long  # naive AD in forward mode compiles for a minute
-@pytest.mark.parametrize("normalization", ["attached", "detached"])
-def test_as_a_plugin_every_pixel_is_that_of_naive_ad(normalization: str):
-    script = Script(normalization)
-    ours, naive = script.tangent(type="reslrb", estimator="stack"), script.tangent(type="walk_ad", attached=True)
-    assert np.abs(naive).max() > 0
-    assert relative(ours, naive) < ROUNDING
 
 
 def test_a_moving_lamp_is_refused():

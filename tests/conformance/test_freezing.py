@@ -21,9 +21,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 BY_NAME = {case.name: case for case in CASES}
 #: Mitsuba's thin lens keeps an array that a recording does not contain.
 NOT_RECORDED = ("thin_lens",)
-#: One case of each kind. The other cases take minutes in total.
-QUICK = ("texture", "rgba", "roughplastic", "glass", "mask", "area_texture", "envmap", "visible_lamp")
-#: The cases that the default suite runs: one for each estimator.
+#: The cases of the default suite, one for each estimator.
 FEWEST = ("texture", "glass", "mask", "visible_lamp")
 ESTIMATORS = ("reservoir", "event", "gather", "stack")
 #: Recorded functions, by the way in which a step obtains dL/dI.
@@ -50,20 +48,9 @@ def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list
     return found, counts
 
 
-@taking_turns("case", [BY_NAME[name] for name in QUICK], "estimator", ESTIMATORS, FEWEST)
+@taking_turns("case", [case for case in CASES if case.name not in NOT_RECORDED], "estimator", ESTIMATORS, FEWEST)
 def test_a_recorded_step_equals_the_step(case: GradientCase, estimator: str) -> None:
-    recorded_step_is_the_step(case, estimator)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("name", [name for name in BY_NAME if name not in QUICK + NOT_RECORDED])
-def test_a_recorded_step_of_other_cases_equals_the_step(name: str, estimator: str) -> None:
-    recorded_step_is_the_step(BY_NAME[name], estimator)
-
-
-def recorded_step_is_the_step(case: GradientCase, estimator: str) -> None:
-    """Check recorded steps for one kind of dL/dI, which depends on case and estimator."""
+    """Case and estimator determine the kind of dL/dI."""
     adjoint = list(KINDS)[(ESTIMATORS.index(estimator) + len(case.name)) % len(KINDS)]
     expected, none = gradients(case, adjoint, estimator=estimator, freeze=False)
     gc.collect()  # no other scene may be alive

@@ -4,167 +4,35 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare
-from conformance.gradient_cases import CASES
+from conformance.drawing import BY_NAME, SPP, guided, strength
 from conformance.guiding_faults import FAULTS, learned_in_its_midst, same_numbers
-from turns import a_few
 
 import reslrb_cli
-from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.guiding.tables import EVERY
-from reslrb_cli.integrators.step import known_step, render_image
-from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.estimators import base
+from reslrb_cli.guiding import collect
+from reslrb_cli.guiding import tables as guiding
+from reslrb_cli.guiding.tables import EVERY, Guiding
+from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import SIZE, diffuse, rgb, texture, transform
+from reslrb_cli.transport import plan
+from reslrb_cli.transport.guide import Guide, Table, make_grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Guided emission is unbiased: with the tables after some steps, the means equal those of unguided samples.  Table
-# values affect only the variance. Faults that could cause bias are planted, and the same tests must fail with them.
+# Guided numbers are uniform on average, and tables learn from numbers of their own. Faults that could cause bias are
+# planted. test_drawing.py compares means of whole steps.
 
-BY_NAME = {case.name: case for case in CASES}
-NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "gaussian", "area_texture", "glass", "mask", "rgba")
-FEW = ["two_emitters"]
-SPP = 64
 LANES = 2**14
-
-
-def guided(name: str, steps: int, **options: Any) -> tuple[Case, Any, Any]:
-    """Return a case, a guided integrator and an unguided one. The guided integrator's tables have learned from `steps`
-    gradients and learn no more.
-    """
-    case = BY_NAME[name]
-    scene = Case(case.scene(), case.keys)
-    own = case.options | case.both | options
-    ours = integrator("reslrb", **{"estimator": "stack", **own}, guiding="on")
-    for seed in range(steps):
-        learn(scene, ours, seed)
-    ours.preparation.guiding.due = lambda number: False
-    return scene, ours, integrator("reslrb", **{"estimator": "stack", **own})
-
-
-def learn(scene: Case, ours: Any, seed: int) -> None:
-    """Run one step from which the tables learn."""
-    ours.preparation.guiding.due = lambda number: True
-    sample(scene, ours, 9000 + seed)
-
-
-def sample(scene: Case, ours: Any, seed: int) -> np.ndarray:
-    """Return the gradient of a step with known dL/dI, followed by its image's means over blocks of pixels, as
-    one row.
-    """
-    images = []
-
-    def step(integrator: Any, film: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
-        result = known_step(integrator, film, sensor, scene.adjoint, **options)
-        images.append(np.array(result.image, np.float64)[:, :, :3])
-        return result
-
-    gradient = scene.gradient(ours, seed, SPP, step=step)
-    return np.concatenate([gradient, tiles(images[0])])
-
-
-def tiles(image: np.ndarray) -> np.ndarray:
-    """Return means over tiles of 4 x 4 pixels, (T,). Smaller tiles at the edge count too."""
-    rows, columns = (range(0, size, 4) for size in image.shape[:2])
-    return np.concatenate([image[y : y + 4, x : x + 4].mean((0, 1)) for y in rows for x in columns])
-
-
-def samples(scene: Case, ours: Any, count: int, block: int = 0) -> np.ndarray:
-    """Return one row of samples for each of `count` seeds."""
-    return np.stack([sample(scene, ours, seed) for seed in seeds(count, block)])
-
-
-@pytest.mark.parametrize("name", a_few(NAMES, FEW))
-def test_means_equal_those_of_unguided_samples(name: str) -> None:
-    means_hold(name, 4, 32)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("steps", [1, 10, 100])
-@pytest.mark.parametrize("name", ["two_emitters", "envmap", "roulette"])
-def test_means_hold_after_any_number_of_steps(name: str, steps: int) -> None:
-    means_hold(name, steps, 200)
-
-
-def means_hold(name: str, steps: int, count: int) -> None:
-    scene, ours, plain = guided(name, steps)
-    assert strength(ours) > 2, "the table has learned nothing"
-    result = compare(samples(scene, ours, count), samples(scene, plain, count, 1), block=None)
-    print(name, steps, result)
-    assert result
-
-
-def strength(ours: Any) -> float:
-    """Return how much more often the most frequent cell is drawn than in a uniform distribution."""
-    from reslrb_cli.guiding.tables import Purpose
-
-    guiding = ours.preparation.guiding
-    measures = guiding.grid.measures()
-    return float((guiding.counts(0, Purpose.BOTH)[measures > 0] / (guiding.grid.slots * measures[measures > 0])).max())
-
-
-@pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["stack"]))
-@pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
-def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) -> None:
-    """The replay draws the same numbers as the trace, whatever the tables learn in between."""
-    scene, ours, plain = guided("two_emitters", 3, estimator=estimator)
-    del ours.preparation.guiding.due  # the default schedule: some steps learn
-    found = [scene.gradients(each, seeds(24, block), SPP, adjoint=adjoint) for block, each in enumerate((ours, plain))]
-    result = compare(*found, block=None)
-    print(estimator, adjoint, result)
-    assert result
-
-
-@pytest.mark.long
-def test_an_image_alone_has_the_unguided_mean() -> None:
-    scene, ours, plain = guided("envmap", 3)
-    images = [
-        np.stack([np.array(render_image(each, scene.scene, 0, seed, SPP), np.float64) for seed in seeds(24, block)])
-        for block, each in enumerate((ours, plain))
-    ]
-    assert compare(*images)
-
-
-@pytest.mark.parametrize("name", a_few(["two_emitters", "mask_texture_in_view"], ["two_emitters"]))
-def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
-    """Estimators would disagree if a replay drew other cells than the trace, or used another weight."""
-    scene, ours, _ = guided(name, 2)
-    learned = ours.preparation.guiding.learned
-    others = [guided(name, 0, estimator=kind, stack_size=2) if kind == "stack" else guided(name, 0, estimator=kind)
-              for kind in ("gather", "stack")]  # fmt: skip
-    for adjoint in ("correlated", "independent"):
-        reference = scene.gradient(ours, 5, SPP, adjoint=adjoint)
-        for _, other, _ in others:
-            other.expect(SPP)
-            other.plan(scene.scene, scene.scene.sensors()[0], scene.params)
-            other.preparation.guiding.learned = dict(learned)
-            assert relative(scene.gradient(other, 5, SPP, adjoint=adjoint), reference) < 1e-4
-
-
-def test_a_recorded_step_equals_the_step() -> None:
-    scene, ours, _ = guided("envmap", 2)
-    _, frozen, _ = guided("envmap", 0, freeze=True)
-    frozen.expect(SPP)
-    frozen.plan(scene.scene, scene.scene.sensors()[0], scene.params)
-    guiding = frozen.preparation.guiding
-    for steps in range(3):  # tables change, and recordings use the new tables
-        guiding.learned = dict(ours.preparation.guiding.learned)
-        guiding._tables.clear()
-        both = [sample(scene, each, 5 + steps) for each in (ours, frozen)]
-        assert relative(*both) < 1e-4
-        learn(scene, ours, steps)
-        ours.preparation.guiding.due = lambda number: False
-    assert frozen.preparation.recordings.counts()["fused"] > 0
 
 
 def test_renders_of_a_script_learn_from_each_other() -> None:
     """The renders are forward and backward passes of `mi.render`. The tables are kept in the integrator."""
-    import drjit as dr
-    import mitsuba as mi
-
     reslrb_cli.register()
     scene = Case(BY_NAME["two_emitters"].scene(), BY_NAME["two_emitters"].keys)
     plugin = mi.load_dict({"type": "reslrb", "estimator": "stack", "max_depth": 4, "guiding": "on"})
@@ -196,16 +64,11 @@ def drawn_evenly() -> Any:
     """Compare weighted sums over the numbers' intervals with sums of uniform numbers. The grid has three emitters and a
     table of large contrasts.
     """
-    import mitsuba as mi
-
-    from reslrb_cli.guiding import tables as guiding
-    from reslrb_cli.transport.guide import Guide, Table, make_grid
-
     grid = make_grid([True] * 4, [1.0, 2.0, 0.5])
     density = np.random.default_rng(3).gamma(0.05, size=grid.cells)
     guide = Guide.of(Table.of(grid, guiding.apportion(grid, density)), LANES)
     rows: dict[bool, list[np.ndarray]] = {True: [], False: []}
-    for number in range(64):
+    for number in range(32):
         random = np.random.default_rng(number)
         own = [mi.Float(random.random(LANES, np.float32)) for _ in range(5)]
         rows[False].append(histogram(own, np.ones(LANES)))
@@ -238,9 +101,6 @@ def test_tables_use_their_own_random_numbers_and_change_between_steps(
 
 def learns_apart(patch: pytest.MonkeyPatch) -> bool:
     """Return True if the walks of each of two steps use one table, and learning uses seeds that no other walk has."""
-    from reslrb_cli.estimators import base
-    from reslrb_cli.guiding import collect
-
     walks: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
     right, tables = base.walk, []  # held, so that no other table reuses an address
 
@@ -266,16 +126,6 @@ def learns_apart(patch: pytest.MonkeyPatch) -> bool:
     return one_each and not {seed for seed, _ in walks[True]} & set(by_seed)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("fault", FAULTS)
-def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    fault(monkeypatch)
-    scene, ours, plain = guided("two_emitters", 4)
-    result = compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
-    print(fault.__name__, result)
-    assert not result
-
-
 # A scene that changes so that a table becomes wrong: a shutter slides from one opening of a room to the other.
 
 #: Steps with each of the two openings. The shutter slides just after the tables have learned, so that the time to the
@@ -294,8 +144,6 @@ def place(x: float) -> Any:
 
 def chamber() -> dict[str, Any]:
     """Return a closed room under a sky, with two openings in its ceiling. A shutter covers the opening on the right."""
-    import mitsuba as mi
-
     grey = {"type": "twosided", "bsdf": diffuse(0.6, 0.6, 0.6)}
     scene: dict[str, Any] = {
         "type": "scene",
@@ -326,8 +174,6 @@ def chamber() -> dict[str, Any]:
 
 def slide(scene: Case, x: float) -> None:
     """Move the shutter to the horizontal position `x`."""
-    import mitsuba as mi
-
     scene.params["shutter.to_world"] = mi.Transform4f(place(x).matrix)
     scene.params.update()
 
@@ -383,18 +229,10 @@ def holds(found: tuple[tuple[float, float], ...]) -> bool:
     return not any(beyond)
 
 
-def test_a_wrong_table_does_little_harm_and_is_soon_corrected() -> None:
-    assert holds(errors(32))
-
-
 @pytest.mark.long
-def test_many_steps_agree() -> None:
-    assert holds(errors(400))
-
-
-@pytest.mark.long
-def test_confident_tables_forget_as_fast() -> None:
-    assert holds(errors(100, 8 * EVERY))
+@pytest.mark.parametrize(("count", "before"), [(32, BEFORE), (100, 8 * EVERY)])
+def test_a_wrong_table_does_little_harm_and_is_soon_corrected(count: int, before: int) -> None:
+    assert holds(errors(count, before))
 
 
 @pytest.mark.long
@@ -407,8 +245,6 @@ def test_tables_that_update_too_late_are_too_wrong(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.long
 def test_tables_that_stop_learning_stay_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.guiding.tables import Guiding
-
     right = Guiding.due
 
     def due(self: Guiding, number: int) -> bool:
@@ -420,8 +256,6 @@ def test_tables_that_stop_learning_stay_wrong(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.long
 def test_tables_without_a_uniform_share_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.transport import plan
-
     monkeypatch.setattr(plan, "GUIDE_UNIFORM", 0.02)
     monkeypatch.setattr(plan, "SLOTS_PER_CELL", 64)
     assert not holds(errors(32))

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
-from turns import a_few, taking_turns
+from turns import taking_turns
 
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.scene.load import load_scene
@@ -36,8 +38,6 @@ class Kernels:
 
     def new(self, step: Callable[[], Any]) -> list[dict]:
         """Return the kernels of `step` that no earlier step launched."""
-        import drjit as dr
-
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             step()
@@ -64,39 +64,18 @@ def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
         assert not found, f"step {seed} compiled kernels of {[k['operation_count'] for k in found]} operations"
 
 
-#: The cases that also run with independent samples. With `-m long`, all cases do.
-INDEPENDENT = ("texture", "passes", "glass", "mask", "area_texture", "envmap", "visible_lamp")
-#: The cases that the default suite runs of these.
-FEW = ("texture", "passes", "glass", "mask", "envmap")
-#: The other cases that the default suite runs. Each has objects of a kind that the remaining cases do not have.
-CORRELATED = ("thin_lens", "principled", "two_emitters")
+#: The cases of the default suite. Each has objects of a kind that the others do not have.
+FEW = ("texture", "passes", "glass", "mask", "envmap", "thin_lens", "principled", "two_emitters")
 
 
-@taking_turns("name", INDEPENDENT, "adjoint", ("independent", "correlated"), FEW)
+@taking_turns("name", [case.name for case in CASES], "adjoint", ("independent", "correlated"), FEW)
 def test_second_step_compiles_nothing(name: str, adjoint: str):
-    case_compiles_nothing(name, adjoint)
-
-
-@pytest.mark.parametrize("name", a_few([case.name for case in CASES if case.name not in INDEPENDENT], CORRELATED))
-def test_second_step_of_other_cases_compiles_nothing(name: str):
-    case_compiles_nothing(name, "correlated")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [case.name for case in CASES if case.name not in INDEPENDENT])
-def test_independent_second_step_of_other_cases_compiles_nothing(name: str):
-    case_compiles_nothing(name, "independent")
-
-
-def case_compiles_nothing(name: str, adjoint: str) -> None:
-    """Assert that steps of a gradient case compile nothing. Their dL/dI changes with the image."""
+    """The steps' dL/dI changes with the image."""
     case = next(case for case in CASES if case.name == name)
     scene = Case(case.scene(), case.keys)
     ours = integrator("reslrb", **case.both | case.options)
 
     def loss(image: Any) -> Any:
-        import drjit as dr
-
         return dr.sum(dr.square(image[:, :, :3] - scene.weights), axis=None)
 
     steps_compile_nothing(scene, lambda seed: scene.gradient(ours, seed, 16, loss, adjoint=adjoint))
@@ -104,9 +83,6 @@ def case_compiles_nothing(name: str, adjoint: str) -> None:
 
 @taking_turns("name", list(SHIPPED), "adjoint", ("correlated", "independent"), ("caustic_slab", "furnace"))
 def test_second_step_compiles_nothing_on_shipped_scenes(name: str, adjoint: str):
-    import drjit as dr
-    import mitsuba as mi
-
     loaded = load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": 16, "resy": 16, "spp": 4})
     found = list(mi.traverse(loaded).keys())
     keys = SHIPPED[name] or [key for key in found if "reflectance" in key or "radiance" in key][:2]
@@ -141,14 +117,3 @@ def test_zero_texels_come_and_go():
     assert not kernels.new(lambda: step(3, zero))
     assert not kernels.new(lambda: step(4, initial))
     assert not kernels.new(lambda: step(5, zero))
-
-
-def test_image_seeds_compile_nothing():
-    from reslrb_cli.integrators.step import render_image
-
-    case = next(case for case in CASES if case.name == "texture")
-    scene = Case(case.scene(), case.keys)
-    ours = integrator("reslrb")
-    kernels = Kernels()
-    kernels.new(lambda: np.array(render_image(ours, scene.scene, 0, 1, 16)))
-    assert not kernels.new(lambda: np.array(render_image(ours, scene.scene, 0, 2, 16)))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 
 from reslrb_cli.measure.gradients import Case, integrator
@@ -27,9 +29,6 @@ def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **
     """Return the maximum number of bytes that the allocator gave out during a second step, beyond the number before
     this step.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     backend = dr.backend_v(mi.Float)
     # rr_depth exceeds every depth, so that there is no roulette
     tracer = integrator(name, max_depth, 1000, **({"estimator": estimator} if estimator else {}))
@@ -45,7 +44,7 @@ def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **
 
 
 def test_reservoir_is_flat(case: Case):
-    peaks = {depth: peak(case, "reslrb", depth) for depth in (2, 16, 128)}
+    peaks = {depth: peak(case, "reslrb", depth) for depth in (2, 128)}
     print(peaks)
     assert peaks[2] > 1 << 20, "the watermark sees nothing"
     assert max(peaks.values()) <= 1.02 * min(peaks.values()), peaks
@@ -76,11 +75,3 @@ def test_naive_ad_grows(case: Case):
         print(name, peaks, "reslrb", ours)
         assert peaks[16] > 2.5 * peaks[4], name
         assert ours[16] < 0.25 * peaks[16], name
-
-
-@pytest.mark.long
-def test_naive_ad_grows_linearly(case: Case):
-    peaks = {depth: peak(case, "ptracer", depth) for depth in (4, 8, 16, 32)}
-    print(peaks)
-    slopes = [(peaks[2 * depth] - peaks[depth]) / depth for depth in (4, 8, 16)]
-    assert max(slopes) < 1.5 * min(slopes)

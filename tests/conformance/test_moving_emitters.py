@@ -12,8 +12,7 @@ import pytest
 from conformance.moving import Moving, flat
 from conformance.moving_lamps import CASES, PIVOT, LampCase, mesh, over_floor, smooth_weights, surface
 from conformance.operations import count, tracking
-from measure.faults import Fault
-from measure.test_mutations import plant
+from measure.faults import Fault, plant, planted
 from turns import a_few
 
 from reslrb_cli.errors import UnsupportedScene
@@ -23,6 +22,8 @@ from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import diffuse, load, rgb, transform
 from reslrb_cli.records.measurements import Verdict
+from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.transport.lamps import drawn_face, sums_of_areas
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -231,7 +232,6 @@ REFUSED = {
 @pytest.mark.parametrize("name", list(REFUSED))
 def test_refused_with_a_reason(name: str):
     light, key, reason = REFUSED[name]
-
     scene = load(tiles(1, light) if name != "cutoff" else over_floor(light))
     params = mi.traverse(scene)
     assert key in params
@@ -241,39 +241,35 @@ def test_refused_with_a_reason(name: str):
         integrator("reslrb", estimator="stack").plan(scene, scene.sensors()[0], params)
 
 
-FAULTS = {
-    "area_of_faces_detached": ("mesh", "transport.lamps:lamp_point", "area / dr.detach(area)", "mi.Float(1)"),
-    "start_does_not_move": ("parallel", "estimators.attached:differentiate_start",
-                            "if plan.moving_emission:", "if False:"),
-    "normal_of_sphere_as_mitsuba_has_it": ("turned", "transport.lamps:lamp_point",
-                                           "if lamp.is_sphere:", "if False:"),
-    "parallel_light_off_the_face": ("parallel_mesh", "transport.lamps:lamp_ray", "si.sh_frame.n", "si.n"),
-    "texture_looked_up_along_a_ray": ("textured_mesh", "transport.lamps:_textured_point",
-                                      "mi.RayFlags.All | mi.RayFlags.FollowShape", "mi.RayFlags.All"),
-    "density_detached": ("parallel", "transport.lamps:lamp_ray",
-                         "radiance * weight", "radiance * dr.detach(weight)"),
-    "rays_detached": ("spot", "transport.emission:sample_emission",
-                      "Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)",
-                      "Emission(dr.detach(ray), weight, emitter)"),
-}  # fmt: skip
-QUICK = "area_of_faces_detached"
+FAULTS = [
+    Fault("area_of_faces_detached", "mesh", "transport.lamps:lamp_point", "area / dr.detach(area)", "mi.Float(1)",
+          quick=True),
+    Fault("start_does_not_move", "parallel", "estimators.attached:differentiate_start", "if plan.moving_emission:",
+          "if False:"),
+    Fault("normal_of_sphere_as_mitsuba_has_it", "turned", "transport.lamps:lamp_point", "if lamp.is_sphere:",
+          "if False:"),
+    Fault("parallel_light_off_the_face", "parallel_mesh", "transport.lamps:lamp_ray", "si.sh_frame.n", "si.n"),
+    Fault("texture_looked_up_along_a_ray", "textured_mesh", "transport.lamps:_textured_point",
+          "mi.RayFlags.All | mi.RayFlags.FollowShape", "mi.RayFlags.All"),
+    Fault("density_detached", "parallel", "transport.lamps:lamp_ray", "radiance * weight",
+          "radiance * dr.detach(weight)"),
+    Fault("rays_detached", "spot", "transport.emission:emission_of",
+          "Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter, position",
+          "Emission(dr.detach(ray), weight, emitter, position"),
+]  # fmt: skip
 #: Tests for faults that finite differences share.
 FOUND_BY = {"turned": test_a_flipped_sphere_emits_outward}
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == QUICK else pytest.mark.long) for n in FAULTS])
-def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
-    case, where, right, wrong = FAULTS[name]
-    plant(Fault(name, "", where, right, wrong, frozenset()), monkeypatch)
-    find = FOUND_BY.get(case) or partial(check, next(c for c in CASES if c.name == case), 4)
+@planted(FAULTS)
+def test_fault(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+    plant(fault, monkeypatch)
+    find = FOUND_BY.get(fault.check) or partial(check, next(c for c in CASES if c.name == fault.check), 4)
     with pytest.raises(AssertionError):
         find()
 
 
 def test_faces_of_a_mesh_match_those_that_mitsuba_samples():
-    from reslrb_cli.scene.graph import SceneGraph
-    from reslrb_cli.transport.lamps import drawn_face, sums_of_areas
-
     scene = load(over_floor(mesh()))
     [lamp] = SceneGraph.of(scene).find_lamps(scene)
     [areas] = sums_of_areas([lamp])

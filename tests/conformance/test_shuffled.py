@@ -16,6 +16,7 @@ from conformance.gradient_cases import _IN_VIEW, _mask, _pane, _textured
 from conformance.moving import camera as above
 from conformance.moving import enclosed, flat, sheet, under_glass
 from runs.going_on import one_thread
+from turns import a_few
 
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
@@ -134,7 +135,7 @@ def differing(way: str, names: tuple[str, ...], orders: Iterator[np.random.Gener
 @pytest.mark.parametrize("way", ["both"])
 def test_results_do_not_depend_on_earlier_work(way: str) -> None:
     with one_thread():
-        assert differing(way, ("mirror", "zero", "moving"), map(np.random.default_rng, range(3)), 8) == []
+        assert differing(way, ("mirror", "zero", "moving"), map(np.random.default_rng, range(2)), 8) == []
 
 
 @pytest.mark.long
@@ -157,7 +158,7 @@ def test_weights_of_emitters_may_change() -> None:
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["reslrb", "ptracer"])
+@pytest.mark.parametrize("name", a_few(["reslrb", "ptracer"], ["reslrb"]))
 def test_a_scene_at_a_reused_address_is_another_one(name: str) -> None:
     """The directional light uses the bounding sphere of the current scene."""
 

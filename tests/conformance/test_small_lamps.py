@@ -14,8 +14,8 @@ from conformance.moving import Moving, flat
 from conformance.moving_lamps import over_floor, smooth_weights
 from conformance.operations import count, with_change
 from conformance.test_kernels import Kernels
-from measure.faults import Fault
-from measure.test_mutations import plant
+from measure.faults import Fault, plant, planted
+from turns import a_few
 
 from reslrb_cli.measure.extreme.suite import Exact, ExtremeCase, Stock, run_case
 from reslrb_cli.measure.gradients import Case, integrator, relative
@@ -176,7 +176,7 @@ def radiance_gradient(key: str, moves: bool, size: float) -> np.ndarray:
     return moving.gradient(integrator("reslrb", 1, estimator="stack"), 1, 64)[key]
 
 
-@pytest.mark.parametrize("size", [0.4, 0.01])
+@pytest.mark.parametrize("size", a_few([0.4, 0.01], ["0.01"]))
 def test_radiance_counts_once_if_its_lamp_moves_too(size: float):
     """Primary rays and the points that follow the moving lamp must not both count the radiance."""
     key = "light.emitter.radiance.value"
@@ -190,12 +190,12 @@ def test_radiance_counts_once_if_its_lamp_moves_too(size: float):
 SPLAT = "transport.visible:small_points"
 FAULTS = [
     Fault("left_out", "third", "transport.visible:splat_visible_emission", "if samples.plan.small_lamps",
-          "if False", frozenset({("stack", "ptracer")})),
+          "if False", frozenset({("stack", "ptracer")}), quick=True),
     Fault("not_differentiated", "third", "transport.visible:differentiate_visible_emission",
           "plan.small_lamps and plan", "False and plan", frozenset({("stack", "walk_ad"), ("stack", "analytic")})),
     Fault("primary_rays_find_them_too", "third", "transport.visible:_radiance",
           "emitter != mi.EmitterPtr(lamp.emitter)", "mi.Bool(True)",
-          frozenset({("stack", "analytic"), ("stack", "ptracer")})),
+          frozenset({("stack", "analytic"), ("stack", "ptracer")}), quick=True),
     Fault("cosine_forgotten", "two", "transport.visible:_points", "cos * weight", "weight",
           frozenset({("stack", "ptracer")})),
     Fault("turns_not_counted", "two", SPLAT, "(mi.Float(count) / mi.Float(lanes))", "1",
@@ -204,17 +204,8 @@ FAULTS = [
           frozenset({("stack", "ptracer")})),
 ]  # fmt: skip
 
-#: The faults that the default suite plants.
-QUICK = ("left_out", "primary_rays_find_them_too")
 
-
-@pytest.mark.parametrize("fault", [pytest.param(f, marks=() if f.name in QUICK else pytest.mark.long) for f in FAULTS],
-                         ids=lambda fault: fault.name)  # fmt: skip
+@planted(FAULTS)
 def test_fault(fault: Fault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
     assert {reference for _, reference in fault.fails} <= failures(fault.check)
-
-
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_the_faults_apply_to_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
-    plant(fault, monkeypatch)

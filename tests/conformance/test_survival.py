@@ -6,116 +6,48 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare
 from conformance.attached_cases import CASES as MOVING
-from conformance.test_guiding import SPP, guided, sample, samples, seeds
-from turns import a_few
+from conformance.drawing import SPP, by_harsh_table, guided, harsh
 
-from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked
-from reslrb_cli.guiding.tables import Guiding, Purpose, learning_seed
+from reslrb_cli.estimators.attached import AttachedSweep
+from reslrb_cli.guiding import collect
+from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked, hear
+from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.measure.gradients import Case, integrator, relative
-from reslrb_cli.transport.guide import Table
+from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.transport.roulette import BITS, CELLS, LEAST, SHAPE, Survival
+from reslrb_cli.transport.walk import Hooks, walk
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Roulette by the expected later contributions of a path: means are unchanged with every table, and replays follow the
-# same paths.
+# Roulette by the expected later contributions of a path. test_drawing.py compares means of whole steps.
 
-NAMES = ("texture", "two_emitters", "envmap", "roulette", "glass", "mask", "mask_texture_in_view")
 BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat in z
-
-
-def harsh(scene: Case, ours: Any, factor: float = 1.0) -> Any:
-    """Let an integrator play roulette with a table of large contrasts that is unrelated to the scene. Return the
-    integrator.
-    """
-    ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params)
-    by_harsh_table(ours.preparation.guiding, factor)
-    return ours
-
-
-def by_harsh_table(guiding: Guiding, factor: float = 1.0) -> None:
-    """Give the guiding tables a roulette with large contrasts. Samples of the first sensor use it until the tables
-    learn again.
-    """
-    onward = guiding.learned[0].onward if 0 in guiding.learned else None
-    light = 1.0 if onward is None else onward.light
-    survival = Survival.of(guiding.box, factor / light * np.random.default_rng(1).lognormal(-1, 1.5, CELLS))
-    for purpose in Purpose:
-        table, counts = guiding._table(0, purpose)
-        guiding._tables[0, purpose] = replace(table, survival=survival), counts
-
-
-@pytest.mark.parametrize("name", a_few(NAMES, ["two_emitters"]))
-def test_means_equal_those_of_unguided_samples(name: str) -> None:
-    assert means_hold(name, 32)
-
-
-def means_hold(name: str, count: int) -> Any:
-    scene, ours, plain = guided(name, 1)
-    result = compare(samples(scene, harsh(scene, ours), count), samples(scene, plain, count, 1), block=None)
-    print(name, result)
-    return result
-
-
-@pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["reservoir", "event"]))
-@pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["correlated"]))
-def test_every_kind_of_step_has_the_unguided_mean(estimator: str, adjoint: str) -> None:
-    scene, ours, plain = guided("two_emitters", 1, estimator=estimator)
-    harsh(scene, ours)
-    found = [scene.gradients(each, seeds(24, block), SPP, adjoint=adjoint) for block, each in enumerate((ours, plain))]
-    result = compare(*found, block=None)
-    print(estimator, adjoint, result)
-    assert result
-
-
-def without_weight(patch: pytest.MonkeyPatch) -> None:
-    """Do not raise the weight of paths that survive roulette."""
-    from reslrb_cli.transport.factors import Product
-
-    patch.setattr(Product, "scaled", lambda self, scale: self)
-
-
-def of_another_cell(patch: pytest.MonkeyPatch) -> None:
-    """Compute the weight of surviving paths from a probability that differs from the survival probability."""
-    import drjit as dr
-
-    from reslrb_cli.transport import walk
-
-    right = dr.rcp
-    patch.setattr(walk.dr, "rcp", lambda q: right(dr.clip(1.1 * q, 0, 1)))
-
-
-@pytest.mark.parametrize("fault", [without_weight, of_another_cell])
-def test_planted_biases_are_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    fault(monkeypatch)
-    assert not means_hold("two_emitters", 32)
 
 
 #: The parameter of the lamp lies before the moving slab. The parameters of the texture and the shell lie behind it.
 BOUNCES = next(case for case in MOVING if case.name == "bounces")
 
 
-@pytest.mark.parametrize("rr_depth", [2, 5])
-def test_means_hold_with_moving_light(rr_depth: int) -> None:
+@pytest.mark.parametrize(
+    ("estimator", "table", "rr_depth"),
+    [
+        pytest.param(estimator, table, rr_depth, marks=() if (estimator, table, rr_depth) == ("stack", "harsh", 5)
+                     else pytest.mark.long)
+        for estimator in ("stack", "reservoir") for table in ("harsh", "learned") for rr_depth in (2, 5, 1000)
+    ],
+)  # fmt: skip
+def test_means_hold_with_moving_light(estimator: str, table: str, rr_depth: int) -> None:
     """Guided and unguided means agree for parameters before and behind the moving object. Roulette on throughput is on
     (`rr_depth` 2) or off (5).
     """
-    assert moving_means_hold("stack", "harsh", rr_depth, 8, 16)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("rr_depth", [2, 5, 1000])
-@pytest.mark.parametrize("table", ["harsh", "learned"])
-@pytest.mark.parametrize("estimator", ["stack", "reservoir"])
-def test_means_hold_with_moving_light_over_many_seeds(estimator: str, table: str, rr_depth: int) -> None:
-    assert moving_means_hold(estimator, table, rr_depth, 24, 32)
+    assert moving_means_hold(estimator, table, rr_depth, *((8, 16) if table == "harsh" else (24, 32)))
 
 
 def moving_means_hold(estimator: str, table: str, rr_depth: int, count: int, spp: int) -> bool:
@@ -145,8 +77,6 @@ def moving_means_hold(estimator: str, table: str, rr_depth: int, count: int, spp
 
 def test_a_lost_weight_of_learned_roulette_is_found_with_moving_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """The fault applies the weights of learned roulette only together with roulette on throughput."""
-    from reslrb_cli.estimators.attached import AttachedSweep
-
     right = AttachedSweep.survived
 
     def survived(self: AttachedSweep, state: Any, weight: Any) -> Any:
@@ -156,68 +86,10 @@ def test_a_lost_weight_of_learned_roulette_is_found_with_moving_light(monkeypatc
     assert not moving_means_hold("stack", "harsh", 5, 8, 16)
 
 
-def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) -> None:
-    """Let the replay use the table that `other` makes from its own table."""
-    from reslrb_cli.integrators import reslrb as lt
-    from reslrb_cli.integrators.reslrb import Reslrb
-
-    right = Reslrb._replay
-
-    def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
-        [samples] = trace.samples
-        again = replace(samples, guide=replace(samples.guide, table=other(samples.guide.table)))
-        right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
-
-    patch.setattr(Reslrb, "_replay", wrong)
-
-
-def replays_agree(make: Callable[[str], tuple[Case, Any]]) -> bool:
-    """Return True if the correlated gradient of `gather`, which traces twice, equals the gradient of `stack` for a
-    known dL/dI. All use the same seed.
-
-    `make` returns a case and an integrator for an estimator. The function also asserts that `stack` with two traversals
-    has the same gradient, unless `gather` differs.
-    """
-    found = {}
-    for kind in ("gather", "stack"):
-        scene, ours = make(kind)
-        found[kind] = scene.gradient(ours, 5, SPP, adjoint="correlated")
-    known = sample(scene, ours, 5)[: len(found["gather"])]  # by `stack`, in one traversal
-    agree = {kind: relative(gradient, known) < 1e-4 for kind, gradient in found.items()}
-    assert agree["stack"] or not agree["gather"]
-    return agree["gather"]
-
-
-@pytest.mark.parametrize("fault", [False, True])
-@pytest.mark.parametrize("name", a_few(["two_emitters", "mask_texture_in_view"], ["two_emitters"]))
-def test_a_replay_follows_the_traced_paths(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    def make(estimator: str) -> tuple[Case, Any]:
-        scene, ours, _ = guided(name, 1, estimator=estimator)
-        return scene, harsh(scene, ours)
-
-    def other(table: Table) -> Table:
-        return replace(table, survival=replace(table.survival, chances=1.2 * table.survival.chances))
-
-    if fault:
-        replayed_from(monkeypatch, other)
-    assert replays_agree(make) is not fault
-
-
-def test_a_recorded_step_equals_the_step() -> None:
-    """Recorded steps use the current table, not the table of the recording."""
-    (scene, ours, _), (_, frozen, _) = (guided("envmap", 0, freeze=freeze) for freeze in (False, True))
-    for factor in (1.0, 0.3, 3.0):
-        both = [sample(scene, harsh(scene, each, factor), 5) for each in (ours, frozen)]
-        assert relative(*both) < 1e-4
-    assert frozen.preparation.recordings.counts()["fused"] > 0
-
-
 # What roulette learns about the later vertices and contributions of paths: compared with sums in NumPy.
 
 
 def test_cells_are_indexed_by_position_and_octant() -> None:
-    import mitsuba as mi
-
     random = np.random.default_rng(2)
     o = random.uniform(-3, 4, (3, 1000)).astype(np.float32)
     d = random.normal(size=(3, 1000)).astype(np.float32)
@@ -234,8 +106,6 @@ def test_cells_are_indexed_by_position_and_octant() -> None:
 
 def test_the_probability_is_bounded_on_both_sides() -> None:
     """The bounds also hold for NaN, which gets the lower bound."""
-    import mitsuba as mi
-
     throughput = mi.Float([0.0, 1e-30, 0.1, 0.5, 1e30, np.inf, np.nan])
     for chance, expected in (
         (1.0, [LEAST, LEAST, LEAST, 0.5, 1, 1, LEAST]),
@@ -307,8 +177,6 @@ def test_learned_state_does_not_depend_on_the_unit_of_light() -> None:
 
 def walk_of(scene: Case, ours: Any, seed: int) -> Walked:
     """Return the data of one walk, from which a table would learn."""
-    from reslrb_cli.guiding.collect import hear
-
     leaves = scene.leaves()
     job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(seed), SPP, scene.params)
     samples = ours.passes(job, Purpose.BOTH)[0]
@@ -341,8 +209,6 @@ def test_collected_values_do_not_depend_on_roulette(fault: str | None, monkeypat
     """The collected values do not contain the weights of roulette. Otherwise, a table would learn from its own
     weights.
     """
-    from reslrb_cli.guiding import collect
-
     if fault is not None:
         right = collect.Trail.survives
         power = {"square": 3.0, "length": 0.0}[fault]
@@ -356,10 +222,6 @@ def test_later_contributions_are_collected_at_the_ray_of_the_bounce() -> None:
     """The numbers of rays and later vertices, and the squared contributions, equal sums in NumPy over the paths of the
     same seed.
     """
-    import drjit as dr
-    import mitsuba as mi
-
-    from reslrb_cli.transport.walk import Hooks, walk
 
     class Keeping(Hooks):
         """Records for each path the ray that leaves the first vertex, its throughput, and the contribution of the
@@ -403,8 +265,6 @@ def test_vertices_beyond_the_capacity_are_summed(monkeypatch: pytest.MonkeyPatch
     """The result is the same if one vertex or both vertices fit into the storage. In walks of two bounces, rays leave
     only the first vertex.
     """
-    from reslrb_cli.guiding import collect
-
     scene, ours, _ = guided("two_emitters", 1, max_depth=3)
     found = []
     for places in (32, 1):

@@ -34,7 +34,7 @@ SETTINGS = {
     "mirror, tilted receiver": replace(MIRROR, tilt=(-15.0, 20.0)),
 }
 FEW = {
-    "lens", "lens, point light", "lens, tilted receiver", "lens, round", "mirror", "mirror, point light",
+    "lens, tilted receiver", "lens, round", "mirror, point light",
 }  # fmt: skip
 
 

@@ -194,6 +194,7 @@ def test_a_lens_rotates_with_both_faces_about_the_middle_of_its_front(folder: Pa
     assert turned[corner, 2] - points[corner, 2] == pytest.approx(-np.sin(np.radians(1)) * points[corner, 0], abs=0.01)
 
 
+@pytest.mark.long
 def test_a_wide_light_is_the_mean_of_rotated_ones(folder: Path) -> None:
     made, angles = bench(folder), []
     turned = made.turned
@@ -211,18 +212,6 @@ def test_a_wide_light_is_the_mean_of_rotated_ones(folder: Path) -> None:
     noise = [float(np.mean((image - exact) ** 2)) for image in (made.sun(56), planned)]
     assert noise[0] < 2.5 * noise[1]  # with equal seeds it is about seven times as large
     assert wide.sum() == pytest.approx(planned.sum(), rel=0.05)
-
-
-def test_meshes_move_like_shapes(folder: Path) -> None:
-    made = bench(folder)
-    by = mi.ScalarTransform4f().translate([1, 2, 3])
-    values = made.moved(["face", "back"], by)
-    before, after = (np.array(v).reshape(-1, 3) for v in (made.params["face.vertex_positions"],
-                                                         values["face.vertex_positions"]))  # fmt: skip
-    assert after - before == pytest.approx(np.broadcast_to([1.0, 2, 3], before.shape), abs=1e-4)
-    moved, there = (np.ravel(matrix @ mi.Point3f(0)) for matrix in (values["back.to_world"],
-                                                                   made.params["back.to_world"]))  # fmt: skip
-    assert moved - there == pytest.approx([1, 2, 3], abs=1e-4)
 
 
 def test_a_tool_ball_touches_the_vertices_of_the_face(folder: Path) -> None:
@@ -260,6 +249,7 @@ def test_the_command_reports_all_figures(folder: Path) -> None:
     assert "needs a folder as output" in f"{result.output}{result.exception}"
 
 
+@pytest.mark.long
 def test_the_page_of_a_run_has_the_figures_for_the_maker(
     tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

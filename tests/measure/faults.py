@@ -4,10 +4,16 @@ the extreme suite.
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import textwrap
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from unittest.mock import patch
+
+import pytest
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.config.schema import Config
@@ -107,11 +113,12 @@ CHECKS: dict[str, Check] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault in the source of the function `where` that replaces `right` by `wrong`. Then `check` fails at least in
+    """A fault in the source of the function `where` that replaces `right` by `wrong`. Then `check` fails, at least in
     the records in `fails`.
 
     `fails` are pairs of an estimator and a reference. In an image's record, the estimator is None. Estimators that are
-    not in `fails` do not have the fault, and their records hold.
+    not in `fails` do not have the fault, and their records hold. With `stock`, naive AD of our walk shares the fault,
+    so that only `ptracer` can find it. The default suite plants faults that are `quick`.
     """
 
     name: str
@@ -119,7 +126,34 @@ class Fault:
     where: str
     right: str
     wrong: str
-    fails: frozenset[tuple[str | None, str]]
+    fails: frozenset[tuple[str | None, str]] = frozenset()
+    stock: bool = False
+    quick: bool = False
+
+
+def planted(faults: Iterable[Fault]) -> pytest.MarkDecorator:
+    """Parametrise a test with faults. All but the quick faults need `-m long`."""
+    marked = [pytest.param(fault, id=fault.name, marks=() if fault.quick else pytest.mark.long) for fault in faults]
+    return pytest.mark.parametrize("fault", marked)
+
+
+def plant(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plant a fault in a function. The fault takes effect in every module that imports the function.
+
+    The function's source must contain the fault's line exactly once. A fault that no longer fits the code fails the
+    test.
+    """
+    module, _, path = fault.where.partition(":")
+    function = attrgetter(path)(importlib.import_module(f"reslrb_cli.{module}"))
+    function = getattr(function, "__func__", function)
+    source = textwrap.dedent(inspect.getsource(function))
+    assert source.count(fault.right) == 1, f"{fault.where} has no such line any more: {fault.right}"
+    # Annotations name types that are imported only for type checkers.
+    broken_source = "from __future__ import annotations\n" + source.replace(fault.right, fault.wrong)
+    scope = dict(function.__globals__)
+    exec(compile(broken_source, fault.where, "exec", dont_inherit=True), scope)
+    broken = scope[function.__name__]
+    monkeypatch.setattr(function, "__code__", getattr(broken, "__func__", broken).__code__)
 
 
 def by(estimators: str, *references: str) -> frozenset[tuple[str | None, str]]:
@@ -223,7 +257,7 @@ FAULTS = [
           "& 1) != 0", "& 1) == 0", by("gather stack", *GRADIENT)),
     Fault("stack_without_last_vertex", "cornell", "estimators.stack:walk_back",
           "state.needed, bottom", "state.needed - dr.select(state.needed > 0, mi.UInt32(1), 0), bottom",
-          by("stack", *GRADIENT)),
+          by("stack", *GRADIENT), quick=True),
     Fault("blocks_begin_anew", "cornell_stack_of_2", "estimators.stack:walk_back",
           "again(left), left, bottom, adjoint)", "again(left), left, bottom, 0 * adjoint)",
           by("stack", *GRADIENT)),

@@ -60,20 +60,13 @@ def spot(origin: tuple = (0.05, 3.2, -0.04), target: tuple = (0, 0, 0), cutoff: 
             "to_world": look_at(origin, target)}  # fmt: skip
 
 
-def sheet(y: float, up: bool, bsdf: dict, tilt: float = 0, scale: float = 3) -> dict:
-    """Return a flat surface. Light enters the glass if it comes from the side that the surface faces."""
-    turn = (-90 if up else 90) + tilt
-    return rectangle(bsdf, translate=[0, y, 0], rotate=([1, 0, 0], turn), scale=scale)
-
-
-def slab(bsdf: dict = GLASS, cells: int = 64, half: float = 1.0, wide: float = 0, lamp: Any = None, y: float = 1.8,
-         **objects: Any) -> dict:  # fmt: skip
-    """Return a scene with a slab under a lamp. The slab's upper surface at `y` has waves."""
-    positions, faces, uv = grid(cells, lambda x, z: y + waves(x, z), half, wide)
+def slab(bsdf: dict = GLASS, lamp: Any = None, **objects: Any) -> dict:
+    """Return a scene with a slab under a lamp. The slab's upper surface has waves."""
+    positions, faces, uv = grid(64, lambda x, z: 1.8 + waves(x, z))
     return setting(
         lamp=spot() if lamp is None else lamp,
         top=mesh(positions, faces, bsdf, uv),
-        bottom=sheet(y - 0.2, False, bsdf, scale=max(3, half)),
+        bottom=rectangle(bsdf, translate=[0, 1.6, 0], rotate=([1, 0, 0], 90), scale=3),
         **objects,
     )
 
@@ -103,110 +96,22 @@ def beam(half: float = 0.3) -> dict:
     return lit_square(rgb(9, 8, 7), aim @ transform(scale=half), "directionalarea")
 
 
-def square_lamp(half: float = 0.25, y: float = 3.2) -> dict:
-    """Return a square area light that shines down."""
-    return lit_square(rgb(9, 8, 7), translate=[0.05, y, -0.04], rotate=([1, 0, 0], 90), scale=half)
-
-
 def sphere_lens(radius: float = 0.8, y: float = 1.95, cutoff: float = 18, bsdf: dict = GLASS) -> dict:
     """Return a scene with a glass ball in a cone of light that the ball contains."""
     return setting(lamp=spot(cutoff=cutoff, origin=(0.1, 3.6, -0.08), target=(0.05, y, 0)),
                    lens={"type": "sphere", "center": [0, y, 0], "radius": radius, "bsdf": bsdf})  # fmt: skip
 
 
-def ball(radius: float, center: tuple[float, float, float], levels: int = 4, inward: bool = False
-         ) -> tuple[Array, Array]:  # fmt: skip
-    """Return the vertices and triangles of a sphere with 20 * 4^levels triangles. The triangles face outward, or inward
-    if `inward`.
-    """
-    golden = (1 + 5**0.5) / 2
-    corners = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
-    points = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners], float)
-    points /= np.linalg.norm(points[0])
-    near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 1.1
-    faces = np.array([(a, b, c) for a in range(12) for b in range(a) for c in range(b)
-                      if near[a, b] and near[b, c] and near[a, c]])  # fmt: skip
-    for _ in range(levels):
-        points, faces = _divided(points, faces)
-    p, q, r = (points[faces[:, k]] for k in range(3))
-    outward = np.sum(np.cross(q - p, r - p) * p, 1) > 0
-    faces = np.where((outward != inward)[:, None], faces, faces[:, ::-1])
-    return points * radius + np.array(center), faces
-
-
-def _divided(points: Array, faces: Array) -> tuple[Array, Array]:
-    """Return the mesh with each triangle divided into four. All vertices lie on the unit sphere."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
-    unique, number = np.unique(edges, axis=0, return_inverse=True)
-    middles = points[unique].sum(1)
-    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
-    ab, bc, ca = np.split(number.ravel() + len(points), 3)
-    a, b, c = faces.T
-    divided = [np.stack(corners, 1) for corners in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-    return np.concatenate([points, middles]), np.concatenate(divided)
-
-
-def mesh_lens(radius: float = 0.8, y: float = 1.95) -> dict:
-    """Return the scene of `sphere_lens` with the ball as a mesh."""
-    return setting(lamp=spot(cutoff=18, origin=(0.1, 3.6, -0.08), target=(0.05, y, 0)),
-                   lens=mesh(*ball(radius, (0, y, 0), 5), GLASS))  # fmt: skip
-
-
-def bent(scene: Any, name: str = "lens", count: int = 10, span: float = 0.8) -> list[Move]:
-    """Return the moves of a mesh: its size along x about its middle, and smooth displacements."""
-    positions = vertices(scene, name)
-    wider = np.zeros_like(positions)
-    wider[:, 0] = positions[:, 0] - positions[:, 0].mean()
-    return [Displacement(f"{name}.vertex_positions", np.stack([wider, *smooth_fields(positions, count, span)]))]
-
-
-def prism() -> dict:
-    """Return a scene with a slab whose flat upper surface is tilted."""
-    return setting(lamp=spot(), top=sheet(1.9, True, GLASS, tilt=12), bottom=sheet(1.6, False, GLASS))
-
-
-def two_lenses() -> dict:
-    """Return a scene with a slab with waves over a ball, that is four glass surfaces in a row."""
-    scene = slab(lamp=spot(cutoff=7, origin=(0.03, 4.4, -0.02)), y=2.8)
-    return scene | {"lens": {"type": "sphere", "center": [0, 1.55, 0], "radius": 0.5, "bsdf": GLASS}}
-
-
-def smooth_texture() -> dict:
-    """Return a receiver with a smooth texture."""
-    at = np.linspace(0, 2 * np.pi, 65)
-    x, y = np.meshgrid(at, at)
-    texels = np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * x + y), 0.5 + 0.3 * np.sin(4 * y)], -1)
-    floor = setting()["floor"]
-    floor["to_world"] = transform(rotate=([1, 0, 0], -90), scale=3)
-    return floor | {"bsdf": {"type": "diffuse", "reflectance": bitmap(texels, "bilinear")}}
-
-
 GLASS_SCENES = [
     AttachedScene("slab", "a glass slab with waves under a spot light", slab, waving, spp=256),
     AttachedScene("slab_beam", "the same under parallel light with a hard edge", lambda: slab(lamp=beam()), waving,
                   step=0.005),
-    AttachedScene("slab_area", "the same, wide and under an area light",
-                  lambda: slab(lamp=square_lamp(0.2, 2.3), half=40, wide=6, cells=160), waving, spp=512, seeds=16),
-    AttachedScene("slab_depth_6", "the same with what is reflected inside of it twice", slab, waving,
-                  options={"max_depth": 6}, step=0.0025, spp=512, seeds=16),
-    AttachedScene("slab_texture", "the same over a smooth texture", lambda: slab(floor=smooth_texture()), waving,
-                  spp=256),
     AttachedScene("sphere_lens", "a ball of glass, moved and scaled", sphere_lens,
                   lambda scene: moving_sphere("lens", (0, 1.95, 0)), spp=512),
-    AttachedScene("mesh_lens", "a ball of glass, a mesh that is bent", mesh_lens, bent,
-                  step=0.005, spp=512, seeds=24),
-    AttachedScene("prism", "a tilted flat surface, turned and moved", prism,
-                  lambda scene: [Pose("top.to_world", ("rx", "rz", "ty"), (0, 1.9, 0))], spp=512, seeds=16),
-    AttachedScene("two_lenses", "a slab with waves over a ball", two_lenses,
-                  lambda scene: [*waving(scene, height=2.8), *moving_sphere("lens", (0, 1.55, 0))],
-                  options={"max_depth": 6}, spp=512, seeds=24),
     AttachedScene("rough_surface", "rough glass with waves, the receiver inside", rough_surface, waving,
                   spp=512, seeds=32, options={"max_depth": 3}),
     AttachedScene("rough_surface_alpha", "the roughness of rough glass", rough_surface,
                   lambda scene: [Number("top.bsdf.alpha.value")], step=0.03, spp=512, seeds=32,
-                  options={"max_depth": 3, "attached": True}),
-    AttachedScene("rough_surface_eta", "the index of rough glass", rough_surface,
-                  lambda scene: [Number("top.bsdf.eta")], step=0.1, spp=1024, seeds=96,
                   options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip
 
@@ -223,35 +128,15 @@ def ceiling(bsdf: dict = MIRROR) -> dict:
                    mirror=mesh(positions, faces[:, ::-1], bsdf, uv))  # fmt: skip
 
 
-def convex(bsdf: dict = MIRROR) -> dict:
-    """Return a scene with a spherical mirror, lit from below by a cone that the mirror contains."""
-    return setting(lamp=spot(origin=(0.03, 0.6, -0.02), target=(0, 2, 0), cutoff=9),
-                   mirror={"type": "sphere", "center": [0, 2.1, 0], "radius": 0.6, "bsdf": bsdf})  # fmt: skip
-
-
 MIRRORS_SCENES = [
     AttachedScene("mirror", "a mirror with waves", ceiling, lambda scene: waving(scene, "mirror", 1.9), step=0.002),
-    AttachedScene("mirror_ball", "a mirror that is a ball, moved and scaled", convex,
-                  lambda scene: [Pose("mirror.to_world", ("tx", "ty", "tz", "s"), (0, 2.1, 0))], spp=128),
     AttachedScene("rough_mirror", "a rough metal with waves", lambda: ceiling(BRUSHED),
                   lambda scene: waving(scene, "mirror", 1.9), step=0.003, options={"max_depth": 3}),
-    AttachedScene("rough_mirror_alpha", "the roughness of a metal",
-                  lambda: ceiling(BRUSHED | {"sample_visible": True}),
-                  lambda scene: [Number("mirror.bsdf.alpha.value")], spp=256,
-                  options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip
-
-AIM = ("tx", "ty", "tz", "rx", "rz")
 
 
 def point(position: tuple = (0.1, 1.5, 0.2)) -> dict:
     return {"type": "point", "position": list(position), "intensity": rgb(3, 2, 4)}
-
-
-def bulb(radius: float = 0.3) -> dict:
-    """Return a ball that emits light."""
-    return {"type": "sphere", "center": [0.1, 2.2, 0.2], "radius": radius, "bsdf": diffuse(0, 0, 0),
-            "emitter": {"type": "area", "radiance": rgb(3, 2, 4)}}  # fmt: skip
 
 
 def hills() -> dict:
@@ -272,15 +157,6 @@ def rolling(scene: Any, name: str = "floor", y: float = 0) -> list[Move]:
 PLACES_SCENES = [
     AttachedScene("moved_point", "a point light over a plane", lambda: setting(lamp=point()),
                   lambda scene: [Pose("lamp.position", ("ty", "tx", "tz"))], options={"max_depth": 2}),
-    AttachedScene("moved_spot", "a spot light over glass with waves, moved and turned", slab,
-                  lambda scene: [Pose("lamp.to_world", AIM, (0.05, 3.2, -0.04))], spp=512),
-    AttachedScene("moved_area", "an area light over a plane, moved, turned and scaled",
-                  lambda: setting(lamp=square_lamp(0.4, 2.2)),
-                  lambda scene: [Pose("lamp.to_world", (*AIM, "s"), (0.05, 2.2, -0.04))],
-                  options={"max_depth": 2}, spp=128),
-    AttachedScene("moved_bulb", "a ball that glows over a plane, moved and scaled", lambda: setting(lamp=bulb()),
-                  lambda scene: [Pose("lamp.to_world", ("ty", "tx", "tz", "s"), (0.1, 2.2, 0.2))],
-                  options={"max_depth": 2}),
     AttachedScene("moved_receiver", "a plane under a point light, moved and tilted", lambda: setting(lamp=point()),
                   lambda scene: [Pose("floor.to_world", ("ty", "rx", "rz"))], options={"max_depth": 2}),
     AttachedScene("bent_receiver", "a plane under a point light that is bent", hills, rolling,

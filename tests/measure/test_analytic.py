@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from agreement import compare, renders
 from measure.analytic_motion import KnownMotion, ball_lens, lamp_over_plane, tilted_surface
-from turns import taking_turns
+from turns import a_few, taking_turns
 
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.comparison import Family, compare_expectations
@@ -128,7 +128,7 @@ def test_slab_derivatives(name: str):
     assert exact == pytest.approx((image(1e-5) - image(-1e-5)) / 2e-5, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", a_few(SCENES, [name for name in SCENES if name != "slab_head_on"]))
 def test_images(name: str, llvm: str):
     make, spp, stock = SCENES[name]
     known: KnownScene = make()
@@ -165,21 +165,13 @@ MOTIONS: dict[str, Callable[[], KnownMotion]] = {
 }
 
 
-@pytest.fixture
-def _quiet(llvm: str) -> None:
-    import mitsuba as mi
-
-    mi.set_log_level(mi.LogLevel.Error)
-
-
 def gradients(motion: KnownMotion, count: int = 8, spp: int = 128) -> np.ndarray:
     case = motion.scene.case()
     case.weigh(motion.weights)
     return case.gradients(integrator("reslrb", **motion.scene.options, estimator="stack"), seeds(count), spp)
 
 
-@pytest.mark.usefixtures("_quiet")
-@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("name", a_few(MOTIONS, ["tilted_surface", "lamp_over_plane"]))
 def test_derivatives(name: str):
     motion = MOTIONS[name]()
     ours = gradients(motion)
@@ -194,7 +186,6 @@ def test_derivatives(name: str):
     assert error < 4e-3, "too noisy to see a fault"
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_a_surface_that_does_not_refract(monkeypatch: pytest.MonkeyPatch):
     right = Segment.next_ray
     monkeypatch.setattr(Segment, "next_ray", lambda self, attached=False: dr.detach(right(self, attached)))
@@ -203,7 +194,6 @@ def test_a_surface_that_does_not_refract(monkeypatch: pytest.MonkeyPatch):
     assert abs(ours.mean() / motion.derivatives[0] - 1) > 0.1
 
 
-@pytest.mark.usefixtures("_quiet")
 def test_the_focus_of_a_ball_depends_on_its_index():
     for ior in (1.4, 1.8):
         across, along, grown = ball_lens(ior=ior, radius=2.0, offset=0.02).derivatives

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 import pytest
 from measure.pretended_steps import Pretended
 
-from reslrb_cli.cli import main
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.bench import Bench, BenchResult
@@ -33,9 +31,9 @@ run: {spp: 4}
 LIST = "ptracer,reslrb:stack,walk_ad"
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def _clean() -> None:
-    Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive = [], {}, set(), 0
+    Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive, Sized.firsts = [], {}, set(), 0, []
 
 
 def sweep(list_of: str = LIST, **changes: Any) -> Sweep:
@@ -61,7 +59,6 @@ def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[BenchResu
     return play(what, stop=stop)[0]
 
 
-@pytest.mark.usefixtures("_clean")
 def test_steps_are_interleaved_in_rotating_order() -> None:
     run(sweep(values=[2]))
     types = ["ptracer", "reslrb", "walk_ad"]
@@ -70,7 +67,6 @@ def test_steps_are_interleaved_in_rotating_order() -> None:
     assert Pretended.log == warm + rounds
 
 
-@pytest.mark.usefixtures("_clean")
 def test_records() -> None:
     rows = run(sweep())
     assert [(row.record.integrator, row.record.max_depth) for row in rows] == [
@@ -88,7 +84,6 @@ def test_records() -> None:
     assert rows[0].step_ratio == Spread(1.0, 1.0, 1.0)
 
 
-@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize("question", [0, 1, 2, 5], ids=["loading", "cold", "warming up", "in a round"])
 def test_an_ended_case_is_recorded_and_the_rest_continues(question: int) -> None:
     Pretended.ends = {("walk_ad", 2): question}
@@ -102,7 +97,6 @@ def test_an_ended_case_is_recorded_and_the_rest_continues(question: int) -> None
     assert rows[5].record.status is BenchStatus.OK  # the case is tried again at the next depth
 
 
-@pytest.mark.usefixtures("_clean")
 def test_without_a_baseline_there_are_no_ratios() -> None:
     Pretended.ends = {("ptracer", 2): 1}
     rows = run(sweep())
@@ -114,13 +108,11 @@ def test_times_are_relative_to_ptracer_or_the_first_case(cases: str) -> None:
     assert sweep(cases).baseline.label == ("ptracer" if "ptracer" in cases else "reslrb:stack")
 
 
-@pytest.mark.usefixtures("_clean")
 def test_all_cases_may_end() -> None:
     Pretended.ends = {(name, 2): 1 for name in ("ptracer", "reslrb", "walk_ad")}
     assert {row.record.status for row in run(sweep(values=[2]))} == {BenchStatus.OUT_OF_MEMORY}
 
 
-@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(("after", "kept"), [(5, []), (14, [1, 1, 1]), (13, [1, 1]), (33, [3, 3, 3, 1])])
 def test_a_stop_keeps_finished_measurements(after: int, kept: list[int]) -> None:
     answers = iter(range(1000))
@@ -129,7 +121,6 @@ def test_a_stop_keeps_finished_measurements(after: int, kept: list[int]) -> None
     assert all(row.record.status is BenchStatus.OK for row in rows)
 
 
-@pytest.mark.usefixtures("_clean")
 def test_cases_that_need_shared_memory_release_it() -> None:
     asked: list[bool] = []
 
@@ -143,7 +134,6 @@ def test_cases_that_need_shared_memory_release_it() -> None:
     assert "memory" in said[0]
 
 
-@pytest.mark.usefixtures("_clean")
 def test_pace_divides_the_budget() -> None:
     now = [0.0]
     pace, spent = Pace(100.0, 3, now=lambda: now[0]), Pace(200.0, 2, now=lambda: now[0])
@@ -172,7 +162,6 @@ def test_pace_divides_the_budget() -> None:
     assert [cheap.another(done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
 
 
-@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(
     ("budget_s", "measured", "left"),
     [
@@ -225,7 +214,6 @@ def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
     return found, said, now[0]
 
 
-@pytest.mark.usefixtures("_clean")
 def test_a_warning_of_every_process_is_shown_once() -> None:
     class Warning(Pretended):
         def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
@@ -236,14 +224,12 @@ def test_a_warning_of_every_process_is_shown_once() -> None:
     assert said == ["scene.xml:3: old"]
 
 
-@pytest.mark.usefixtures("_clean")
 def test_depths() -> None:
     assert depths(2) == [2]
     assert depths(16) == [2, 4, 8, 16]
     assert depths(20) == [2, 4, 8, 16, 20]
 
 
-@pytest.mark.usefixtures("_clean")
 def test_options_of_cases() -> None:
     cases = parse_cases("reslrb:reservoir(capacity=4, weight=adjoint), ptracer(rr_depth=3),prb,reslrb")
     config = loads(CONFIG, "x.yaml")
@@ -254,7 +240,6 @@ def test_options_of_cases() -> None:
     assert "samples_per_pass" not in options[2]
 
 
-@pytest.mark.usefixtures("_clean")
 def test_cases_may_have_their_own_adjoint() -> None:
     case, other, third = parse_cases("reslrb:stack(adjoint=batched,batches=2),ptracer(adjoint=correlated),prb")
     config = loads(CONFIG, "x.yaml", ["run.adjoint=batched"])
@@ -268,7 +253,6 @@ def test_cases_may_have_their_own_adjoint() -> None:
     assert case.at(loads(CONFIG, "x.yaml"), 9, known=False).run.batches == 2
 
 
-@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -290,7 +274,6 @@ def test_wrong_lists_are_located(text: str, line: str) -> None:
     assert line in str(caught.value)
 
 
-@pytest.mark.usefixtures("_clean")
 def test_unnamed_cases_that_refuse_are_left_out():
     Pretended.refusing = {"reslrb"}
     results, lines = play(sweep(default=True))
@@ -299,7 +282,6 @@ def test_unnamed_cases_that_refuse_are_left_out():
     assert lines == ["left out: reslrb:stack: no derivatives of moving light"]
 
 
-@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(("refusing", "default"), [("reslrb", False), ("ptracer", True)])
 def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool):
     Pretended.refusing = {refusing}
@@ -329,11 +311,6 @@ class Sized(Pretended):
         return answer | {"step_ms": float(self.spp * width * texture)}
 
 
-@pytest.fixture
-def _clean_values() -> None:
-    Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive, Sized.firsts = [], {}, set(), 0, []
-
-
 def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[BenchResult], list[str]]:
     cases = parse_cases(LIST, deep=False)
     settings: dict[str, Any] = {
@@ -346,7 +323,6 @@ def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[Bench
     return play(what, Sized)
 
 
-@pytest.mark.usefixtures("_clean_values")
 @pytest.mark.parametrize(
     ("swept", "expected"),
     [
@@ -365,7 +341,6 @@ def test_one_quantity_varies_and_the_rest_stays(swept: str, expected: list[tuple
     assert all({name for name in first if name.endswith("_width")} == names for first in Sized.firsts)
 
 
-@pytest.mark.usefixtures("_clean_values")
 def test_the_table_starts_with_the_varied_quantity() -> None:
     Pretended.ends = {("walk_ad", 5): 2}
     rows, _ = run_swept("film", [16, 128])
@@ -378,46 +353,22 @@ def test_the_table_starts_with_the_varied_quantity() -> None:
     assert {row.record.status for row in rows} == {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}
 
 
-@pytest.mark.usefixtures("_clean_values")
 def test_unmeasured_rows_are_named_by_the_varied_quantity() -> None:
     assert run_swept("texture", [8, 64], rounds=None)[1] == [
         "not measured: texture width 8, 64: the budget was spent; allow more with --budget"
     ]
 
 
-@pytest.mark.usefixtures("_clean_values")
 def test_impossible_sample_counts_are_located() -> None:
     with pytest.raises(ConfigError, match=r"--integrators ptracer: integrator.samples_per_pass: 2 does not divide"):
         run_swept("spp", [4, 3])
 
 
-@pytest.mark.usefixtures("_clean_values")
 def test_default_values() -> None:
     config = loads(CONFIG, Path("x.yaml"))
     assert usual_values("spp", config) == [1, 2, 4, 8, 16]
     assert usual_values("spp", loads(CONFIG, Path("x.yaml"), ["run.spp=2"])) == [1, 2, 4, 8]
     assert usual_values("film", config) == [32, 64, 128, 256]
-
-
-@pytest.mark.usefixtures("_clean_values")
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (("--sweep", "film", "--max-depth", "4"), "--max-depth: needs --sweep depth; use --set integrator.max"),
-        (("--values", "2", "--max-depth", "4"), "--max-depth: has no effect with --values"),
-        (("--sweep", "size"), "'size' is not one of 'depth', 'spp', 'film', 'texture'"),
-        (("--sweep", "spp", "--values", "4,4"), "`4,4` has a number twice"),
-        (("--sweep", "spp", "--integrators", "ptracer(max_depth=3)"), "all share one max_depth"),
-    ],
-)
-def test_bad_input_is_one_located_line(args: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["bench", *args], prog_name="reslrb")
-    assert ended.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert line in printed.err
-    assert len(printed.err.splitlines()) == 1
 
 
 # A `bench` that continues an earlier one: which measurements count, which are repeated, and what is refused.
@@ -442,7 +393,6 @@ def again(made: Bench) -> Earlier:
     return Earlier("bench", Path("b.jsonl"), json.loads(json.dumps(head)), arrays)
 
 
-@pytest.mark.usefixtures("_clean")
 def test_continued_rounds_give_the_records_of_one_session() -> None:
     """Pretended steps become slower from round to round, so that every figure shows the rounds that it covers."""
     short = measure(sweep(rounds=3))
@@ -456,7 +406,6 @@ def test_continued_rounds_give_the_records_of_one_session() -> None:
     assert {result.record.repeats for result in whole.results()} == {7}
 
 
-@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize("after", [5, 14, 20, 33, 40])
 def test_unmeasured_cases_of_a_stop_are_measured(after: int) -> None:
     answers = iter(range(1000))
@@ -470,7 +419,6 @@ def test_unmeasured_cases_of_a_stop_are_measured(after: int) -> None:
     assert all(result.record.repeats >= 3 for result in whole.results())
 
 
-@pytest.mark.usefixtures("_clean")
 def test_finished_depths_are_not_repeated() -> None:
     Pretended.ends = {("walk_ad", 2): 4}
     first = measure(sweep(values=[2, 4], rounds=3), stop=lambda: len(Pretended.log) > 31)
@@ -483,7 +431,6 @@ def test_finished_depths_are_not_repeated() -> None:
     assert (ended.record.status, ended.reason) == (BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
 
 
-@pytest.mark.usefixtures("_clean")
 def test_refused_cases_stay_left_out() -> None:
     Pretended.refusing = {"reslrb"}
     first = measure(sweep(default=True))
@@ -493,45 +440,6 @@ def test_refused_cases_stay_left_out() -> None:
     assert {result.record.repeats for result in whole.results()} == {5}
 
 
-@pytest.mark.usefixtures("_clean")
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
-        ({"config": loads(CONFIG, Path("x.yaml"), ["run.spp=8"])}, "run.spp is 4 there, 8 here"),
-        ({"cases": parse_cases("ptracer,walk_ad")}, "integrators is ['ptracer', 'reslrb:stack', 'walk_ad'] there"),
-        ({"values": [2, 8]}, "values is [2, 4] there, [2, 8] here"),
-        ({"objective": "l2"}, "objective is fixed there, l2 here"),
-        ({"swept": "spp"}, "sweep is depth there, spp here"),
-        ({"memory_limit": 2**30}, "memory limit is None there, 1073741824 here"),
-        ({"variant": "cuda_ad_rgb"}, "variant is llvm_ad_rgb there, cuda_ad_rgb here"),
-    ],
-)
-def test_only_the_same_measurement_is_continued(change: dict[str, Any], line: str) -> None:
-    first = measure(sweep())
-    with pytest.raises(ConfigError, match=re.escape(f"--json: b.jsonl belongs to another measurement: {line}")):
-        session(sweep(**({"rounds": 5} | change)), again(first))
-
-
-@pytest.mark.usefixtures("_clean")
-def test_saved_rounds_are_not_repeated() -> None:
-    first = measure(sweep())
-    Pretended.log.clear()
-    again_ = measure(sweep(), again(first))
-    assert Pretended.log == []
-    assert [result.record for result in again_.results()] == [result.record for result in first.results()]
-
-
-@pytest.mark.usefixtures("_clean")
-def test_a_changed_scene_is_another_one(tmp_path: Path) -> None:
-    (tmp_path / "scene.xml").write_text("<scene/>")
-    what = sweep(config=loads(CONFIG, tmp_path / "x.yaml"))
-    first = again(measure(what))
-    (tmp_path / "scene.xml").write_text("<scene></scene>")
-    with pytest.raises(ConfigError, match=r"another measurement: scene\.file has changed"):
-        session(what, first)
-
-
-@pytest.mark.usefixtures("_clean")
 def test_running_work_is_saved_between_rounds() -> None:
     """Saving after each round ensures that a process killed within a depth loses only its last round."""
     made, seen = session(sweep(values=[2])), []

@@ -4,19 +4,14 @@ processes.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.convergence.setup import MOST_REFERENCE_STEPS, MOST_STEPS, Role
-from reslrb_cli.measure.methods import Plan
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus
@@ -123,10 +118,6 @@ def test_only_unnamed_methods_are_left_out(tmp_path: Path, default: bool) -> Non
     assert ("ptracer" in [m.label for m in session.of(Role.CASE)]) is not default
 
 
-def begin(what: Plan, earlier: Earlier) -> Session:
-    return Session(what, Path(), lambda: False, print, earlier=earlier)
-
-
 def test_continuing(tmp_path: Path) -> None:
     """The steps of both calls count, dL/dI is computed once, and no seed is used twice."""
     stage = Stage()
@@ -146,17 +137,6 @@ def test_continuing(tmp_path: Path) -> None:
         assert len(member.seconds) == 12
         np.testing.assert_array_equal(member.rows[: len(before.rows)], before.rows)
         assert len({row.tobytes() for row in member.rows}) == len(member.rows)
-
-
-def test_saved_rounds_are_not_repeated(tmp_path: Path) -> None:
-    _, first, _ = play(tmp_path, Stage(), plan(rounds=4))
-    kept = play(tmp_path, Stage(), plan(rounds=4))[0].kept()
-    assert kept is not None
-    stage = Stage()
-    _, second, _ = play(tmp_path, stage, plan(rounds=4), earlier=Earlier("convergence", Path("c.jsonl"), *kept))
-    assert stage.asked == []
-    assert [record.efficiency for record in second.methods] == [record.efficiency for record in first.methods]
-    assert second.methods[0].efficiency is not None
 
 
 @pytest.mark.parametrize("after", [188, 212, 236])
@@ -195,35 +175,6 @@ def test_a_second_budget_too_small_for_a_round_is_reported(tmp_path: Path) -> No
     assert again.rounds == first.rounds
     assert of(results, "ptracer").efficiency is not None  # from the earlier samples
     assert said[-1].startswith("no round was added; allow about ")
-
-
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
-        (
-            {"cases": "ptracer"},
-            "integrators is ['ptracer', 'reslrb:stack', 'reslrb:event'] there, ['ptracer'] here",
-        ),
-        (
-            {"config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"])},
-            "integrator.max_depth is 4 there, 5 here",
-        ),
-        ({"objective": "image"}, "objective is fixed there, image here"),
-        ({"spps": (4, 8)}, "spp is [] there, [4, 8] here"),
-    ],
-)
-def test_only_the_same_measurement_is_continued(tmp_path: Path, change: dict[str, Any], line: str) -> None:
-    session, _, _ = play(tmp_path, Stage(), plan(rounds=4))
-    kept = session.kept()
-    assert kept is not None
-    earlier = Earlier("convergence", Path("c.jsonl"), *kept)
-    with pytest.raises(ConfigError, match=re.escape(f"--json: c.jsonl belongs to another measurement: {line}")):
-        begin(plan(**({"rounds": 8} | change)), earlier)
-    begin(plan(rounds=8), earlier)
-    with pytest.raises(ConfigError, match="by another version"):
-        Earlier("convergence", Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
-    with pytest.raises(ConfigError, match="it belongs to `convergence`, this is `bench`"):
-        Earlier("bench", Path("c.jsonl"), *kept)
 
 
 @pytest.mark.parametrize("after", [0, 5, 12, 40, 120])
@@ -284,19 +235,3 @@ def test_the_budget_is_kept_and_used(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4, cold_s=2.0))
     play(tmp_path, stage, plan(rounds=None, budget_s=100.0))
     assert 88 < stage.now < 100
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("reslrb:stack(max_depth=3)", "all share one max_depth; use --set integrator.max_depth=3"),
-        ("reslrb:stack(adjoint=batched)", "has no effect if dL/dI is known; change --objective"),
-        ("reslrb:auto", "`auto` is for whole runs; use `stack`"),
-        ("path", "integrator.type: must be one of"),
-    ],
-)
-def test_wrong_lists_are_located(text: str, line: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        plan(text).check()
-    assert str(caught.value).startswith("--integrators")
-    assert line in str(caught.value)

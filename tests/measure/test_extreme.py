@@ -11,16 +11,9 @@ from reslrb_cli.measure.extreme import CASES, LISTED, run_suite
 from reslrb_cli.measure.extreme.suite import WAYS
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
-#: Cases of the default suite: no path that connects, values that are not finite, and a lamp of which no point can be
-#: drawn. Tests of roulette with its fault, and of a furnace, stand below.
-FEW = ("no_connection", "nan_loss", "black_lamp")
-
-
-@pytest.fixture(autouse=True)
-def _quiet(llvm: str) -> None:
-    import mitsuba as mi
-
-    mi.set_log_level(mi.LogLevel.Error)
+#: Cases of the default suite: no path that connects, and a lamp of which no point can be drawn. test_replay.py has
+#: values that are not finite. Tests of roulette with its fault, and of a furnace, stand below.
+FEW = ("no_connection", "black_lamp")
 
 
 def failures(records: Iterable[GradcheckRecord]) -> list[str]:
@@ -37,11 +30,8 @@ def test_names():
 
 @pytest.mark.parametrize("name", FEW)
 def test_case(name: str):
-    records = list(run_suite([name]))
-    moving = CASES[name].moves is not None
-    assert {record.estimator for record in records} == {"stack", "reservoir"} | (
-        set() if moving else {"gather", "event", *WAYS}
-    )
+    records = list(run_suite([name], estimators := ["stack", WAYS[0]]))
+    assert {record.estimator for record in records} == set(estimators)
     assert not failures(records)
 
 
@@ -63,9 +53,9 @@ def test_along_the_border_camera_paths_are_compared_with_a_complete_reference():
     """`ptracer` loses light along the film's border, and is therefore no reference for camera paths. The comparison
     would report the missing light.
     """
-    records = list(run_suite(["film_crop"], WAYS))
+    records = list(run_suite(["film_crop"], WAYS[:1]))
     assert {record.reference.value for record in records} == {"walk_ad", "prb", "path"}
-    assert {record.paths for record in records} == {"both", "camera"}
+    assert {record.paths for record in records} == {"both"}
     assert all(record.holds for record in records)
 
 
@@ -74,7 +64,7 @@ def test_moving_cases_use_only_light_paths():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [name for name in CASES if name not in FEW])
+@pytest.mark.parametrize("name", CASES)
 def test_every_case(name: str):
     assert not failures(run_suite([name]))
 

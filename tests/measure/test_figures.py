@@ -12,7 +12,7 @@ from make_figures import write_panels
 
 from paper import figure1, figure5
 from paper.figures import main
-from paper.gradients import OWN, Kind, fall, relative_noise, sample
+from paper.gradients import OWN, Kind, comparable, fall, relative_noise, sample
 from paper.page import FIGURES
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
@@ -115,12 +115,9 @@ def test_written_files(tmp_path: Path) -> None:
     assert "about 5.9 GiB at 1024 spp" in said
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.long
 def test_compared_methods_have_one_expectation(config: Config) -> None:
     """The comparison disables every part of our method that naive AD lacks."""
-    from paper.gradients import comparable
-
     y, x = np.mgrid[0:16, 0:16] / 16
     adjoint = np.repeat((np.sin(5 * x) * np.cos(4 * y) + 1.5)[:, :, None], 3, 2).astype(np.float32)
     options = comparable(config, OWN).integrator.options()
@@ -136,7 +133,6 @@ def test_compared_methods_have_one_expectation(config: Config) -> None:
     assert figures.verdict is Verdict.HOLDS, figures
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_process_ends_at_its_limit() -> None:
     """The process loads the scene, but its memory limit is too small for the paths that naive AD stores at this sample
     count.
@@ -221,7 +217,6 @@ def test_a_difference_at_equal_seeds_fails() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("llvm")
 def test_a_small_box() -> None:
     plan = figure5.Plan(spp=16, reference_spp=256, seeds=16)
     record, _ = figure5.measure(load(BOX, SMALL_ROOM), plan, print)
@@ -235,7 +230,6 @@ def test_invalid_comparisons_are_refused() -> None:
             figure5.measure(load(BOX, [wrong]), figure5.Plan(), print)
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("text", [None, "<scene version='3.0.0'></scene>"])
 def test_too_little_memory_is_one_line(text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if text is not None:

@@ -24,7 +24,6 @@ from reslrb_cli.records.measurement_files import Kept
 
 checks = pytest.importorskip("reslrb_cli.cluster.checks", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
-pytestmark = pytest.mark.usefixtures("llvm")
 
 #: Initial values that no file of an experiment contains: a start for each part of a motion.
 MOTION = (

@@ -1,17 +1,14 @@
-"""Statistics that decide whether two gradients agree, the differences they detect, and the use of a budget for them."""
+"""Statistics that decide whether two gradients agree, and the differences that they detect."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from agreement import blocks, compare
 
-from reslrb_cli.measure import sampling
 from reslrb_cli.measure.comparison import (
     Family,
     combined_z_rms,
@@ -27,10 +24,7 @@ from reslrb_cli.measure.comparison import (
     z_rms_limit,
     z_scores,
 )
-from reslrb_cli.measure.gradients import Direction
-from reslrb_cli.measure.sampling import FEWEST, LEAST_SEEDS, MOST_SEEDS, Name, Sampling
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
-from reslrb_cli.report.tables import cells, failure_line, gradcheck_columns
 
 # Statistics of the conformance tests: they hold for equal expectations, and detect a small bias.
 
@@ -271,98 +265,3 @@ def test_a_record_survives_a_round_trip() -> None:
     assert json.loads(record().to_json())["holds"] is False
     assert record_of(GradcheckRecord, json.loads(json.dumps(asdict(found)))) == found
     assert record_of(GradcheckRecord, {"case": "a", "colour": 3}) is None
-
-
-def test_the_table_and_the_line_of_a_failure():
-    table = gradcheck_columns([record()])
-    assert table.head().split() == ["parameter", "integrator", "reference", "seeds", "rel.", "L2", "z", "rms", "max",
-                                    "|z|", "cosine", "variance", "detectable", "verdict"]  # fmt: skip
-    told = table.line(cells(record())).split()
-    assert told == ["floor.data", "reslrb:stack", "ptracer", "16", "3.1e-02", "3.20", ">",
-                    "1.50", "9.1", ">", "5.2", "2.0%", "fails"]  # fmt: skip
-    assert failure_line(record()) == (
-        "a.yaml: floor.data: reslrb:stack against ptracer: z rms 3.2, limit 1.5; max |z| 9.1, limit 5.2; "
-        "the means differ by 3.12%"
-    )
-
-
-# How a gradcheck spends its budget. The samples only pretend, and the tests have their own clock.
-
-NAMES: list[Name] = [
-    ("image", "walk_ad"), ("image", "ptracer"), ("gradient", "reslrb:event"), ("gradient", "walk_ad"),
-    ("gradient", "ptracer"), ("differences", "a"), ("tangents", "a"), ("gradient", "reslrb:stack"),
-]  # fmt: skip
-
-
-class Pretended:
-    """Participants whose samples cost `sample_s` each. The first sample of each name costs `compile_s` more."""
-
-    compile_s, sample_s, load_s = 5.0, 0.1, 2.0
-
-    def __init__(self, settings: Any) -> None:
-        self.now, self.known, self.exact = settings.clock, set(), {}
-        self.stock = {"a": Reference.PTRACER}
-        self.case = SimpleNamespace(size=3)
-        self.listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
-        self.integrators = dict.fromkeys(label for _, label in NAMES)
-        self.directions = {"a": [Direction(np.ones(3), "both")]}
-        self.now[0] += self.load_s
-
-    def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
-        self.now[0] += self.sample_s + (0.0 if (kind, of) in self.known else self.compile_s)
-        self.known.add((kind, of))
-        return np.zeros(3)
-
-    def choose_steps(self, key: str) -> None:
-        self.sample("choose", key, 0)
-
-
-@pytest.fixture
-def _pretend(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sampling, "Participants", Pretended)
-
-
-def spent(budget_s: float, seeds: int | None = None) -> tuple[dict[Name, int], float, list[str]]:
-    """Return the sample counts of all names with enough samples, the elapsed time, and the messages."""
-    clock, said = [0.0], []
-    listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
-    settings: Any = SimpleNamespace(budget_s=budget_s, seeds=seeds, integrators=listed, clock=clock, spent_s=0.0)
-    made = Sampling(settings, now=lambda: clock[0])
-    made.expect(NAMES)
-    counts = {name: len(made.of(name)) for name in NAMES if made.take(name, lambda: False, said.append)}
-    return counts, clock[0], said
-
-
-@pytest.mark.usefixtures("_pretend")
-def test_a_sufficient_budget_is_kept_and_used() -> None:
-    counts, seconds, said = spent(90.0)
-    assert list(counts) == NAMES
-    assert 70.0 < seconds <= 90.0
-    assert min(counts.values()) >= LEAST_SEEDS
-    assert max(counts.values()) > LEAST_SEEDS
-    assert said[0].startswith("image walk_ad: seeds ")
-    assert said[0].endswith("of which the first 5.1 s")
-
-
-@pytest.mark.usefixtures("_pretend")
-def test_an_unlimited_budget_stops_when_more_is_useless() -> None:
-    counts, _, _ = spent(1e6)
-    cheap = [name for name in NAMES if name[0] == "image" or (name[0] == "gradient" and name[1] != "walk_ad")]
-    assert {name: MOST_SEEDS if name in cheap else LEAST_SEEDS for name in NAMES} == counts
-
-
-@pytest.mark.usefixtures("_pretend")
-@pytest.mark.parametrize("budget_s", [0.0, 1.0, 8.0, 20.0, 40.0])
-def test_a_budget_exceeded_by_compilation_runs_over_by_one_sample(budget_s: float) -> None:
-    counts, seconds, _ = spent(budget_s)
-    assert seconds <= max(budget_s, 2.0) + 5.2 + 0.1
-    assert len(counts) < len(NAMES)
-    assert all(count >= FEWEST for count in counts.values())
-    assert bool(counts) == (budget_s > 2.0)
-
-
-@pytest.mark.usefixtures("_pretend")
-def test_a_number_of_seeds_is_taken_at_any_cost() -> None:
-    counts, seconds, _ = spent(0.0, seeds=5)
-    assert counts == dict.fromkeys(NAMES, 5)
-    assert seconds > 40.0

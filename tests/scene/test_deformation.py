@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene.deformation import _corners, _Lookup
 from reslrb_cli.scene.parameters import select_parameters, set_values
 
 WORDS = ["translation", "rotation", "scale"]
@@ -36,8 +39,6 @@ def scene(make_scene):
     """The lit floor with more objects. Among these are a box, a ball, a spot light and a mesh without texture
     coordinates.
     """
-    import mitsuba as mi
-
     T = mi.ScalarTransform4f
     place = T().translate([1, 0.5, 2]).rotate([0, 1, 0], 20).scale([0.3, 0.2, 0.4])
     bare = mi.Mesh("bare", 3, 1)
@@ -92,9 +93,6 @@ def test_a_mesh_is_scaled_rotated_and_translated_in_this_order(scene):
 
 def test_axes_move_alone(scene):
     """Only the free axes move, each by its own number. The derivative of a fixed axis reaches no parameter."""
-    import drjit as dr
-    import mitsuba as mi
-
     before = positions(select(scene, motion("box")))
     selection = select(scene, motion("box", "x", "y", initial={"x": 0.25, "y": -0.5}))
     assert selection.keys == ["box.x", "box.y"]
@@ -149,10 +147,6 @@ def test_a_heightmap_displaces_along_the_initial_normals(scene):
 
 
 def test_a_heightmap_is_bilinear_and_clamped_outside(scene):
-    import mitsuba as mi
-
-    from reslrb_cli.scene.deformation import _corners
-
     texels = np.array([[0, 1, 3], [10, 20, 40]], np.float32)
     u, v = [0.0, 1 / 6, 0.5, 0.4, 5 / 6, 1.0, 0.5], [0.25, 0.25, 0.25, 0.5, 0.75, 0.9, -2.0]
     indices, weights = _corners(mi.Point2f(u, v), 3, 2)
@@ -190,9 +184,6 @@ def test_interpolated_normals_follow(scene):
 
 def test_gradients_reach_the_moving_parameters(scene):
     """The gradients equal central differences of weighted vertex positions and of the ball's weighted transform."""
-    import drjit as dr
-    import mitsuba as mi
-
     selection = select(scene, heightmap("box", (3, 3)), motion(["box", "ball"], pivot=[1, 0, 0], initial=POSE))
     random = np.random.default_rng(1)
     leaves = {}
@@ -227,11 +218,6 @@ def test_gradients_reach_the_moving_parameters(scene):
 
 def test_a_non_finite_gradient_is_not_lost(llvm):
     """Atomic sums would drop the non-finite gradient of a vertex that shares its texels with no other vertex."""
-    import drjit as dr
-    import mitsuba as mi
-
-    from reslrb_cli.scene.deformation import _Lookup
-
     texels = mi.Float(np.zeros(64, np.float32))
     dr.enable_grad(texels)
     first = mi.UInt32(np.arange(0, 64, 2, dtype=np.uint32))
@@ -257,8 +243,6 @@ def test_tied_keys_share_one_value(scene):
 
 
 def test_true_values_move_the_scene(scene, tmp_path):
-    import mitsuba as mi
-
     before = positions(select(scene, motion("box", "translation")))
     heights = np.linspace(-0.1, 0.2, 12, dtype=np.float32).reshape(2, 6, 1)
     mi.Bitmap(np.tile(heights, 3)).write(str(tmp_path / "h.exr"))

@@ -14,6 +14,7 @@ from agreement import compare
 
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene import export as replacing
 from reslrb_cli.scene import load
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.load import load_scene
@@ -257,8 +258,6 @@ def test_inexpressible_values_are_refused_without_output(key: str, reason: str, 
 def test_values_that_mitsuba_reads_differently_are_refused_without_output(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from reslrb_cli.scene import export as replacing
-
     write = replacing.write_file
     monkeypatch.setattr(replacing, "write_file", lambda path, image, linear: write(path, image[::-1], linear))
     _, description, selection = changed(file, ["texture"])

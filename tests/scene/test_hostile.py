@@ -14,6 +14,8 @@ import pytest
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.load import load_scene
 
+pytestmark = pytest.mark.usefixtures("llvm")
+
 HEAD = '<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/><shape type="sphere"/>\n'
 TEXTURE = (
     '<bsdf type="diffuse">\n<texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'
@@ -28,7 +30,6 @@ def write(folder: Path, text: str, name: str = "scene.xml") -> Path:
     return folder / name
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("text", "line", "said"),
     [
@@ -71,7 +72,6 @@ OPENED = {
 }  # fmt: skip
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("kind", OPENED)
 def test_no_pipe_is_opened(kind: str, tmp_path: Path) -> None:
     (tmp_path / "data" / "ior").mkdir(parents=True)
@@ -88,7 +88,6 @@ def test_no_pipe_is_opened(kind: str, tmp_path: Path) -> None:
         freeing.kill()
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("objects", "said"),
     [
@@ -130,7 +129,6 @@ end_header
 """
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("vertices", "last", "said"),
     [
@@ -152,7 +150,6 @@ def test_a_mesh_with_faces_of_missing_vertices_is_refused(tmp_path, vertices, la
     assert said in str(error.value)
 
 
-@pytest.mark.usefixtures("llvm")
 def test_a_damaged_texture_is_refused_with_a_location(tmp_path):
     lines = bytes((2, 2, 0, 8)) + bytes((136, 1)) * 4
     image = b"#?RGBE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n" + lines + b"\xff" * 12
@@ -167,7 +164,6 @@ def test_a_damaged_texture_is_refused_with_a_location(tmp_path):
     assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: claims 8x0 pixels; save it again"
 
 
-@pytest.mark.usefixtures("llvm")
 def test_irregular_files(tmp_path):
     os.mkfifo(tmp_path / "pipe.xml")
     for file in (tmp_path / "pipe.xml", Path("/dev/zero")):
@@ -175,7 +171,6 @@ def test_irregular_files(tmp_path):
             load_scene(file)
 
 
-@pytest.mark.usefixtures("llvm")
 def test_an_impossible_file_name(tmp_path):
     file = write(tmp_path, HEAD + f'<shape type="ply"><string name="filename" value="{"a" * 5000}"/></shape></scene>')
     with pytest.raises(ConfigError) as error:
@@ -183,7 +178,6 @@ def test_an_impossible_file_name(tmp_path):
     assert str(error.value).startswith(f"{file}:2: ")
 
 
-@pytest.mark.usefixtures("llvm")
 def test_elements_nested_too_deeply_are_one_line(tmp_path):
     file = write(tmp_path, HEAD + "<shape type='sphere'>\n" * 5000 + "</shape>" * 5000 + "</scene>")
     with pytest.raises(ConfigError, match=f"{file}: elements are nested too deeply"):

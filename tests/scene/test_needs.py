@@ -32,12 +32,14 @@ from reslrb_cli.scene.visibility import (
     visible_texels,
 )
 
+pytestmark = pytest.mark.usefixtures("llvm")
+
 # The needs of a scene, and scenes that light tracing cannot render.
 
 GLASS = {"type": "dielectric"}
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def _without_scenes_of_before() -> Iterator[None]:
     """Collect garbage after the test. Mitsuba asks all existing emitters, also a `timed_sunsky` of a scene that an
     error still holds.
@@ -46,7 +48,6 @@ def _without_scenes_of_before() -> Iterator[None]:
     gc.collect()
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_plain_scene(make_scene):
     scene = make_scene()
     needs = scene_needs(scene, scene.sensors()[0])
@@ -57,7 +58,6 @@ def test_plain_scene(make_scene):
     check_paths(scene, scene.sensors()[0], "light")
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_everything(make_scene):
     scene = make_scene(
         camera={"type": "thinlens", "aperture_radius": 0.1, "shutter_close": 1.0},
@@ -73,11 +73,8 @@ def test_everything(make_scene):
     assert needs.moving_shutter
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize("flat", [True, False])
 def test_shading_normals(make_scene, tmp_path, flat):
-    import mitsuba as mi
-
     mesh = mi.Mesh("m", 3, 1, has_vertex_normals=True)
     params = mi.traverse(mesh)
     params["vertex_positions"] = [0, 0, 0, 1, 0, 0, 0, 1, 0]
@@ -88,10 +85,7 @@ def test_shading_normals(make_scene, tmp_path, flat):
     assert scene_needs(scene, scene.sensors()[0]).has_shading_normals is not flat
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_nested_bsdfs_and_groups_are_seen(make_scene, tmp_path):
-    import mitsuba as mi
-
     mi.load_dict({"type": "cube"}).write_ply(str(tmp_path / "cube.ply"))
     group = {"type": "shapegroup", "cube": {"type": "ply", "filename": str(tmp_path / "cube.ply"), "bsdf": GLASS}}
     scene = make_scene(group=group, copy={"type": "instance", "group": {"type": "ref", "id": "group"}})
@@ -101,10 +95,7 @@ def test_nested_bsdfs_and_groups_are_seen(make_scene, tmp_path):
     assert summarise(scene).shapes == {"Rectangle": 1, "PLYMesh": 1}
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_view(make_scene):
-    import mitsuba as mi
-
     far = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 9], up=[0, 1, 0])
     scene = make_scene(sky={"type": "constant"})
     view = look(scene, scene.sensors()[0])
@@ -117,13 +108,11 @@ def test_view(make_scene):
     check_paths(scene, scene.sensors()[0], "light")  # correctly black
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_mask_in_front_is_looked_through(make_scene):
     scene = make_scene(veil={"type": "sphere", "radius": 2, "bsdf": {"type": "null"}})
     assert look(scene, scene.sensors()[0]) == look(make_scene(), make_scene().sensors()[0])
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(
     ("changes", "hide_emitters", "reason"),
     [
@@ -149,7 +138,6 @@ def test_refused(make_scene, changes, hide_emitters, reason):
         check_paths(scene, scene.sensors()[0], "light", hide_emitters)
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize("plugin", ["directional", "projector"])
 def test_scaled_emitters_are_refused_for_both_kinds_of_paths(make_scene, plugin):
     def scene(scale):
@@ -164,13 +152,11 @@ def test_scaled_emitters_are_refused_for_both_kinds_of_paths(make_scene, plugin)
     check_paths(plain, plain.sensors()[0], "both")
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_specular_scene_with_a_visible_light(make_scene):
     scene = make_scene(plane={"type": "rectangle", "bsdf": GLASS}, sky={"type": "constant"})
     check_paths(scene, scene.sensors()[0], "light")
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_summary(make_scene):
     summary = summarise(make_scene())
     assert summary.emitters == {"PointLight": 1}
@@ -186,17 +172,13 @@ def test_summary(make_scene):
     assert by_key["plane.to_world"].obstacle.startswith("is recovered as a motion")
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_summary_of_an_unrenderable_scene(make_scene):
     sensor = summarise(make_scene(camera={"type": "orthographic"})).sensors[0]
     assert sensor.view is None
     assert "OrthographicCamera" in sensor.obstacle
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_fractions_refer_to_the_crop_window(make_scene):
-    import mitsuba as mi
-
     film = {"type": "hdrfilm", "width": 16, "height": 12, "crop_offset_x": 7, "crop_offset_y": 5, "crop_width": 2,
             "crop_height": 2}  # fmt: skip
     to_world = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0])
@@ -205,7 +187,6 @@ def test_fractions_refer_to_the_crop_window(make_scene):
     assert np.isclose(look(make_scene(), make_scene().sensors()[0]).smooth, 0.45, atol=0.15)
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_light_that_camera_paths_cannot_find_is_refused_for_prb(make_scene):
     scene = make_scene()
     check_paths(scene, scene.sensors()[0], "prb")
@@ -220,7 +201,6 @@ WARM = {"type": "roughconductor", "alpha": {"type": "blackbody", "temperature": 
 REF = {"type": "ref", "id": "group"}
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -244,14 +224,12 @@ def test_scenes_unknown_to_every_integrator_are_refused_alike(make_scene, change
     assert "integrator.type" not in said[0]
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_an_unreachable_medium_is_ignored(make_scene):
     scene = make_scene(group={"type": "shapegroup", "fog": FOG})
     check_paths(scene, scene.sensors()[0], "light")
     check_paths(scene, scene.sensors()[0], "prb")
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(
     ("changes", "way"),
     [
@@ -273,7 +251,6 @@ def test_an_existing_remedy_is_named(make_scene, changes, way):
         check_paths(scene, scene.sensors()[0], "light")
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize("paths", ["camera", "both"])
 def test_a_blocked_remedy_is_not_named(make_scene, paths):
     scene = make_scene(camera={"type": "orthographic"}, lamp=BEAM)
@@ -282,11 +259,8 @@ def test_a_blocked_remedy_is_not_named(make_scene, paths):
     assert "use integrator" not in str(error.value)
 
 
-@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(("bsdf", "same"), [("hair", False), ("pplastic", True), ("principled", True)])
 def test_asymmetric_materials_are_refused_for_light_paths(make_scene, bsdf, same):
-    import mitsuba as mi
-
     scene = make_scene(plane={"type": "rectangle", "bsdf": {"type": bsdf}})
     material = next(shape for shape in scene.shapes() if shape.id() == "plane").bsdf()
     light, view = (mi.Vector3f(mi.ScalarVector3f(way)) for way in ([0.36, 0.48, 0.8], [-0.64, 0.48, 0.6]))
@@ -320,7 +294,6 @@ def inside(albedo: float) -> mi.Scene:
     )
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(("albedo", "segments"), [(0.5, 8), (0.7, 16), (0.85, 32), (0.97, 64)])
 def test_missing_light_is_that_of_longer_paths(albedo: float, segments: int) -> None:
     found = find_depth(inside(albedo), 0)
@@ -346,8 +319,6 @@ def test_an_open_floor_in_full(make_scene):
 
 
 def test_texels_are_visible_through_as_many_surfaces_as_pixels(make_scene):
-    import mitsuba as mi
-
     place = mi.ScalarTransform4f()
     for count, is_seen in ((12, True), (CROSSINGS, False)):
         veil = {"type": "rectangle", "bsdf": {"type": "null"}}
@@ -357,8 +328,6 @@ def test_texels_are_visible_through_as_many_surfaces_as_pixels(make_scene):
 
 
 def test_proposals_see_through_eight_panes(make_scene):
-    import mitsuba as mi
-
     pane = {"type": "rectangle", "bsdf": {"type": "thindielectric"}}
     places = [mi.ScalarTransform4f().translate([0, 0, 0.2 + 0.1 * number]).scale(9) for number in range(8)]
     panes = {f"pane_{number}": pane | {"to_world": place} for number, place in enumerate(places)}
@@ -367,8 +336,6 @@ def test_proposals_see_through_eight_panes(make_scene):
 
 
 def test_crop_window_and_orientation(make_scene):
-    import mitsuba as mi
-
     # The lower left quarter of the film. The film's rows run downwards, and the texture's rows run upwards, with v.
     film = {"type": "hdrfilm", "width": 16, "height": 16, "crop_offset_x": 0, "crop_offset_y": 8, "crop_width": 8,
             "crop_height": 8}  # fmt: skip
@@ -410,8 +377,6 @@ def test_excluded_pixels_show_nothing(make_scene):
 
 
 def test_hidden_texels_and_occluders(make_scene):
-    import mitsuba as mi
-
     half = mi.ScalarTransform4f().translate([0.5, 0, 0.01]).scale([0.5, 1, 1])
     expected = np.ones((4, 6), dtype=bool)
     expected[:, 3:] = False
@@ -423,8 +388,6 @@ def test_hidden_texels_and_occluders(make_scene):
 
 
 def test_nested_shared_and_repeated(make_scene):
-    import mitsuba as mi
-
     values = mi.TensorXf(np.full((4, 6, 3), 0.5, np.float32))
     scale = mi.ScalarTransform4f().scale([3, 2, 1])
     texture = {"type": "bitmap", "raw": True, "data": values, "to_uv": scale}
@@ -433,8 +396,6 @@ def test_nested_shared_and_repeated(make_scene):
 
 
 def test_emission_does_not_affect_visibility(make_scene):
-    import mitsuba as mi
-
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
     scene = make_scene(sky=sky)
     assert visible_texels(scene, scene.sensors(), "sky.data").all()
@@ -484,7 +445,6 @@ def pixels(margin: int = 0) -> np.ndarray:
     return mask
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("bsdf", "kind"),
     [
@@ -507,7 +467,6 @@ def test_counted_surfaces(bsdf: dict, kind: str | None) -> None:
         assert np.array_equal(getattr(found, name), expected), name
 
 
-@pytest.mark.usefixtures("llvm")
 def test_glass_is_visible_through_transparent_surfaces() -> None:
     veil = {"type": "mask", "opacity": 0.5, "bsdf": DIFFUSE}
     found = seen(MIRROR, in_front=veil)
@@ -515,13 +474,11 @@ def test_glass_is_visible_through_transparent_surfaces() -> None:
     assert not seen(MIRROR, in_front=DIFFUSE).alone.any()
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(("filter", "margin"), [("tent", 1), ("gaussian", 2)])
 def test_the_filter_spreads_visibility(filter: str, margin: int) -> None:
     assert np.array_equal(seen(MIRROR, filter).alone, pixels(margin))
 
 
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("size", [16, 300])
 @pytest.mark.parametrize("sensor", [{}, {"type": "thinlens", "aperture_radius": 2.0, "focus_distance": 50.0}])
 def test_pixels_that_see_lamps(size: int, sensor: dict) -> None:

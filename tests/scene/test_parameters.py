@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -19,15 +20,11 @@ def select(scene, *specs: dict):
 
 
 def write(path, array):
-    import mitsuba as mi
-
     mi.Bitmap(np.ascontiguousarray(array)).write(str(path))
     return ImageFile(file=path)
 
 
 def envmap(height=4, width=8):
-    import mitsuba as mi
-
     pixels = np.arange(height * width * 3, dtype=np.float32).reshape(height, width, 3)
     return {"type": "envmap", "bitmap": mi.Bitmap(pixels)}
 
@@ -48,8 +45,6 @@ def test_numbers_and_colours(make_scene):
 
 
 def test_values_reach_the_scene(make_scene):
-    import mitsuba as mi
-
     dark, bright = make_scene(), make_scene()
     select(dark, {"key": TEXTURE, "initial": 0.0})
     select(bright, {"key": TEXTURE, "initial": 0.8})
@@ -60,8 +55,6 @@ def test_values_reach_the_scene(make_scene):
 def test_resolution_resamples(make_scene):
     ramp = np.tile(np.linspace(0, 1, 6, dtype=np.float32)[None, :, None], (4, 1, 3))
     scene = make_scene()
-    import mitsuba as mi
-
     params = mi.traverse(scene)
     params[TEXTURE] = mi.TensorXf(ramp)
     params.update()
@@ -95,8 +88,6 @@ def test_environment_map_has_no_halo(make_scene):
 
 
 def test_mesh_attributes(make_scene):
-    import mitsuba as mi
-
     mesh = mi.load_dict({"type": "cube", "bsdf": {"type": "diffuse"}})
     mesh.add_attribute("vertex_color", 3, np.zeros(3 * mesh.vertex_count(), np.float32))
     scene = make_scene(box=mesh)
@@ -176,8 +167,6 @@ def test_refused_files(make_scene, tmp_path, array, what):
 
 
 def test_colour_for_a_grey_texture(make_scene, tmp_path):
-    import mitsuba as mi
-
     grey = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((4, 6, 1), 0.5, np.float32))}
     scene = make_scene(floor={"type": "diffuse", "reflectance": grey})
     colour = np.tile(np.float32([0.1, 0.2, 0.3]), (4, 6, 1))
@@ -188,8 +177,6 @@ def test_colour_for_a_grey_texture(make_scene, tmp_path):
 
 
 def test_nan_in_the_scene_itself(make_scene):
-    import mitsuba as mi
-
     values = np.full((4, 6, 3), 0.5, np.float32)
     values[2, 1, 0] = np.nan
     texture = {"type": "bitmap", "raw": True, "data": mi.TensorXf(values)}
@@ -200,8 +187,6 @@ def test_nan_in_the_scene_itself(make_scene):
 
 @pytest.mark.parametrize(("type_", "bits"), [(np.uint8, 8), (np.float16, 16)])
 def test_textures_with_few_bits(make_scene, type_, bits):
-    import mitsuba as mi
-
     texture = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.ones((4, 6, 3), type_))}
     scene = make_scene(floor={"type": "diffuse", "reflectance": texture})
     with pytest.raises(ConfigError, match=f'stored with {bits} bits.*name="format" value="variant"'):

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mitsuba as mi
 import pytest
 
 from reslrb_cli.backend import installation
@@ -188,8 +189,6 @@ def test_modules_of_the_working_folder_are_not_imported(trap):
 
 
 def test_registered_plugins_are_known():
-    import mitsuba as mi
-
     assert installation.is_known("prb")
     assert not installation.is_known("mine")
     mi.register_texture("mine", lambda props: mi.Texture(props))

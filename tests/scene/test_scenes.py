@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from turns import a_few
@@ -33,8 +34,6 @@ def small(name: str):
 
 
 def test_images_match_the_script():
-    import mitsuba as mi
-
     for name, expected in make_scenes().images().items():
         found = np.array(mi.Bitmap(str(ROOT / "scenes" / name)))
         assert found.shape == expected.shape, name
@@ -42,15 +41,11 @@ def test_images_match_the_script():
 
 
 def test_the_stiff_wall_matches_the_script():
-    import mitsuba as mi
-
     found = np.array(mi.Bitmap(str(ROOT / "scenes" / "stiff" / "wall.png")))
     assert np.abs(np.squeeze(found).astype(int) - make_scenes().mottled_wall(192, 384)).max() <= 1
 
 
 def test_meshes_match_the_script():
-    import mitsuba as mi
-
     for name, (positions, normals, *texcoords, faces) in make_scenes().meshes().items():
         mesh = mi.load_dict({"type": "ply", "filename": str(ROOT / "scenes" / name)})
         assert np.allclose(np.array(mesh.vertex_positions_buffer()).reshape(-1, 3), positions, atol=2e-6), name
@@ -65,8 +60,6 @@ def test_meshes_match_the_script():
 @pytest.mark.parametrize("name", a_few(["lens_pose", "caustic_heightmap"], ["caustic_heightmap"]))
 def test_moving_light_stays_off_the_border(name):
     """At the border, derivatives of the parameters that move the light would be cut off."""
-    import mitsuba as mi
-
     config = load(ROOT / "configs" / f"{name}.yaml", [])
     render = config.target.render
     scene = load_scene(config.scene.file, {"resx": 32, "resy": 32, "spp": 64})
@@ -88,8 +81,6 @@ def test_floor_has_detail_at_the_scale_of_its_texels():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_mitsuba_alone_loads_and_renders_it(name):
-    import mitsuba as mi
-
     scene = mi.load_file(str(ROOT / "scenes" / name / "scene.xml"), resx=32, resy=32, spp=4)
     image = np.array(mi.render(scene))
     assert image.shape == (32, 32, 3)
@@ -113,8 +104,6 @@ def test_cornell_floor_is_visible():
 
 
 def test_grey_room_is_lit_only_by_a_rotated_sky():
-    import mitsuba as mi
-
     scene = small("grey_room")
     needs = scene_needs(scene, scene.sensors()[0])
     assert needs.emitters == ("EnvironmentMapEmitter",)
@@ -135,8 +124,6 @@ def test_mixed_room_has_light_that_each_side_misses():
     """Light paths do not see the mirror. In the caustic on the wall, connections to the lamp find less than a tenth of
     the light that light paths find.
     """
-    import mitsuba as mi
-
     scene = small("mixed_room")
     image = {name: np.array(mi.render(scene, spp=256, integrator=mi.load_dict(options))).mean(2) for name, options in {
         "light": {"type": "ptracer", "max_depth": 8},
@@ -148,12 +135,11 @@ def test_mixed_room_has_light_that_each_side_misses():
     assert image["direct"][caustic].mean() < 0.1 * image["light"][caustic].mean()
 
 
+@pytest.mark.long
 def test_the_target_of_the_mixed_room_is_its_image():
     """Blocks of 16 pixels are compared with an image of light and camera paths. That integrator shares no code with the
     one that made the target.
     """
-    import mitsuba as mi
-
     scene = load_scene(ROOT / "scenes" / "mixed_room" / "scene.xml", {"resx": 128, "resy": 128})
     both = make_integrator("reslrb", paths="both", estimator="stack", max_depth=8)
     images = np.array([np.array(render_image(both, scene, 0, seed, 16)) for seed in range(8)])
@@ -165,8 +151,6 @@ def test_the_target_of_the_mixed_room_is_its_image():
 
 
 def test_furnace_is_exact():
-    import mitsuba as mi
-
     rho, emitted, depth = np.array([0.5, 0.7, 0.3]), np.array([1.0, 0.6, 1.4]), 6
     image = np.array(mi.render(small("furnace"), spp=64, integrator=mi.load_dict({
         "type": "path", "max_depth": depth, "rr_depth": 100})))  # fmt: skip
