@@ -35,6 +35,12 @@ def done(*arguments: object) -> Result:
     return result
 
 
+def outcome(*arguments: object) -> tuple[int, str, str]:
+    """Run `reslrb ARGUMENTS` and return the exit code, standard output and standard error."""
+    result = reslrb(*arguments)
+    return result.exit_code, result.stdout, result.stderr
+
+
 def settings(*given: str) -> list[str]:
     """Return `--set SETTING` for each of the settings."""
     return [word for setting in given for word in ("--set", setting)]
