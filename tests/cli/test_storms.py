@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli import tiny
-from cli.tiny import COMPLETE, ROOT, faults, files, start, write_experiment
+from cli.tiny import COMPLETE, faults, files, start, write_experiment
 from compilation import search_path
 from turns import a_few
 
@@ -29,7 +29,6 @@ from reslrb_cli.records import measurement_files
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.measurement_files import LineFile
 from reslrb_cli.records.measurements import SummaryRecord
-from reslrb_cli.runs import recorder
 
 # Runs that are hit at random moments, and runs on disks that are too small. The remaining files are complete and true.
 # The default suite has one run of each kind. `-m long` has enough runs to hit every part of a run.
@@ -230,24 +229,6 @@ def test_both_files_are_current_and_old_ones_are_removed(tmp_path: Path, monkeyp
     assert {path.name for path in tmp_path.iterdir()} == {"c.jsonl", "c.samples.npz"}
 
 
-def test_files_are_written_every_few_seconds_at_low_cost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    now, written = [100.0], []
-    monkeypatch.setattr(recorder.time, "monotonic", lambda: now[0])
-    measured = Measurement(tmp_path / "c.jsonl")
-
-    def slowly(path: Path, head: object, arrays: object) -> None:
-        written.append(now[0])
-        now[0] += 1.0
-
-    monkeypatch.setattr("reslrb_cli.cli.options.write_samples", slowly)
-    measured.rows = np.ones(1)
-    for _ in range(100):
-        measured.keeper.refresh()
-        now[0] += 1.0
-    assert len(written) in (4, 5)
-    assert np.diff(written).min() >= 20
-
-
 def test_a_failed_intermediate_write_is_reported_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "c.jsonl"
     measured = Measurement(file)
@@ -286,27 +267,11 @@ def test_a_pipe_gets_each_line_once_at_once(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
 
 
-def test_the_target_of_a_link_is_written(tmp_path: Path) -> None:
-    (tmp_path / "link").symlink_to(tmp_path / "c.jsonl")
-    LineFile(tmp_path / "link").write(lines("here", "a"))
-    assert (tmp_path / "link").is_symlink()
-    assert read(tmp_path / "c.jsonl") == ["a"]
-
-
 # Measurements whose process is killed. Their files hold all results so far, and a later measurement continues from
 # them.
 
-BENCH = ["bench", "tiny.yaml", "--integrators", "reslrb:stack", "--max-depth", "2"]
-CONVERGENCE = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack"]
-
-
-def start_measuring(folder: Path, *args: str) -> subprocess.Popen[str]:
-    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
-    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
-    return subprocess.Popen(
-        [sys.executable, "-c", script, *args],
-        cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+BENCH = ["--integrators", "reslrb:stack", "--max-depth", "2"]
+CONVERGENCE = ["--integrators", "reslrb:stack"]
 
 
 def repeats(file: Path) -> set[int]:
@@ -318,19 +283,19 @@ def repeats(file: Path) -> set[int]:
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
 @pytest.mark.parametrize(
-    ("command", "steps"),
-    [(BENCH, 1), pytest.param(CONVERGENCE, 2, marks=pytest.mark.long)],
+    ("command", "words", "steps"),
+    [("bench", BENCH, 1), pytest.param("convergence", CONVERGENCE, 2, marks=pytest.mark.long)],
     ids=["bench", "convergence"],
 )
 def test_a_killed_measurement_continues(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str], steps: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, words: list[str], steps: int
 ) -> None:
     """A measurement of 1000000 rounds is killed once its first rounds are on the disk. The same command with 4 rounds
     continues to exactly 4 rounds.
     """
     write_experiment(tmp_path)
     file, kept = tmp_path / "c.jsonl", tmp_path / "c.samples.npz"
-    process = start_measuring(tmp_path, *command, "--rounds", "1000000", "--json", file.name)
+    process = start(tmp_path, *words, "--rounds", "1000000", "--json", file.name, command=command)
     end = time.monotonic() + 60
     while not (file.exists() and kept.exists()) and time.monotonic() < end:
         time.sleep(0.02)
@@ -342,6 +307,6 @@ def test_a_killed_measurement_continues(
     assert all(json.loads(line) for line in text.splitlines())
     # The next write would come seconds later, so the files hold one round.
     monkeypatch.chdir(tmp_path)
-    tiny.done(*command, "--rounds", "4", "--json", file.name)
+    tiny.done(command, "tiny.yaml", *words, "--rounds", "4", "--json", file.name)
     assert repeats(file) == {4 * steps}
     assert not list(tmp_path.glob(".c.*"))

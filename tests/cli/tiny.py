@@ -136,14 +136,14 @@ def write_experiment(folder: Path, text: str = SCENE) -> None:
     (folder / "tiny.yaml").write_text(CONFIG)
 
 
-def start(folder: Path, *args: str, **options: Any) -> subprocess.Popen[str]:
-    """Start `reslrb optimize tiny.yaml` in its own process, with `folder` as its working directory."""
+def start(folder: Path, *args: str, command: str = "optimize", **options: Any) -> subprocess.Popen[str]:
+    """Start `reslrb COMMAND tiny.yaml` in its own process, with `folder` as its working directory."""
     # Start the program like its entry point, so that its name is `reslrb` from the first line on.
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
-    command = [sys.executable, "-c", script, "optimize", "tiny.yaml", *args]
+    words = [sys.executable, "-c", script, command, "tiny.yaml", *args]
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
-    return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
+    return subprocess.Popen(words, cwd=folder, env=environment, **pipes)
 
 
 def files(folder: Path) -> set[str]:

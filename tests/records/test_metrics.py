@@ -65,11 +65,6 @@ def test_a_torn_last_line_is_repaired_before_the_next_one(tmp_path):
     assert [record["iteration"] for record in read_metrics(tmp_path)] == [0, 1]
 
 
-def test_a_missing_file_has_no_records(tmp_path):
-    with MetricsWriter(tmp_path):
-        assert list(tmp_path.iterdir()) == []  # no reader ever sees an empty file
-
-
 def test_an_incomplete_line_leaves_complete_ones(tmp_path, file_size_limit):
     line = len(make_record().to_json()) + 1
     with MetricsWriter(tmp_path) as writer:
@@ -147,11 +142,10 @@ def test_records_survive_a_round_trip(tmp_path: Path) -> None:
     assert (tmp_path / "metrics.jsonl").read_text().splitlines() == list(map(text, records[:3]))
 
 
-@pytest.mark.parametrize("kept", [0, 2])
-def test_the_last_line_is_restored(tmp_path: Path, kept: int) -> None:
-    records = written(tmp_path, kept)
-    last = replace(RECORD, iteration=kept)
-    found, size = read_records(tmp_path, kept + 1, last)
+def test_the_last_line_is_restored(tmp_path: Path) -> None:
+    records = written(tmp_path, 2)
+    last = replace(RECORD, iteration=2)
+    found, size = read_records(tmp_path, 3, last)
     cut_back(tmp_path, found, size)
     assert (tmp_path / "metrics.jsonl").read_text() == "".join(f"{text(each)}\n" for each in (*records, last))
 
@@ -164,12 +158,8 @@ def test_a_run_before_its_first_iteration_has_no_lines(tmp_path: Path) -> None:
 
 BAD = {
     "another iteration": '{"iteration": 5}',
-    "no record": "[1]",
-    "half": '{"iteration": 0, "lo',
     "a nest": "[" * 100_000,
     "text": text(RECORD).replace('"spp": 4', '"spp": "4"'),
-    "another name": text(RECORD).replace('"spp"', '"spq"'),
-    "true": text(RECORD).replace('"iteration": 0', '"iteration": true'),
     "a list of errors": text(RECORD).replace('{"a": 0.1}', "[0.1]"),
     "infinity": text(RECORD).replace("1.5", "1e999"),
 }
@@ -205,19 +195,9 @@ def test_the_file_names_the_command_and_versions(monkeypatch: pytest.MonkeyPatch
     assert entry["written"].endswith("+00:00")
 
 
-def test_written_lines_are_read_again() -> None:
+def test_other_lines_are_skipped_and_members_of_other_types_are_empty() -> None:
+    assert [read_origin(entry) for entry in ({}, {"kind": "point"}, {"kind": ["origin"]})] == [None] * 3
+    damage = {"command": "rm -r", "versions": [1], "device": 3, "platform": None, "written": {"a": 1}, "variant": []}
+    assert read_origin({"kind": "origin", **damage}) == EMPTY
     origin = Origin("a machine", "llvm_ad_rgb", ["reslrb", "bench"])
     assert read_origin(json.loads(origin.to_json())) == origin
-
-
-@pytest.mark.parametrize("entry", [{}, {"kind": "point"}, {"kind": ["origin"]}, {"versions": {}}])
-def test_other_lines_are_skipped(entry: dict) -> None:
-    assert read_origin(entry) is None
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [{}, {"command": "rm -r", "versions": [1], "device": 3, "platform": None}, {"written": {"a": 1}, "variant": []}],
-)
-def test_members_of_other_types_are_empty(damage: dict) -> None:
-    assert read_origin({"kind": "origin", **damage}) == EMPTY
