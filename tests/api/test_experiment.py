@@ -9,6 +9,8 @@ import os
 import pickle
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -356,6 +358,78 @@ def test_an_export_equals_that_of_the_command(folder: Path) -> None:
 
 
 # --- the package's face -----------------------------------------------------------------------------------------------
+
+
+#: A user's script. mypy checks the script against the installed packages.
+TYPED = """
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import reslrb_cli as rl
+
+config: rl.Config = rl.load({"scene": {}}, overrides={"run.iterations": 3}, base="..")
+with rl.optimize(config, folder="x") as run:
+    for record in run:
+        loss: float = record.loss
+        image: np.ndarray[tuple[int, ...], np.dtype[np.float32]] = run.images[0]
+        kept: rl.Record = record
+    for kept in run.live(figure=False):
+        reveal_type(kept)
+one: rl.Run = run
+reveal_type((run.config, run.folder, run.status, run.iteration, run.records))
+run.close()
+rl.register()
+reveal_type((run.parameters, run.gradients, run.images, run.targets, run.truth))
+reveal_type((rl.gradient(config), rl.render(config, values={"a": 3}), rl.export("x", "y", tolerances=True)))
+reveal_type([(check.holds, check.verdict, check.to_json()) for check in rl.gradcheck(config)])
+reveal_type([line.to_json() for line in rl.convergence(config, objective="image")])
+reveal_type(rl.__version__)
+
+
+def l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+    return dr.mean(dr.square(image - target), axis=None)
+
+
+def weighted(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
+    return dr.mean(image if weights is None else image * weights, axis=None).array
+
+
+scene = rl.load_scene("scene.xml")
+reveal_type(scene)
+reveal_type(rl.step(mi.load_dict({"type": "reslrb"}), scene, 0, lambda image: l2(image, image), seed=1, spp=4).loss)
+try:
+    rl.optimize("x.yaml", loss=l2)
+    rl.optimize("x.yaml", loss=weighted)
+except rl.ConfigError as error:
+    reveal_type((error.source, error.key, error.message))
+except rl.ReslrbError:
+    pass
+rl.optimize(config, folders="x")
+rl.optimize(config, loss=lambda image: image)
+rl.render(config)["0"]
+"""
+
+
+@pytest.mark.long
+def test_users_type_checkers_see_the_types(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(TYPED)
+    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--cache-dir", str(tmp_path / "c"),
+               "script.py"]  # fmt: skip
+    environment = {**os.environ, "MYPYPATH": str(tiny.ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300, env=environment)
+    out = done.stdout
+    for name in rl.__all__:
+        assert f"rl.{name}" in TYPED
+    assert (tiny.ROOT / "reslrb_cli/py.typed").exists()
+    seen = [line.partition("Revealed type is ")[2] for line in out.splitlines() if "Revealed type" in line]
+    assert len(seen) == TYPED.count("reveal_type("), out + done.stderr
+    for each in seen:  # only the number of an array's dimensions may be Any
+        assert "Any" not in each.replace("numpy.ndarray[Any, ", ""), each
+    assert "import-untyped" not in out
+    errors = [line.partition(" error: ")[2] for line in out.splitlines() if ": error:" in line]
+    assert len(errors) == 3, out
+    for words, error in zip(('argument "folders"', 'Argument "loss"', "Invalid index type"), errors, strict=True):
+        assert words in error
 
 
 def test_public_names_have_docstrings() -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.tiny import read_metrics, write_experiment
+from cli.tiny import done, read_metrics, settings, write_experiment
 
-from reslrb_cli.cli import main
 from reslrb_cli.config.integrators import largest_pass, passes_obstacle
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization import forecast as trial
@@ -32,17 +31,15 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def call(*words: str) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["optimize", "tiny.yaml", *(word for text in SETS for word in ("--set", text)), *words])
-    assert end.value.code == 0
+def call(*words: str) -> str:
+    """Run the experiment, and return standard output."""
+    return done("optimize", "tiny.yaml", *settings(*SETS), *words).stdout
 
 
-def test_memory_matches_the_run(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_memory_matches_the_run(experiment: Path) -> None:
     before = sorted(os.listdir(experiment))
-    call("--dry-run")
+    printed = call("--dry-run")
     assert sorted(os.listdir(experiment)) == before
-    printed = capsys.readouterr().out
     told = re.search(r"memory of the iterations: at most ([\d.]+) MiB", printed)
     assert told is not None, printed
     sizes = re.findall(r"^ +([\d.]+) (MiB|KiB|B) ", printed, re.MULTILINE)[:-2]  # no thread-local or process memory
@@ -102,7 +99,7 @@ def test_each_trial_starts_at_the_initial_values(experiment: Path) -> None:
 
 @pytest.mark.parametrize("keeps", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_work_before_the_iterations_is_measured_once(
-    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keeps: bool
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, keeps: bool
 ) -> None:
     """A dry run measures the decisions and stores them for the run that follows. Without a cache, the run measures them
     again.
@@ -113,8 +110,7 @@ def test_work_before_the_iterations_is_measured_once(
         cache.write_text("no folder")
     auto = ["--set", "integrator={type: reslrb, max_depth: 3, paths: light}", "--set", "run.certainty=false"]
     auto += ["--set", "run.measuring=1000"]
-    call("--dry-run", *auto)
-    printed = capsys.readouterr().out
+    printed = call("--dry-run", *auto)
     told = re.search(r"^ +([\d.]+ m?s)(, done now and stored)?  choosing the sampling$", printed, re.MULTILINE)
     assert told is not None, printed
     assert (told[2] is not None) == keeps
@@ -122,8 +118,7 @@ def test_work_before_the_iterations_is_measured_once(
     manifest = read_manifest(experiment / "runs" / "tiny")
     assert manifest is not None
     assert [manifest[name]["cached"] for name in ("guided", "sequence")] == [keeps, keeps]
-    call("--dry-run", *auto)
-    printed = capsys.readouterr().out
+    printed = call("--dry-run", *auto)
     assert ("none, or stored from before" in printed) == keeps
 
 

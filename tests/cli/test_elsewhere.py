@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from cli import tiny
 from cli.tiny import done, reslrb, settings
+from kit import area, diffuse, scene, sensor, shape
 from turns import real_room
 
 from reslrb_cli.records.manifest import read_manifest
@@ -136,58 +137,33 @@ TRUE = {
 COLOUR, BRIGHT, FACTOR = 0.1, 0.1, 0.05
 #: Largest error of colours after few iterations. The initial guesses are up to 230 % off.
 SHORT_COLOUR = 0.15
-LEFT, RIGHT, SEAT = TRUE.values()
 
 
-def paint(color: list[float] | str) -> str:
-    value = color if isinstance(color, str) else ", ".join(map(str, color))
-    return f'<bsdf type="diffuse"><rgb name="reflectance" value="{value}"/></bsdf>'
-
-
-def wall(place: str, bsdf: str) -> str:
-    return f'<shape type="rectangle"><transform name="to_world">{place}</transform>{bsdf}</shape>'
-
-
-def room(left: list[float] | str, right: list[float] | str, seat: list[float] | str) -> str:
+def room(left: str, right: str, seat: str, size: int) -> str:
     """Return a room that is open to the camera. A mirror and a lamp are in view, and no element has an id."""
-    shapes = [
-        wall('<rotate x="1" angle="-90"/><translate y="-1"/>', paint("0.5, 0.45, 0.4")),
-        wall('<rotate x="1" angle="90"/><translate y="1"/>', paint("0.8, 0.8, 0.8")),
-        wall('<translate z="-1"/>', paint("0.7, 0.7, 0.65")),
-        wall('<rotate y="1" angle="90"/><translate x="-1"/>', paint(left)),
-        wall('<rotate y="1" angle="-90"/><translate x="1"/>', paint(right)),
-        wall(
-            '<scale x="0.35" y="0.3"/><translate x="0.3" y="0.3" z="-0.99"/>',
-            '<bsdf type="conductor"><string name="material" value="none"/></bsdf>',
-        ),
-        wall(
-            '<scale value="0.25"/><rotate x="1" angle="70"/><translate y="0.8" z="-0.3"/>',
-            '<emitter type="area"><rgb name="radiance" value="17, 15, 12"/></emitter>',
-        ),
-        f"""<shape type="cube"><transform name="to_world"><scale x="0.4" y="0.2" z="0.25"/><rotate y="1" angle="-15"/>
-            <translate x="-0.3" y="-0.8" z="-0.2"/></transform>{paint(seat)}</shape>""",
-    ]
-    return "\n".join(
-        [
-            '<scene version="3.0.0"><integrator type="path"/>',
-            '<sensor type="perspective"><float name="fov" value="38"/>',
-            '<transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>',
-            '<film type="hdrfilm"><integer name="width" value="256"/><integer name="height" value="256"/></film>',
-            "</sensor>",
-            *shapes,
-            "</scene>",
-        ]
-    )
+    mirror = '<bsdf type="conductor"><string name="material" value="none"/></bsdf>'
+    seat_place = '<scale x="0.4" y="0.2" z="0.25"/><rotate y="1" angle="-15"/><translate x="-0.3" y="-0.8" z="-0.2"/>'
+    lamp_place = '<scale value="0.25"/><rotate x="1" angle="70"/><translate y="0.8" z="-0.3"/>'
+    return scene(
+        '<integrator type="path"/>', sensor(size=size, fov=38, rfilter="gaussian"),
+        shape("rectangle", "", diffuse("0.5, 0.45, 0.4"), place='<rotate x="1" angle="-90"/><translate y="-1"/>'),
+        shape("rectangle", "", diffuse("0.8, 0.8, 0.8"), place='<rotate x="1" angle="90"/><translate y="1"/>'),
+        shape("rectangle", "", diffuse("0.7, 0.7, 0.65"), place='<translate z="-1"/>'),
+        shape("rectangle", "", diffuse(left), place='<rotate y="1" angle="90"/><translate x="-1"/>'),
+        shape("rectangle", "", diffuse(right), place='<rotate y="1" angle="-90"/><translate x="1"/>'),
+        shape("rectangle", "", mirror, place='<scale x="0.35" y="0.3"/><translate x="0.3" y="0.3" z="-0.99"/>'),
+        shape("rectangle", "", area("17, 15, 12"), place=lamp_place),
+        shape("cube", "", diffuse(seat), place=seat_place),
+    )  # fmt: skip
 
 
 def write_room(folder: Path, size: int, spp: int) -> None:
     """Write `room/scene.xml` with the guesses, and `photo.png`, an 8-bit image of the true room rendered by `path`."""
     (folder / "room").mkdir()
-    (folder / "room/scene.xml").write_text(room(GUESS, GUESS, GUESS))
-    true = room(LEFT, RIGHT, SEAT).replace('value="256"', f'value="{size}"')
+    (folder / "room/scene.xml").write_text(room(GUESS, GUESS, GUESS, 256))
+    true = room(*(", ".join(map(str, color)) for color in TRUE.values()), size)
     image = mi.render(mi.load_string(true), integrator=mi.load_dict({"type": "path", "max_depth": -1}), spp=spp)
-    bitmap = mi.Bitmap(EXPOSURE * np.array(image)[:, :, :3])
-    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(folder / "photo.png"))
+    tiny.write_photo(folder / "photo.png", EXPOSURE * np.array(image))
 
 
 def keep(file: Path, keys: list[str]) -> None:
@@ -274,15 +250,14 @@ WIDTH, HEIGHT, SPP, PARTS = 320, 180, 128, 4
 
 def photograph_room(scene_file: Path, path: Path) -> None:
     """Render the room in its true colours with camera paths of any length, and write the image."""
-    scene = load_scene(scene_file, size=(WIDTH, HEIGHT))
-    params = mi.traverse(scene)
+    loaded = load_scene(scene_file, size=(WIDTH, HEIGHT))
+    params = mi.traverse(loaded)
     for key, true in TRUE_OF_ROOM.items():
         params[key] = mi.Color3f(true)
     params.update()
     integrator = mi.load_dict({"type": "path", "max_depth": -1})
-    image = sum(np.array(mi.render(scene, integrator=integrator, spp=SPP, seed=part)) for part in range(PARTS)) / PARTS
-    bitmap = mi.Bitmap((EXPOSURE * image[:, :, :3]).astype(np.float32))
-    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+    image = sum(np.array(mi.render(loaded, integrator=integrator, spp=SPP, seed=part)) for part in range(PARTS)) / PARTS
+    tiny.write_photo(path, EXPOSURE * image)
 
 
 @pytest.mark.usefixtures("llvm")

@@ -35,14 +35,6 @@ from reslrb_cli.scene import load as scene_load
 COMMANDS = main.list_commands(click.Context(main))
 
 
-def call(*args: str) -> int:
-    """Run the command line in this process and return its exit code."""
-    with pytest.raises(SystemExit) as ended:
-        main(list(args), prog_name="reslrb")
-    assert isinstance(ended.value.code, int)
-    return int(ended.value.code)
-
-
 @pytest.fixture
 def raising(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make every command raise the error that a test puts into `failing`."""
@@ -82,28 +74,23 @@ failing: list[BaseException] = []
         (RuntimeError("jit_llvm_compile(): could not allocate 5 bytes of memory!"), 4, "out of memory"),
     ],
 )
-def test_exit_codes(capsys: pytest.CaptureFixture[str], error: BaseException, code: int, line: str) -> None:
+def test_exit_codes(error: BaseException, code: int, line: str) -> None:
     failing[:] = [error]
-    assert call("failing") == code
-    told = capsys.readouterr()
-    assert line in told.err
-    assert len(told.err.strip().splitlines()) == 1
-    assert told.out == ""
+    found, out, err = tiny.outcome("failing")
+    assert (found, out, len(err.strip().splitlines())) == (code, "", 1)
+    assert line in err
 
 
 @pytest.mark.usefixtures("raising")
 @pytest.mark.parametrize("by", ["option", "variable"])
-def test_debug_shows_the_traceback(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, by: str
-) -> None:
+def test_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, by: str) -> None:
     failing[:] = [ConfigError("a.yaml", "run.spp", "must be positive")]
     if by == "variable":
         monkeypatch.setenv("RESLRB_DEBUG", "1")
-    assert call(*(["--debug"] if by == "option" else []), "failing") == ExitCode.USAGE
-    assert "Traceback" in capsys.readouterr().err
+    code, _, err = tiny.outcome(*(["--debug"] if by == "option" else []), "failing")
+    assert (code, "Traceback" in err) == (ExitCode.USAGE, True)
     monkeypatch.delenv("RESLRB_DEBUG", raising=False)
-    call("failing")
-    assert "Traceback" not in capsys.readouterr().err
+    assert "Traceback" not in tiny.outcome("failing")[2]
 
 
 @pytest.mark.usefixtures("raising")
@@ -124,17 +111,15 @@ def test_an_internal_error_keeps_its_traceback() -> None:
         (["doctor", "--nope"], "reslrb doctor: No such option"),
     ],
 )
-def test_usage_errors_are_one_line(capsys: pytest.CaptureFixture[str], args: list[str], line: str) -> None:
-    assert call(*args) == ExitCode.USAGE
-    told = capsys.readouterr().err.strip()
-    assert told.startswith(line)
-    assert len(told.splitlines()) == 1
+def test_usage_errors_are_one_line(args: list[str], line: str) -> None:
+    code, _, err = tiny.outcome(*args)
+    assert (code, len(err.strip().splitlines())) == (ExitCode.USAGE, 1)
+    assert err.startswith(line)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(command, "--help") == ExitCode.DONE
-    assert capsys.readouterr().out.startswith(f"Usage: reslrb {command}")
+def test_help_of_every_command(command: str) -> None:
+    assert tiny.done(command, "--help").stdout.startswith(f"Usage: reslrb {command}")
 
 
 def test_help_loads_nothing_heavy() -> None:

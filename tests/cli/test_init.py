@@ -29,8 +29,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 def write_noise(path: Path, width: int, height: int) -> Path:
     """Write an 8-bit image of random pixels."""
-    image = np.random.default_rng(3).uniform(0, 0.9, (height, width, 3)).astype(np.float32)
-    mi.Bitmap(image).convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+    tiny.write_photo(path, np.random.default_rng(3).uniform(0, 0.9, (height, width, 3)))
     return path
 
 

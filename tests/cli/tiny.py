@@ -25,7 +25,7 @@ from reslrb_cli.runs import recorder as recording
 
 def reslrb(*arguments: object) -> Result:
     """Run `reslrb ARGUMENTS` and return its output and exit code."""
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], prog_name="reslrb")
 
 
 def done(*arguments: object) -> Result:
@@ -134,6 +134,15 @@ def write_experiment(folder: Path, text: str = SCENE) -> None:
     mi.Bitmap(texture).write(str(folder / "poster.exr"))
     (folder / "scene.xml").write_text(text)
     (folder / "tiny.yaml").write_text(CONFIG)
+
+
+def write_photo(path: Path, image: Any) -> None:
+    """Write linear values as an 8-bit image. A variant must be set."""
+    import mitsuba as mi
+    import numpy as np
+
+    bitmap = mi.Bitmap(np.ascontiguousarray(image[:, :, :3], dtype=np.float32))
+    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
 
 
 def start(folder: Path, *args: str, command: str = "optimize", **options: Any) -> subprocess.Popen[str]:

@@ -8,7 +8,16 @@ import sys
 import numpy as np
 import pytest
 
-from reslrb_cli.records.images import read_layers, write_layers
+from reslrb_cli.records.images import (
+    FORMATS,
+    load_image,
+    read_layers,
+    write_file,
+    write_image,
+    write_layers,
+    write_mask,
+    write_parameters,
+)
 
 # Images are whole or absent in every format, and contain the given values.
 
@@ -21,8 +30,6 @@ def make_image(channels=3):
 @pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png", ".jpg"])
 def test_every_format_can_be_read_back(tmp_path, suffix):
     import mitsuba as mi
-
-    from reslrb_cli.records.images import FORMATS, write_file
 
     assert suffix in FORMATS
     image, linear = make_image(), suffix in (".exr", ".hdr", ".pfm")
@@ -37,8 +44,6 @@ def test_every_format_can_be_read_back(tmp_path, suffix):
 
 @pytest.mark.usefixtures("llvm")
 def test_an_incomplete_image_is_removed(tmp_path, file_size_limit):
-    from reslrb_cli.records.images import write_file, write_mask, write_parameters
-
     with file_size_limit(500), pytest.raises(OSError, match=r"final\.png"):
         write_file(tmp_path / "final.png", make_image(), linear=False)
     with file_size_limit(300), pytest.raises(OSError, match=r"a\.exr"):
@@ -54,8 +59,6 @@ def test_an_incomplete_image_is_removed(tmp_path, file_size_limit):
 @pytest.mark.usefixtures("llvm")
 def test_a_heightmap_is_shown_from_lowest_to_highest(tmp_path):
     from matplotlib.image import imread
-
-    from reslrb_cli.records.images import load_image, write_parameters
 
     heights = np.linspace(-1e-3, 2e-3, 12, dtype=np.float32).reshape(3, 4, 1)
     write_parameters(tmp_path, {"face.heightmap": heights, "wall.data": np.abs(heights)})
@@ -92,8 +95,6 @@ def layers():
 
 
 def test_layers_survive_a_round_trip(tmp_path, llvm):
-    from reslrb_cli.records.images import write_image
-
     written = layers()
     write_layers(tmp_path / "a.exr", written)
     read = read_layers(tmp_path / "a.exr")

@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import threading
@@ -201,23 +200,6 @@ def test_a_slowly_written_folder_is_not_removed(tmp_path):
     assert names(tmp_path) == ["exported", "run"]
     with FolderLock(tmp_path / "exported", wait_s=0):
         pass
-
-
-def test_a_half_failed_replacement_is_reported(tmp_path, monkeypatch):
-    create(tmp_path)
-    rmtree = shutil.rmtree
-
-    def fail(path, ignore_errors=False):
-        if not ignore_errors:
-            raise OSError(5, "Input/output error", str(path))
-        rmtree(path, ignore_errors=True)
-
-    monkeypatch.setattr(shutil, "rmtree", fail)
-    with pytest.raises(MachineError, match="Input/output error"):
-        create(tmp_path, force=True, seed=8)
-    content = read_manifest(tmp_path / "run")
-    assert (content["status"], content["seed"]) == ("failed", 8)
-    assert names(tmp_path) == ["run"]
 
 
 CONTEND = """
