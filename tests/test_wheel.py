@@ -182,6 +182,7 @@ def execute(notebook: Any, python: Path, folder: Path, monkeypatch: pytest.Monke
     assert Path(first.outputs[0].text.strip()).is_relative_to(python.parents[1])
 
 
+@pytest.mark.long  # tests/api run the calls of the notebooks
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(
     path: Path, python: Path, tmp_path: Path, llvm: str, monkeypatch: pytest.MonkeyPatch

@@ -247,7 +247,7 @@ def test_a_measurement_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     benchmarks_measure.draw_bench([record.origin, *record.rows], tmp_path / "tiny.png")
     assert (tmp_path / "tiny.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SystemExit, match="exit code 2; its record is left as it was"):
-        benchmarks_measure.measure("tiny", ("bench", "--nonsense"))
+        benchmarks_measure.measure("tiny", ("--nonsense",))
     assert read(tmp_path / "tiny.jsonl") == record
 
 

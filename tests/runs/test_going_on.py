@@ -342,36 +342,33 @@ def kill_at_random(process: subprocess.Popen[str], run: Path, chance: random.Ran
     ("kills", "iterations"), [(1, 30), pytest.param(50, 1200, marks=pytest.mark.long)], ids=["one", "fifty"]
 )
 def test_a_repeatedly_killed_run_reaches_the_same_end(tmp_path: Path, kills: int, iterations: int) -> None:
+    """Each killed life has its own process. The last life ends in this process."""
+
+    def finish(*words: str) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(tmp_path)
+            patch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+            work_alone(patch)
+            assert optimize(*words) == 0
+
     tiny.write_experiment(tmp_path)
-    length = ["--set", f"run.iterations={iterations}"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(tmp_path)
-        patch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-        work_alone(patch)
-        assert optimize("tiny.yaml", *SETS, *length, "--set", "run.name=whole") == 0
+    whole = words = ["tiny.yaml", *SETS, "--set", f"run.iterations={iterations}"]
+    finish(*whole, "--set", "run.name=whole")
     run, chance = tmp_path / "runs/tiny", random.Random(11)
-    process = start(tmp_path, "tiny.yaml", *SETS, *length)
-    lives, done = 1, 0
-    while lives <= kills:
-        kill_at_random(process, run, chance)
+    for _ in range(kills):
+        kill_at_random(start(tmp_path, *words), run, chance)
+        words = whole
         if run.exists():
             manifest = read_manifest(run)
             assert manifest is not None
             assert manifest["status"] in ("interrupted", "finished")
             assert left_over(run) == []  # a reader has repaired the folder
             if (run / "checkpoint/state.npz").exists():
-                done = int(state_of(run)["iteration"])
-                assert done <= count(run)
-                process = start(tmp_path, "--resume", str(run), "--quiet")
+                assert int(state_of(run)["iteration"]) <= count(run)
+                words = ["--resume", str(run), "--quiet"]
             else:
                 shutil.rmtree(run)
-                process = start(tmp_path, "tiny.yaml", *SETS, *length)
-        else:
-            process = start(tmp_path, "tiny.yaml", *SETS, *length)
-        lives += 1
-    code, err = end(process)
-    print(f"{lives} lives, {done} iterations before the last")
-    assert (code, err) == (0, "")
+    finish(*words)
     assert differences(tmp_path / "runs/whole", run) == []
     assert [record["iteration"] for record in records_of(run)] == list(range(iterations))
     assert read_manifest(run)["status"] == "finished"  # type: ignore[index]
