@@ -179,7 +179,7 @@ def test_a_planted_violation_is_found(tmp_path: Path, file: str, source: str, se
 def test_importing_the_package_and_the_configuration_loads_no_mitsuba() -> None:
     heavy = "{'mitsuba', 'drjit', 'matplotlib', 'numpy'}"
     script = f"import sys, reslrb_cli\nassert not ({heavy} | {{'click', 'pydantic'}}) & set(sys.modules)\n"
-    script += f"import reslrb_cli.config\nassert not {heavy} & set(sys.modules)"
+    script += f"import reslrb_cli.config.loader\nassert not {heavy} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
