@@ -81,6 +81,15 @@ def pytest_configure(config: pytest.Config) -> None:
         leave_out_optimisations()
 
 
+def tested_variant() -> str:
+    """Set the variant of the tests, and return its name."""
+    named = os.environ.get("RESLRB_TEST_VARIANT")
+    try:
+        return set_variant(named or "llvm_ad_rgb")
+    except BackendError as error:
+        (pytest.fail if named else pytest.skip)(str(error))
+
+
 @pytest.fixture(scope="session")
 def llvm(pytestconfig: pytest.Config) -> str:
     """Set the variant once, and return its name.
@@ -88,11 +97,7 @@ def llvm(pytestconfig: pytest.Config) -> str:
     The variant is `llvm_ad_rgb`. Tests are skipped if the machine has no backend for it. If RESLRB_TEST_VARIANT names a
     variant, a missing backend fails the tests, because the user wants to test this variant.
     """
-    named = os.environ.get("RESLRB_TEST_VARIANT")
-    try:
-        variant = set_variant(named or "llvm_ad_rgb")
-    except BackendError as error:
-        (pytest.fail if named else pytest.skip)(str(error))
+    variant = tested_variant()
     if variant.startswith("llvm") and is_quick(pytestconfig):
         compute_alone()
     return variant
@@ -101,11 +106,12 @@ def llvm(pytestconfig: pytest.Config) -> str:
 @pytest.fixture(autouse=True, scope="module")
 def _release_jit_memory() -> Iterator[None]:
     """Free the JIT's cached memory after each module, so that the memory peaks of one module do not affect the next
-    module.
+    module. Exclude the remaining objects from later garbage collections.
     """
     yield
+    gc.collect()
+    gc.freeze()
     if "drjit" in sys.modules:
-        gc.collect()
         sys.modules["drjit"].flush_malloc_cache()
 
 

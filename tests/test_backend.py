@@ -15,6 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cli.tiny import ROOT
+from compilation import search_path
 from conformance.operations import even_table
 
 from reslrb_cli.backend import doctor, llvm, variant
@@ -77,13 +79,9 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     ("name", "version"),
     [
         ("libLLVM-15.so.1", 15),
-        ("libLLVM-14.0.6.so.1", 14),
-        ("libLLVM-19.so", 19),
         ("libLLVM.so.19.1", 19),
-        ("libLLVM.so.22.1", 22),
         ("libLLVM.21.1.dylib", 21),
         ("libLLVM.so", None),
-        ("libLLVM.dylib", None),
         ("libLLVMSPIRVLib.so.19.1", None),
         ("libLLVM-19.a", None),
     ],
@@ -114,12 +112,11 @@ def test_the_newest_working_version_is_chosen(machine: Machine) -> None:
 @pytest.mark.usefixtures("_forget")
 def test_a_file_without_a_version_in_its_name_is_tried(machine: Machine) -> None:
     machine({"libLLVM.so": "21.1.0", "libLLVM.so.20.1": "20.1.2"})
-    library = llvm.require()
-    assert library.version == "21.1.0"
+    assert llvm.require().version == "21.1.0"
 
 
 @pytest.mark.usefixtures("_forget")
-@pytest.mark.parametrize("name", ["libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1", "libLLVM-18.so.1"])
+@pytest.mark.parametrize("name", ["libLLVM-14.so.1", "libLLVM-18.so.1"])
 def test_old_versions_are_refused(machine: Machine, name: str) -> None:
     machine({name: "must-not-be-tried"})
     with pytest.raises(BackendError, match=f"{name}: version 1[4-8] is too old") as refused:
@@ -163,20 +160,15 @@ def test_an_old_version_chosen_by_the_user_is_refused_too(
 
 
 @pytest.mark.usefixtures("_forget")
-def test_prepare_passes_the_choice_to_dr_jit(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepare_passes_the_choice_to_dr_jit_and_keeps_that_of_the_user(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (path,) = machine({"libLLVM.so.19.1": "19.1.7"})
-    monkeypatch.setenv(llvm.VARIABLE, "")
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
-    llvm.prepare()
-    assert os.environ[llvm.VARIABLE] == str(path)
-
-
-@pytest.mark.usefixtures("_forget")
-def test_prepare_keeps_the_choice_of_the_user(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    machine({"libLLVM.so.19.1": "19.1.7"})
-    monkeypatch.setenv(llvm.VARIABLE, "/somewhere/libLLVM.so")
-    llvm.prepare()
-    assert os.environ[llvm.VARIABLE] == "/somewhere/libLLVM.so"
+    for given, used in (("", str(path)), ("/somewhere/libLLVM.so", "/somewhere/libLLVM.so")):
+        monkeypatch.setenv(llvm.VARIABLE, given)
+        llvm.prepare()
+        assert os.environ[llvm.VARIABLE] == used
 
 
 @pytest.mark.usefixtures("_forget")
@@ -184,14 +176,12 @@ def test_prepare_keeps_the_choice_of_the_user(machine: Machine, monkeypatch: pyt
     ("message", "library"),
     [
         ("libz3.so.4: cannot open shared object file: No such file or directory", "libz3.so.4"),
-        ("ImportError: libatomic.so.1: cannot open shared object file: No such file", "libatomic.so.1"),
         (
             "raise ImportError('libz3.so.4: cannot open shared object file')\nlibm.so.6: cannot open shared object",
             "libm.so.6",
         ),
         ("dlopen(...): Library not loaded: @rpath/libz3.4.dylib\n  Referenced from: ...", "libz3.4.dylib"),
         ("/nope/libLLVM.so: cannot open shared object file: No such file or directory", None),
-        ("/lib/libLLVM.so: undefined symbol: x", None),
     ],
 )
 def test_missing_library(message: str, library: str | None) -> None:
@@ -217,8 +207,8 @@ def test_a_library_finds_its_dependencies_beside_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_forget")
-@pytest.mark.parametrize("name", ["libLLVM-15.so.1", "libLLVM-14.so.1"])
-def test_the_command_line_exits_with_3(tmp_path: Path, name: str) -> None:
+def test_the_command_line_exits_with_3(tmp_path: Path) -> None:
+    name = "libLLVM-15.so.1"
     (tmp_path / name).write_bytes(b"")
     script = "from reslrb_cli.cli import main; main(prog_name='reslrb')"
     env = {**os.environ, llvm.VARIABLE: str(tmp_path / name), "DRJIT_LIBCUDA_PATH": "/nonexistent"}
@@ -308,15 +298,6 @@ def test_an_unknown_variant_is_refused(llvm: str) -> None:
         variant.set_variant("llvm_ad_taste")
 
 
-def test_a_broken_mitsuba_is_one_line(llvm: str) -> None:
-    script = (
-        "import sys; sys.modules['drjit'] = None\n"
-        "from reslrb_cli.backend.variant import set_variant; set_variant('llvm_ad_rgb')"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert "BackendError: Mitsuba cannot be loaded" in done.stderr.splitlines()[-1]
-
-
 # Values from NumPy lie in Dr.Jit's own memory, so that kernels and recordings fit all later values.
 
 ALIGNMENT = 64  # bytes, as in Dr.Jit's own memory
@@ -338,13 +319,12 @@ def lying_at(offset, values):
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("offset", [0, 4, 16, 32])
+@pytest.mark.parametrize("offset", [0, 4])
 @pytest.mark.parametrize(
     ("kind", "values"),
     [
         ("Float", np.float32([-0.0, np.nan, np.inf, 1e-45, 3.0])),
         ("UInt32", np.uint32([0, 1, 2**32 - 1])),
-        ("Float", np.float32([7.0])),
     ],
 )
 def test_bits_are_kept_outside_the_memory_of_numpy(kind, values, offset):
@@ -365,3 +345,26 @@ def test_restored_arrays_are_copied():
     for _ in range(8):  # NumPy's memory has another address every time
         table = even_table(make_grid([True] * 4, [1.0, 2.0], 14))
         assert [address(part) % ALIGNMENT for part in (table.slots, table.weights, table.edges)] == [0, 0, 0]
+
+
+#: Mitsuba needs two threads to read and write EXR files.
+ONE_CORE = """
+import os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from reslrb_cli.backend.variant import set_variant
+set_variant("llvm_ad_rgb")
+import mitsuba as mi, numpy as np
+file = sys.argv[1] + "/image.exr"
+mi.Bitmap(np.ones((8, 8, 3), np.float32)).write(file)
+print(np.array(mi.Bitmap(file)).sum())
+"""
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs to choose the cores of a process")
+def test_a_machine_of_one_core_reads_and_writes_images(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_CORE, str(tmp_path)], capture_output=True, text=True, check=False, timeout=60,
+        env={"PYTHONPATH": search_path(ROOT), "HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "192.0\n"), done.stderr

@@ -16,7 +16,6 @@ from reslrb_cli.seeds import seed
         ("plain, Fläche, 名前, प्रथम", "plain, Fläche, 名前, प्रथम"),
         ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
         ("\x9b2J", "\\x9b2J"),
-        ("a\nb\tc", "a\\nb\\tc"),
         ("\u202eright to left", "\\u202eright to left"),
         ("bytes \udcff", "bytes \\udcff"),
         ("\U000e0041", "\\U000e0041"),
@@ -48,14 +47,9 @@ def test_an_error_is_one_bounded_line() -> None:
 # Seeds: reproducible, in range, and distinct for every use.
 
 
-def test_seeds_are_reproducible_uint32():
-    values = [seed(7, 3, 1, "image") for _ in range(2)]
-    assert values[0] == values[1]
-    assert 0 <= values[0] < 2**32
-
-
 def test_a_seed_does_not_change_between_versions():
     assert seed(0, 0, 0, "image") == 2478797459
+    assert len({seed(1, 11, 0, "image"), seed(11, 1, 0, "image"), seed(1, 1, 10, "image")}) == 3
 
 
 def test_every_purpose_has_its_own_seed():
@@ -67,11 +61,6 @@ def test_every_purpose_has_its_own_seed():
         for purpose in ("image", "target", "initial", "reach, pass 0", "reach, pass 1")
     ]
     assert len({seed(*use) for use in uses}) == len(uses)
-
-
-def test_the_parts_of_a_seed_are_separated():
-    assert seed(1, 11, 0, "image") != seed(11, 1, 0, "image")
-    assert seed(1, 1, 10, "image") != seed(1, 11, 0, "image")
 
 
 def test_seeds_are_uniform_in_their_range():

@@ -51,6 +51,12 @@ def taking_turns(
     return pytest.mark.parametrize((name, way), pairs)
 
 
+def common_setup(config: pytest.Config) -> Any:
+    """Return the module tests/conftest.py, as pytest has loaded it."""
+    file = str(Path(__file__).with_name("conftest.py"))
+    return next(plugin for plugin in config.pluginmanager.get_plugins() if getattr(plugin, "__file__", "") == file)
+
+
 # A scene by another author, which is not part of the project: its place, if it exists.
 
 _BESIDE = Path(__file__).parents[2] / "shared" / "scenes" / "grey-white-room"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import re
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli import tiny
 from cli.tiny import ROOT
 from compilation import search_path
 from make_reference import DOCS, python_page
@@ -61,10 +64,18 @@ def quick_checkout(llvm: str, tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("where", ["quick_checkout", pytest.param("checkout", marks=pytest.mark.long)])
-def test_scripts_of_the_docs_run(where: str, request: pytest.FixtureRequest) -> None:
-    folder: Path = request.getfixturevalue(where)
-    lines = run(script_of(PAGE.read_text(encoding="utf-8")), folder)
+def run_here(script: str, folder: Path) -> list[str]:
+    """Run a script in this process and return the lines it prints."""
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as said:
+        patch.chdir(folder)
+        patch.setenv("RESLRB_CACHE", str(folder / "cache"))
+        exec(compile(script, "script.py", "exec"), {"__name__": "__main__"})
+    return said.getvalue().splitlines()
+
+
+def test_scripts_of_the_docs_run(quick_checkout: Path) -> None:
+    folder = quick_checkout
+    lines = run_here(script_of(PAGE.read_text(encoding="utf-8")), folder)
     assert [line.split()[0] for line in lines[:6]] == ["0", "1", "2", "3", "4", "5"]
     assert lines[6].startswith("finished ")
     assert lines[7] == "interrupted 3"
@@ -109,14 +120,11 @@ def test_statements_of_the_docs_about_a_run_hold(checkout: Path) -> None:
     settings = ("scene.options={resx: 32, resy: 32}", "run.iterations=8", "run.final_spp=8", "target.render.spp=16",
                 "run.measuring=0", f"loss={{type: custom, file: {checkout / 'my_loss.py'}:edges}}",
                 f"run.output={checkout / 'runs'}")  # fmt: skip
-    words = [word for each in settings for word in ("--set", each)]
-    command = [sys.executable, "-m", "reslrb_cli", "optimize", "configs/cornell_floor.yaml", "--allow-code", *words]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=checkout, env=environment(checkout), timeout=300)
-    assert done.returncode == 0, done.stderr
+    tiny.done("optimize", checkout / "configs/cornell_floor.yaml", "--allow-code", *tiny.settings(*settings))
     (checkout / "runs/ours").symlink_to("cornell_floor")
-    (found,) = run(slope, checkout)
+    (found,) = run_here(slope, checkout)
     assert np.isfinite(float(found))
-    step_ms, peak = map(float, run(steps, checkout)[0].split())
+    step_ms, peak = map(float, run_here(steps, checkout)[0].split())
     records = [json.loads(line) for line in (checkout / "runs/ours/metrics.jsonl").read_text().splitlines()]
     assert step_ms == sorted(record["step_ms"] for record in records[5:])[1]
     assert peak > 0
@@ -127,11 +135,6 @@ def test_the_reference_matches_the_docstrings() -> None:
     assert text == python_page(text), "run `python scripts/make_reference.py`"
     for name in set(reslrb_cli.__all__) - {"__version__"}:
         assert f"### `{name}`\n" in text
-
-
-def test_links_of_the_page_exist() -> None:
-    for name in re.findall(r"\]\(([^)#:]+)[^)]*\)", PAGE.read_text(encoding="utf-8")):
-        assert (DOCS / name).exists(), name
 
 
 # --- notebooks: tests/test_wheel.py runs them -------------------------------------------------------------------------

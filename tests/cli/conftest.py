@@ -41,6 +41,7 @@ def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: py
     logger.handlers.clear()
     yield
     logger.handlers.clear()
+    logger.setLevel(logging.NOTSET)
 
 
 @pytest.fixture

@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import json
-import logging
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from cli.tiny import KEY, ROOT, write_experiment
-from compilation import search_path
+from cli.tiny import KEY, done, outcome, write_experiment
 
-from reslrb_cli.cli import main
 from reslrb_cli.measure.processes import Process
 from reslrb_cli.records.measurements import TARGETS
 
@@ -22,13 +15,6 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 
 # `reslrb convergence` from the command line, on a poster of 8x8 pixels.
-
-
-def call(*args: str) -> int:
-    logging.getLogger("reslrb_cli").handlers.clear()
-    with pytest.raises(SystemExit) as ended:
-        main(["convergence", *args], prog_name="reslrb")
-    return int(ended.value.code or 0)
 
 
 @pytest.fixture
@@ -44,12 +30,12 @@ def read(path: Path) -> list[dict]:
     return lines[1:]
 
 
-def test_a_scene_end_to_end(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scene_end_to_end(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bias of each method stays below its limit, and the error of averages falls at the expected rate."""
     names = ["ptracer", "reslrb:reservoir(capacity=2)"]
     args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16"]
     (folder / "out").mkdir()
-    assert call("tiny.yaml", *args) == 0
+    printed = done("convergence", "tiny.yaml", *args).stdout.splitlines()
     lines = read(folder / "out/c.jsonl")
     methods = [line for line in lines if line["kind"] == "method"]
     assert [(line["label"], line["parameter"]) for line in methods] == [(n, k) for n in names for k in (KEY, "all")]
@@ -71,62 +57,47 @@ def test_a_scene_end_to_end(folder: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert (reference["label"], reference["bias_reference"], reference["biased"]) == (
         "reslrb:stack(paths=both,light_share=0.5)", "prb", False
     )  # fmt: skip
-    printed = capsys.readouterr().out.splitlines()
     assert printed[-1].startswith("Best for this scene: ")
     assert sum("16 rounds " in line for line in printed) == len(names)  # one row for each method
     assert any(line.startswith("ptracer: first step") for line in printed)  # compilation has its own line
     # Samples that are already in the file are not taken again.
     monkeypatch.setattr(Process, "__init__", None)
-    assert call("tiny.yaml", *args) == 0
+    again = done("convergence", "tiny.yaml", *args).stdout.splitlines()
     assert read(folder / "out/c.jsonl") == lines
-    again = capsys.readouterr().out.splitlines()
     assert "using the samples in out/c.samples.npz" in again
     assert again[-1] == printed[-1]
 
 
 @pytest.mark.long
-def test_the_loss_reveals_correlated_samples(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_loss_reveals_correlated_samples(folder: Path) -> None:
     args = ["--objective", "loss", "--rounds", "64", "--json", "c.jsonl", "--set", "run.spp=4", "--set", "loss.type=l2"]
     cases = "reslrb:stack(adjoint=correlated),reslrb:stack(adjoint=independent)"
-    assert call("tiny.yaml", *args, "--integrators", cases) == 0
+    sentence = done("convergence", "tiny.yaml", *args, "--integrators", cases).stdout.splitlines()[-1]
     methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method" and line["parameter"] == "all"]
     assert [(line["adjoint"], line["biased"]) for line in methods] == [("correlated", True), ("independent", False)]
     assert methods[0]["slope"]["low"] > -0.4
     assert methods[1]["slope"]["low"] < -0.5 < methods[1]["slope"]["high"]
     assert methods[0]["bias"] > 0.1
-    sentence = capsys.readouterr().out.splitlines()[-1]
     assert "Best for this scene: reslrb:stack(adjoint=independent); of all others a bias was found." in sentence
 
 
-@pytest.mark.long
-def test_the_image(folder: Path) -> None:
-    assert call("tiny.yaml", "--objective", "image", "--rounds", "4", "--json", "c.jsonl", "--integrators", "prb") == 0
-    methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method"]
-    assert [(line["label"], line["parameter"], line["biased"]) for line in methods] == [("prb", "image", False)]
-
-
-def test_a_too_small_budget_is_reported(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call("tiny.yaml", "--budget", "1", "--integrators", "reslrb:stack") == 1
-    printed = capsys.readouterr()
-    assert "the budget of 1 s was spent before dL/dI was known" in printed.out
-    assert "Traceback" not in printed.err
+def test_a_too_small_budget_is_reported(folder: Path) -> None:
+    code, out, err = outcome("convergence", "tiny.yaml", "--budget", "1", "--integrators", "reslrb:stack")
+    assert (code, "Traceback" in err) == (1, False)
+    assert "the budget of 1 s was spent before dL/dI was known" in out
 
 
 @pytest.mark.parametrize(
     ("args", "line"),
     [
-        (("--integrators", "ptracer,ptracer"), "--integrators: `ptracer` is given twice"),
         (("--integrators", "reslrb:stack(adjoint=batched)"), "adjoint: has no effect if dL/dI is known"),
         (("--reference", "ptracer,prb"), "--reference: errors are relative to one method; name one"),
         (("--reference", "walk"), "--reference walk: integrator.type: must be one of"),
         (("--json", "no/such/folder.jsonl"), "--json: cannot write no/such/folder.jsonl"),
         (("--objective", "gradient"), "'gradient' is not one of 'fixed', 'loss', 'image'"),
-        (("--set", "run.spp=0"), "run.spp"),
-        (("--spp", "4,x"), "'x' is not a valid integer range"),
         (("--spp", "4,0"), "0 is not in the range"),
         (("--spp", "4,4"), "`4,4` has a number twice"),
         (("--spp", "3", "--set", "integrator.samples_per_pass=2"), "integrator.samples_per_pass: 2 does not divide"),
-        (("--integrators", "prb(rr_depth=x)"), "integrator.rr_depth"),
         (("--runs", "3"), "--runs was removed; compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max"),
         (
             ("--rates=1,3",),
@@ -135,60 +106,35 @@ def test_a_too_small_budget_is_reported(folder: Path, capsys: pytest.CaptureFixt
         (("--integrators", "reslrb:auto"), "`auto` is for whole runs; use `stack`"),
     ],
 )
-def test_bad_input_is_one_located_line(
-    folder: Path, args: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert call("tiny.yaml", *args) == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert line in printed.err
-    assert len(printed.err.splitlines()) == 1
+def test_bad_input_is_one_located_line(folder: Path, args: tuple[str, ...], line: str) -> None:
+    code, out, err = outcome("convergence", "tiny.yaml", *args)
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert line in err
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off"])
-def test_steps_that_cannot_be_continued(folder: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+def test_steps_that_cannot_be_continued(folder: Path) -> None:
     (folder / "c.jsonl").write_text("kept\n")
-    (folder / "c.samples.npz").write_bytes(content)
-    assert call("tiny.yaml", "--json", "c.jsonl") == 2
-    assert "c.samples.npz: " in capsys.readouterr().err
+    (folder / "c.samples.npz").write_bytes(b"PK\x03\x04 cut off")
+    code, _, err = outcome("convergence", "tiny.yaml", "--json", "c.jsonl")
+    assert (code, "c.samples.npz: " in err) == (2, True)
     assert (folder / "c.jsonl").read_text() == "kept\n"
 
 
 @pytest.mark.long
-def test_continuing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = ["--integrators", "reslrb:stack", "--rounds", "4"]
-    assert call("tiny.yaml", *args, "--json", "c.jsonl") == 0
-    assert call("tiny.yaml", *args[:-1], "8", "--json", "c.jsonl") == 0
+def test_the_image(folder: Path) -> None:
+    words = ("--objective", "image", "--rounds", "4", "--json", "c.jsonl", "--integrators", "prb")
+    done("convergence", "tiny.yaml", *words)
+    methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method"]
+    assert [(line["label"], line["parameter"], line["biased"]) for line in methods] == [("prb", "image", False)]
+
+
+@pytest.mark.long
+def test_continuing(folder: Path) -> None:
+    args = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack", "--json", "c.jsonl", "--rounds"]
+    done(*args, "4")
+    done(*args, "8")
     assert {line["repeats"] for line in read(folder / "c.jsonl") if line["kind"] == "method"} == {16}
-    capsys.readouterr()
-    assert call("tiny.yaml", *args[:-1], "9", "--json", "c.jsonl", "--set", "run.spp=8") == 2
+    code, _, err = outcome(*args, "9", "--set", "run.spp=8")
     reason = "run.spp is 4 there, 8 here; remove the file, or use another one"
-    assert capsys.readouterr().err == f"--json: c.jsonl belongs to another measurement: {reason}\n"
+    assert (code, err) == (2, f"--json: c.jsonl belongs to another measurement: {reason}\n")
     assert len(read(folder / "c.jsonl")) > 2  # file is unchanged
-
-
-@pytest.mark.long
-def test_a_method_that_does_not_support_the_scene_is_located(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = (folder / "scene.xml").read_text().replace('type="area"', 'type="directionalarea"')
-    (folder / "scene.xml").write_text(text)
-    assert call("tiny.yaml", "--rounds", "3", "--integrators", "prb") == 2
-    assert "directionalarea" in capsys.readouterr().err
-
-
-@pytest.mark.long
-def test_an_interrupt_keeps_finished_work(folder: Path) -> None:
-    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
-    args = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack", "--rounds", "100000", "--json", "c.jsonl"]
-    environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, *args], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    for line in process.stdout:
-        if "16 rounds" in line:
-            process.send_signal(signal.SIGINT)
-            break
-    rest = process.stdout.read()
-    assert process.wait() == 130
-    assert "the only one that was measured" in rest
-    assert {line["kind"] for line in read(folder / "c.jsonl")} == {"point", "method", "reference", "summary"}

@@ -10,21 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.tiny import read_metrics, write_experiment
+from cli.tiny import done, read_metrics, settings, write_experiment
 
-from reslrb_cli.cli import main
-from reslrb_cli.config.files import in_words
 from reslrb_cli.config.integrators import largest_pass, passes_obstacle
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization import forecast as trial
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.forecast import make_forecast
 from reslrb_cli.optimization.loop import optimize
-from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.manifest import read_manifest
 
 pytestmark = pytest.mark.usefixtures("llvm")
-SETS = ["scene.size=[96, 64]", "run.iterations=8", "run.final_spp=4"]
+SETS = ["scene.size=[96, 64]", "run.iterations=8", "run.final_spp=4", "run.adjoint=batched"]
 
 
 @pytest.fixture
@@ -34,18 +31,15 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def call(*words: str) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["optimize", "tiny.yaml", *(word for text in SETS for word in ("--set", text)), *words])
-    assert end.value.code == 0
+def call(*words: str) -> str:
+    """Run the experiment, and return standard output."""
+    return done("optimize", "tiny.yaml", *settings(*SETS), *words).stdout
 
 
-@pytest.mark.parametrize("adjoint", ["batched", pytest.param("correlated", marks=pytest.mark.long)])
-def test_memory_matches_the_run(experiment: Path, capsys: pytest.CaptureFixture[str], adjoint: str) -> None:
+def test_memory_matches_the_run(experiment: Path) -> None:
     before = sorted(os.listdir(experiment))
-    call("--dry-run", "--set", f"run.adjoint={adjoint}")
+    printed = call("--dry-run")
     assert sorted(os.listdir(experiment)) == before
-    printed = capsys.readouterr().out
     told = re.search(r"memory of the iterations: at most ([\d.]+) MiB", printed)
     assert told is not None, printed
     sizes = re.findall(r"^ +([\d.]+) (MiB|KiB|B) ", printed, re.MULTILINE)[:-2]  # no thread-local or process memory
@@ -53,7 +47,7 @@ def test_memory_matches_the_run(experiment: Path, capsys: pytest.CaptureFixture[
     assert sum(float(size) * units[unit] for size, unit in sizes) == pytest.approx(float(told[1]), abs=0.2)
     assert "time of the iterations: " in printed
     assert "time of the whole run: about " in printed
-    call("--quiet", "--set", f"run.adjoint={adjoint}")
+    call("--quiet")
     peak = read_metrics(experiment / "runs" / "tiny")[-1]["peak_mib"]
     assert peak > 0.5
     assert float(told[1]) == pytest.approx(peak, rel=0.15)
@@ -103,18 +97,9 @@ def test_each_trial_starts_at_the_initial_values(experiment: Path) -> None:
     assert losses[0] == losses[1]
 
 
-def test_steps_are_timed_without_compilation(experiment: Path) -> None:
-    forecast = make_forecast(load(experiment / "tiny.yaml", SETS), lambda line: None)
-    assert 0 < forecast.iteration_s < forecast.elapsed_s
-    assert forecast.peak / MIB > 0.5
-    assert forecast.whole_s > forecast.elapsed_s
-    for kept in (True, False):
-        assert (replace(forecast, measuring_s=1e6, kept=kept).whole_s > 1e6) != kept
-
-
 @pytest.mark.parametrize("keeps", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_work_before_the_iterations_is_measured_once(
-    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keeps: bool
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, keeps: bool
 ) -> None:
     """A dry run measures the decisions and stores them for the run that follows. Without a cache, the run measures them
     again.
@@ -125,8 +110,7 @@ def test_work_before_the_iterations_is_measured_once(
         cache.write_text("no folder")
     auto = ["--set", "integrator={type: reslrb, max_depth: 3, paths: light}", "--set", "run.certainty=false"]
     auto += ["--set", "run.measuring=1000"]
-    call("--dry-run", *auto)
-    printed = capsys.readouterr().out
+    printed = call("--dry-run", *auto)
     told = re.search(r"^ +([\d.]+ m?s)(, done now and stored)?  choosing the sampling$", printed, re.MULTILINE)
     assert told is not None, printed
     assert (told[2] is not None) == keeps
@@ -134,8 +118,7 @@ def test_work_before_the_iterations_is_measured_once(
     manifest = read_manifest(experiment / "runs" / "tiny")
     assert manifest is not None
     assert [each["cached"] for each in manifest["decisions"] if each["gain"] is not None] == [keeps]
-    call("--dry-run", *auto)
-    printed = capsys.readouterr().out
+    printed = call("--dry-run", *auto)
     assert ("none, or stored from before" in printed) == keeps
 
 
@@ -157,8 +140,3 @@ def test_passes(spp: int, per_pass: int | None, pixels: int, said: str | None) -
     if most is not None and spp // most <= 2**16:  # the advice itself is accepted
         assert spp % most == 0
         assert passes_obstacle(spp, most, pixels) is None
-
-
-def test_wording() -> None:
-    found = [in_words(n) for n in (0, 2**19, 1.5 * 2**20, 2**30, 3 * 2**31, 2**42)]
-    assert found == ["0 B", "512 KiB", "1.5 MiB", "1 GiB", "6 GiB", "4 TiB"]

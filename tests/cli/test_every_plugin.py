@@ -117,27 +117,13 @@ def test_the_page_matches_the_table() -> None:
     assert PAGE.read_text(encoding="utf-8") == page(), "`python tests/cli/every_plugin.py` writes it anew"
 
 
-@pytest.mark.parametrize("name", a_few(("homogeneous", "timed_sunsky", "linearcurve that emits"), ("homogeneous",)))
-def test_unknown_plugins_are_refused_by_every_command_and_integrator(name: str, folder: Path) -> None:
-    [row] = [row for row in ROWS if row.name == name]
+def test_unknown_plugins_are_refused_by_every_command_and_integrator(folder: Path) -> None:
+    [row] = [row for row in ROWS if row.name == "homogeneous"]
     (folder / "scene.xml").write_text(row.xml())
     (folder / "c.yaml").write_text(BY_HAND)
     for type in TYPES:
-        other = settings(f"integrator.type={type}")
-        for command in (("optimize", "c.yaml"), ("render", "c.yaml", "-o", "image.exr"),
-                        ("render", "c.yaml", "--scene", "-o", "image.exr")):  # fmt: skip
-            assert row.light in said(*command, *other, code=2)
-    for command in ("gradcheck", "convergence", "bench"):
-        assert row.light in said(command, "c.yaml", code=2)
+        assert row.light in said("optimize", "c.yaml", *settings(f"integrator.type={type}"), code=2)
+    for command, *words in (("render", "-o", "image.exr"), ("render", "--scene", "-o", "image.exr"), ("gradcheck",),
+                            ("convergence",), ("bench",)):  # fmt: skip
+        assert row.light in said(command, "c.yaml", *words, code=2)
     assert not (folder / "image.exr").exists()
-
-
-def test_an_older_run_is_not_exported(folder: Path) -> None:
-    [row] = [row for row in ROWS if row.name == "diffuse"]
-    (folder / "scene.xml").write_text(row.xml())
-    (folder / "c.yaml").write_text(BY_HAND)
-    said("optimize", "c.yaml", *settings("integrator.type=prb"))
-    [fog] = [row for row in ROWS if row.name == "homogeneous"]
-    (folder / "scene.xml").write_text(fog.xml())
-    assert fog.light in said("export", "runs/c", "-o", "out", code=2)
-    assert not (folder / "out").exists()

@@ -1,8 +1,7 @@
-"""Uses of a finished run: `initial: {run: RUN}`, `render --run RUN`, `export`."""
+"""Uses of a finished run: `initial: {run: RUN}`, `render RUN`, `export`."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import mitsuba as mi
@@ -27,8 +26,6 @@ from reslrb_cli.scene.values import resample
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Commands and settings that continue from a run: `initial: {run: RUN}` and `render --run RUN`.
-
 LAMP = "lamp.emitter.radiance.value"
 #: A texture, a colour and a motion: all shapes that a value can have.
 PARAMETERS = f"""[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAMP}, initial: [3, 4, 5]}},
@@ -44,10 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     scene = (folder / "scene.xml").read_text().replace('<rfilter type="box"/>', '<rfilter type="gaussian"/>')
     (folder / "scene.xml").write_text(scene)
     (folder / "tiny.yaml").write_text(config + "optimizer: {learning_rate: 0.05}\n")
-    result = reslrb(
-        "optimize", folder / "tiny.yaml", "--set", f"parameters={PARAMETERS}", "--set", f"run.output={folder}/runs"
-    )
-    assert result.exit_code == 0, result.output
+    tiny.done("optimize", folder / "tiny.yaml", *tiny.settings(f"parameters={PARAMETERS}", f"run.output={folder}/runs"))
     return folder
 
 
@@ -100,13 +94,11 @@ def test_rendering_a_run_renders_its_recovered_values(folder: Path) -> None:
         f"initial: {{translation: {left['wall.translation'].tolist()}, scale: {left['wall.scale']}}}}}]"
     )
     common = ("--set", "run.spp=16", "--sensor", 0, "--set", "run.seed=3", "-o")
-    expected = reslrb("render", folder / "tiny.yaml", "--set", f"parameters={by_hand}", *common, folder / "a.exr")
-    assert expected.exit_code == 0, expected.output
-    assert reslrb("render", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
+    tiny.done("render", folder / "tiny.yaml", "--set", f"parameters={by_hand}", *common, folder / "a.exr")
+    tiny.done("render", folder / "runs/tiny", *common, folder / "b.exr")
     # The samples are equal, but a CPU adds them in any order.
     assert np.allclose(load_image(folder / "a.exr"), load_image(folder / "b.exr"), rtol=1e-5)
-    initial = reslrb("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
-    assert initial.exit_code == 0
+    tiny.done("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
     assert not np.allclose(load_image(folder / "a.exr"), load_image(folder / "c.exr"), rtol=1e-2)
 
 
@@ -116,8 +108,7 @@ def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
 ) -> None:
     spec = "[{motion: {of: wall, free: [translation]}, learning_rate: 0.01}]"  # a colour cannot be told from exposure
     given = tiny.settings(f"target.exposure={exposure}", f"parameters={spec}", f"run.output={tmp_path}/runs")
-    result = reslrb("optimize", folder / "tiny.yaml", *given, *tiny.settings("optimizer.learning_rate=0.2"))
-    assert result.exit_code == 0, result.output
+    tiny.done("optimize", folder / "tiny.yaml", *given, *tiny.settings("optimizer.learning_rate=0.2"))
     run = tmp_path / "runs/tiny"
     factor = read_value(run, "exposure") if exposure == "per_channel" else np.float32(exposure)
     assert np.all(np.abs(factor - 1) > 0.01)
@@ -140,9 +131,7 @@ def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
 
 
 def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
-    result = reslrb("export", folder / "runs/tiny", "-o", folder / "exported")
-    assert result.exit_code == 0, result.output
-    assert "rendered by ptracer" in result.output
+    assert "rendered by ptracer" in tiny.done("export", folder / "runs/tiny", "-o", folder / "exported").output
     theirs = mi.load_file(str(folder / "exported/scene.xml"))
     problem = assemble_scene(recovered(folder / "runs/tiny", ("integrator.rr_depth=9",)))
     found = np.stack([np.array(mi.render(theirs, spp=64, seed=seed)) for seed in range(16)])
@@ -158,11 +147,9 @@ def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "Missing argument 'CONFIG|RUN'"),
         (("--run", "runs/tiny"), "--run was removed; name the folder of the run in place of CONFIG"),
         (("tiny.yaml", "--spp", "4"), "--spp was removed; use --set run.spp=N"),
         (("runs/tiny", "--scene"), "remove --initial or --scene"),
-        (("runs/none",), "no such file"),
         (("runs",), "has no manifest.json"),
     ],
 )
@@ -220,108 +207,3 @@ def test_an_exported_scene_names_path_if_ptracer_is_wrong(tmp_path: Path) -> Non
     by_prb = load(tmp_path / "tiny.yaml", ["integrator={type: prb, max_depth: 4}"])
     integrator, why = choose_integrator(by_prb, scene, mi.traverse(scene), "camera")
     assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")
-
-
-# Continuing from runs whose cameras come from a file, and which recovered a relief: `render` and `export`.
-
-SIZE = 12
-#: A sheet of 5x5 vertices that is lit by a lamp. The cameras of the file replace this sensor.
-SCENE = """<scene version="3.0.0">
-    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>
-        <string name="pixel_format" value="rgb"/><rfilter type="gaussian"/></film></sensor>
-    <shape type="obj" id="sheet"><string name="filename" value="sheet.obj"/>
-        <bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.5, 0.4"/></bsdf></bsdf></shape>
-    <shape type="rectangle" id="lamp">
-        <transform name="to_world"><rotate x="1" angle="180"/><scale value="0.4"/><translate x="1.5" z="2"/></transform>
-        <emitter type="area"><rgb name="radiance" value="8, 8, 8"/></emitter>
-    </shape>
-</scene>
-"""
-CONFIG = """
-variant: llvm_ad_rgb
-scene: {file: scene.xml, cameras: transforms.json}
-parameters:
-  - {heightmap: {mesh: sheet, resolution: [4, 4]}, bounds: [-0.3, 0.3], learning_rate: 0.03}
-  - {key: sheet.bsdf.brdf_0.reflectance.value, initial: 0.5, bounds: [0, 1], learning_rate: 0.05}
-integrator: {type: reslrb, max_depth: 3, estimator: stack}
-views: [{sensor: 0}, {sensor: 1, exposure: 0.9}]
-run: {iterations: 6, spp: 16, final_spp: 4, held_out: [right]}
-"""
-EYES = ((-0.8, 0.0, 3.5), (0.9, 0.5, 3.2))
-
-
-def look_at_origin(eye: tuple[float, ...]) -> list[list[float]]:
-    """Return a camera's pose for `transforms.json`. The camera looks along its -z, with y upwards."""
-    z = np.array(eye) / np.linalg.norm(eye)
-    x = np.cross([0, 1, 0], z)
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3] = np.column_stack([x, np.cross(z, x), z, eye])
-    return [[float(number) for number in row] for row in pose]
-
-
-def write_sheet(path: Path) -> None:
-    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5)))
-    corners = [k for k in range(20) if k % 5 < 4]
-    lines = [f"v {a:g} {b:g} 0" for a, b in zip(x, y, strict=True)]
-    lines += [f"vt {(a + 1) / 2:g} {(b + 1) / 2:g}" for a, b in zip(x, y, strict=True)]
-    faces = [face for k in corners for face in ((k, k + 1, k + 5), (k + 1, k + 6, k + 5))]
-    lines += ["f " + " ".join(f"{k + 1}/{k + 1}" for k in face) for face in faces]
-    path.write_text("\n".join(lines) + "\n")
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
-    """Folder of a finished run with two cameras, `left` and `right`. The run recovers the relief of a sheet."""
-    folder = tmp_path_factory.mktemp("other-runs")
-    write_sheet(folder / "sheet.obj")
-    (folder / "scene.xml").write_text(SCENE)
-    (folder / "box.yaml").write_text(CONFIG)
-    frames = [
-        {"file_path": f"{name}.exr", "transform_matrix": look_at_origin(eye)}
-        for name, eye in zip(("left", "right"), EYES, strict=True)
-    ]
-    shared = {"w": SIZE, "h": SIZE, "fl_x": 18.0, "fl_y": 18.0, "cx": SIZE / 2, "cy": SIZE / 2}
-    (folder / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
-    shade = np.linspace(0.1, 0.6, SIZE, dtype=np.float32)[None, :, None]
-    for name in ("left", "right"):
-        mi.Bitmap(np.broadcast_to(shade, (SIZE, SIZE, 3)).copy()).write(str(folder / f"{name}.exr"))
-    result = reslrb("optimize", folder / "box.yaml", "--set", f"run.output={folder}/runs")
-    assert result.exit_code == 0, result.output
-    return folder / "runs/box"
-
-
-#: The view of the second camera is held out. The view of the first camera is an ordinary view.
-SENSORS = pytest.mark.parametrize("sensor", [pytest.param(0, marks=pytest.mark.long), 1])
-
-
-@SENSORS
-def test_each_camera_is_rendered_with_the_relief(run: Path, tmp_path: Path, sensor: int) -> None:
-    heights = read_value(run, "sheet.heightmap")
-    assert np.abs(heights).max() > 0.05, "it never rose, so this would show nothing"
-    file = tmp_path / "image.exr"
-    common = ("--set", "run.spp=256", "--exposure", 1, "--set", "run.seed=3")
-    done = reslrb("render", run, "--sensor", sensor, *common, "-o", file)
-    assert done.exit_code == 0, done.output
-    image = load_image(file)
-    assert image.shape == (SIZE, SIZE, 3)
-    ended, begun = (assemble_scene(config) for config in (recovered(run, ()), load(run / "config.yaml")))
-    own, first = (np.stack([one.render(sensor, 16, k, "test").mean() for k in range(16)]) for one in (ended, begun))
-    error = own.std(ddof=1) * np.sqrt(2 / len(own))  # the image has as many samples as all these renderings
-    far = np.abs(np.array([own.mean(), first.mean()]) - image.mean()) / error
-    assert far[0] < 3 < far[1], (image.mean(), own, first)
-
-
-@pytest.mark.long
-@SENSORS
-def test_mitsuba_sees_the_relief_from_each_camera(run: Path, tmp_path: Path, sensor: int) -> None:
-    done = reslrb("export", run, "-o", tmp_path / "exported")
-    assert done.exit_code == 0, done.output
-    theirs = mi.load_file(str(tmp_path / "exported/scene.xml"))
-    assert len(theirs.sensors()) == 2
-    ended, begun = (assemble_scene(config) for config in (recovered(run, ()), load(run / "config.yaml")))
-    own, first = (np.stack([one.render(sensor, 64, k, "test") for k in range(16)]) for one in (ended, begun))
-    found = np.stack([np.array(mi.render(theirs, sensor=sensor, spp=64, seed=seed)) for seed in range(16)])
-    result = compare(own, found)
-    assert result, result
-    assert not compare(first, found)

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-
-from reslrb_cli.cli import main
+from cli.tiny import done, outcome, settings
 
 pytestmark = pytest.mark.usefixtures("llvm")
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "cornell_floor.yaml"
@@ -18,9 +16,7 @@ TINY = ["--set", "scene.options={resx: 16, resy: 16}", "--set", "integrator.max_
 
 def inspect(*arguments: str) -> str:
     """Return the output of `inspect`."""
-    result = CliRunner().invoke(main, ["inspect", str(CONFIG), *TINY, *arguments])
-    assert result.exit_code == 0, result.output
-    return result.stdout
+    return done("inspect", CONFIG, *TINY, *arguments).stdout
 
 
 def plan_lines(text: str) -> list[str]:
@@ -33,11 +29,7 @@ def test_the_plan_lists_needed_and_omitted_features():
     lines = plan_lines(inspect())
     assert any(line.split()[:3] == ["needed", "derivatives", "of"] for line in lines)
     assert any("left out" in line and "delta lobes" in line for line in lines)
-
-
-def test_plan_as_json():
-    plan = json.loads(inspect("--json"))["plan"]
-    rows = {row["feature"]: row for row in plan["rows"]}
+    rows = {row["feature"]: row for row in json.loads(inspect("--json"))["plan"]["rows"]}
     assert rows["derivatives of BSDFs"]["needed"]
     assert not rows["null surfaces"]["needed"]
 
@@ -83,9 +75,7 @@ def scene(tmp_path, monkeypatch):
 
 def lines_of(*arguments: str) -> list[str]:
     """Return the output lines of `inspect`, with single blanks."""
-    result = CliRunner().invoke(main, ["inspect", *arguments])
-    assert result.exit_code == 0, result.output
-    return [" ".join(line.split()) for line in result.stdout.splitlines()]
+    return [" ".join(line.split()) for line in done("inspect", *arguments).stdout.splitlines()]
 
 
 def test_a_scene_file_by_itself(scene):
@@ -112,28 +102,20 @@ def test_a_scene_file_by_itself(scene):
     assert "plan" not in found
 
 
-def test_everything_with_all(scene):
-    short, full = lines_of("scene.xml"), lines_of("scene.xml", "--all")
-    assert len(short) < 40 < len(full)
-    assert (
-        "Rectangle_2.to_world AffineTransform4f differentiable, discontinuous is recovered as a motion "
-        "(`motion: {of: Rectangle_2}`)" in full
-    )
-
-
 def test_a_long_list_is_cut(scene):
     scene.write_text(SCENE.replace("</scene>", '<shape type="sphere"/>' * 60 + "</scene>"))
     short = lines_of("scene.xml")
     assert "can be recovered: 69" in short
     assert "and 39 more; --all lists them" in short
     assert len(short) < 60
-    assert "Sphere_62.bsdf.reflectance.value 0.5" in lines_of("scene.xml", "--all")
+    full = lines_of("scene.xml", "--all")
+    assert "Sphere_62.bsdf.reflectance.value 0.5" in full
+    moved = "Rectangle_2.to_world AffineTransform4f differentiable, discontinuous is recovered as a motion"
+    assert f"{moved} (`motion: {{of: Rectangle_2}}`)" in full
 
 
 def test_everything_as_json(scene):
-    result = CliRunner().invoke(main, ["inspect", "scene.xml", "--json"])
-    assert result.exit_code == 0, result.output
-    report = json.loads(result.stdout)
+    report = json.loads(done("inspect", "scene.xml", "--json").stdout)
     assert (report["plan"], report["run"]) == (None, None)
     parameters = {entry["key"]: entry for entry in report["parameters"]}
     assert len(parameters) == 34
@@ -158,7 +140,6 @@ def test_a_selected_8_bit_texture_is_shown_as_floats(scene):
     ("text", "next_step"),
     [
         ("", 'add `target: {file: IMAGE}` and `parameters: [{key: "wall.reflectance.data"}]` to c.yaml'),
-        ("target: {file: photo.exr}", 'add `parameters: [{key: "wall.reflectance.data"}]` to c.yaml'),
         ("parameters: [{key: Sphere_1.*}]", "add `target: {file: IMAGE}` to c.yaml"),
         ("parameters:\ntarget:\nrun: {iterations: 3}", "add `target: {file: IMAGE}` and `parameters: "),
         ("parameters: [{key: Sphere_1.*}]\ntarget: {render: {}}", "`reslrb optimize c.yaml` runs it"),
@@ -172,13 +153,6 @@ def test_an_incomplete_configuration_is_accepted(scene, text, next_step):
     assert ("plan" in found) is has_parameters
     assert ("* Sphere_1.emitter.radiance.value [5, 2, 0.25]" in found) is has_parameters
     assert ("can be recovered: 9 (* in `parameters`)" in found) is has_parameters
-
-
-def test_sections_can_be_given_on_the_command_line(scene):
-    Path("c.yaml").write_text("scene: {file: scene.xml}")
-    found = lines_of("c.yaml", "--set", "parameters=[{key: Envmap_1.scale}]", "--set", "target.file=x.exr")
-    assert "* Envmap_1.scale 1" in found
-    assert found[-1] == "next: `reslrb optimize c.yaml` runs it"
 
 
 @pytest.mark.parametrize(
@@ -197,13 +171,11 @@ def test_sections_can_be_given_on_the_command_line(scene):
         (["run.yaml"], "run.yaml: scene: missing; it has no default"),
     ],
 )
-def test_wrong_arguments(scene, capsys, arguments, said):
+def test_wrong_arguments(scene, arguments, said):
     Path("empty.yaml").write_text("")
     Path("run.yaml").write_text("run: {spp: 4}")
-    with pytest.raises(SystemExit) as end:
-        main.main(["inspect", *arguments])
-    assert end.value.code == 2
-    assert said in capsys.readouterr().err.splitlines()[-1]
+    code, _, err = outcome("inspect", *arguments)
+    assert (code, said in err.splitlines()[-1]) == (2, True)
 
 
 def test_a_run_folder_shows_its_progress(scene):
@@ -211,22 +183,12 @@ def test_a_run_folder_shows_its_progress(scene):
         "scene: {file: scene.xml}\ntarget: {render: {spp: 4}}\nparameters: [{key: Sphere_1.emitter.radiance.value}]\n"
         "integrator: {type: ptracer, max_depth: 2}\nrun: {iterations: 2, spp: 1}\n"
     )
-    done = CliRunner().invoke(main, ["optimize", "c.yaml", "--quiet"])
-    assert done.exit_code == 0, done.output
+    done("optimize", "c.yaml", "--quiet")
     for path in ("runs/c", "runs/c/config.yaml"):
         found = lines_of(path)
         assert found[0] == f"run {path}: finished, 2 iterations"
         assert "* Sphere_1.emitter.radiance.value [5, 2, 0.25]" in found
         assert found[-1] == "next: `reslrb optimize runs/c/config.yaml` runs it again"
-
-
-def test_unmatched_keys_get_suggestions(scene, capsys):
-    Path("c.yaml").write_text(
-        "scene: {file: scene.xml}\ntarget: {render: {}}\nparameters: [{key: Sphere_3.emitter.radiance}]"
-    )
-    with pytest.raises(SystemExit):
-        main.main(["optimize", "c.yaml"])
-    assert "did you mean `Sphere_1.emitter.radiance.value`" in capsys.readouterr().err
 
 
 STIFF = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
@@ -235,26 +197,12 @@ STIFF = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 def conditioning(*arguments: str) -> str:
     """Return the output of `inspect --conditioning` for a small stiff lamp."""
     small = ["scene.options={resx: 12, resy: 12}", "integrator={max_depth: 2}", "run.spp=32", "target.render.spp=64"]
-    sets = [word for each in small for word in ("--set", each)]
-    result = CliRunner().invoke(main, ["inspect", str(STIFF), "--conditioning", *sets, *arguments])
-    assert result.exit_code == 0, result.output
-    return result.stdout
+    return done("inspect", STIFF, "--conditioning", *settings(*small), *arguments).stdout
 
 
 def test_conditioning_as_a_table_and_as_json():
     lines = conditioning().splitlines()
-    assert lines[-4].split() == [
-        "parameter",
-        "entries",
-        "value",
-        "gradient",
-        "noise",
-        "image",
-        "/",
-        "unit",
-        "curvature",
-        "length",
-    ]
+    assert " ".join(lines[-4].split()) == "parameter entries value gradient noise image / unit curvature length"
     assert lines[-5] == "conditioning (8 gradients of 32 spp, seed 0)"
     measured = json.loads(conditioning("--json"))["conditioning"]
     floor, lamp = measured["parameters"]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import json
-import logging
 import re
 import shlex
 from pathlib import Path
@@ -12,10 +12,10 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 import pytest
+from cli.tiny import done, manifest, outcome, settings
 from kit import TEXTURE, area, ref, scene, sensor, shape
 from turns import a_few
 
-from reslrb_cli.cli import main
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.measure import nonfinite_trace
@@ -48,66 +48,58 @@ run: {iterations: 3, spp: 16, seed: 5, adjoint: correlated}
 KEY = "poster.reflectance.value"
 
 
-@pytest.fixture
-def spoilt_experiment(llvm, tmp_path, monkeypatch):
-    """Working directory with a scene, textures, a target and a configuration."""
+def write_spoilt(folder):
+    """Write a scene, textures, a target and a configuration."""
     import mitsuba as mi
 
     wall = np.full((8, 8, 3), 0.5, np.float32)
-    mi.Bitmap(wall).write(str(tmp_path / "wall.exr"))
+    mi.Bitmap(wall).write(str(folder / "wall.exr"))
     wall[4, 1, 1] = np.nan
-    mi.Bitmap(wall).write(str(tmp_path / "spoilt.exr"))
-    mi.Bitmap(np.full((8, 8, 3), 0.2, np.float32)).write(str(tmp_path / "target.exr"))
-    (tmp_path / "scene.xml").write_text(SCENE.replace("REFLECTANCE", PLAIN))
-    (tmp_path / "config.yaml").write_text(CONFIG)
+    mi.Bitmap(wall).write(str(folder / "spoilt.exr"))
+    mi.Bitmap(np.full((8, 8, 3), 0.2, np.float32)).write(str(folder / "target.exr"))
+    (folder / "scene.xml").write_text(SCENE.replace("REFLECTANCE", PLAIN))
+    (folder / "config.yaml").write_text(CONFIG)
+
+
+@pytest.fixture
+def spoilt_experiment(llvm, tmp_path, monkeypatch):
+    """Working directory with a scene, textures, a target and a configuration."""
+    write_spoilt(tmp_path)
     monkeypatch.chdir(tmp_path)
-    yield tmp_path
-    logging.getLogger("reslrb_cli").handlers.clear()
+    return tmp_path
 
 
-def reslrb_nonfinite(capsys, *args):
-    """Run the command line in this process, and return the exit code, standard output and standard error."""
-    with pytest.raises(SystemExit) as end:
-        main.main([str(arg) for arg in args])
-    out, err = capsys.readouterr()
-    return int(end.value.code or 0), out, err
-
-
-def optimize(capsys, *sets, code=5):
+def optimize(*sets, code=5):
     """Run `optimize`, check the exit code, and return its output and errors."""
-    arguments = [argument for setting in sets for argument in ("--set", setting)]
-    found, out, err = reslrb_nonfinite(capsys, "optimize", "config.yaml", *arguments)
+    found, out, err = outcome("optimize", "config.yaml", *settings(*sets))
     assert found == code, err
     assert "Traceback" not in err
     return out, err
 
 
-def inspect(capsys, err):
-    """Run the `inspect` command in `err`, and return iteration, offenders and text."""
+def inspect(err):
+    """Run the `inspect` command in `err`, and return iteration and offenders."""
+    report = json.loads(done(*command_in(err), "--json").stdout)
+    return report["iteration"], report["offenders"]
+
+
+def command_in(err):
+    """Return the words of the `inspect` command in `err`."""
     [command] = set(re.findall(r"where: (reslrb inspect .* --nonfinite)", err))
     program, *arguments = shlex.split(command)
     assert program == "reslrb"
-    code, out, _ = reslrb_nonfinite(capsys, *arguments)
-    assert code == 0
-    code, as_json, _ = reslrb_nonfinite(capsys, *arguments, "--json")
-    assert code == 0
-    report = json.loads(as_json)
-    assert out.startswith(f"iteration {report['iteration']}, sensor 0, pixel")
-    return report["iteration"], report["offenders"], out
-
-
-def manifest(folder="runs/config"):
-    return json.loads((Path(folder) / "manifest.json").read_text())
+    return arguments
 
 
 STOP = "run.on_nonfinite=stop"
 
 
-@pytest.mark.parametrize("film", a_few(["rgb", "rgba"], ["rgba"]))
-def test_a_nan_texel(spoilt_experiment, capsys, film):
-    _, err = optimize(capsys, STOP, f"scene.options={{wall: spoilt.exr, format: {film}}}")
+def test_a_nan_texel(spoilt_experiment):
+    _, err = optimize(STOP, "scene.options={wall: spoilt.exr, format: rgba}")
     assert "not finite in iteration 0" in err.splitlines()[-1]
-    iteration, [offender], text = inspect(capsys, err)
+    iteration, [offender] = inspect(err)
+    text = done(*command_in(err)).stdout
+    assert text.startswith("iteration 0, sensor 0, pixel")
     assert iteration == 0
     assert offender["value"][1] == "nan"
     assert all(isinstance(value, float) for value in offender["value"][::2])
@@ -121,39 +113,39 @@ def test_a_nan_texel(spoilt_experiment, capsys, film):
     assert f"path {at['path']} of 1024" in text
 
 
-def test_an_overflowing_light(spoilt_experiment, capsys):
-    _, err = optimize(capsys, STOP, "scene.options={power: 3e38}")
-    _, [offender], _ = inspect(capsys, err)
+def test_an_overflowing_light(spoilt_experiment):
+    _, err = optimize(STOP, "scene.options={power: 3e38}")
+    _, [offender] = inspect(err)
     assert offender["quantity"] == "emission E"
     assert (offender["value"], offender["where"]["vertex"]) == (["inf"] * 3, 0)
 
 
-def test_an_overflowing_sum(spoilt_experiment, capsys):
-    _, err = optimize(capsys, STOP, "scene.options={power: 2e36}")
-    _, [offender], _ = inspect(capsys, err)
+def test_an_overflowing_sum(spoilt_experiment):
+    _, err = optimize(STOP, "scene.options={power: 2e36}")
+    _, [offender] = inspect(err)
     assert "finite" in offender["quantity"]
     assert min(offender["value"]) > 1e30
 
 
-def test_a_non_finite_derivative(spoilt_experiment, capsys):
+def test_a_non_finite_derivative(spoilt_experiment):
     """The reflectance is 0.5 + sqrt(x), and x is 0."""
     _register_root()
     Path("scene.xml").write_text(SCENE.replace("REFLECTANCE", '<texture type="root" name="reflectance"/>'))
-    _, err = optimize(capsys, STOP, "parameters=[{key: poster.reflectance.x, initial: 0.0, bounds: [0, 1]}]")
+    _, err = optimize(STOP, "parameters=[{key: poster.reflectance.x, initial: 0.0, bounds: [0, 1]}]")
     assert "the gradient of poster.reflectance.x in 1 entry" in err
-    _, [offender], _ = inspect(capsys, err)
+    _, [offender] = inspect(err)
     assert offender["quantity"].startswith("derivative of the")
     assert offender["where"]["surface"] == "poster_shape"
 
 
-def test_the_replay_uses_the_parameters_of_that_iteration(spoilt_experiment, capsys):
+def test_the_replay_uses_the_parameters_of_that_iteration(spoilt_experiment):
     """The reflectance is NaN once x has moved by more than 0.015, which happens in iteration 2."""
     import drjit as dr
 
     _register_root(lambda x: dr.select(dr.abs(x - 0.5) > 0.015, dr.nan, x))
     Path("scene.xml").write_text(SCENE.replace("REFLECTANCE", '<texture type="root" name="reflectance"/>'))
-    _, err = optimize(capsys, STOP, "parameters=[{key: poster.reflectance.x, initial: 0.5, bounds: [0, 1]}]")
-    iteration, [offender], _ = inspect(capsys, err)
+    _, err = optimize(STOP, "parameters=[{key: poster.reflectance.x, initial: 0.5, bounds: [0, 1]}]")
+    iteration, [offender] = inspect(err)
     assert iteration == 2
     assert offender["where"]["surface"] == "poster_shape"
 
@@ -194,20 +186,22 @@ def root_of_pixel(image, target, weights=None):
 
 
 @pytest.mark.parametrize("kind", ["stop", "skip", "zero"])
-def test_a_loss_with_a_non_finite_derivative(spoilt_experiment, capsys, monkeypatch, kind):
+def test_a_loss_with_a_non_finite_derivative(spoilt_experiment, monkeypatch, kind):
     monkeypatch.setitem(losses.LOSSES, "l2", root_of_pixel)
-    _, err = optimize(capsys, f"run.on_nonfinite={kind}", code=5 if kind == "stop" else 0)
+    out, err = optimize(f"run.on_nonfinite={kind}", code=5 if kind == "stop" else 0)
     assert "dL/dI in 1 entry, the first at pixel (5, 3), channel 1, of sensor 0" in err
-    _, [offender], text = inspect(capsys, err)
+    _, [offender] = inspect(err)
     assert (offender["pixel"], offender["where"]) == ([5, 3], None)
     assert offender["quantity"].endswith("dL/dI, channel 1")
     assert offender["target"] == pytest.approx([0.2] * 3)
-    assert "target (0.2, 0.2, 0.2)" in text
+    assert kind != "stop" or "target (0.2, 0.2, 0.2)" in done(*command_in(err)).stdout
+    assert kind == "stop" or "3 values not finite in 3 iterations" in out.splitlines()[-1]
+    assert err.count("--nonfinite") == 1, "the first says where to look"
     moved = np.load("runs/config/parameters/parameters.npz")[KEY] != 0.5
     assert moved.all() if kind == "zero" else not moved.any()
 
 
-def test_finished_work_is_kept(spoilt_experiment, capsys, monkeypatch):
+def test_finished_work_is_kept(spoilt_experiment, monkeypatch):
     """After a fault in the second iteration, the run folder is complete and holds the parameters of that iteration."""
     calls = []
 
@@ -217,9 +211,9 @@ def test_finished_work_is_kept(spoilt_experiment, capsys, monkeypatch):
         return root_of_pixel(image, target) if len(calls) == 3 else losses.l2(image, target)
 
     monkeypatch.setitem(losses.LOSSES, "l2", sometimes)
-    out, err = optimize(capsys, STOP)
+    out, err = optimize(STOP)
     folder = Path("runs/config")
-    result = manifest()
+    result = manifest("runs/config")
     assert (result["status"], result["results"]["iterations"]) == ("failed", 2)
     assert result["error"] == err.splitlines()[-1]
     assert result["results"]["nonfinite"] == {"iterations": 1, "values": 1, "by_parameter": {}}
@@ -232,84 +226,68 @@ def test_finished_work_is_kept(spoilt_experiment, capsys, monkeypatch):
     assert "1 values were not finite" in (folder / "report.html").read_text()
     calls.clear()
     monkeypatch.setitem(losses.LOSSES, "l2", losses.l2)
-    code, out, _ = reslrb_nonfinite(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
+    code, out, _ = outcome("inspect", "runs/config/config.yaml", "--nonfinite")
     assert (code, out) == (1, "iteration 1: all values are finite now\n")
 
 
-def test_the_last_line_counts(spoilt_experiment, capsys, monkeypatch):
-    monkeypatch.setitem(losses.LOSSES, "l2", root_of_pixel)
-    out, err = optimize(capsys, "run.on_nonfinite=zero", code=0)
-    assert "3 values not finite in 3 iterations" in out.splitlines()[-1]
-    assert err.count("--nonfinite") == 1, "the first says where to look"
-
-
-@pytest.mark.parametrize("adjoint", a_few(["independent", "batched"], ["batched"]))
-def test_each_set_of_samples_is_checked(spoilt_experiment, capsys, adjoint):
-    _, err = optimize(
-        capsys, STOP, "scene.options={wall: spoilt.exr}", f"run.adjoint={adjoint}", "run.memory_budget=64"
-    )
-    _, [offender], _ = inspect(capsys, err)
-    assert offender["where"]["samples"] in ("image", "gradient", "batch 1", "batch 2", "batch 3", "batch 4")
+@pytest.mark.parametrize("sets", ["run={adjoint: batched, memory_budget: 64}", "run={shards: 2}"])
+def test_each_set_of_samples_is_checked(spoilt_experiment, sets):
+    _, err = optimize("scene.options={wall: spoilt.exr}", sets, "run.iterations=3", "run.spp=16", STOP)
+    _, [offender] = inspect(err)
+    assert re.fullmatch(r"batch [1-4]|shard [12], image and gradient", offender["where"]["samples"])
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
 
 
-def test_each_shard_is_checked(spoilt_experiment, capsys):
-    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", "run.shards=2")
-    _, [offender], _ = inspect(capsys, err)
-    assert offender["where"]["samples"] in ("shard 1, image and gradient", "shard 2, image and gradient")
-    assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
-
-
-def test_without_a_fault_there_is_nothing_to_show(spoilt_experiment, capsys):
-    code, _, err = reslrb_nonfinite(capsys, "inspect", "config.yaml", "--nonfinite")
+def test_without_a_fault_there_is_nothing_to_show(spoilt_experiment):
+    code, _, err = outcome("inspect", "config.yaml", "--nonfinite")
     assert (code, len(err.splitlines())) == (2, 1)
     assert "is not in a run folder" in err
-    optimize(capsys, code=0)
-    code, _, err = reslrb_nonfinite(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
+    optimize(code=0)
+    code, _, err = outcome("inspect", "runs/config/config.yaml", "--nonfinite")
     assert code == 2
     assert "all values of this run were finite" in err
 
 
-def test_the_step_of_the_run_is_traced_again(spoilt_experiment, capsys):
+def test_the_step_of_the_run_is_traced_again(spoilt_experiment):
     """The replay needs the files and the complete state of the run. The replay uses the run's own settings and refuses
     `--set`.
     """
-    optimize(capsys, STOP, "scene.options={wall: spoilt.exr}")
+    optimize(STOP, "scene.options={wall: spoilt.exr}")
     command = ("inspect", "runs/config/config.yaml", "--nonfinite")
-    code, _, err = reslrb_nonfinite(capsys, *command, "--set", "run.spp=4")
+    code, _, err = outcome(*command, "--set", "run.spp=4")
     assert (code, err) == (2, "--set: has no effect with --nonfinite, which repeats a step of the run\n")
     wall = Path("spoilt.exr").read_bytes()
     Path("spoilt.exr").write_bytes(Path("wall.exr").read_bytes())
-    code, _, err = reslrb_nonfinite(capsys, *command)
+    code, _, err = outcome(*command)
     assert code == 2
     assert "has changed since runs/config began; put it back" in err
     Path("spoilt.exr").write_bytes(wall)
     file = Path("runs/config/checkpoint/nonfinite.npz")
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
-    code, _, err = reslrb_nonfinite(capsys, *command)
+    code, _, err = outcome(*command)
     assert (code, len(err.splitlines())) == (2, 1)
     assert err.startswith(f"{file}: is damaged, cut off, or not written by reslrb")
 
 
-@pytest.mark.parametrize("sequence", ["independent", "low_discrepancy", "auto"])
-def test_paths_use_the_sequence_of_the_run(spoilt_experiment, capsys, sequence):
+@pytest.mark.parametrize("sequence", ["low_discrepancy", "auto"])
+def test_paths_use_the_sequence_of_the_run(spoilt_experiment, sequence):
     """If the sequence is `auto`, the paths use the sequence that the run chose."""
     sets = ("scene.options={wall: spoilt.exr}", f"integrator.sequence={sequence}", "run.measuring=1000")
-    optimize(capsys, STOP, *sets)
+    optimize(STOP, *sets)
     problem, _ = problem_before_nonfinite(Path("runs/config"), print)
     own = problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence
-    chosen = {each["setting"]: each["value"] for each in manifest()["decisions"]}.get("sequence", sequence)
+    chosen = {each["setting"]: each["value"] for each in manifest("runs/config")["decisions"]}.get("sequence", sequence)
     assert (own is not None) == (chosen == "low_discrepancy")
     parts = nonfinite_trace._parts(problem, problem.views[0], 1)
     assert {samples.plan.sequence for samples, *_ in parts} == {own}
 
 
 @pytest.mark.parametrize("paths", a_few(["camera", "both, light_share: 0.02", "auto"], ["camera", "auto"]))
-def test_camera_paths_are_checked(spoilt_experiment, capsys, paths):
+def test_camera_paths_are_checked(spoilt_experiment, paths):
     ours = f"integrator={{type: reslrb, max_depth: 4, estimator: stack, paths: {paths}}}"
-    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", ours)
-    _, [offender], _ = inspect(capsys, err)
+    _, err = optimize(STOP, "scene.options={wall: spoilt.exr}", ours)
+    _, [offender] = inspect(err)
     where = offender["where"]
     assert offender["quantity"] in ("connection factor c", "scattering weight s")
     assert offender["value"][1] == "nan"
@@ -320,32 +298,32 @@ def test_camera_paths_are_checked(spoilt_experiment, capsys, paths):
         assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
 
 
-def test_lamps_hit_by_camera_paths_are_checked(spoilt_experiment, capsys):
+def test_lamps_hit_by_camera_paths_are_checked(spoilt_experiment):
     ours = "integrator={type: reslrb, max_depth: 4, estimator: stack, paths: camera}"
-    _, err = optimize(capsys, STOP, "scene.options={power: 3.4028236e38}", ours)
-    _, [offender], _ = inspect(capsys, err)
+    _, err = optimize(STOP, "scene.options={power: 3.4028236e38}", ours)
+    _, [offender] = inspect(err)
     assert offender["quantity"] in ("incident radiance, or radiance of a sampled emitter", "connection factor c")
     assert offender["where"]["samples"].endswith(", camera paths")
 
 
-def test_other_paths_from_the_sensor_are_not_checked(spoilt_experiment, capsys):
+def test_other_paths_from_the_sensor_are_not_checked(spoilt_experiment):
     prb = "integrator={type: prb, max_depth: 4}"
-    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", prb)
-    _, [offender], _ = inspect(capsys, err)
+    _, err = optimize(STOP, "scene.options={wall: spoilt.exr}", prb)
+    _, [offender] = inspect(err)
     assert offender["quantity"].startswith("image")
     assert offender["image"][1] in ("nan", "inf")
     assert offender["where"] is None
 
 
-def test_visible_emitters_are_checked(spoilt_experiment, capsys):
+def test_visible_emitters_are_checked(spoilt_experiment):
     """The lamp in front of the poster faces the camera. At a depth of 1 there are no light paths."""
     at_camera = SCENE.replace('<rotate x="1" angle="180"/><translate z="5"/>', '<scale value="0.1"/>')
     Path("scene.xml").write_text(
         at_camera.replace("REFLECTANCE", PLAIN).replace('<translate z="0"/>', '<translate z="-0.5"/>')
     )
     sets = ("scene.options={power: 3.4028236e38}", "integrator.max_depth=1")
-    _, err = optimize(capsys, STOP, *sets)
-    _, [offender], _ = inspect(capsys, err)
+    _, err = optimize(STOP, *sets)
+    _, [offender] = inspect(err)
     assert offender["quantity"] == "emission E towards the sensor"
     assert offender["where"]["surface"] == "lamp"
 
@@ -354,22 +332,22 @@ def test_visible_emitters_are_checked(spoilt_experiment, capsys):
     "integrator",
     a_few(["walk_ad", "ptracer", "reslrb, estimator: reservoir", "reslrb, estimator: event"], ["ptracer"]),
 )
-def test_other_integrators_have_the_same_paths(spoilt_experiment, capsys, integrator):
+def test_other_integrators_have_the_same_paths(spoilt_experiment, integrator):
     found = []
     for type in (integrator, "reslrb, estimator: gather"):
         chosen = f"integrator={{type: {type}, max_depth: 4}}"
-        _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", chosen, "run.name=" + type[:4])
-        found.append(inspect(capsys, err)[:2])
+        _, err = optimize(STOP, "scene.options={wall: spoilt.exr}", chosen, "run.name=" + type[:4])
+        found.append(inspect(err))
     assert found[0] == found[1]
 
 
-def test_passes_of_a_memory_budget_are_replayed(spoilt_experiment, capsys):
+def test_passes_of_a_memory_budget_are_replayed(spoilt_experiment):
     sets = (STOP, "scene.options={wall: spoilt.exr}", "run.spp=1024", "integrator.estimator=reservoir")
-    _, err = optimize(capsys, *sets, "run.memory_budget=1e-3", code=2)
+    _, err = optimize(*sets, "run.memory_budget=1e-3", code=2)
     least = int(re.search(r"allow at least (\d+) MiB", err)[1])
-    _, err = optimize(capsys, *sets, f"run.memory_budget={least}")
-    assert manifest()["memory"]["passes"] > 1
-    _, [offender], _ = inspect(capsys, err)
+    _, err = optimize(*sets, f"run.memory_budget={least}")
+    assert manifest("runs/config")["memory"]["passes"] > 1
+    _, [offender] = inspect(err)
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
     assert ", pass " in offender["where"]["samples"]
     assert offender["quantity"] == "connection factor c"
@@ -382,8 +360,6 @@ SETTINGS = ["integrator.guiding=on", "scene.options={wall: spoilt.exr}", "run.it
 #: Kinds of steps. With `batches`, the tables learn between the batches of a step.
 WAYS = {
     "correlated": ["run.adjoint=correlated", "run.spp=2"],
-    "independent": ["run.adjoint=independent", "run.spp=2"],
-    "batched": ["run.adjoint=batched", "run.spp=4"],
     "batches": ["run.adjoint=batched", "run.batches=8", "run.spp=8"],
 }
 #: Seeds that are tried in turn, until a run meets the texel after its tables have learned. Any change of the tables
@@ -409,27 +385,45 @@ def note(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Drawn:
     return drawn
 
 
-def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], way: str) -> list[str]:
+#: The line with which a run stops, and in it the iteration and the first pixel.
+TOLD = re.compile(r"not finite in iteration (\d+): .*the first at pixel \((\d+), (\d+)\)")
+
+
+@pytest.fixture(scope="module")
+def guided(llvm, tmp_path_factory):
+    """Function that makes a guided run once, and returns its folder, its errors, and the samplings of its steps."""
+
+    @functools.cache
+    def made(way: str) -> tuple[Path, str, Drawn]:
+        folder = tmp_path_factory.mktemp(way)
+        write_spoilt(folder)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            taken = note(patch, reslrb)
+            for seed in SEEDS:
+                taken.clear()
+                _, err = optimize(*SETTINGS, *WAYS[way], f"run.seed={seed}")
+                told = TOLD.search(err)
+                if told is not None and int(told[1]) > 0:  # the tables have learned
+                    return folder, err, taken
+        raise AssertionError(err)
+
+    return made
+
+
+def differences(monkeypatch: pytest.MonkeyPatch, made: tuple[Path, str, Drawn]) -> list[str]:
     """Return the differences between the run's last step and the step that its replay examines."""
-    taken, looked_at = note(monkeypatch, reslrb), note(monkeypatch, nonfinite_trace)
-    for seed in SEEDS:
-        taken.clear()
-        _, err = optimize(capsys, *SETTINGS, *WAYS[way], f"run.seed={seed}")
-        told = re.search(r"not finite in iteration (\d+): .*the first at pixel \((\d+), (\d+)\)", err)
-        if told is not None and int(told[1]) > 0:
-            break
-    run = taken[:]
-    assert told is not None, err
-    assert int(told[1]) > 0  # the tables have learned
-    iteration, offenders, _ = inspect(capsys, err)
+    folder, err, run = made
+    monkeypatch.chdir(folder)
+    told, looked_at = TOLD.search(err), note(monkeypatch, nonfinite_trace)
+    iteration, offenders = inspect(err)
     assert iteration == int(told[1])
     seeds = list(dict.fromkeys(seed for seed, _ in looked_at))
     found = [] if len(seeds) == len({seed for seed, _ in run if seed in seeds}) > 0 else ["other seeds"]
     for seed in seeds:
         own, there = ([table for number, table in drawn if number == seed] for drawn in (run, looked_at))
-        found += [] if len(there) == 2 * len(own) else [f"{len(there)} sets in place of {len(own)}"]
-        for one, other in zip(own, there, strict=False):  # the step was inspected twice
-            assert one is not None
+        found += [] if len(there) == len(own) else [f"{len(there)} sets in place of {len(own)}"]
+        for one, other in zip(own, there, strict=False):
             assert one
             if other is None or any(not np.array_equal(other[name], value) for name, value in one.items()):
                 found.append("another table")
@@ -440,18 +434,19 @@ def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
     return found
 
 
-@pytest.mark.parametrize("way", a_few(WAYS, ["correlated", "batches"]))
-def test_it_is_the_step_of_the_run(spoilt_experiment, capsys, monkeypatch, way):
-    assert differences(monkeypatch, capsys, way) == []
+@pytest.mark.parametrize("way", WAYS)
+def test_it_is_the_step_of_the_run(guided, monkeypatch, way):
+    assert differences(monkeypatch, guided(way)) == []
 
 
 @pytest.mark.parametrize("fault", ["untaught", "not learned on", "out of order"])
-def test_differing_tables_are_detected(spoilt_experiment, capsys, fault, monkeypatch):
+def test_differing_tables_are_detected(guided, fault, monkeypatch):
     """The replay's tables were not restored, do not learn between a step's batches, or belong to another batch."""
+    run = guided("batches")
     if fault == "untaught":
         monkeypatch.setattr(state, "restore_tables", lambda problem, calls, learned: None)
     elif fault == "not learned on":
         monkeypatch.setattr(Witness, "learn", lambda self, number, samples, adjoint: self.drawn.pop())
     else:
         monkeypatch.setattr(Witness, "learn", Guiding.learn)
-    assert "another table" in differences(monkeypatch, capsys, "batches")
+    assert "another table" in differences(monkeypatch, run)

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli.test_nonfinite import CONFIG, SCENE
-from cli.test_nonfinite import reslrb_nonfinite as reslrb
+from cli.tiny import outcome
 from records.test_metrics import make_record
 
 from reslrb_cli.cli.progress import Progress, descriptions
@@ -50,20 +50,20 @@ def experiment(llvm, tmp_path, monkeypatch):
     return folder
 
 
-def test_inspect(experiment, capsys):
-    code, out, err = reslrb(capsys, "inspect", experiment / "c.yaml")
+def test_inspect(experiment):
+    code, out, err = outcome("inspect", experiment / "c.yaml")
     assert code == 0
     assert not {"\x1b", TURNED} & set(out + err)
     assert "id `pos\\u202eter` cannot be part of a key: named Diffuse_1" in err
     assert "Diffuse_1.reflectance.value" in out
-    code, out, _ = reslrb(capsys, "inspect", experiment / "c.yaml", "--json")
+    code, out, _ = outcome("inspect", experiment / "c.yaml", "--json")
     assert not {"\x1b", TURNED} & set(out)
     assert "Diffuse_1.reflectance.value" in [entry["key"] for entry in json.loads(out)["parameters"]]
 
 
-def test_a_run_and_its_errors(experiment, capsys):
+def test_a_run_and_its_errors(experiment):
     arguments = ("--set", "run.iterations=1", "--set", 'run.output="o\\e[31m"', "--set", "run.name=n")
-    code, out, err = reslrb(capsys, "optimize", experiment / "c.yaml", *arguments)
+    code, out, err = outcome("optimize", experiment / "c.yaml", *arguments)
     assert code == 0
     assert "\x1b" not in out + err
     assert "look at o\\x1b[31m/n/report.html" in out
@@ -71,86 +71,44 @@ def test_a_run_and_its_errors(experiment, capsys):
     manifest = json.loads(Path(f"o{ESC}/n/manifest.json").read_text())
     assert "\x1b" not in manifest["config"] + "".join(manifest["command_line"])
     for wrong in ("c.yaml", "none.yaml"):
-        code, out, err = reslrb(capsys, "optimize", experiment / wrong, "--set", 'parameters[0].key="x\\e[31m"')
+        code, out, err = outcome("optimize", experiment / wrong, "--set", 'parameters[0].key="x\\e[31m"')
         assert code == 2
         assert "\x1b" not in out + err
 
 
-def test_a_configuration_name_with_invalid_utf8(experiment, capsys, monkeypatch):
-    path = experiment.parent / "c\udcff.yaml"
-    monkeypatch.setattr("sys.argv", ["reslrb", "optimize", str(path), ESC])
-    path.write_text((experiment / "c.yaml").read_text().replace("file: ", f"file: {experiment}/".replace(ESC, "*")))
-    os.rename(experiment, str(experiment).replace(ESC, "*"))
-    code, _, err = reslrb(capsys, "optimize", path, "--set", "run.iterations=1")
-    assert code == 0, err
-    assert Path("runs/c/report.html").exists()
-    manifest = json.loads(Path("runs/c/manifest.json").read_text())
-    assert "c\\udcff.yaml" in manifest["config"]
-    assert manifest["command_line"][2:] == [manifest["config"], "\\x1b[31m"]
-
-
-def test_usage(capsys):
-    code, out, err = reslrb(capsys, "optimize", f"--{ESC}")
-    assert code == 2
-    assert "\x1b" not in out + err
-    assert "No such option" in err
-
-
 def test_the_log(capsys):
-    reslrb(capsys, "optimize", "none.yaml")
+    code, out, err = outcome("optimize", f"--{ESC}")
+    assert (code, "\x1b" in out + err) == (2, False)
+    assert "No such option" in err
+    outcome("optimize", "none.yaml")
     logging.getLogger("reslrb_cli.x").warning("%s: %s", f"a{ESC}", "b\nc")
     assert capsys.readouterr().err == "a\\x1b[31m: b\\nc\n"
-
-
-def test_long_keys_become_file_names(experiment, capsys):
-    long = "k" * 120  # longer ids are replaced
-    scene = (experiment / "scene.xml").read_text()
-    (experiment / "scene.xml").write_text(scene.replace('id="wall"', f'id="{long}"'))
-    key = f"parameters=[{{key: {long}.reflectance.data, initial: 0.4}}]"
-    code, _, err = reslrb(capsys, "optimize", experiment / "c.yaml", "--set", key, "--set", "run.iterations=1")
-    assert code == 0, err
-    entries = json.loads(Path("runs/c/parameters/parameters.json").read_text())
-    assert (Path("runs/c/parameters") / entries[f"{long}.reflectance.data"]["file"]).exists()
-
-
-def test_an_image_name_with_invalid_utf8(experiment, capsys, monkeypatch):
-    monkeypatch.chdir(experiment)
-    code, out, err = reslrb(capsys, "render", "c.yaml", "-o", "\udcff.png")
-    assert code == 0, err
-    assert out.startswith("\\udcff.png: ")
-    assert os.path.getsize("\udcff.png") > 0
 
 
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
         (("render", "c.yaml", "-o", "pipe.png"), "--output: pipe.png is not a regular file"),
-        (("render", "c.yaml", "-o", "x.bmp"), "--output: x.bmp has no known image format"),
         (("gradcheck", "c.yaml", "--spp", "99999999999999"), "is not in the range 1<=x<=2147483647."),
         (("gradcheck", "c.yaml", "--json", "pipe.png"), "--json: cannot write pipe.png: the pipe has no reader"),
-        (("bench", "c.yaml", "--max-depth", "99999999999999"), "is not in the range 2<=x<=2147483647."),
     ],
 )
-def test_outputs_and_counts(experiment, capsys, monkeypatch, arguments, what):
+def test_outputs_and_counts(experiment, monkeypatch, arguments, what):
     monkeypatch.chdir(experiment)
     os.mkfifo("pipe.png")
-    code, out, err = reslrb(capsys, *arguments)
+    code, out, err = outcome(*arguments)
     assert (code, out) == (2, "")
     assert what in err
-    assert not Path("x.png").exists()
 
 
-def test_a_removed_working_directory(experiment, capsys, monkeypatch):
+def test_a_removed_working_directory(experiment, monkeypatch):
     gone = experiment / "gone"
     gone.mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
-    code, _, err = reslrb(capsys, "inspect", experiment / "c.yaml")
+    code, _, err = outcome("inspect", experiment / "c.yaml")
     assert code in (2, 6)
     assert err == "the working directory: No such file or directory\n"
-
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_losing_the_terminal_does_not_end_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,8 +169,7 @@ def shown(monkeypatch, width, units, iterations=30, resize=None):
     return [frame for frame in re.split(r"[\r\n]+", text.decode()) if frame.strip()]
 
 
-@pytest.mark.parametrize("units", [1, 2])
-@pytest.mark.parametrize("width", [40, 60, 80, 120, 200])
+@pytest.mark.parametrize(("width", "units"), [(40, 1), (40, 2), (60, 1), (80, 2), (120, 2), (200, 1)])
 def test_every_width_shows_a_bar_the_percentage_and_the_loss(monkeypatch, width, units):
     frames = shown(monkeypatch, width, units)
     assert len(frames) >= 30
@@ -260,16 +217,8 @@ def test_a_very_narrow_terminal(monkeypatch):
     assert all(re.fullmatch(r" *\d+%\|.*\|", frame) for frame in frames)
 
 
-def test_an_error_is_shown_if_it_is_known():
-    meter = make_meter(2)
-    assert descriptions(make_record(), meter) == ["loss 0.5"]
-    long, short, loss = descriptions(record(0, 2), meter)
-    assert long.startswith("loss 0.01235, relative error 0.8642 at worst (wall.reflectance.value)")
-    assert (short, loss) == ("loss 0.01235, relative error 0.8642", "loss 0.01235")
-    assert descriptions(record(0, 1), make_meter(1))[0] == "loss 0.01235, parameter RMSE 0.2468"
-
-
 def test_keys_are_shortened_and_cannot_control_the_terminal():
+    assert descriptions(make_record(), make_meter(2)) == ["loss 0.5"]
     key = "\x1b[31mred" + "x" * 60 + ".value"
     meter = ErrorMeter(
         {key: np.ones(3), "b": np.ones(1)}, {key: np.ones(3, bool), "b": np.ones(1, bool)}, {"b": "radiance"}

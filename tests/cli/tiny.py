@@ -25,7 +25,7 @@ from reslrb_cli.runs import recorder as recording
 
 def reslrb(*arguments: object) -> Result:
     """Run `reslrb ARGUMENTS` and return its output and exit code."""
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], prog_name="reslrb")
 
 
 def done(*arguments: object) -> Result:
@@ -33,6 +33,12 @@ def done(*arguments: object) -> Result:
     result = reslrb(*arguments)
     assert result.exit_code == 0, result.output
     return result
+
+
+def outcome(*arguments: object) -> tuple[int, str, str]:
+    """Run `reslrb ARGUMENTS` and return the exit code, standard output and standard error."""
+    result = reslrb(*arguments)
+    return result.exit_code, result.stdout, result.stderr
 
 
 def settings(*given: str) -> list[str]:
@@ -130,8 +136,19 @@ def write_experiment(folder: Path, text: str = SCENE) -> None:
     (folder / "tiny.yaml").write_text(CONFIG)
 
 
-def start(folder: Path, *args: str, details: bool = False, **options: Any) -> subprocess.Popen[str]:
-    """Start `reslrb optimize tiny.yaml` in its own process, with `folder` as its working directory. With `details`, it
+def write_photo(path: Path, image: Any) -> None:
+    """Write linear values as an 8-bit image. A variant must be set."""
+    import mitsuba as mi
+    import numpy as np
+
+    bitmap = mi.Bitmap(np.ascontiguousarray(image[:, :, :3], dtype=np.float32))
+    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+
+
+def start(
+    folder: Path, *args: str, command: str = "optimize", details: bool = False, **options: Any
+) -> subprocess.Popen[str]:
+    """Start `reslrb COMMAND tiny.yaml` in its own process, with `folder` as its working directory. With `details`, it
     prints all messages.
     """
     # Start the program like its entry point, so that its name is `reslrb` from the first line on.
@@ -139,10 +156,10 @@ def start(folder: Path, *args: str, details: bool = False, **options: Any) -> su
     if details:  # without the tracebacks of --debug
         script += "log = logging.getLogger('reslrb_cli'); log.addHandler(LogLines()); log.setLevel('DEBUG'); "
     script += "run()"
-    command = [sys.executable, "-c", script, "optimize", "tiny.yaml", *args]
+    words = [sys.executable, "-c", script, command, "tiny.yaml", *args]
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
-    return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
+    return subprocess.Popen(words, cwd=folder, env=environment, **pipes)
 
 
 def files(folder: Path) -> set[str]:

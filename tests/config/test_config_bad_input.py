@@ -37,250 +37,137 @@ def changed(old: str, new: str) -> str:
     return GOOD.replace(old, new)
 
 
-def parameter(options: str) -> str:
-    return changed(PARAMETER, f"{{key: a, {options}}}")
-
-
-def target(section: str) -> str:
-    return changed("{render: {}}", section)
-
-
 def scene(file: str) -> str:
     return changed("scene.xml", file)
 
 
 PARAMETER = "{key: floor.reflectance.data}"
 
+#: Text that is added to the valid file, and parts of the error line.
+ADDED: dict[str, str | tuple[str, ...]] = {
+    "loss: {type: huba}": "loss.type: must be one of l2, l1, relative_l2, ssim, custom, not",
+    "optimiser: {}": ("optimiser: unknown key", "`optimizer`"),
+    "run: {iteration: 3}": ("run.iteration: unknown key", "`iterations`"),
+    "run: {xyz: 3}": "run.xyz: unknown key; known here: name, output",
+    "spp: 3": ("spp: unknown key", "`run.spp`"),
+    "run: {spp: 0, seed: -1, iterations: x}": ("run.", "(and 2 more)"),
+    "run: fast": ("run: must be a mapping", "'fast'"),
+    "loss: [l1]": "loss[0]: must be a mapping such as {type: NAME}",
+    "optimizer: {scale: 1e6}": ("optimizer.scale: must be", "auto"),
+    "views: [{sensor: -1}]": "views[0].sensor: must be at least 0",
+    "integrator: {type: reslbr}": "integrator.type: must be one of reslrb, ptracer, prb, prb_projective, walk_ad,",
+    "integrator: {type: prb, estimator: reservoir}": "integrator.estimator: not an option of prb but of reslrb",
+    "integrator: {estimator: gather, capacity: 2}": "integrator.capacity: has no effect with estimator `gather`, only",
+    "integrator: {capacity: 1}": "integrator.capacity: has no effect with estimator `auto`, only with `reservoir` or",
+    "integrator: {estimator: gater}": ("integrator.estimator: must be one of", "(did you mean gather?)"),
+    "integrator: {capacity: 0}": "integrator.capacity: must be at least 1",
+    "integrator: {weight: adjont}": "integrator.weight: must be luminance or adjoint (did you mean adjoint?)",
+    "integrator: {estimator: event, weight: adjoint}\nrun: {adjoint: correlated}": "`adjoint` needs dL/dI before",
+    "run: {memory_budget: 2 floppies}": "run.memory_budget: must be a number of MiB, or text such as 512 MiB or 2GiB",
+    "integrator: {type: ptracer}\nrun: {memory_budget: 64}": "run.memory_budget: needs integrator `reslrb`, not",
+    "integrator: {samples_per_pass: 4}\nrun: {memory_budget: 64}": "integrator.samples_per_pass: is chosen by",
+    "optimizer: {type: sgd, beta_1: 0.5}": "optimizer.beta_1: not an option of sgd but of adam",
+    "loss: {epsilon: 1}": "loss.epsilon: not an option of l2 but of relative_l2",
+    "loss: {type: relative_l2, epsilon: 0}": "loss.epsilon: must be above 0",
+    "optimizer: {final_fraction: 0.1}": "optimizer.final_fraction: has no effect on a constant",
+    "optimizer: {learning_rate: .nan}": "optimizer.learning_rate: must be a finite",
+    "optimizer: {type: sgd, momentum: 1}": "optimizer.momentum: must be below 1",
+    "integrator: {type: trajectory, max_depth: -1}": "integrator.max_depth: must be at least 0",
+    "integrator: {max_depth: -2}": "integrator.max_depth: must be at least -1",
+    "integrator: {hide_emitters: 1}": "integrator.hide_emitters: must be true or false",
+    "integrator: {samples_per_pass: 5}": "integrator.samples_per_pass: 5 does not divide run.spp, which is 16",
+    "run: {spp: 1.5}": "run.spp: must be an integer, not 1.5",
+    "run: {seed: 4294967296}": "run.seed: must be below 4294967296",
+    "run: {adjoint: batched, spp: 6, batches: 4}": "run.batches: 4 does not divide run.spp, which is 6",
+    "run: {adjoint: batched, batches: 1}": "run.batches: must be",
+    "integrator: {samples_per_pass: 4}\nrun: {adjoint: batched, spp: 24}": "integrator.samples_per_pass: 4 does not",
+    "run: {adjoint: correlate}": "run.adjoint: must be one of auto, correlated, independent, batched",
+    "run: {name: '---'}": "run.name: must contain a letter or a digit",
+    "variant: scalar_rgb": "variant: must be one of auto, llvm_ad_rgb",
+    "<script>: 1": "<script>: unknown key; known here: variant",
+    '"[key]": 1': "[key]: unknown key; known here: variant",
+    "run: {name: ../x}": "run.name: must be a name and not a path",
+    "run: {name: /etc/x}": "run.name: must be a name and not a path",
+    "run: {name: 'C:\\x'}": "run.name: must be a name and not a path",
+}
+#: An entry of `parameters`, and parts of the error line.
+ENTRIES: dict[str, str | tuple[str, ...]] = {
+    "{key: a, initial: {file: x, colour_space: srgb}}": ("parameters[0].initial.colour_space:", "`color_space`"),
+    "{key: ''}": "parameters[0].key: must be nonempty text",
+    "{key: a, bounds: [1, 0]}": ("parameters[0].bounds: ", "low < high"),
+    "{key: a, bounds: [0, .nan]}": ("parameters[0].bounds: ", "low < high"),
+    "{key: a, bounds: 1}": "parameters[0].bounds: must be a list",
+    "{key: a, transform: logarithm}": ("parameters[0].transform: must be one of", "log"),
+    "{key: a, transform: sigmoid}": ("parameters[0].transform: sigmoid maps to finite `bounds`", "has none"),
+    "{key: a, transform: log, bounds: [-1, 0]}": ("parameters[0].bounds: exclude positive values", "log"),
+    "{key: a, bounds: [0, 1], initial: [0.5, 1.5, 0.5]}": "parameters[0].initial: 1.5 is outside of the bounds [0, 1]",
+    "{key: a, initial: .nan}": "parameters[0].initial: must be a finite",
+    "{key: a, resolution: [64, 0]}": ("parameters[0].resolution[1]: ", "1"),
+    "{key: a, resolution: [100000, 100000]}": "parameters[0].resolution: must have at most 134217728 texels, not",
+    "{initial: 1}": "parameters[0]: must have one of `key`, `heightmap` and `motion`",
+    "{key: 3}": "parameters[0].key: must be text",
+    "{key: b}\n  - {key: b}": ("parameters[1].key: ", "parameters[0]"),
+    "{key: [a, a]}": "parameters[0].key: must list each key once",
+    "{key: [a, b], resolution: [4, 4]}": "parameters[0].resolution: needs a single key",
+    "{motion: {of: lens}}\n  - {motion: {of: [x, lens]}}": "parameters[1].motion.of[1]: `lens` is already in",
+    "{motion: {of: []}}": "parameters[0].motion.of: must have at least one entry",
+    "{motion: {of: a, free: [shear]}}": ("parameters[0].motion.free[0]: must be one of", "rotation"),
+    "{motion: {of: a, free: [translation, x]}}": "motion.free: has both `translation` and",
+    "{motion: {of: a, free: [x, y]}, bounds: {z: [0, 1]}}": "parameters[0].bounds.z: has no effect: `motion.free` has",
+    "{motion: {of: a, pivot: [1, 2]}}": "motion.pivot: must be a point, [x, y, z], not",
+    "{motion: {of: a, about: [1, 2, 3]}}": "parameters[0].motion.about: unknown key",
+    "{heightmap: {mesh: a}}": "parameters[0].heightmap.resolution: missing",
+    "{heightmap: {mesh: a, resolution: [99999, 99999]}}": "heightmap.resolution: must be at least",
+    "{heightmap: {mesh: a, resolution: [4, 4]}, resolution: [4, 4]}": "parameters[0].resolution: has no effect here",
+    "{motion: {of: lens}, bounds: {rotaton: [0, 1]}}": "parameters[0].bounds.rotaton: unknown key; did you mean",
+    "{motion: {of: lens}, bounds: {scale: [0, 1]}}": ("parameters[0].bounds.scale: has no", "translation, rotation"),
+    "{key: a, bounds: {scale: [0, 1]}}": "parameters[0].bounds: is a mapping for a motion",
+    "{motion: {of: lens}, bounds: [0, 1]}": "parameters[0].bounds: must be a mapping for `motion.free`",
+    "{key: a, initial: grey}": ("[0].initial: must be a number", "{file: IMAGE}, {run: RUN}, or `scene`"),
+    "{motion: {of: lens}, initial: {file: a.png}}": "parameters[0].initial: is an image file",
+    "{motion: {of: lens}, bounds: {rotation: [1, 0]}}": ("parameters[0].bounds.rotation: ", "low < high"),
+    "{motion: {of: lens}, transform: {rotation: sigmoid}}": ("parameters[0].transform.rotation: sigmoid", "has none"),
+    "{motion: {of: lens}, bounds: {rotation: [0, 1]}, initial: {rotation: 2}}": "parameters[0].initial.rotation: 2 is",
+    "{key: a}\nintegrator: {type: prb, attached: true}": "integrator.attached: not an option",
+    "{key: a}\nintegrator: {filter_normalization: none}": "filter_normalization: must be attached",
+}
+#: A target, and parts of the error line.
+TARGETS: dict[str, str | tuple[str, ...]] = {
+    "{render: {}, file: a.exr}": "target: must have exactly one of",
+    "{file: 3}": "target.file: must be a path",
+    "{file: [a.exr, b.exr]}": "target.file: is a list; give each view its own in `views`",
+    "{render: {}, color_space: srgb}": "target.color_space: has no effect",
+    "{render: {}, truth: true}": "target.truth: has no effect on a rendered",
+    "{file: a.png, color_space: sRGB}": "target.color_space: must be one of auto, linear, srgb (did you mean srgb?)",
+    "{render: {parameters: {a.b.value: [1, x]}}}": "target.render.parameters.a.b.value[1]: must be a number",
+    "{render: {integrator: {type: path}}}": "target.render.integrator.type: must be one of reslrb, ptracer, prb,",
+    "{render: {parameters: {'': 1}}}": "target.render.parameters: must have keys that are not empty",
+}
 #: The text of a file, the start of its error line after the file name, and parts of that line.
 FILES: dict[str, tuple[str | bytes, ...]] = {
     "empty": ("", "is empty", "scene, target and parameters"),
-    "comments only": ("# nothing\n", "is empty"),
     "list at the top": ("- scene\n", "must hold sections"),
-    "text at the top": ("scene\n", "must hold sections"),
     "not UTF-8": (b"\xff\xfe\x00a", "is not UTF-8 text"),
     "control character": ("scene:\n  \x01", ":2: not valid YAML"),
     "syntax": (GOOD + "run: [1,\n", ":6: not valid YAML"),
     "tab": ("scene:\n\tfile: x", ":2: not valid YAML: a tab; YAML allows only spaces for indentation"),
-    "tab behind a colon": ("scene:\n  file:\tx", ":2: not valid YAML: a tab; YAML allows only spaces"),
-    "loss unknown": (
-        GOOD + "loss: {type: huba}\n",
-        "loss.type: must be one of l2, l1, relative_l2, ssim, custom, not",
-    ),
-    "two documents": (GOOD + "---\n" + GOOD, ":5: not valid YAML"),
     "python object": ("scene: !!python/object:os.x {}", ":1: not valid YAML"),
     "contradicting tag": ("variant: !!bool maybe", "not valid YAML"),
-    "deep nesting": ("[" * 20_000, "lists and mappings are nested too deeply"),
     "endless integer": ("variant: " + "1" * 6000, ":1: the integer 1111", "more than 64 bits"),
     "unhashable key": (GOOD + "? [a]\n: 1\n", ":5: has a key that is a list"),
     "value that holds itself": (changed(f"\n  - {PARAMETER}", " &a [*a]"), "parameters[0]: must be a mapping"),
     "duplicate key": (GOOD + "run: {spp: 1}\nrun: {spp: 2}\n", ":6: run: given twice", "line 5"),
-    "duplicate in a list": (parameter("key: b"), ":4: parameters[0].key: given twice"),
     "key is a number": (GOOD + "1: 2\n", ":5: 1: a key must be text"),
-    "unknown section": (GOOD + "optimiser: {}\n", "optimiser: unknown key", "`optimizer`"),
-    "unknown key": (GOOD + "run: {iteration: 3}\n", "run.iteration: unknown key", "`iterations`"),
-    "unknown key, none near": (GOOD + "run: {xyz: 3}\n", "run.xyz: unknown key; known here: name, output"),
-    "key of another section": (GOOD + "spp: 3\n", "spp: unknown key", "`run.spp`"),
-    "key of the section below": (target("{render: {}, spp: 3}"), "target.spp: unknown key", "`target.render.spp`"),
-    "unknown key of an image": (
-        parameter("initial: {file: x, colour_space: srgb}"),
-        "parameters[0].initial.colour_space: unknown key",
-        "`color_space`",
-    ),
-    "missing section": ("scene: {file: x}\ntarget: {render: {}}\n", "parameters: missing"),
-    "missing key": (changed("{file: scene.xml}", "{options: {a: 1}}"), "scene.file: missing"),
     "misspelt, so also missing": (
         changed("file:", "fil:"),
         "scene.fil: unknown key; did you mean `file`?",
         "(and 1 more)",
     ),
-    "several errors": (GOOD + "run: {spp: 0, seed: -1, iterations: x}\n", "run.", "(and 2 more)"),
-    "section is text": (GOOD + "run: fast\n", "run: must be a mapping", "'fast'"),
-    "section is a list": (GOOD + "loss: [l1]\n", "loss[0]: must be a mapping such as {type: NAME}"),
-    "no parameters": (changed(f"\n  - {PARAMETER}", " []"), "parameters: must have at least one entry"),
-    "parameters is a mapping": (changed(f"\n  - {PARAMETER}", " {key: a}"), "parameters: must be a list"),
-    "parameter twice": (
-        changed(f"- {PARAMETER}", f"- {PARAMETER}\n  - {PARAMETER}"),
-        "parameters[1].key: ",
-        "parameters[0]",
-    ),
-    "empty parameter key": (changed(PARAMETER, "{key: ''}"), "parameters[0].key: must be nonempty text"),
-    "bounds reversed": (parameter("bounds: [1, 0]"), "parameters[0].bounds: ", "low < high"),
-    "bounds equal": (parameter("bounds: [1, 1]"), "parameters[0].bounds: ", "low < high"),
-    "bounds NaN": (parameter("bounds: [0, .nan]"), "parameters[0].bounds: ", "low < high"),
-    "bounds of one": (parameter("bounds: [1]"), "parameters[0].bounds: ", "two"),
-    "bounds of three": (parameter("bounds: [1, 2, 3]"), "parameters[0].bounds: ", "two"),
-    "bounds a number": (parameter("bounds: 1"), "parameters[0].bounds: must be a list"),
-    "bounds of text": (parameter("bounds: [0, inf]"), "parameters[0].bounds[1]: must be a number", "'inf'"),
-    "unknown transform": (parameter("transform: logarithm"), "parameters[0].transform: must be one of", "log"),
-    "sigmoid without bounds": (
-        parameter("transform: sigmoid"),
-        "parameters[0].transform: sigmoid maps to finite `bounds`",
-        "has none",
-    ),
-    "sigmoid with an open side": (
-        parameter("transform: sigmoid, bounds: [0, .inf]"),
-        "parameters[0].transform: sigmoid maps to finite `bounds`",
-        "has [0, inf]",
-    ),
-    "log of nothing positive": (
-        parameter("transform: log, bounds: [-1, 0]"),
-        "parameters[0].bounds: exclude positive values",
-        "log",
-    ),
-    "unknown scale": (GOOD + "optimizer: {scale: 1e6}\n", "optimizer.scale: must be", "auto"),
-    "bounds exclude the initial value": (
-        parameter("bounds: [0, 1], initial: [0.5, 1.5, 0.5]"),
-        "parameters[0].initial: 1.5 is outside of the bounds [0, 1]",
-    ),
-    "initial unknown word": (
-        parameter("initial: black"),
-        "parameters[0].initial: must be a number",
-        "`scene`",
-        "'black'",
-    ),
-    "initial NaN": (parameter("initial: .nan"), "parameters[0].initial: must be a finite"),
-    "initial infinite": (parameter("initial: [1, .inf, 1]"), "parameters[0].initial[1]: must be a finite number"),
-    "initial true": (parameter("initial: true"), "parameters[0].initial: must be a number"),
-    "initial empty list": (parameter("initial: []"), "parameters[0].initial: must have"),
-    "resolution": (parameter("resolution: [64, 0]"), "parameters[0].resolution[1]: ", "1"),
-    "both targets": (target("{render: {}, file: a.exr}"), "target: must have exactly one of"),
-    "no target": (target("{}"), "target: must have exactly one of `file` and `render`"),
-    "target file a number": (target("{file: 3}"), "target.file: must be a path"),
-    "target file a list": (
-        target("{file: [a.exr, b.exr]}"),
-        "target.file: is a list; give each view its own in `views`",
-    ),
-    "target file empty": (target("{file: ''}"), "target.file: must be a path"),
-    "colour space of a rendered target": (
-        target("{render: {}, color_space: srgb}"),
-        "target.color_space: has no effect",
-    ),
-    "truth of a rendered target": (target("{render: {}, truth: true}"), "target.truth: has no effect on a rendered"),
-    "colour space unknown": (
-        target("{file: a.png, color_space: sRGB}"),
-        "target.color_space: must be one of auto, linear, srgb (did you mean srgb?)",
-    ),
-    "target value": (
-        target("{render: {parameters: {a.b.value: [1, x]}}}"),
-        "target.render.parameters.a.b.value[1]: must be a number",
-    ),
-    "target integrator": (
-        target("{render: {integrator: {type: path}}}"),
-        "target.render.integrator.type: must be one of reslrb, ptracer, prb, prb_projective, walk_ad, trajectory",
-    ),
-    "sensor negative": (GOOD + "views: [{sensor: -1}]\n", "views[0].sensor: must be at least 0"),
     "scene option a list": (scene("a, options: {r: [1]}"), "scene.options.r: must be text"),
-    "scene option null": (scene("a, options: {r: }"), "scene.options.r: must be text"),
     "null character in a path": (scene('"a\\0"'), "scene.file: must be a path"),
-    "home of nobody": (scene("~no-such-user-here/a"), "scene.file: must be a path"),
-    "unknown integrator": (
-        GOOD + "integrator: {type: reslbr}\n",
-        "integrator.type: must be one of reslrb, ptracer, prb, prb_projective, walk_ad, trajectory, "
-        "custom (did you mean reslrb?)",
-    ),
-    "type is a list": (GOOD + "integrator: {type: [prb]}\n", "integrator.type: must be one of"),
-    "option of another integrator": (
-        GOOD + "integrator: {type: prb, estimator: reservoir}\n",
-        "integrator.estimator: not an option of prb but of reslrb",
-    ),
-    "option of another estimator": (
-        GOOD + "integrator: {estimator: gather, capacity: 2}\n",
-        "integrator.capacity: has no effect with estimator `gather`, only with `reservoir`",
-    ),
-    "estimator's option left at its default": (
-        GOOD + "integrator: {capacity: 1}\n",
-        "integrator.capacity: has no effect with estimator `auto`, only with `reservoir` or `event`",
-    ),
-    "unknown estimator": (
-        GOOD + "integrator: {estimator: gater}\n",
-        "integrator.estimator: must be one of",
-        "(did you mean gather?)",
-    ),
-    "capacity": (GOOD + "integrator: {capacity: 0}\n", "integrator.capacity: must be at least 1"),
-    "weight": (
-        GOOD + "integrator: {weight: adjont}\n",
-        "integrator.weight: must be luminance or adjoint (did you mean adjoint?)",
-    ),
-    "weight that is not known yet": (
-        GOOD + "integrator: {estimator: reservoir, weight: adjoint}\nrun: {adjoint: correlated}\n",
-        "integrator.weight: `adjoint` needs dL/dI before",
-        "run.adjoint: correlated",
-    ),
-    "memory budget in no unit": (
-        GOOD + "run: {memory_budget: 2 floppies}\n",
-        "run.memory_budget: must be a number of MiB, or text such as 512 MiB or 2GiB",
-    ),
-    "memory budget of nothing": (GOOD + "run: {memory_budget: 0}\n", "run.memory_budget: must be a number"),
-    "memory budget of a baseline": (
-        GOOD + "integrator: {type: ptracer}\nrun: {memory_budget: 64}\n",
-        "run.memory_budget: needs integrator `reslrb`, not `ptracer`",
-    ),
-    "memory budget and passes": (
-        GOOD + "integrator: {samples_per_pass: 4}\nrun: {memory_budget: 64}\n",
-        "integrator.samples_per_pass: is chosen by run.memory_budget",
-    ),
-    "option of another optimiser": (
-        GOOD + "optimizer: {type: sgd, beta_1: 0.5}\n",
-        "optimizer.beta_1: not an option of sgd but of adam",
-    ),
-    "option of another loss": (
-        GOOD + "loss: {epsilon: 1}\n",
-        "loss.epsilon: not an option of l2 but of relative_l2",
-    ),
-    "epsilon zero": (GOOD + "loss: {type: relative_l2, epsilon: 0}\n", "loss.epsilon: must be above 0"),
-    "fraction of a constant": (
-        GOOD + "optimizer: {final_fraction: 0.1}\n",
-        "optimizer.final_fraction: has no effect on a constant",
-    ),
-    "learning rate text": (GOOD + "optimizer: {learning_rate: fast}\n", "optimizer.learning_rate: must be a number"),
-    "learning rate true": (GOOD + "optimizer: {learning_rate: true}\n", "optimizer.learning_rate: ", "not true"),
-    "learning rate NaN": (GOOD + "optimizer: {learning_rate: .nan}\n", "optimizer.learning_rate: must be a finite"),
-    "momentum one": (GOOD + "optimizer: {type: sgd, momentum: 1}\n", "optimizer.momentum: must be below 1"),
-    "record without end": (
-        GOOD + "integrator: {type: trajectory, max_depth: -1}\n",
-        "integrator.max_depth: must be at least 0",
-    ),
-    "depth": (GOOD + "integrator: {max_depth: -2}\n", "integrator.max_depth: must be at least -1"),
-    "flag is a number": (GOOD + "integrator: {hide_emitters: 1}\n", "integrator.hide_emitters: must be true or false"),
-    "flag is YAML 1.1": (GOOD + "integrator: {hide_emitters: yes}\n", "integrator.hide_emitters: must be true or"),
-    "passes do not divide": (
-        GOOD + "integrator: {samples_per_pass: 5}\n",
-        "integrator.samples_per_pass: 5 does not divide run.spp, which is 16",
-    ),
-    "spp a fraction": (GOOD + "run: {spp: 1.5}\n", "run.spp: must be an integer, not 1.5"),
-    "spp zero": (GOOD + "run: {spp: 0}\n", "run.spp: must be at least 1"),
-    "seed beyond 32 bits": (GOOD + "run: {seed: 4294967296}\n", "run.seed: must be below 4294967296"),
-    "batches that do not divide": (
-        GOOD + "run: {adjoint: batched, spp: 6, batches: 4}\n",
-        "run.batches: 4 does not divide run.spp, which is 6",
-    ),
-    "one batch": (GOOD + "run: {adjoint: batched, batches: 1}\n", "run.batches: must be"),
-    "batches that passes do not divide": (
-        GOOD + "integrator: {samples_per_pass: 4}\nrun: {adjoint: batched, spp: 24}\n",
-        "integrator.samples_per_pass: 4 does not divide run.spp / run.batches, which is 6",
-    ),
-    "batches of nothing": (
-        GOOD + "run: {adjoint: correlated, batches: 2}\n",
-        "run.batches: has no effect with run.adjoint: correlated",
-    ),
-    "adjoint": (
-        GOOD + "run: {adjoint: correlate}\n",
-        "run.adjoint: must be one of auto, correlated, independent, batched",
-    ),
-    "name without letters": (GOOD + "run: {name: '---'}\n", "run.name: must contain a letter or a digit"),
-    "variant": (GOOD + "variant: scalar_rgb\n", "variant: must be one of auto, llvm_ad_rgb"),
-    "key that looks like a tag": (GOOD + "<script>: 1\n", "<script>: unknown key; known here: variant"),
-    "key that looks like pydantic's": (GOOD + '"[key]": 1\n', "[key]: unknown key; known here: variant"),
-    "such keys in a choice": (
-        GOOD + "integrator: {<prb>: 1, '[key]': {type: 3}}\n",
-        "integrator.<prb>: unknown key",
-        "(and 1 more)",
-    ),
     "control character in a key": (GOOD + 'run: {"\\e[31m": 1}\n', ":5: run.", "must not hold control"),
     "half a surrogate pair": (GOOD + 'run: {name: "\\ud800"}\n', ":5: ", "half of a surrogate pair"),
-    "half a surrogate pair in a key": (GOOD + '"\\ud800": 1\n', ":5: ", "must not hold control"),
     "a byte of a path": (scene('"\\udcff.xml"'), ":1: ", "half of a surrogate pair"),
-    "endless hexadecimal": (GOOD + f"run: {{spp: 0x{'f' * 20_000}}}\n", ":5: the integer 0xff", "64 bits"),
     "memory of 400 digits": (GOOD + f"run: {{memory_budget: {'9' * 400}}}\n", ":5: the integer 99", "64 bits"),
     "tag of other data": (GOOD + "run: {name: !!binary aGFsbG8=}\n", ":5: not valid YAML: the tag !!binary"),
     "glob without quotes": (
@@ -289,21 +176,6 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
         'in quotes: "*.data"',
     ),
     "long name": (GOOD + f"run: {{name: {'a' * 300}}}\n", "run.name: must have at most 200 bytes", "not 300"),
-    "name of many bytes": (GOOD + f"run: {{name: {'ü' * 101}}}\n", "run.name: must have", "not 202"),
-    "name that leads out": (GOOD + "run: {name: ../x}\n", "run.name: must be a name and not a path"),
-    "name that leads back": (GOOD + "run: {name: 'a/../b'}\n", "run.name: must be a name and not a path"),
-    "name from the root": (GOOD + "run: {name: /etc/x}\n", "run.name: must be a name and not a path"),
-    "name from a home": (GOOD + "run: {name: ~root/x}\n", "run.name: must be a name and not a path"),
-    "name of the folder": (GOOD + "run: {name: '..'}\n", "run.name: must be a name and not a path"),
-    "name of a drive": (GOOD + "run: {name: 'C:\\x'}\n", "run.name: must be a name and not a path"),
-    "empty key of a target": (
-        target("{render: {parameters: {'': 1}}}"),
-        "target.render.parameters: must have keys that are not empty",
-    ),
-    "more texels than an image has": (
-        parameter("resolution: [100000, 100000]"),
-        "parameters[0].resolution: must have at most 134217728 texels, not 10000000000",
-    ),
 }
 
 #: An override of the valid file, and parts of its error line.
@@ -312,17 +184,12 @@ OVERRIDES: dict[str, tuple[str, ...]] = {
     "=3": ("--set =3: must be KEY=VALUE",),
     "a..b=3": ("--set a..b=3: `a..b` is not a key",),
     "run.spp=[1,": ("--set run.spp=[1,: not valid YAML",),
-    "run.spp=many": ("--set run.spp=many: run.spp: must be an integer, not the text 'many'",),
     "run.spp=": ("--set run.spp=: run.spp: must be an integer, not null",),
     "run.spq=3": ("--set run.spq=3: run.spq: unknown key; did you mean `spp`?",),
-    "rnu.spp=3": ("--set rnu.spp=3: rnu: unknown key; did you mean `run`?",),
-    "integrator.estimater=reservoir": ("integrator.estimater: unknown key; did you mean `estimator`?",),
     "parameters[0].bounds=[1,0]": ("--set parameters[0].bounds=[1,0]: parameters[0].bounds: must be [low, high]",),
-    "parameters.0.bounds=[1,0]": ("--set parameters.0.bounds=[1,0]: parameters[0].bounds: must be [low, high]",),
     "parameters[2].bounds=[0,1]": (": parameters: has 1 entry; there is no [2]",),
     "parameters.bounds=[0,1]": (": parameters: is a list; give an entry, such as parameters[0]",),
     "scene.file.name=x": (": scene.file: is a single value",),
-    "scene[0]=x": (": scene: is not a list",),
     "scene=null": ("--set scene=null: scene: missing",),
     "parameters[0].key=*.data": (
         "--set parameters[0].key=*.data: *.data is an alias in YAML",
@@ -334,11 +201,23 @@ OVERRIDES: dict[str, tuple[str, ...]] = {
         "--set run.name=\\udcff: not valid YAML: holds a control character, or bytes that are not UTF-8",
     ),
     "\x1b[31m=1": ("--set \\x1b[31m=1: a key must not hold control characters",),
-    "run.name=../x": ("--set run.name=../x: run.name: must be a name and not a path",),
     "target.file=x.exr": (
         "--set target.file=x.exr: target: must have exactly one of `file` and `render`, and has both",
     ),
 }
+
+
+CASES = {text: (f"{GOOD}{text}\n", parts) for text, parts in ADDED.items()}
+CASES |= {text: (changed(PARAMETER, text), parts) for text, parts in ENTRIES.items()}
+CASES |= {text: (changed("{render: {}}", text), parts) for text, parts in TARGETS.items()}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_errors_are_located(case: str, tmp_path: Path) -> None:
+    text, parts = CASES[case]
+    line = line_of(tmp_path, text)
+    assert line.startswith("x.yaml: ")
+    assert all(part in line for part in ([parts] if isinstance(parts, str) else parts))
 
 
 @pytest.mark.parametrize("case", FILES)
@@ -395,16 +274,6 @@ def test_an_override_can_correct_the_file(tmp_path: Path) -> None:
     assert load(path, ["run.spp=2"]).run.spp == 2
 
 
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
-        load(tmp_path / "none.yaml")
-
-
-def test_folder_in_place_of_a_file(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="is a folder"):
-        load(tmp_path)
-
-
 def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_args: object) -> int:
         raise PermissionError(13, "Permission denied")
@@ -413,8 +282,9 @@ def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("pathlib.Path.open", refuse)  # chmod does not stop root from reading
     with pytest.raises(ConfigError, match=r"x\.yaml: cannot be read: Permission denied"):
         load(tmp_path / "x.yaml")
-
-
-def test_null_character_in_the_file_name() -> None:
+    monkeypatch.undo()
+    for path, why in ((tmp_path / "none.yaml", r"none\.yaml: no such file"), (tmp_path, "is a folder")):
+        with pytest.raises(ConfigError, match=why):
+            load(path)
     with pytest.raises(ConfigError, match="cannot be read"):
         load("a\0b.yaml")

@@ -6,16 +6,14 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from config.test_config_bad_input import PARAMETER, changed, line_of
-from make_reference import DOCS, EXAMPLE, json_schema, markdown, write
+from config.test_config_bad_input import PARAMETER, changed
+from make_reference import DOCS, EXAMPLE, json_schema, markdown
 
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb, WalkAdConfig
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb
 from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
 from reslrb_cli.config.optimizers import SGD, Adam
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
@@ -61,6 +59,7 @@ def load_text(folder: Path, text: str, *overrides: str, name: str = "x.yaml") ->
 
 
 def test_defaults(tmp_path: Path) -> None:
+    assert load_text(tmp_path, GOOD + "run:\n  # spp: 3\noptimizer:\n") == load_text(tmp_path, GOOD)
     config = load_text(tmp_path, GOOD, name="my floor.yaml")
     assert config.source == tmp_path / "my floor.yaml"
     assert (config.variant, config.views, config.scene.options) == ("auto", None, {})
@@ -126,9 +125,6 @@ def test_paths_do_not_depend_on_the_working_directory(tmp_path: Path, monkeypatc
         (GOOD, ()),
         (FULL, ()),
         (GOOD, ("views=[{sensor: 1, mask: none}]", "optimizer={type: sgd, schedule: exponential}", "run.name='1e3'")),
-        (FULL, ("integrator={type: prb}", "loss={type: l1}", "optimizer={type: adam}", "run.name='null'")),
-        (GOOD, ("integrator={estimator: stack}",)),
-        (GOOD, ("integrator={estimator: gather}",)),
         (GOOD, ("integrator={estimator: event, capacity: 4, weight: adjoint}", "run.adjoint=independent")),
         (GOOD, ("target.render={parameters: {a.b: 1e-3, c: {file: x.exr}}, integrator: {type: ptracer}}",)),
     ],
@@ -139,13 +135,8 @@ def test_round_trip(tmp_path: Path, text: str, overrides: tuple[str, ...], monke
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     again = load_text(tmp_path / "elsewhere", written, name="config.yaml")
-    assert again == config
+    assert again == config != load_text(tmp_path, text, *overrides, "run.seed=1")
     assert dump(again) == written
-
-
-def test_configs_differ_if_a_setting_does(tmp_path: Path) -> None:
-    assert load_text(tmp_path, GOOD) == load_text(tmp_path, GOOD)
-    assert load_text(tmp_path, GOOD) != load_text(tmp_path, GOOD, "run.seed=1")
 
 
 def test_overrides_are_typed_as_yaml_and_the_last_one_wins(tmp_path: Path) -> None:
@@ -182,10 +173,6 @@ def test_overrides_alone_make_a_configuration(tmp_path: Path) -> None:
     assert [spec.key for spec in config.parameters] == ["c"]
 
 
-def test_commented_sections_have_defaults(tmp_path: Path) -> None:
-    assert load_text(tmp_path, GOOD + "run:\n  # spp: 3\noptimizer:\n") == load_text(tmp_path, GOOD)
-
-
 def test_merge_keys_and_byte_order_mark(tmp_path: Path) -> None:
     text = (
         "\ufeff"
@@ -214,17 +201,11 @@ def test_free_mappings_match_the_schema() -> None:
     assert sorted(found) == sorted(FREE_MAPPINGS)
 
 
-def test_configuration_loads_no_mitsuba() -> None:
-    code = "import sys, reslrb_cli.config; sys.exit(any(m in sys.modules for m in ('mitsuba', 'drjit', 'numpy')))"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 @pytest.mark.parametrize(
     ("sets", "adjoint"),
     [
         ([], "batched"),
         (["run.spp=6"], "independent"),
-        (["run.spp=6", "run.batches=3"], "batched"),
         (["run.spp=24", "integrator.samples_per_pass=4"], "independent"),  # batches of 6 samples
         (["run.spp=32", "integrator.samples_per_pass=4"], "batched"),
         (["run.adjoint=correlated"], "correlated"),
@@ -268,12 +249,6 @@ def test_a_learning_rate_and_transform_apply_to_all_parts() -> None:
     assert spec.settings("rotation").learning_rate == spec.settings("translation").learning_rate == 0.1
 
 
-def test_a_single_free_part_accepts_plain_settings() -> None:
-    spec = ParameterSpec(motion={"of": "lamp", "free": ["translation"]}, initial=[0, 1, 0], bounds=(-1, 1))  # type: ignore[arg-type]
-    assert spec.settings("translation").initial == [0, 1, 0]
-    assert spec.settings("translation").bounds == (-1, 1)
-
-
 def test_each_axis_has_its_own_settings(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     axes = "motion: {of: lens, free: [x, y]}\n    initial: {y: 0.1}\n    bounds: {x: [-1, 1], y: [0, 2]}"
@@ -288,95 +263,6 @@ def test_a_heightmap_has_its_own_resolution() -> None:
     spec = ParameterSpec(heightmap={"mesh": ["slab", "other"], "resolution": [8, 4]}, bounds=(-0.1, 0.1))  # type: ignore[arg-type]
     assert spec.names == ["slab.heightmap"]
     assert (spec.settings().resolution, spec.settings().bounds) == ((8, 4), (-0.1, 0.1))
-
-
-LENS = "motion: {of: lens}"
-MAP = "heightmap: {mesh: a, resolution: [4, 4]}"
-#: The text of `parameters[0]`, and the place and parts of the error line.
-WRONG = {
-    "nothing": ("{initial: 1}", ("parameters[0]: must have one of `key`, `heightmap` and `motion`",)),
-    "two kinds": (f"{{key: a, {LENS}}}", ("parameters[0].motion: cannot be combined with `key`",)),
-    "key is a number": ("{key: 3}", ("parameters[0].key: must be text",)),
-    "no keys": ("{key: []}", ("parameters[0].key: must have at least one entry",)),
-    "key twice": ("{key: [a, a]}", ("parameters[0].key: must list each key once",)),
-    "tied and resampled": ("{key: [a, b], resolution: [4, 4]}", ("parameters[0].resolution: needs a single key",)),
-    "moved twice": (
-        f"{{{LENS}}}\n  - {{motion: {{of: [x, lens]}}}}",
-        ("parameters[1].motion.of[1]: `lens` is already in",),
-    ),
-    "mesh twice": (f"{{{MAP}}}\n  - {{{MAP}}}", ("parameters[1].heightmap.mesh[0]: `a` is already in parameters[0]",)),
-    "nothing moves": ("{motion: {of: []}}", ("parameters[0].motion.of: must have at least one entry",)),
-    "nothing free": ("{motion: {of: a, free: []}}", ("parameters[0].motion.free: must have at least one entry",)),
-    "unknown word": ("{motion: {of: a, free: [shear]}}", ("parameters[0].motion.free[0]: must be one of", "rotation")),
-    "an axis twice": ("{motion: {of: a, free: [translation, x]}}", ("motion.free: has both `translation` and",)),
-    "bounds of an axis that is held": (
-        "{motion: {of: a, free: [x, y]}, bounds: {z: [0, 1]}}",
-        ("parameters[0].bounds.z: has no effect: `motion.free` has only x, y",),
-    ),
-    "pivot of two": ("{motion: {of: a, pivot: [1, 2]}}", ("motion.pivot: must be a point, [x, y, z], not",)),
-    "unknown key of a motion": ("{motion: {of: a, about: [1, 2, 3]}}", ("parameters[0].motion.about: unknown key",)),
-    "no resolution": ("{heightmap: {mesh: a}}", ("parameters[0].heightmap.resolution: missing",)),
-    "resolution of one": ("{heightmap: {mesh: a, resolution: [1, 4]}}", ("heightmap.resolution: must be at least",)),
-    "huge": ("{heightmap: {mesh: a, resolution: [99999, 99999]}}", ("heightmap.resolution: must be at least",)),
-    "resolution outside": (f"{{{MAP}, resolution: [4, 4]}}", ("parameters[0].resolution: has no effect here",)),
-    "motion with a resolution": (f"{{{LENS}, resolution: [4, 4]}}", ("parameters[0].resolution: has no effect",)),
-    "word misspelt": (
-        f"{{{LENS}, bounds: {{rotaton: [0, 1]}}}}",
-        ("parameters[0].bounds.rotaton: unknown key; did you mean `rotation`?",),
-    ),
-    "word that is not free": (
-        f"{{{LENS}, bounds: {{scale: [0, 1]}}}}",
-        ("parameters[0].bounds.scale: has no effect", "translation, rotation"),
-    ),
-    "words without a motion": (
-        "{key: a, bounds: {scale: [0, 1]}}",
-        ("parameters[0].bounds: is a mapping for a motion",),
-    ),
-    "one bound for two units": (
-        f"{{{LENS}, bounds: [0, 1]}}",
-        ("parameters[0].bounds: must be a mapping for `motion.free`",),
-    ),
-    "one value for two units": (
-        f"{{{LENS}, initial: 0}}",
-        ("parameters[0].initial: must be a mapping for `motion.free`",),
-    ),
-    "start that is text": (
-        "{key: a, initial: grey}",
-        ("[0].initial: must be a number", "{file: IMAGE}, {run: RUN}, or `scene`"),
-    ),
-    "file for a motion": (f"{{{LENS}, initial: {{file: a.png}}}}", ("parameters[0].initial: is an image file",)),
-    "bounds of a word": (
-        f"{{{LENS}, bounds: {{rotation: [1, 0]}}}}",
-        ("parameters[0].bounds.rotation: ", "low < high"),
-    ),
-    "bounds of a word, one": (f"{{{LENS}, bounds: {{rotation: [1]}}}}", ("parameters[0].bounds.rotation: ", "two")),
-    "sigmoid of a word": (
-        f"{{{LENS}, transform: {{rotation: sigmoid}}}}",
-        ("parameters[0].transform.rotation: sigmoid maps to finite `bounds`", "has none"),
-    ),
-    "start outside": (
-        f"{{{LENS}, bounds: {{rotation: [0, 1]}}, initial: {{rotation: 2}}}}",
-        ("parameters[0].initial.rotation: 2 is outside of the bounds [0, 1]",),
-    ),
-    "rate of a word": (f"{{{LENS}, learning_rate: {{rotation: 0}}}}", ("learning_rate.rotation: must be above 0",)),
-    "attached is text": ("{key: a}\nintegrator: {attached: yes}", ("integrator.attached: must be auto",)),
-    "attached of another": (
-        "{key: a}\nintegrator: {type: prb, attached: true}",
-        ("integrator.attached: not an option",),
-    ),
-    "normalization": (
-        "{key: a}\nintegrator: {filter_normalization: none}",
-        ("filter_normalization: must be attached",),
-    ),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_errors_are_located(case: str, tmp_path: Path) -> None:
-    parameter, expected = WRONG[case]
-    line = line_of(tmp_path, changed(PARAMETER, parameter))
-    for part in expected:
-        assert part in line
 
 
 # The options of `reslrb` in a configuration are the options of its estimators.
@@ -425,25 +311,19 @@ def test_impossible_paths(options: dict[str, Any], words: str) -> None:
         Reslrb(**options)
 
 
-def test_naive_differentiation_uses_the_given_paths() -> None:
-    assert WalkAdConfig().options()["paths"] == "light"
-    with pytest.raises(ValueError, match="light_share"):
-        WalkAdConfig(paths="both", light_share=0.3)
-
-
 def test_auto_is_stack() -> None:
     assert Reslrb(max_depth=4).undecided_off().options() == Reslrb(estimator="stack", max_depth=4).options()
 
 
 @pytest.mark.parametrize(
     ("written", "bytes_"),
-    [(64, 64 * 2**20), (0.5, 2**19), ("512 MiB", 2**29), ("2GiB", 2**31), ("1.5 gb", 1_500_000_000), ("7 kB", 7000)],
+    [(0.5, 2**19), ("512 MiB", 2**29), ("1.5 gb", 1_500_000_000)],
 )
 def test_amounts_of_memory(written: int | float | str, bytes_: int) -> None:
     assert memory_bytes(written) == bytes_
 
 
-@pytest.mark.parametrize("written", ["", "512", "-1 MiB", "1 XiB", "0 B", 0, -3, float("nan"), float("inf"), True])
+@pytest.mark.parametrize("written", ["", "512", "-1 MiB", "1 XiB", 0, float("nan"), True])
 def test_invalid_amounts_of_memory(written: int | float | str) -> None:
     with pytest.raises(ValueError, match="not an amount of memory"):
         memory_bytes(written)
@@ -477,24 +357,11 @@ def test_pages_are_up_to_date() -> None:
     assert json.loads((DOCS / "config.schema.json").read_text(encoding="utf-8")) == json_schema(), HINT
 
 
-def test_pages_can_be_written(tmp_path: Path) -> None:
-    write(tmp_path)
-    assert (tmp_path / "config.md").read_text(encoding="utf-8") == markdown()
-    assert json.loads((tmp_path / "config.schema.json").read_text(encoding="utf-8")) == json_schema()
-
-
 def test_example_loads(tmp_path: Path) -> None:
     assert EXAMPLE in markdown()
     (tmp_path / "example.yaml").write_text(EXAMPLE)
     config = load(tmp_path / "example.yaml")
     assert (DOCS.parent / "configs" / config.scene.file.relative_to(tmp_path)).is_file()
-
-
-@pytest.mark.parametrize(
-    "key", ["variant", "scene", "target", "target.render", "parameters", "integrator", "loss", "optimizer", "run"]
-)
-def test_every_section_has_its_place(key: str) -> None:
-    assert f"`{key}`" in markdown()
 
 
 def test_every_key_is_described() -> None:

@@ -32,7 +32,7 @@ def _memory(name: str) -> float:
     return int(next(line for line in status.splitlines() if line.startswith(name)).split()[1]) / 1024
 
 
-@pytest.mark.parametrize("count", [100, pytest.param(10_000, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [50, pytest.param(10_000, marks=pytest.mark.long)])
 def test_mutated_configurations(count: int, tmp_path: Path) -> None:
     texts, path = mutations.good_texts(), tmp_path / "x.yaml"
     Path("/proc/self/clear_refs").write_text("5")  # resets the largest size so far
@@ -123,9 +123,3 @@ def test_paths_with_invalid_utf8(tmp_path: Path) -> None:
     ):
         load(folder / "x.yaml")
     assert load(tmp_path / "x\udcff.yaml").run.folder_name == "x"
-
-
-def test_harmless_names_are_kept(tmp_path: Path) -> None:
-    (tmp_path / "x.yaml").write_text(GOOD)
-    for name, folder in {"my first run": "my-first-run", "red/blue": "red-blue", "console": "console"}.items():
-        assert load(tmp_path / "x.yaml", [f"run.name={name}"]).run.folder_name == folder

@@ -25,8 +25,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("durable", [False, True])
-def test_a_file_appears_when_it_is_complete(tmp_path: Path, durable: bool) -> None:
+def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
     path, seen = tmp_path / "file", []
 
     def write(file):
@@ -35,7 +34,7 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path, durable: bool) -> No
         seen.append((path.read_bytes(), names(tmp_path)))
 
     path.write_bytes(b"old")
-    write_atomically(path, write, durable)
+    write_atomically(path, write, True)
     assert seen == [(b"old", [f".file.{os.getpid()}.part", "file"])]
     assert path.read_bytes() == b"new"
     assert names(tmp_path) == ["file"]
@@ -166,17 +165,12 @@ def test_unopenable_files_are_located(tmp_path: Path) -> None:
 # Every parameter has its own files, whatever its key is.
 
 
-@pytest.mark.parametrize("key", ["wall.reflectance.data", "Sphere_3.emitter.radiance.value", "Wände.alpha-2"])
-def test_valid_names(key: str) -> None:
-    assert file_stem(key) == key
-
-
 def test_similar_keys_have_distinct_file_names() -> None:
     long = "a" * 300
     keys = ["a b", "a_b", "a/b", "a__b", "a  b", "a\x1bb", long, long + "b", f"{long} b", f"{long}_b", "é" * 200 + "/"]
     names = [file_stem(key) for key in keys]
     assert len(set(names)) == len(keys)
     assert all(len(name.encode()) <= MOST_BYTES and "/" not in name and name.isprintable() for name in names)
-    assert file_stem("a_b") == "a_b"
+    assert [file_stem(key) for key in ("a_b", "Wände.alpha-2")] == ["a_b", "Wände.alpha-2"]
     assert file_stem("a b").startswith("a_b-")
     assert file_stem("a b") == file_stem("a b")

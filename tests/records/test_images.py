@@ -8,7 +8,16 @@ import sys
 import numpy as np
 import pytest
 
-from reslrb_cli.records.images import read_layers, write_layers
+from reslrb_cli.records.images import (
+    FORMATS,
+    load_image,
+    read_layers,
+    write_file,
+    write_image,
+    write_layers,
+    write_mask,
+    write_parameters,
+)
 
 # Images are whole or absent in every format, and contain the given values.
 
@@ -18,11 +27,9 @@ def make_image(channels=3):
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg"])
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png", ".jpg"])
 def test_every_format_can_be_read_back(tmp_path, suffix):
     import mitsuba as mi
-
-    from reslrb_cli.records.images import FORMATS, write_file
 
     assert suffix in FORMATS
     image, linear = make_image(), suffix in (".exr", ".hdr", ".pfm")
@@ -36,24 +43,11 @@ def test_every_format_can_be_read_back(tmp_path, suffix):
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("suffix", [".exr", ".png"])
-def test_an_incomplete_image_is_removed(tmp_path, file_size_limit, suffix):
-    from reslrb_cli.records.images import write_file
-
-    path = tmp_path / f"final{suffix}"
-    with file_size_limit(500), pytest.raises(OSError, match=f"final{suffix}"):
-        write_file(path, make_image(), linear=suffix == ".exr")
-    assert list(tmp_path.iterdir()) == []
-    path.write_bytes(b"what was there before")
-    with file_size_limit(500), pytest.raises(OSError, match=f"final{suffix}"):
-        write_file(path, make_image(), linear=suffix == ".exr")
-    assert path.read_bytes() == b"what was there before"
-
-
-@pytest.mark.usefixtures("llvm")
-def test_parameters_and_masks_are_written_likewise(tmp_path, file_size_limit):
-    from reslrb_cli.records.images import write_mask, write_parameters
-
+def test_an_incomplete_image_is_removed(tmp_path, file_size_limit):
+    with file_size_limit(500), pytest.raises(OSError, match=r"final\.png"):
+        write_file(tmp_path / "final.png", make_image(), linear=False)
+    with file_size_limit(300), pytest.raises(OSError, match=r"a\.exr"):
+        write_layers(tmp_path / "a.exr", layers())
     with file_size_limit(300), pytest.raises(OSError, match=r"wall\.data\.exr"):
         write_parameters(tmp_path, {"wall.data": make_image()})
     mask = np.random.default_rng(3).uniform(size=(64, 64)) > 0.5
@@ -65,8 +59,6 @@ def test_parameters_and_masks_are_written_likewise(tmp_path, file_size_limit):
 @pytest.mark.usefixtures("llvm")
 def test_a_heightmap_is_shown_from_lowest_to_highest(tmp_path):
     from matplotlib.image import imread
-
-    from reslrb_cli.records.images import load_image, write_parameters
 
     heights = np.linspace(-1e-3, 2e-3, 12, dtype=np.float32).reshape(3, 4, 1)
     write_parameters(tmp_path, {"face.heightmap": heights, "wall.data": np.abs(heights)})
@@ -102,7 +94,7 @@ def layers():
     return {name: generator.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
 
 
-def test_layers_survive_a_round_trip(tmp_path):
+def test_layers_survive_a_round_trip(tmp_path, llvm):
     written = layers()
     write_layers(tmp_path / "a.exr", written)
     read = read_layers(tmp_path / "a.exr")
@@ -110,6 +102,8 @@ def test_layers_survive_a_round_trip(tmp_path):
     for name, array in written.items():
         np.testing.assert_array_equal(read[name], array[:, :, None] if array.ndim == 2 else array)
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    write_image(tmp_path / "b", np.abs(written["image"]))
+    np.testing.assert_array_equal(read_layers(tmp_path / "b.exr")[""], np.abs(written["image"]))
 
 
 def test_other_programs_find_the_channels(tmp_path):
@@ -122,20 +116,6 @@ def test_other_programs_find_the_channels(tmp_path):
     fields = {field.name: place for place, field in enumerate(bitmap.struct_())}
     assert set(fields) == {"image.R", "image.G", "image.B", "z.Y"}
     np.testing.assert_array_equal(np.array(bitmap)[:, :, fields["image.G"]], written["image"][:, :, 1])
-
-
-def test_an_image_without_layers_has_no_name(tmp_path, llvm):
-    from reslrb_cli.records.images import write_image
-
-    image = np.abs(layers()["image"])
-    write_image(tmp_path / "a", image)
-    np.testing.assert_array_equal(read_layers(tmp_path / "a.exr")[""], image)
-
-
-def test_an_incomplete_layered_image_is_removed(tmp_path, file_size_limit):
-    with file_size_limit(300), pytest.raises(OSError, match=r"a\.exr"):
-        write_layers(tmp_path / "a.exr", layers())
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_damaged_files_are_reported(tmp_path):

@@ -65,11 +65,6 @@ def test_a_torn_last_line_is_repaired_before_the_next_one(tmp_path):
     assert [record["iteration"] for record in read_metrics(tmp_path)] == [0, 1]
 
 
-def test_a_missing_file_has_no_records(tmp_path):
-    with MetricsWriter(tmp_path):
-        assert list(tmp_path.iterdir()) == []  # no reader ever sees an empty file
-
-
 def test_an_incomplete_line_leaves_complete_ones(tmp_path, file_size_limit):
     line = len(make_record().to_json()) + 1
     with MetricsWriter(tmp_path) as writer:
@@ -154,12 +149,8 @@ def test_a_run_before_its_first_iteration_has_no_lines(tmp_path: Path) -> None:
 
 BAD = {
     "another iteration": '{"iteration": 5}',
-    "no record": "[1]",
-    "half": '{"iteration": 0, "lo',
     "a nest": "[" * 100_000,
     "text": text(RECORD).replace('"spp": 4', '"spp": "4"'),
-    "another name": text(RECORD).replace('"spp"', '"spq"'),
-    "true": text(RECORD).replace('"iteration": 0', '"iteration": true'),
     "a list of errors": text(RECORD).replace('{"a": 0.1}', "[0.1]"),
     "infinity": text(RECORD).replace("1.5", "1e999"),
 }

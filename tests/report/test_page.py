@@ -29,7 +29,7 @@ from reslrb_cli.records.images import read_layers
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
-from reslrb_cli.report.page.values import parameter_table, texture_pictures
+from reslrb_cli.report.page.values import texture_pictures
 from reslrb_cli.report.sources import ShownRun, read_sources
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
@@ -146,22 +146,13 @@ def test_heights_are_shown_from_lowest_to_highest(tmp_path):
     assert "black is -0.001, white is 0.003" in page.sections[""]
 
 
-def test_a_position_has_no_colour():
-    values = {"value": [0.1, 0.2, 0.3]}
-    results = {"parameters": {"lamp.translation": {"quantity": "length", "shape": [3], "final": values}}}
-    assert "swatch" not in parameter_table(results)
-    results["parameters"]["lamp.translation"]["quantity"] = "intensity"
-    assert "swatch" in parameter_table(results)
-
-
-@pytest.mark.parametrize("sensors", [1, 3])
-def test_every_sensor_has_its_images_and_error_map(tmp_path, sensors):
-    page = page_of(make_run(tmp_path / "lamp", sensors=sensors))
+def test_every_sensor_has_its_images_and_error_map(tmp_path):
+    page = page_of(make_run(tmp_path / "lamp", sensors=3))
     alts = [alt for alt, _ in page.pictures if FLOOR not in alt]
-    assert len(alts) == 5 * sensors
-    assert sum("error map" in alt for alt in alts) == sum("derivative" in alt for alt in alts) == sensors
-    assert page.sections["Images"].count("or more") == 2 * sensors
-    assert ("Sensor 2" in page.sections["Images"]) == (sensors == 3)
+    assert len(alts) == 5 * 3
+    assert sum("error map" in alt for alt in alts) == sum("derivative" in alt for alt in alts) == 3
+    assert page.sections["Images"].count("or more") == 2 * 3
+    assert "Sensor 2" in page.sections["Images"]
 
 
 def test_the_colours_of_an_error_map_end_at_the_stated_value(tmp_path):
@@ -269,19 +260,6 @@ def test_faults_come_first(tmp_path):
 EVIL = '<script>alert("1")</script>.a & b.value'
 
 
-def test_names_stay_text(tmp_path):
-    folder = make_run(tmp_path / "<img src=x onerror=alert(1)>", keys=(EVIL, "\x1b[31m</pre>\u202e.value"))
-    (folder / "config.yaml").write_text("name: </pre><script>alert(1)</script>\n")
-    markup = render_run(folder)
-    page = Page(markup)
-    assert page.tags.count("script") == 1  # the page's own script
-    assert page.tags.count("img") == len(page.pictures) == 9
-    assert page.row("Parameters", EVIL)
-    assert "\x1b" not in markup
-    assert "\u202e" not in markup
-    assert "<script>alert(1)</script>" in page.sections["Configuration"]
-
-
 def test_nothing_is_loaded_from_elsewhere(tmp_path):
     markup = render_run(make_run(tmp_path / "lamp"))
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', markup) == []
@@ -304,27 +282,13 @@ def test_an_almost_empty_folder_has_a_page(tmp_path):
     assert "end" not in [alt for alt, _ in page.pictures]
 
 
-def test_existing_parts_are_shown_without_missing_ones(tmp_path):
-    folder = make_run(tmp_path / "interrupted")
-    for name in ("final", "target", "comparison"):
-        (folder / "images" / f"{name}.exr").unlink()
-    assert [alt for alt, _ in page_of(folder).pictures if FLOOR not in alt] == ["start"]
-
-
 def test_a_page_of_a_long_run_with_large_pictures_is_small(tmp_path):
-    folder = make_run(tmp_path / "long", iterations=5000, size=(600, 1000))
+    folder = make_run(tmp_path / "long", iterations=1200, size=(500, 700))
     page = write_report(folder)
     assert page.stat().st_size < 6e6
     parsed = Page(page.read_text())
     assert max(pixels(uri).shape[1] for _, uri in parsed.pictures) <= 640
-    assert "Each point is the mean of 9 iterations" in parsed.sections["Convergence"]
-
-
-def test_the_worst_of_many_parameters_are_drawn(tmp_path):
-    keys = tuple(f"part{number}.reflectance.value" for number in range(12))
-    page = page_of(make_run(tmp_path / "many", keys=keys))
-    assert len(page.cells["Parameters"]) == 13
-    assert "4 more are not drawn" in page.sections["Convergence"]
+    assert "Each point is the mean of " in parsed.sections["Convergence"]
 
 
 def grey(shape=(64, 64), value=0.02):
@@ -350,6 +314,8 @@ def test_a_visible_lamp_does_not_darken_the_rest():
 
 
 def test_a_small_caustic_is_not_blown_out():
+    assert exposure_for(None) == exposure_for(grey(value=0.0)) == exposure_for(grey(value=0.5)) == 1
+    assert exposure_for(grey(value=np.nan)) == exposure_for(np.zeros((0, 4, 3))) == 1
     image = grey(value=0.0)
     image[30:33, 30:38] = 40.0  # less than a hundredth of the pixels, and all of the light
     assert exposure_for(image) == 0.02
@@ -357,14 +323,6 @@ def test_a_small_caustic_is_not_blown_out():
     few = image + np.float32(0.01)
     few[0, :4, 0] = 1e9, np.inf, np.nan, 1e9  # a thousandth of the pixels
     assert exposure_for(few) == 0.02
-
-
-def test_an_ordinary_image_is_shown_unchanged():
-    assert exposure_for(None) == exposure_for(grey(value=0.0)) == exposure_for(grey(value=0.5)) == 1
-    assert exposure_for(grey(value=np.nan)) == exposure_for(np.zeros((0, 4, 3))) == 1
-    assert exposure_for(grey(value=3.2)) == 0.25
-    alpha = np.concatenate([grey(value=0.001)[:, :, :1], np.ones((64, 64, 1), np.float32)], axis=2)
-    assert exposure_for(alpha) == 800
 
 
 def test_clipping_is_mentioned():
@@ -424,28 +382,13 @@ OUTSIDE = """[...document.querySelectorAll('body *')].filter(e => {
 }).map(e => e.tagName + ': ' + e.textContent.slice(0, 60))"""
 
 
-@pytest.mark.parametrize("width", [320, 400, 750, 1400])
+@pytest.mark.parametrize("width", [320, 750, 1400])
 @pytest.mark.parametrize("name", [*RUNS, EVERYTHING])
 def test_nothing_scrolls_sideways(chromium, pages, name, width):
     chromium.open(pages[name], width)
     assert chromium.evaluate("document.documentElement.scrollWidth") <= width
+    assert chromium.evaluate("document.scripts.length") == 1  # markup in names has no effect
     assert chromium.evaluate(OUTSIDE.replace("WIDTH", str(width))) == []
-
-
-@pytest.mark.parametrize("width", [400, 750, 1400])
-def test_no_number_is_wrapped(chromium, pages, width):
-    """Each number is on one line of its own table cell."""
-    broken = """[...document.querySelectorAll('.rows td, thead th')].filter(cell => {
-        const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT), range = document.createRange();
-        for (let node = walker.nextNode(); node; node = walker.nextNode())
-            for (const word of node.data.matchAll(/[^\\s-]+/g)) {
-                range.setStart(node, word.index); range.setEnd(node, word.index + word[0].length);
-                if (new Set([...range.getClientRects()].map(r => r.top)).size > 1) return true;
-            }
-        return false }).map(cell => cell.textContent)"""
-    for name in ("textures and colours", EVERYTHING):
-        chromium.open(pages[name], width)
-        assert chromium.evaluate(broken) == []
 
 
 def test_pictures_and_curves_work_without_script_and_network(chromium, pages):
@@ -480,17 +423,6 @@ def test_a_slider_compares_the_images_of_each_sensor(chromium, pages):
     assert chromium.evaluate("document.querySelectorAll('img[data-moment]').length") == 9
 
 
-def test_a_click_shows_the_pixels_of_a_picture(chromium, pages):
-    chromium.open(pages["textures and colours"], 1280)
-    chromium.evaluate("document.querySelector('figure img').click()")
-    shown = "[document.querySelector('dialog').open, document.querySelector('dialog img').width / FIRST.width]"
-    first = "document.querySelector('figure img').getAttribute('width')"
-    is_open, factor = chromium.evaluate(shown.replace("FIRST.width", first))
-    assert is_open
-    assert factor >= 2
-    assert factor == int(factor)
-
-
 def test_only_a_reliable_result_is_green(chromium, pages, tmp_path):
     certain = {"certainty": {"parameters": {FLOOR: {"verdict": "settled"}}}, "loss_trend": {"change": "fell"}}
     good = write_report(make_run(tmp_path / "good", results=certain))
@@ -499,15 +431,6 @@ def test_only_a_reliable_result_is_green(chromium, pages, tmp_path):
         chromium.open(path, 1280)
         colors.append(chromium.evaluate("getComputedStyle(document.querySelector('.status')).color"))
     assert colors == ["rgb(23, 112, 58)", "rgb(138, 75, 0)"]
-
-
-def test_a_page_of_everything_is_self_contained(chromium, pages):
-    chromium.open(pages[EVERYTHING], 1400)
-    assert all(address.startswith("data:") for address in chromium.requests()[1:])
-    assert chromium.evaluate("[...document.images].filter(i => !i.complete || i.naturalWidth == 0).length") == 0
-    assert chromium.evaluate("document.images.length") > 25
-    assert chromium.evaluate("document.scripts.length") == 1
-    assert [event for event in chromium.events if event["method"] == "Log.entryAdded"] == []
 
 
 def test_the_page_of_a_running_run_reloads_until_the_end(chromium, pages, tmp_path, monkeypatch):
@@ -521,13 +444,6 @@ def test_the_page_of_a_running_run_reloads_until_the_end(chromium, pages, tmp_pa
     chromium.events.clear()
     assert not chromium.wait_for("false", 2)
     assert chromium.requests() == []
-
-
-def test_markup_in_names_has_no_effect(chromium, pages):
-    name = "long-" * 40 + "name"
-    chromium.open(pages[name], 1400)
-    assert chromium.evaluate("document.title") == name
-    assert chromium.evaluate("document.scripts.length") == 1
 
 
 @pytest.mark.parametrize("dark", [False, True])

@@ -18,10 +18,8 @@ from reslrb_cli.report.run_summary import last_line, parameter_lines, warnings
     ("value", "error", "text"),
     [
         (0.013123, 0.00041, "0.0131 +- 0.0004"),
-        (0.1296, 0.0612, "0.13 +- 0.06"),
         (123.4, 12.0, "123 +- 12"),
         (1.234e-7, 3.2e-9, "(1.23 +- 0.03)e-07"),
-        (2.5e6, 1.2e5, "(2.5 +- 0.1)e+06"),
         (0.5, 0.0, "0.5"),
         (0.0, 0.02, "0.00 +- 0.02"),
         (1.0, float("nan"), "1"),
@@ -35,10 +33,8 @@ def test_a_value_with_its_error(value, error, text):
     ("seconds", "text"),
     [
         (0.0123, "12.3 ms"),
-        (0, "0 ms"),
         (4.56, "4.56 s"),
         (59.97, "1 min 0 s"),
-        (200, "3 min 20 s"),
         (7500, "2 h 5 min"),
         (2e6, "23.1 days"),
     ],
@@ -48,11 +44,8 @@ def test_times(seconds, text):
 
 
 def test_numbers():
-    assert (number(None), number(0.123456), number(1e6), number(0.5, 3)) == ("", "0.1235", "1e+06", "0.5")
-
-
-def test_one_item_is_singular():
     assert [count(amount, "iteration") for amount in (0, 1, 2)] == ["0 iterations", "1 iteration", "2 iterations"]
+    assert (number(None), number(0.123456), number(1e6), number(0.5, 3)) == ("", "0.1235", "1e+06", "0.5")
 
 
 def test_keys_are_shortened_in_the_middle():
@@ -78,7 +71,7 @@ def test_without_a_truth_the_table_has_only_values():
     ]
 
 
-@pytest.mark.parametrize("width", [40, 60, 80, 100, 160])
+@pytest.mark.parametrize("width", [40, 80, 160])
 def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut(width):
     key = "a_very_long_name_of_a_wall_that_goes_on_and_on.brdf_0.reflectance.data"
     texture = {"mean": [0.123, 0.456, 0.789], "min": -0.00123, "max": 1.23e5}
@@ -93,16 +86,12 @@ def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut(width):
 
 
 def test_many_parameters_are_a_few_lines():
+    assert parameter_lines({}, 80) == parameter_lines(results(parameters={"a": {"initial": None}}), 80) == []
     values = {"initial": {"value": 0.5}, "final": {"value": 0.1}}
     found = results(parameters={f"part{number}.alpha.value": values for number in range(40)})
     lines = parameter_lines(found, 80)
     assert len(lines) == 14
     assert lines[-1] == "and 28 more parameters, on the page"
-
-
-def test_a_run_without_iterations_has_no_table():
-    assert parameter_lines({}, 80) == []
-    assert parameter_lines(results(parameters={"a": {"initial": None}}), 80) == []
 
 
 def test_the_last_line():
@@ -161,7 +150,6 @@ def judged(about, **measured):
     # The steps were long enough in total, but the lamp did not arrive. It oscillates, or moves along a valley.
     (judged({"reach": 60.0}), "more iterations", "--set run.iterations=680"),
     (judged({"reach": 60.0, "moved": 0.0}), "more iterations", "--set run.iterations=1000"),
-    (judged({"reach": None}), "more iterations", "--set run.iterations=680"),
     (judged({}, trend={"change": "rose", "start": {"mean": 1, "error": 0.1}, "end": {"mean": 2, "error": 0.1}}),
      "a lower rate", "--set optimizer.learning_rate=0.01"),
     # The loss fell at first and is flat since then, so more of the same steps do not help.

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 from cli import tiny
-from cli.test_storms import mount
 from compilation import search_path
 from runs.going_on import (
     MOTION,
@@ -59,13 +58,11 @@ FALLING = ["--set", f"parameters=[{{key: {tiny.KEY}, initial: 0.05, bounds: [0, 
 CASES: dict[str, list[str]] = {
     "adam": [],
     "cosine": ["optimizer.schedule=cosine"],
-    "exponential": ["optimizer.schedule=exponential"],
     "sgd": ["optimizer.type=sgd", "optimizer.learning_rate=0.5"],
     "momentum": ["optimizer={type: sgd, momentum: 0.8, learning_rate: 0.1}"],
     "log": ["parameters[1].transform=log", "parameters[1].bounds=[0.1, 20]"],
     "sigmoid, momentum": ["parameters[0].transform=sigmoid", "optimizer={type: sgd, momentum: 0.8}"],
     "softplus": ["parameters[1].transform=softplus", "parameters[1].bounds=[0.1, 20]"],
-    "scale auto": ["optimizer.scale=auto"],
     "scale auto, sigmoid": ["optimizer={scale: auto, schedule: cosine}", "parameters[0].transform=sigmoid"],
     "views": [VIEWS, "run.views_per_iteration=1"],
     "held out": [VIEWS, "run.views_per_iteration=1", "run.held_out=[2]", "optimizer.scale=auto"],
@@ -73,12 +70,9 @@ CASES: dict[str, list[str]] = {
         "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0.3, 0.7]}]",
         "views=[{sensor: 0}, {sensor: 1, exposure: auto}]",
     ],
-    "motion": [f"parameters[2]={MOTION}"],
     "motion, scale auto": [f"parameters[2]={MOTION}", "optimizer.scale=auto", VIEWS],
     "certainty": ["run.certainty=true", "run.iterations=24", "run.checkpoint_every={iterations: 5}"],
-    "correlated": ["run.adjoint=correlated"],
     "independent, l1": ["run.adjoint=independent", "loss.type=l1"],
-    "batched": BATCHED,
     "reservoir": [*BATCHED, "integrator.estimator=reservoir"],
     "event": [*BATCHED, "integrator.estimator=event"],
     "gather": [*BATCHED, "integrator.estimator=gather"],
@@ -249,10 +243,10 @@ from reslrb_cli.cli import run; run()"""
 SETS = ["--set", "run.checkpoint_every={iterations: 1}", "--set", "run.certainty=false", "--quiet"]
 
 
-def start(folder: Path, *args: str, script: str = SCRIPT) -> subprocess.Popen[str]:
+def start(folder: Path, *args: str) -> subprocess.Popen[str]:
     environment = {**os.environ, "RESLRB_CACHE": str(folder / "cache"), "PYTHONPATH": search_path(tiny.ROOT)}
     return subprocess.Popen(
-        [sys.executable, "-c", script, "optimize", *args],
+        [sys.executable, "-c", SCRIPT, "optimize", *args],
         cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
@@ -287,101 +281,33 @@ def kill_at_random(process: subprocess.Popen[str], run: Path, chance: random.Ran
     ("kills", "iterations"), [(1, 30), pytest.param(50, 1200, marks=pytest.mark.long)], ids=["one", "fifty"]
 )
 def test_a_repeatedly_killed_run_reaches_the_same_end(tmp_path: Path, kills: int, iterations: int) -> None:
+    """Each killed life has its own process. The last life ends in this process."""
+
+    def finish(*words: str) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(tmp_path)
+            patch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+            work_alone(patch)
+            assert optimize(*words) == 0
+
     tiny.write_experiment(tmp_path)
-    length = ["--set", f"run.iterations={iterations}"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(tmp_path)
-        patch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-        work_alone(patch)
-        assert optimize("tiny.yaml", *SETS, *length, "--set", "run.name=whole") == 0
+    whole = words = ["tiny.yaml", *SETS, "--set", f"run.iterations={iterations}"]
+    finish(*whole, "--set", "run.name=whole")
     run, chance = tmp_path / "runs/tiny", random.Random(11)
-    process = start(tmp_path, "tiny.yaml", *SETS, *length)
-    lives, done = 1, 0
-    while lives <= kills:
-        kill_at_random(process, run, chance)
+    for _ in range(kills):
+        kill_at_random(start(tmp_path, *words), run, chance)
+        words = whole
         if run.exists():
             manifest = read_manifest(run)
             assert manifest is not None
             assert manifest["status"] in ("interrupted", "finished")
             assert left_over(run) == []  # a reader has repaired the folder
             if (run / "checkpoint/state.npz").exists():
-                done = int(state_of(run)["iteration"])
-                assert done <= count(run)
-                process = start(tmp_path, "--resume", str(run), "--quiet")
+                assert int(state_of(run)["iteration"]) <= count(run)
+                words = ["--resume", str(run), "--quiet"]
             else:
                 shutil.rmtree(run)
-                process = start(tmp_path, "tiny.yaml", *SETS, *length)
-        else:
-            process = start(tmp_path, "tiny.yaml", *SETS, *length)
-        lives += 1
-    code, err = end(process)
-    print(f"{lives} lives, {done} iterations before the last")
-    assert (code, err) == (0, "")
+    finish(*words)
     assert differences(tmp_path / "runs/whole", run) == []
     assert [record["iteration"] for record in records_of(run)] == list(range(iterations))
     assert read_manifest(run)["status"] == "finished"  # type: ignore[index]
-
-
-SIZES = [8, 48, 96, 128, 160, 256, 512]
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
-@pytest.mark.long
-@pytest.mark.parametrize("kib", SIZES)
-def test_a_run_with_a_full_disk_resumes_when_there_is_room(tmp_path: Path, disk: Path, kib: int) -> None:
-    tiny.write_experiment(tmp_path)
-    mount(disk, kib)
-    output = ["--set", f"run.output={disk}/runs"]
-    code, err = end(start(tmp_path, "tiny.yaml", *SETS, "--set", "run.iterations=20000", *output))
-    run = disk / "runs/tiny"
-    assert code == 6, err
-    if not run.exists():
-        return
-    assert read_manifest(run)["status"] in ("failed", "interrupted")  # type: ignore[index]
-    subprocess.run(["mount", "-o", "remount,size=8m", disk], check=True)
-    if not (run / "checkpoint/state.npz").exists():
-        code, err = end(start(tmp_path, "--resume", str(run), "--quiet"))
-        assert (code, err) == (2, f"{run}: has no checkpoint/state.npz: the run ended before it kept anything\n")
-        return
-    iterations = int(state_of(run)["iteration"]) + 12
-    length = ["--set", f"run.iterations={iterations}"]
-    assert end(start(tmp_path, "--resume", str(run), "--quiet", *length)) == (0, "")
-    assert end(start(tmp_path, "tiny.yaml", *SETS, *length)) == (0, "")
-    # Certainty makes its notes at four fifths of the iterations, and the run had 20000 iterations before.
-    found = differences(tmp_path / "runs/tiny", run)
-    asked = ("squares/", "last steps/", "noted_by")
-    assert [name for name in found if not any(part in name for part in asked)] == []
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
-@pytest.mark.long
-def test_with_several_threads_it_differs_no_more_than_repeated_runs(tmp_path: Path) -> None:
-    """The allowed distance is twice the largest distance among five complete runs. These runs differ because their sums
-    have different orders.
-    """
-    tiny.write_experiment(tmp_path)
-    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
-    sets = [*SETS, "--set", "run.iterations=80", "--set", "run.spp=1024", "--set", "run.adjoint=batched"]
-    for number in range(5):
-        assert end(start(tmp_path, "tiny.yaml", *sets, "--set", f"run.name=whole-{number}", script=script))[0] == 0
-    process = start(tmp_path, "tiny.yaml", *sets, script=script)
-    run = tmp_path / "runs/tiny"
-    for _ in range(3):
-        before = count(run)
-        while count(run) < before + 10 and process.poll() is None:
-            time.sleep(0.005)
-        process.kill()
-        process.communicate()
-        process = start(tmp_path, "--resume", str(run), "--quiet", script=script)
-    assert end(process)[0] == 0
-    values = [
-        state_of(tmp_path / "runs" / name)[f"parameter/{tiny.KEY}"]
-        for name in (*(f"whole-{number}" for number in range(5)), "tiny")
-    ]
-    *whole, resumed = [value.astype(np.float64) for value in values]
-    farthest = max(float(np.abs(a - b).max()) for a in whole for b in whole)
-    distance = min(float(np.abs(resumed - each).max()) for each in whole)
-    print(f"distance {distance:.3g}, among whole runs {farthest:.3g}")
-    assert distance <= 2 * farthest

@@ -61,13 +61,11 @@ def rewritten(run: Path, arrays: dict[str, Any] | None = None, values: dict[str,
 PARAMETER = f"parameter/{tiny.KEY}"
 WRONG: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "a shape": ({PARAMETER: np.ones((4, 5, 3), np.float32)}, {}, f"{PARAMETER}: has shape (4, 5, 3), not (4, 4, 3)"),
-    "no value": ({PARAMETER: None}, {}, f"{PARAMETER}: is missing"),
     "objects": ({"mask/x": np.array([{}], dtype=object)}, {}, "is damaged, cut off, or not written by reslrb ("),
     "no state": ({"state": None}, {}, ""),
     "more iterations than lines": ({}, {"iteration": 6}, "metrics.jsonl: holds 4 of the 6 iterations"),
     "too many iterations": ({}, {"iteration": 7}, "run.iterations: is 6; the run has done 7 already"),
     "a time": ({}, {"elapsed_s": "long"}, "elapsed_s: Input should be a valid number"),
-    "a configuration": ({}, {"config": 5}, "config: Input should be a valid string"),
     "a decision": ({}, {"decisions": [{"setting": 3}]}, "decisions.0."),
     "an earlier version": ({}, {"format": 2}, "state: is of another version of reslrb"),
     "a later version": ({}, {"format": 99}, "state: is of another version of reslrb"),
@@ -87,9 +85,7 @@ def test_an_unfitting_state_is_one_line(case: str, run: Path, capsys: pytest.Cap
 
 DAMAGED: dict[str, Callable[[bytes], bytes]] = {
     "nothing": lambda data: b"",
-    "zeros": lambda data: bytes(len(data)),
     "half": lambda data: data[: len(data) // 2],
-    "all but a byte": lambda data: data[:-1],
     "a bit": lambda data: data[:700] + bytes([data[700] ^ 1]) + data[701:],
 }
 
@@ -122,15 +118,7 @@ def test_differences_are_shown(run: Path, capsys: pytest.CaptureFixture[str]) ->
     assert all(part in line for part in ("is l1, l2 in the run", "run.spp is 8", "1 more"))
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(text.replace("max_depth: 3", "max_depth: 4"))
-    assert told(capsys, run).startswith("config.yaml: integrator.max_depth: is 4, 3 in the run; ")
-
-
-def test_the_source_of_a_change_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The line names the changed configuration file, not the override beside it. This override only changes a setting
-    that may change.
-    """
-    text = (run / "config.yaml").read_text()
-    (run / "config.yaml").write_text(text.replace("max_depth: 3", "max_depth: 4"))
+    # The override only changes a setting that may change, so the file is the source of the change.
     line = told(capsys, run, "--set", "run.iterations=9")
     assert line.startswith("config.yaml: integrator.max_depth: is 4, 3 in the run; ")
 
