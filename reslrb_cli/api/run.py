@@ -22,7 +22,7 @@ from reslrb_cli.config.loader import OVERRIDDEN, Override, overrides_of
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, describe
 from reslrb_cli.optimization.loop import iterate
-from reslrb_cli.optimization.problem import saved_spp
+from reslrb_cli.optimization.problem import progress_spp
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import check_output
@@ -239,7 +239,7 @@ class Run:
         problem = course.problem
         with held():
             course.stand()
-            spp = saved_spp(problem, between=True)
+            spp = progress_spp(problem)
             seen = {view.sensor: view.exposure.of_array(problem.render(view.sensor, spp, course.done, "saved image"))
                     for view in problem.views}  # fmt: skip
         return seen

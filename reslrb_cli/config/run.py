@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -122,9 +122,6 @@ _Shards = Annotated[
 
 class RunConfig(Section):
     """Length, samples and output of a run."""
-
-    #: Iterations between two saved images; a run saves only the first and the last image.
-    images_every: ClassVar[int] = 0
 
     name: Annotated[str, AfterValidator(check_name)] = Field(
         default="run", min_length=1, json_schema_extra=_without_default

@@ -25,7 +25,7 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.race import lessons, sets_of
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.memory import plans
-from reslrb_cli.optimization.problem import Problem, saved_spp
+from reslrb_cli.optimization.problem import Problem, progress_spp, saved_spp
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.records.clock import MIB
@@ -206,8 +206,6 @@ def make_forecast(
     parts = _parts(problem)
     rest = max(steps.peak - sum(parts.values()), 0)
     parts["images of a step, gradients, stored paths (reservoir)"] = rest
-    between = run.iterations // run.images_every if run.images_every else 0
-    images = 2 * saved_spp(problem, between=False) + between * saved_spp(problem, between=True)
     has_verdicts = run.certainty and config.by_pixel and run.iterations >= LEAST_ITERATIONS
     return Forecast(
         **{**vars(steps), "peak": sum(parts.values())},
@@ -219,7 +217,7 @@ def make_forecast(
         measuring_s=problem.measured_s,
         kept=cache is not None and cache.keeps,
         target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
-        images_s=image_s * images * views,
+        images_s=image_s * 2 * saved_spp(problem) * views,
         verdicts_s=VERDICTS * steps.iteration_s if has_verdicts else 0.0,
     )
 
@@ -237,7 +235,7 @@ def with_short_target(config: Config) -> Config:
 
 def _image_seconds(problem: Problem) -> float:
     """Return the render time of a saved image of the first view, in seconds per sample per pixel."""
-    view, spp = problem.views[0], saved_spp(problem, between=True)
+    view, spp = problem.views[0], progress_spp(problem)
     problem.render(view.sensor, spp, 0, "forecast")  # compiles, and records small calls: several times as long
     begin = time.perf_counter()
     problem.render(view.sensor, spp, 1, "forecast")

@@ -26,16 +26,18 @@ from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 
 
-def saved_spp(problem: Problem, between: bool) -> int:
-    """Return the samples per pixel of the initial and the final image.
-
-    The sample count is `run.final_spp`, or the next larger multiple of the samples per pass. Images between the first
-    and the last iteration (`between`) only show progress. The sample count of these images is a multiple of `run.spp`.
+def saved_spp(problem: Problem) -> int:
+    """Return the samples per pixel of the initial and the final image: `run.final_spp`, or the next larger multiple of
+    the samples per pass.
     """
     run, unit = problem.config.run, problem.samples_per_pass or 1
-    if between:
-        return run.spp * -(-BETWEEN_SPP // run.spp)  # passes that divide a step divide this as well
     return run.final_spp if unit >= run.final_spp else unit * -(-run.final_spp // unit)
+
+
+def progress_spp(problem: Problem) -> int:
+    """Return the samples per pixel of an image that shows progress, a multiple of `run.spp`."""
+    spp = problem.config.run.spp
+    return spp * -(-BETWEEN_SPP // spp)  # passes that divide a step divide this as well
 
 
 Array = np.ndarray[Any, Any]
@@ -228,7 +230,7 @@ class Problem:
         views = [view for view in self.views if view.held_out]
         if not views:
             return None
-        spp = saved_spp(self, between=True)
+        spp = progress_spp(self)
         losses = [float(view.compare(to_tensor(self.render(view.sensor, spp, 0, "held out")))[0]) for view in views]
         return float(np.mean(losses))
 

@@ -172,7 +172,7 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
     weights = view.masked.total(target.shape[:2])
     line = mask_line(f"view {view.sensor}", view.masked, weights)
     if not weights.any():
-        advice = "switch off kinds, such as {specular: false}, or set it to none"
+        advice = "leave out fewer kinds, as in {kinds: [border]}, or set it to none"
         raise ConfigError(config.source, view.mask_key, f"leaves no pixel to compare ({line}); {advice}")
     masked = "specular" in view.masked.left_out
     if masked and problem.moves and scene_needs(problem.scene, problem.scene.sensors()[view.sensor]).has_delta_lobes:

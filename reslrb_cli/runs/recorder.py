@@ -357,7 +357,7 @@ class Recording:
         self._saved = self.course.save(self.folder.checkpoint)
 
     def _write_images(self, name: str) -> None:
-        spp = saved_spp(self.problem, between=False)
+        spp = saved_spp(self.problem)
         if name == "final":
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:

@@ -73,7 +73,7 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
     because = "not measured (over 10 % of this run); "
     sequence = "sequence low_discrepancy: evenly spread numbers have been no loss in any scene"
     chosen = "sequence low_discrepancy, paths both, pixels even, guiding off"
-    assert f"chosen without measuring: {chosen} (-v gives the reasons)" in err.splitlines()
+    assert f"chosen without measuring: {chosen} (`reslrb --debug` gives the reasons)" in err.splitlines()
     manifest = read_manifest(Path("runs/box"))
     assert manifest["plan"]["estimator"] == "stack"
     assert [each["setting"] for each in manifest["decisions"]] == ["sequence", "paths", "pixels", "guiding"]

@@ -236,7 +236,7 @@ def test_the_same_in_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)
     few = ("run.iterations=60", "run.spp=64", "run.final_spp=8", "run.certainty=false", "integrator.estimator=stack")
     run = three_commands(*few)
-    check_mask(run, mirror=True)  # the estimator `stack` has light paths only
+    check_mask(run, mirror=True)  # with a named estimator, all paths are light paths
     assert misses(run, SHORT_COLOUR) == []
 
 

@@ -243,6 +243,16 @@ def test_the_generated_configuration_recovers_lamps(tmp_path: Path, monkeypatch:
     assert "noise and errors of targets are not in it" in done.output
 
 
+def test_lamps_of_a_clipped_photograph_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bulb.xml").write_text(BULB.format(plate=METAL.format(0.3), radiance=WRONG))
+    photo = write_noise(tmp_path / "photo.png", 24, 24)
+    tiny.done("init", "bulb.xml", "--target", photo)
+    config = load(tmp_path / "bulb.yaml")
+    assert [spec.keys for spec in config.parameters] == [["plate.bsdf.alpha.value"]]
+    assert (config.target.exposure, config.optimizer.scale) == ("auto", "none")
+
+
 def test_only_the_front_of_a_lamp_is_in_view(tmp_path: Path) -> None:
     """The back of an area light is dark at any radiance."""
     shares = []

@@ -262,7 +262,7 @@ def test_a_run_reports_remembers_and_records_the_decision(
     assert (found["setting"], found["value"], found["cached"]) == ("guiding", "on", False)
     gain = f"{found['gain']:.2g} times the efficiency here ("
     line = f"guiding on: {gain}"
-    chosen = "chosen by measurement: guiding on (-v gives the reasons)"
+    chosen = "chosen by measurement: guiding on (`reslrb --debug` gives the reasons)"
     assert chosen in said
     assert "guiding: auto" in (RUN / "config.yaml").read_text()
     assert line in (RUN / "report.html").read_text()

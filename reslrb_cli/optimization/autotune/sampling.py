@@ -99,7 +99,7 @@ class Tuner:
         elif found:
             chosen = ", ".join(f"{each.setting} {each.value}" for each in found)
             how = "by measurement" if any(each.seconds for each in found) else "without measuring"
-            self.say(f"chosen {how}: {chosen} (-v gives the reasons)")
+            self.say(f"chosen {how}: {chosen} (`reslrb --debug` gives the reasons)")
 
     def race(self, otherwise: Decision, of: Any, kernels: float, measure: Callable[[float], Decision]) -> Decision:
         """Return the decision of an earlier run, or the result of `measure`, which takes the time limit in seconds.
