@@ -191,7 +191,7 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
         "no best": (prepare.RunProgress, "restore", without_best),
         "no squares": (prepare.RunProgress, "restore", without_squares),
         "no last steps": (prepare.RunProgress, "restore", without_steps),
-        "metrics not cut back": (resume, "cut_back", lambda folder, records, size: None),
+        "metrics not cut back": (resume, "cut_back", lambda folder, size: None),
     }
     monkeypatch.setattr(*places[fault])
     assert optimize("--resume", str(left), "--quiet") == 0
