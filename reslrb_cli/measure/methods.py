@@ -140,7 +140,7 @@ def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Cas
     `source` is the command-line option that contains the list. `deep` is True if the measurement varies the maximum
     depth. `Case.at` checks the options of the cases.
     """
-    return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
+    return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or FILE.py:CLASS", deep)
 
 
 def parse_estimators(text: str) -> list[Case]:

@@ -20,7 +20,7 @@ from reslrb_cli.estimators.reservoir import ReservoirSelection
 from reslrb_cli.integrators.protocol import Job, first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, load, rgb, texture
+from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, load, rgb, room, texture, transform
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import Hooks
 
@@ -124,6 +124,14 @@ def test_a_replay_visits_the_same_vertices(name: str):
     assert error(u, slot.u) < 1e-6
     if not samples.plan.roulette:  # a replay does not know the roulette's weights
         assert error(C, stored) < 1e-6
+
+
+def test_without_light_there_is_no_replay():
+    """If a scene's light reaches nothing, the reservoir keeps nothing and the gradient is zero."""
+    lamp = room()["lamp"] | {"to_world": transform(translate=[0, 5, 0], rotate=([1, 0, 0], -90))}
+    case = Case(room(lamp=lamp | {"emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}),
+                ("floor.brdf_0.reflectance.value",))  # fmt: skip
+    assert not case.gradient(integrator("reslrb"), 1, 16).any()
 
 
 # Derivatives of a loss that are not finite: every step counts them, and replaces them by 0.

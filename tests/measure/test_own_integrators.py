@@ -236,9 +236,8 @@ def test_two_black_images_agree() -> None:
         ("own_replay.py:Black(what=raises)", "its render raises in line"),
         ("own_replay.py:Black(what=list)", "its render returns list, not mi.TensorXf"),
         ("own_replay.py:Black(what=wide)", "its image is 16x17x3, not 16x16 (height, width) with channels"),
-        ("own_replay:Replay", "is not your own (FILE.py:CLASS)"),
-        ("own_replay.py", "is not an integrator of your own; write FILE.py:CLASS"),
-        ("reslrb:stack", "is not your own (FILE.py:CLASS)"),
+        ("own_replay:Replay", "integrator.type: must be one of reslrb, ptracer"),
+        ("own_replay.py", "is not an integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or FILE.py:CLASS"),
     ],
 )
 def test_invalid_integrators_are_one_line(capsys: pytest.CaptureFixture[str], name: str, said: str) -> None:
