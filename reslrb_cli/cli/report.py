@@ -36,10 +36,13 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
 
     if len(paths) > MOST_SOURCES:
         raise ConfigError("RUN", "", f"{len(paths)} are given; a page shows at most {MOST_SOURCES}")
+    gc.collect()  # so that unused objects, such as a scene, are not frozen below
     gc.disable()  # Python would search millions of numbers for cycles, again and again
-    sources = read_sources(paths)
+    try:
+        sources = read_sources(paths)
+    finally:
+        gc.enable()
     gc.freeze()
-    gc.enable()
     if output is None:
         if len(sources) != 1 or not isinstance(sources[0], ShownRun | SweepRuns):
             raise ConfigError("--output", "", "is missing; give a file to write, e.g. -o page.html")
