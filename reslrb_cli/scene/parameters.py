@@ -77,8 +77,8 @@ class Selection:
             if not kind:
                 raise place.fail(at, f"`{key}` has no surface; heightmaps and bitmaps have one")
             if each.type not in REGULARIZERS[kind]:
-                would = f"use {', '.join(REGULARIZERS[kind])}" if REGULARIZERS[kind] else "remove it"
-                raise place.fail(at, f"{each.type} is not defined for `{key}`, a {kind}; {would}")
+                would = ", ".join(REGULARIZERS[kind])
+                raise place.fail(at, f"{each.type} is not defined for `{key}`, a {kind}; use {would or 'none'}")
             if each.type in seen:
                 raise place.fail(at, f"{each.type} is given twice; give it once, with the sum of the weights")
             seen.add(each.type)
