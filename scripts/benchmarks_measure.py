@@ -169,7 +169,8 @@ def _differs(commit: str, file: str) -> bool:
 def _syntax(text: str) -> str:
     """Return the syntax tree of a Python file without docstrings and messages.
 
-    Messages are texts of at least two words on one line. No figure depends on messages.
+    Messages are texts of at least two words on one line. No figure depends on messages, nor on the statements that
+    prepare the message of an error.
     """
     tree = ast.parse(text)
     for node in ast.walk(tree):
@@ -183,7 +184,16 @@ _WORD = re.compile(r"[a-z]{2,}", re.IGNORECASE)
 
 
 class _WithoutMessages(ast.NodeTransformer):
-    """Transformer that replaces all messages of a syntax tree by the same text."""
+    """Transformer that replaces all messages of a syntax tree by the same text, and leaves out the statements that
+    prepare an error: those before a `raise` in the same branch of an `if`.
+    """
+
+    def visit_If(self, node: ast.If) -> ast.If:
+        self.generic_visit(node)
+        for branch in (node.body, node.orelse):
+            if branch and isinstance(branch[-1], ast.Raise):
+                branch[:] = branch[-1:]
+        return node
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.expr:
         return self._without(

@@ -86,7 +86,7 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
     for name, content in {
         "configs/room.yaml": "scene: {file: ../scenes/room/scene.xml}\nrun: {spp: 1}", "scenes/room/scene.xml": "",
         "docs/a.md": "", "reslrb_cli/measure/bench.py": "", "reslrb_cli/cli/bench.py": "",
-        "reslrb_cli/transport/walk.py": 'a = f"must be less than {1}"',
+        "reslrb_cli/transport/walk.py": 'a = f"must be less than {1}"\nif a:\n    b = 1\n    raise ValueError(b)',
     }.items():  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content)
@@ -104,10 +104,16 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
         (tmp_path / "docs" / "benchmarks" / f"{name}.jsonl").write_text(json.dumps(origin) + "\n")
     (tmp_path / "reslrb_cli/cli/bench.py").write_text("1")  # no figure depends on it, nor on words
     (tmp_path / "configs/room.yaml").write_text("# a room\nscene:\n  file: ../scenes/room/scene.xml\nrun: {spp: 1}\n")
-    (tmp_path / "reslrb_cli/transport/walk.py").write_text('"""Walk."""  # along a path\na = "this is another message"')
+    (tmp_path / "reslrb_cli/transport/walk.py").write_text(
+        '"""Walk."""  # along a path\na = "this is another message"\nif a:\n    b = 2\n    raise ValueError(b)'
+    )
     assert benchmarks_measure.code_state()["clean"] is False
     commit_all(tmp_path)
     assert main(["stale"]) == 0
+    (tmp_path / "reslrb_cli/transport/walk.py").write_text('a = "a message"\nif a:\n    b = 2\n    raise TypeError(b)')
+    commit_all(tmp_path)
+    assert main(["stale"]) == 1  # another type of error may be handled in another way
+    subprocess.run(["git", "reset", "-q", "--hard", "HEAD~1"], cwd=tmp_path, check=True)
     for place, names in {
         "reslrb_cli/measure/bench.py": ["depth"], "configs/room.yaml": ["depth", "room"],
         "scenes/room/scene.xml": ["depth", "room"],
