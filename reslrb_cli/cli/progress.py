@@ -16,9 +16,6 @@ from reslrb_cli.report.run_summary import descriptions
 #: Without a terminal, a line is written after each tenth of the iterations and after this many seconds.
 SECONDS_PER_LINE = 10.0
 
-#: Minimum duration, in seconds, for a bar.
-LEAST_SECONDS = 1.0
-
 #: Minimum width of the bar; the text beside it is shortened for this.
 LEAST_BAR = 8
 
