@@ -65,6 +65,9 @@ class Recordings:
         # other sensor gets its address.
         widths = tuple(side.width for side in s.sides())
         key = (kind, s.plan, s.spp, widths, tuple(s.film.size), s.sensor)
+        # Another integrator's render leaves its whole path loop pending in the sampler's state. Dr.Jit would evaluate
+        # the state as an input, and with CUDA read an acceleration structure that may be gone.
+        s.sensor.sampler().seed(0, 1)
         plain = _on_samples(samples, function)
         common = (s.scene, s.sensor, *(_arrays(side) for side in s.sides()))
         if key not in self._functions and len(self._functions) < MOST_CALLS:

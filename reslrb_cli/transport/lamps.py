@@ -35,7 +35,8 @@ def lamp_ray(
     black texels of a lamp's texture are sampled, too.
     """
     si, weight = lamp_point(lamp, areas, time, position, active, evened)
-    _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
+    # For all lanes: with CUDA, Dr.Jit 1.5 ends the process if it records a masked texture lookup outside of a call.
+    _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, True)
     if lamp.parallel:
         d = mi.Vector3f(si.sh_frame.n)  # for a mesh the interpolated normal, as in Mitsuba
     else:

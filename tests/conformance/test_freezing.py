@@ -7,6 +7,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 
+import drjit as dr
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES, GradientCase
@@ -14,6 +15,7 @@ from turns import a_few, taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import freezing
+from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.measure.scenes.small import camera
 
@@ -71,6 +73,20 @@ def test_unrecordable_calls_are_computed_plainly(estimator: str, adjoint: str) -
     for a, b in zip(found, expected, strict=True):
         assert relative(a, b) < 1e-5
     assert not KINDS[adjoint] & set(counts[-1]) & {"trace", "image", "fused"}
+
+
+def test_a_recording_does_not_evaluate_the_work_of_other_integrators() -> None:
+    """A render leaves its path loop pending in the sampler's state. With CUDA, the loop used a freed scene."""
+    case, spp = BY_NAME["texture"], 7
+    scene = Case(case.scene(), case.keys)
+    chosen = integrator("reslrb", estimator="stack", freeze=True)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for seed in range(5):  # recordings and steps from recordings
+            dr.eval(render_image(integrator("ptracer"), scene.scene, 0, seed, spp))
+            dr.kernel_history_clear()
+            scene.gradient(chosen, seed, 8)
+            paths = spp * dr.prod(scene.scene.sensors()[0].film().crop_size())
+            assert paths not in [kernel["size"] for kernel in dr.kernel_history([dr.KernelType.JIT])]
 
 
 def test_an_outdated_recording_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
