@@ -25,12 +25,12 @@ DIM = 0.1  # minimum value of a factor in a weight, as a fraction of its stand-i
 
 
 def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
-    """Return `value` with infinity in place of NaN if the backend's atomic sums would drop NaN.
+    """Return `value` with infinity in place of NaN, so that images and gradients show the fault.
 
-    On a CPU, atomic sums ignore a NaN unless the NaN shares its address with other numbers of the same packet (Dr.Jit
-    1.5). If NaN were dropped, images and gradients would be finite, but wrong.
+    In Dr.Jit 1.5, `x != 0` is false for NaN. On a CPU, atomic sums ignore a NaN unless it shares its address with other
+    numbers of the same packet.
     """
-    return dr.select(dr.isnan(value), dr.inf, value) if dr.backend_v(value) == dr.JitBackend.LLVM else value
+    return dr.select(dr.isnan(value), dr.inf, value)
 
 
 @dataclass
