@@ -451,8 +451,7 @@ def _parts(problem: Problem, view: View, step_seed: int, noted: list[NotedSet]) 
             label = name if len(passes) == 1 else f"{name}, pass {place + 1}"
             for side in samples.sides():
                 if side.plan.attached:  # only contributions are checked: derivatives of moving light need Jacobians
-                    off = dict.fromkeys(("differentiate_bsdfs", "differentiate_emission", "differentiate_null"), False)
-                    side = replace(side, plan=replace(side.plan, **off))
+                    side = replace(side, plan=side.plan.differentiating(False, False, side.plan.track_zeros))
                 yield side, f"{label}, camera paths" if side.plan.camera else label
 
 
@@ -504,7 +503,8 @@ def _take_step(problem: Problem, view: View, step_seed: int, noted: list[NotedSe
         _, gradient = derivative_of(view.objective, image, refused)
         given_step(*at, gradient, seed=step_seed, spp=config.share_spp, **own)
     else:
-        step = gradient_step(*at, view.objective, seed=step_seed, **config.step_options(shard=True), **own)
+        own |= config.step_options(shard=True)
+        step = gradient_step(*at, view.objective, seed=step_seed, **own)
         image, refused = step.image, step.refused
     gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}
     for key in problem.selection.keys:
