@@ -10,7 +10,8 @@ repeatedly. The measurement uses the step around which E changes least. Larger s
 steps have rounding errors, or errors of paths that change discontinuously. Rounding errors of the scene's geometry are
 the same for all seeds. The remaining change of E counts as an error if it exceeds the noise. The contribution of noise
 to the squares is subtracted. The reported standard error is the error of the mean over seeds. `MissingCheck` implements
-`gradcheck --missing` for an experiment.
+`gradcheck --missing` for an experiment. With the steps of `choose_step` and no extrapolation, the complete derivative
+of configs/lens_pose.yaml seems to lack 1.1 %.
 
 `check_missing` measures the missing share before a run's first iteration. The measurement is limited to a part of the
 run's samples, and uses one or two finite-difference steps.
