@@ -100,8 +100,7 @@ def command(**given: Any) -> int:
 def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write. Return the results, and True if the user interrupted."""
     from reslrb_cli.measure.convergence.judgement import Judgement
-    from reslrb_cli.measure.convergence.session import Session
-    from reslrb_cli.measure.convergence.setup import Role
+    from reslrb_cli.measure.convergence.session import Role, Session
     from reslrb_cli.report.tables import (
         closing_sentence,
         method_cells,
@@ -145,7 +144,7 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
 
 def _table(session: Session) -> Columns:
     """Return a table with columns that fit the finished and the expected results of the session."""
-    from reslrb_cli.measure.convergence.setup import Role
+    from reslrb_cli.measure.convergence.session import Role
     from reslrb_cli.report.tables import method_columns
 
     labels = [member.label for member in session.of(Role.CASE)]

@@ -93,8 +93,8 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
     from reslrb_cli.measure.missing import KIND, MissingCheck
 
     json_file, seeds, spp = options.json_file, options.seeds, options.spp
-    to_keep = settings(config, {}, variant, device_name(variant), spp=spp, directions=None)
-    check = MissingCheck(config, options.budget, seeds, spp, None, read_earlier(KIND, json_file, to_keep))
+    to_keep = settings(config, {}, variant, device_name(variant), spp=spp)
+    check = MissingCheck(config, options.budget, seeds, spp, read_earlier(KIND, json_file, to_keep))
     echo(check.conditions())
     records: list[MissingRecord] = []
     keeper = Keeper(

@@ -10,7 +10,8 @@ repeatedly. The measurement uses the step around which E changes least. Larger s
 steps have rounding errors, or errors of paths that change discontinuously. Rounding errors of the scene's geometry are
 the same for all seeds. The remaining change of E counts as an error if it exceeds the noise. The contribution of noise
 to the squares is subtracted. The reported standard error is the error of the mean over seeds. `MissingCheck` implements
-`gradcheck --missing` for an experiment.
+`gradcheck --missing` for an experiment. With the steps of `choose_step` and no extrapolation, the complete derivative
+of configs/lens_pose.yaml seems to lack 1.1 %.
 
 `check_missing` measures the missing share before a run's first iteration. The measurement is limited to a part of the
 run's samples, and uses one or two finite-difference steps.
@@ -174,9 +175,8 @@ class MissingCheck:
     """
 
     def __init__(
-        self, config: Config, budget_s: float, count: int | None, spp: int | None, along: int | None,
-        earlier: Earlier | None = None,
-    ) -> None:  # fmt: skip
+        self, config: Config, budget_s: float, count: int | None, spp: int | None, earlier: Earlier | None = None
+    ) -> None:
         self._budget, self._count, self._start = budget_s, count, time.perf_counter()
         depth = config.integrator.max_depth
         [listed] = parse_estimators(ESTIMATOR)
@@ -190,8 +190,7 @@ class MissingCheck:
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")}
         self._tracer = make_integrator("reslrb", **options, freeze=True)
         self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
-        count_of_each = along or MOVING_DIRECTIONS
-        self._directions = all_directions(self.case, problem.selection, count_of_each, count_of_each)
+        self._directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, MOVING_DIRECTIONS)
         #: By parameter, in the order of `case.keys`, as far as measured.
         self._found: dict[str, Missing] = {} if earlier is None else self._restore(earlier)
 
@@ -293,7 +292,7 @@ def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[Missing
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:
     """Measure the missing share of each parameter that moves light. The sample limit is the fraction `run.measuring` of
-    the run's samples. Only the longer step and the last seed may exceed the limit.
+    the run's samples.
 
     The parameters keep their values. If the sample limit is too low for a measurement, the parameter's record has no
     share. Heightmaps with an unknown share are left out, because their rims hardly move. The function restores the
@@ -353,8 +352,7 @@ class _Short:
         If the remaining samples are too few, or if dL/dI is zero, all records have no share.
         """
         image_spp, fewest = 2 * self.problem.config.run.spp, seeds(FEWEST)
-        along = sum(map(len, self._rows.values()))
-        if image_spp + FEWEST * (1 + 2 * along) * self._spp > self._left or not self._weigh(image_spp):
+        if image_spp + FEWEST * self._spp_of_seed(*self.keys) > self._left or not self._weigh(image_spp):
             return [self._record(key, None) for key in self.keys]
         self._left -= image_spp
         short = {key: [self._difference(key, SHORT, seed) for seed in fewest] for key in self.keys}
@@ -364,15 +362,23 @@ class _Short:
                 records[key] = self._look_longer(key, short[key])
         return list(records.values())
 
-    def _look_longer(self, key: str, short: list[np.ndarray]) -> MissingRecord:
-        """Measure the share with more seeds. If the short and the long step agree, use the long step."""
-        long = [self._difference(key, LONG, seed) for seed in seeds(FEWEST)]
-        change, noise = _mean(np.array(long) - np.array(short))
-        agree = np.square(change).sum() <= NOTHING**2 * np.square(noise).sum()
-        samples, step = (long, LONG) if agree else (short, SHORT)
+    def _spp_of_seed(self, *keys: str) -> int:
+        """Return the maximum number of samples per pixel for one seed of these parameters."""
+        return (1 + 2 * sum(len(self._rows[key]) for key in keys)) * self._spp
+
+    def _look_longer(self, key: str, samples: list[np.ndarray]) -> MissingRecord:
+        """Measure the share with more seeds than the `samples` of the short step. If the short and the long step agree,
+        use the long step.
+        """
+        step = SHORT
+        if FEWEST * self._spp_of_seed(key) <= self._left:
+            long = [self._difference(key, LONG, seed) for seed in seeds(FEWEST)]
+            change, noise = _mean(np.array(long) - np.array(samples))
+            if np.square(change).sum() <= NOTHING**2 * np.square(noise).sum():
+                samples, step = long, LONG
         record = self._record(key, samples)
         for seed in seeds(MOST_SEEDS)[FEWEST:]:
-            if record.is_known or self._left < 0:
+            if record.is_known or self._spp_of_seed(key) > self._left:
                 break
             samples.append(self._difference(key, step, seed))
             record = self._record(key, samples)

@@ -8,6 +8,7 @@ is not finite either.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,11 +18,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.guiding.collect import Said
-from reslrb_cli.guiding.tables import Guiding, Purpose
+from reslrb_cli.guiding.tables import Purpose
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.integrators.step import gradient_step, sample_sets
-from reslrb_cli.optimization.loading import LIGHT_TRACERS, pass_spp
+from reslrb_cli.integrators.step import (
+    Refused,
+    derivative_of,
+    given_step,
+    gradient_step,
+    render_image,
+    sample_sets,
+)
+from reslrb_cli.optimization.loading import LIGHT_TRACERS
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.shards import make_tasks
@@ -34,8 +42,7 @@ from reslrb_cli.transport.connection import Connection, forward_derivatives
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import Film
-from reslrb_cli.transport.guide import Table
-from reslrb_cli.transport.samples import Samples, passes
+from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.visible import primary_ray, small_points, visible_radiance, visible_tangent
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
@@ -77,51 +84,6 @@ class Offender:
     where: PathVertex | None
     image: list[float] | None = None
     target: list[float] | None = None
-
-
-class Witness(Guiding):
-    """A wrapper of another guide. The wrapper continues to update the tables, and records the tables from which samples
-    are drawn.
-
-    `drawn` has the tables of all samples so far, in order. `drawn` excludes tables whose samples were drawn only for
-    learning.
-    """
-
-    def __init__(self, other: Guiding) -> None:
-        super().__init__()
-        self.images, self.held, self.grid = other.images, other.held, other.grid
-        self.learned, self.films = dict(other.learned), dict(other.films)
-        self.drawn: list[Table] = []
-
-    def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
-        """Return the table from which samples for sensor `number` are drawn."""
-        found = super().table(number, purpose, delta)
-        self.drawn.append(found)
-        return found
-
-    def learn(self, number: int, paths: int, said: Said) -> None:
-        """Update the table of a sensor from paths drawn only for learning."""
-        self.drawn.pop()
-        super().learn(number, paths, said)
-
-
-def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
-    """Return the purpose (image, gradient, or both) of each sample set of a step or shard, in order. Each item has the
-    set's index in `sample_sets`, a word for the set's label, and the purpose.
-    """
-    options = problem.config.step_options(shard=True)
-    gradient = Purpose.GRADIENT if problem.on_samples(view) is None else Purpose.BOTH
-    if options["adjoint"] == "correlated":
-        found = [(0, "", Purpose.BOTH)]
-    elif problem.config.in_rounds:
-        found = [(0, "", Purpose.IMAGE), (0, ", again", gradient)]
-    elif options["adjoint"] == "independent":
-        found = [(0, "", Purpose.IMAGE), (1, "", gradient)]
-    else:
-        found = [(0, "", Purpose.IMAGE), *((b, "", Purpose.BOTH) for b in range(1, options["batches"]))]
-    if options.get("halves"):
-        return [(2 * place + half, word, purpose) for place, word, purpose in found for half in (0, 1)]
-    return found
 
 
 #: Quantities that may be non-finite; `Suspect.kind` is the index.
@@ -307,6 +269,9 @@ class CameraSearch(CameraHooks):
 
 Array = np.ndarray[Any, Any]
 
+#: The seed of a set of samples, and its passes.
+NotedSet = tuple[int, list[Samples]]
+
 
 @dataclass
 class Found:
@@ -328,7 +293,7 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
             state.u = state.largest_u = first.u
             state.there = reaches(samples.film, first.u, pixel)
         else:
-            with dr.resume_grad():
+            with dr.resume_grad(when=plan.differentiate_emission):
                 E = sample_emission(samples, samples.sampler())
                 [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
             state = walk(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight), E.emitter), dE, pixel))
@@ -421,10 +386,11 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
     `problem`.
     """
     found: list[Offender] = []
-    apart = problem.config.shards != 1
+    apart, guiding = problem.config.shards != 1, guiding_of(problem)
     views = {view.sensor: view for view in problem.views}
     seeds = [(sensor, "", seed(problem.config.run.seed, iteration, sensor, "image")) for sensor in views]
-    if guiding_of(problem) is not None:  # a sensor that was not drawn in this iteration has updated no table
+    if guiding is not None:  # a sensor that was not drawn in this iteration has updated no table
+        guiding.held = apart  # tables do not learn while shards are computed
         drawn = {view.sensor for view, _ in problem.drawn(iteration)}
         seeds = [each for each in seeds if each[0] in drawn]
     if apart:
@@ -443,23 +409,18 @@ def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offende
     """Return the first non-finite value of one view, or None. The search covers the view's samples, or the samples of
     the shard named `word`.
 
-    With `adjoint: others`, the shard's own samples give the image for dL/dI. The mean image of the other shards is not
-    used.
+    If shards split a view's samples (`in_rounds`), the shard's own samples give the image for dL/dI. The mean image of
+    the other shards is not used.
     """
-    guiding = guiding_of(problem)
-    witness = None if guiding is None else Witness(guiding)
-    if witness is not None and problem.config.shards != 1:
-        witness.held = True  # as during the computation of shards
-    if witness is not None:
-        problem.integrator.preparation.draw_from(witness, problem.scene)
-    step = _take_step(problem, view, step_seed)
+    noted: list[NotedSet] = []
+    step = _take_step(problem, view, step_seed, noted)
     if problem.config.integrator.type not in LIGHT_TRACERS:
         return _of_step(step, view, None)  # their paths are not ours
     if not is_attached(problem):
         _set_tangents(problem)
     pixel = None if step.refused is None else step.refused[:2]
-    parts = _parts(problem, view, step_seed, witness)
-    found = [search_paths(samples, sensor, word + label, pixel) for samples, sensor, label in parts]
+    parts = _parts(problem, view, step_seed, noted)
+    found = [search_paths(samples, view.sensor, word + label, pixel) for samples, label in parts]
     problem.apply()
     offenders = [part.offender for part in sorted(found, key=lambda part: not part.there) if part.offender is not None]
     if offenders:
@@ -469,45 +430,40 @@ def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offende
     return _of_step(step, view, most)
 
 
-def _parts(
-    problem: Problem, view: View, step_seed: int, witness: Witness | None = None
-) -> Iterator[tuple[Samples, int, str]]:
-    """Yield a step's samples pass by pass, with the sensor's index and a name. Light paths are the same as in the run.
+def _parts(problem: Problem, view: View, step_seed: int, noted: list[NotedSet]) -> Iterator[tuple[Samples, str]]:
+    """Yield a step's samples pass by pass, with a name.
 
-    For a guided step, `witness` supplies the tables from which samples were drawn.
+    `noted` has the samples that `reslrb` traced. The samples of other light tracers are made here, from the same seeds.
     """
-    scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
-    given = problem.config.integrator.options()
-    names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
-    shared = {name: given[name] for name in names if name in given}
-    own = problem.integrator
-    if shared.get("sequence") == "auto" and isinstance(own, Reslrb):  # as the run decided
-        shared["sequence"] = "independent" if own.plan(scene, sensor).sequence is None else "low_discrepancy"
-    tracer = Reslrb.of(estimator="gather", **shared)
-    if isinstance(own, Reslrb):
-        tracer.have_paths(own.paths, own.light_share, own.preparation.whole)
-    # For moving light, only contributions are checked: `gather` has no derivatives of them.
-    params = None if is_attached(problem) else problem.selection.params
     options = problem.config.step_options(shard=True)
     if problem.config.in_rounds:
         options["adjoint"] = "correlated"  # both rounds have the same samples
     sets = sample_sets(step_seed, options)
-    tables: list[Table | None] = [None] * len(sets)
-    if witness is not None:
-        tracer.expect(pass_spp(problem.config))
-        tracer.preparation.draw_from(witness, scene)  # to get its grid
-        wanted, noted = purposes(problem, view), iter(witness.drawn[:])
-        tables = [next(noted) if witness.serves(purpose) else None for _, _, purpose in wanted]
-        sets = [(sets[place][0] + word, *sets[place][1:]) for place, word, _ in wanted]
-    plan = tracer.plan(scene, sensor, params)
-    emitters = tracer.preparation.emitters(plan, scene) if plan.weighs else None
-    for (name, samples_seed, spp), table in zip(sets, tables, strict=True):
-        size = problem.samples_per_pass
-        parts = passes(plan, scene, sensor, samples_seed, spp, size, table, tracer.light_share, emitters)
-        for number, samples in enumerate(parts):
-            label = name if len(parts) == 1 else f"{name}, pass {number + 1}"
+    if not isinstance(problem.integrator, Reslrb):
+        noted = _sets_of_others(problem, view, sets)
+    names = {int(samples_seed[0]): name for name, samples_seed, _ in sets}
+    for number, passes in noted:
+        if number not in names:  # samples that only tables learn from
+            continue
+        name = names[number]
+        names[number] = f"{name}, again"
+        for place, samples in enumerate(passes):
+            label = name if len(passes) == 1 else f"{name}, pass {place + 1}"
             for side in samples.sides():
-                yield side, view.sensor, f"{label}, camera paths" if side.plan.camera else label
+                if side.plan.attached:  # only contributions are checked: derivatives of moving light need Jacobians
+                    side = replace(side, plan=side.plan.differentiating(False, False, side.plan.track_zeros))
+                yield side, f"{label}, camera paths" if side.plan.camera else label
+
+
+def _sets_of_others(problem: Problem, view: View, sets: list[tuple[str, mi.UInt32, int]]) -> list[NotedSet]:
+    """Return the samples of light tracers other than `reslrb`, which trace the same paths as `reslrb`."""
+    given = problem.config.integrator.options()
+    shared = {name: given[name] for name in ("max_depth", "rr_depth", "hide_emitters") if name in given}
+    tracer = Reslrb.of(estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
+    # For moving light, only contributions are checked: `gather` has no derivatives of them.
+    params = None if is_attached(problem) else problem.selection.params
+    scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
+    return [(int(own[0]), tracer.passes(Job(scene, sensor, own, spp, params))) for _, own, spp in sets]
 
 
 def _set_tangents(problem: Problem) -> None:
@@ -533,18 +489,40 @@ class TracedStep:
     refused: tuple[int, int, int] | None
 
 
-def _take_step(problem: Problem, view: View, step_seed: int) -> TracedStep:
-    """Repeat the gradient step that the run took for this view. Leaves no gradients."""
-    optimizer, keys = problem.optimizer, problem.selection.keys
-    step = gradient_step(
-        problem.integrator, problem.scene, view.sensor, view.objective,
-        seed=step_seed, **problem.config.step_options(shard=True), params=problem.selection.params,
-        on_samples=problem.on_samples(view),
-    )  # fmt: skip
+def _take_step(problem: Problem, view: View, step_seed: int, noted: list[NotedSet]) -> TracedStep:
+    """Repeat the gradient step that the run took for this view. Leaves no gradients. Adds the samples of `reslrb` to
+    `noted`.
+    """
+    optimizer, config, tracer = problem.optimizer, problem.config, problem.integrator
+    if isinstance(tracer, Reslrb):
+        tracer = _noting(tracer, noted)
+    at = tracer, problem.scene, view.sensor
+    own: dict[str, Any] = {"params": problem.selection.params, "on_samples": problem.on_samples(view)}
+    if config.in_rounds:
+        image, refused = render_image(*at, step_seed, config.share_spp), Refused()
+        _, gradient = derivative_of(view.objective, image, refused)
+        given_step(*at, gradient, seed=step_seed, spp=config.share_spp, **own)
+    else:
+        own |= config.step_options(shard=True)
+        step = gradient_step(*at, view.objective, seed=step_seed, **own)
+        image, refused = step.image, step.refused
     gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}
-    for key in keys:
+    for key in problem.selection.keys:
         optimizer.clear_gradient(key)
-    return TracedStep(np.array(step.image), gradients, step.refused.entry())
+    return TracedStep(np.array(image), gradients, refused.entry())
+
+
+def _noting(tracer: Reslrb, noted: list[NotedSet]) -> Reslrb:
+    """Return a copy of the tracer that adds the samples of each of its jobs to `noted`."""
+
+    def passes(job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
+        made = tracer.passes(job, purpose, delta)
+        noted.append((int(job.seed[0]), made))
+        return made
+
+    noting = copy.copy(tracer)
+    noting.passes = passes  # type: ignore[method-assign]
+    return noting
 
 
 def _of_step(step: TracedStep, view: View, largest: Offender | None) -> Offender | None:

@@ -12,8 +12,10 @@ from kit import area, diffuse, scene, sensor, shape
 from optimization import glass
 
 from reslrb_cli.config.loader import load
+from reslrb_cli.measure.gradients import Case
 from reslrb_cli.measure.missing import measure_missing, share_of
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.measurements import MissingRecord
 from reslrb_cli.report.run_summary import find_remedy, warnings
@@ -101,6 +103,34 @@ def test_an_unmeasured_share_is_reported(experiment: Path):
     result = done("optimize", experiment, "--dry-run", *settings("run.measuring=0"))
     assert "box.x: the derivative lacks silhouettes and shadow edges; their share was not measured" in result.output
     assert "--set integrator.type=prb_projective includes all of it" in result.output
+
+
+@pytest.mark.parametrize("measuring", [0.36, 0.5, 0.9])
+def test_the_measurement_stays_within_its_samples(experiment: Path, monkeypatch: pytest.MonkeyPatch, measuring: float):
+    """Noise leaves the share unknown, so the measurement asks for as many samples as it may take."""
+    problem, taken = assemble(load(experiment, [f"run.measuring={measuring}"])), []
+    random = np.random.default_rng(1)
+
+    def gradient(case: Case, tracer: Any, seed: int, spp: int, step: Any) -> np.ndarray:
+        taken.append(spp)
+        return random.normal(size=case.size)
+
+    def difference(case: Case, tracer: Any, row: np.ndarray, seed: int, spp: int, step: float) -> float:
+        taken.append(2 * spp)
+        return float(random.normal())
+
+    render = Problem.render
+
+    def image(problem: Problem, sensor: int, spp: int, iteration: int, purpose: str) -> np.ndarray:
+        taken.append(spp)
+        return render(problem, sensor, spp, iteration, purpose)
+
+    monkeypatch.setattr(Case, "gradient", gradient)
+    monkeypatch.setattr(Case, "difference", difference)
+    monkeypatch.setattr(Problem, "render", image)
+    assert not any(record.is_known for record in measure_missing(problem))
+    allowed = measuring * problem.config.run.iterations * problem.config.run.spp
+    assert 0.7 * allowed < sum(taken) <= allowed
 
 
 def test_light_without_edges_has_a_complete_derivative(llvm: str, tmp_path: Path):

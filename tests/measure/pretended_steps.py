@@ -109,7 +109,7 @@ class Stage:
         self.asked: list[dict[str, Any]] = []
         keys = list(SHAPES)
         self.facts = {
-            "keys": keys, "shapes": SHAPES, "independent": dict.fromkeys(keys, "ptracer"),
+            "paths": "both", "shapes": SHAPES, "independent": dict.fromkeys(keys, "ptracer"),
             "why": dict.fromkeys(keys, ""), "without": {}, "masked": False, "pixels": 64, "pictures": "",
         } | (facts or {})  # fmt: skip
 

@@ -15,12 +15,12 @@ from scipy import stats
 from turns import a_few
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement
-from reslrb_cli.measure.convergence.setup import Role, Sampler, survey
-from reslrb_cli.measure.convergence.statistics import MethodSamples, ReferenceMean
+from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement, MethodSamples, ReferenceMean
+from reslrb_cli.measure.convergence.session import Role
+from reslrb_cli.measure.convergence.setup import Sampler, survey
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.records.measurements import BenchStatus
+from reslrb_cli.records.measurements import BenchStatus, Method
 from reslrb_cli.report.tables import closing_sentence, notes
 
 # What `convergence` reports about methods of known cost, noise and bias. The processes only pretend to measure.
@@ -167,6 +167,7 @@ LEAST, MOST = (int(stats.binom.ppf(p, REPETITIONS, 0.95)) for p in (0.0005, 0.99
 TRUTH = np.random.default_rng(2).uniform(0.5, 2.0, 40)
 SIGNAL = float(TRUTH @ TRUTH)
 SECONDS = 0.2
+METHOD = Method("ptracer", "ptracer", None, None, None, 4)
 
 
 def noise(random: np.random.Generator, count: int) -> np.ndarray:
@@ -197,7 +198,7 @@ def test_errors_are_those_of_averages_without_that_of_the_reference() -> None:
     """
     made = [make(seed, steps=64, rows=6, per_row=1) for seed in range(REPETITIONS)]
     for level in range(6):
-        found = [samples.points()[level] for samples in made]
+        found = [samples.points(METHOD, KEY)[level] for samples in made]
         assert {point.steps for point in found} == {2**level}
         assert {point.repeats for point in found} == {64 // 2**level}
         assert found[0].elapsed_s == pytest.approx(2**level * made[0].step_s)
@@ -356,7 +357,7 @@ def asked(what: Any, objective: str = "fixed", camera: bool = False, named: bool
 
 def test_facts(tmp_path: Path) -> None:
     facts, arrays = asked(problem(tmp_path))
-    assert (facts["keys"], facts["shapes"]) == ([KEY], {KEY: [4, 4, 3]})
+    assert facts["shapes"] == {KEY: [4, 4, 3]}
     assert (facts["independent"], facts["why"], facts["without"]) == ({KEY: "ptracer"}, {KEY: ""}, {})
     assert (facts["pixels"], facts["masked"]) == (64, False)
     assert (arrays["adjoints"].shape, arrays["target-0"].shape) == ((1, 8, 8, 3), (8, 8, 3))
@@ -400,7 +401,7 @@ def test_a_method_that_is_never_right_is_reported(tmp_path: Path) -> None:
     assert arrays["mask"].all()  # prb takes no part
 
 
-@pytest.mark.parametrize("mode", a_few(["known", "loss", "image"], ["known", "image"]))
+@pytest.mark.parametrize("mode", a_few(["fixed", "loss", "image"], ["fixed", "image"]))
 def test_steps_are_repeatable_and_the_border_does_not_count(tmp_path: Path, mode: str) -> None:
     what = problem(tmp_path, GAUSSIAN, overrides=("run.adjoint=independent",))
     _, arrays = asked(what, "image" if mode == "image" else "loss", camera=True)
@@ -414,5 +415,5 @@ def test_steps_are_repeatable_and_the_border_does_not_count(tmp_path: Path, mode
     assert not np.allclose(sampler.step(4, 4, 0)[0], row)
     if mode == "image":
         assert (row.reshape(8, 8, 3)[arrays["mask"][:, :, 0] == 0] == 0).all()
-    if mode == "known":
+    if mode == "fixed":
         assert not np.allclose(sampler.step(3, 4, 1)[0], row, rtol=1e-6, atol=0)

@@ -11,7 +11,7 @@ import pytest
 from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.measure.convergence.setup import MOST_REFERENCE_STEPS, MOST_STEPS, Role
+from reslrb_cli.measure.convergence.session import MOST_REFERENCE_STEPS, MOST_STEPS, Role
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus

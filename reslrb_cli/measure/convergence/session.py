@@ -1,4 +1,4 @@
-"""Processes of a `convergence`: the compared methods, the reference, and the tests for bias.
+"""Members of a `convergence`: the compared methods, the reference, and the tests for bias.
 
 All members take turns (`Arena`). Each member has separate seeds, so no two members share noise. A session may continue
 from the steps of an earlier one, with the same dL/dI.
@@ -6,7 +6,9 @@ from the steps of an earlier one, with the same dL/dI.
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +18,146 @@ from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.arena import Arena
-from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
-from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
 from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Contestant
+from reslrb_cli.measure.processes import Contestant, Ended, Stepping
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurements import Method
 
 #: Maximum memory for the samples of all methods, in bytes.
 MEMORY = 2**30
 
 #: Light paths of a step of an independent reference, which has its own sample count: naive AD keeps all paths.
 INDEPENDENT_PATHS = 2**18
+
+#: Fewer turns, or rows of a reference, give no useful standard error.
+FEWEST = 3
+
+#: Fewer steps give no slope.
+FEWEST_FOR_SLOPE = 16
+
+#: A turn lasts as long as a step of the slowest method, but at most this many seconds.
+TURN_S = 2.0
+
+#: A turn has at least two steps that are shorter than this many seconds: the first one refills the caches.
+SHORT_S = 1.0
+
+#: Maximum number of steps of one turn.
+MOST_STEPS = 8
+
+#: Turns of references, per turn of the compared methods.
+SHARES = {"reference": 0.5, "independent": 0.35}
+
+#: Steps of a turn if their number must not depend on time.
+FIXED = {"case": 2, "reference": 8, "independent": 4}
+
+#: Maximum number of steps of a reference's turn.
+MOST_REFERENCE_STEPS = 64
+
+
+class Role(str, enum.Enum):
+    """Role of a member."""
+
+    CASE = "case"
+    REFERENCE = "reference"
+    INDEPENDENT = "independent"
+
+
+@dataclass(kw_only=True)
+class Member(Stepping):
+    """Process of one member, with its steps so far and its number of steps per turn.
+
+    `rows` are samples (P,), `turns` are their rounds, and `seconds` has the time of one step in each turn. `count` is
+    the number of steps in a turn. `taken` is the number of all requested steps, which determines the seeds.
+    """
+
+    role: Role
+    method: Method
+    config: Config
+    spp: int
+    out: Path
+    count: int = 1
+    taken: int = 0
+    step_s: float = 0.0
+    rows: list[np.ndarray] = field(default_factory=list)
+    turns: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    message: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name of the method."""
+        return self.method.label
+
+    @property
+    def cold_s(self) -> float | None:
+        """Seconds of the first step, which includes compilation."""
+        return None if self.cold is None else self.cold["step_ms"][0] / 1e3
+
+    @property
+    def name(self) -> str:
+        """Role and label."""
+        return f"{self.role.value} {self.label}"
+
+    def question(self, round: int | None) -> dict[str, Any]:
+        """Return the request for the steps of a turn, with the round's dL/dI. During warm-up, a turn has one step."""
+        start, count = self.taken, 1 if round is None else self.count
+        self.taken += count
+        return {"start": start, "count": count, "spp": self.spp, "image": round or 0, "out": str(self.out)}
+
+    def keep(self, round: int, answer: dict[str, Any]) -> None:
+        """Record a turn's steps."""
+        rows = np.load(self.out)
+        if not np.isfinite(rows).all() and not self.message:
+            self.message = f"{np.count_nonzero(~np.isfinite(rows))} entries of step {len(self.rows) + 1} are not finite"
+        self.rows += list(rows)
+        self.turns += [round] * len(rows)
+        times = answer["step_ms"]
+        self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
+
+    def kept(self, rounds: int) -> tuple[dict[str, Any], np.ndarray]:
+        """Return the data of the first `rounds` rounds for a later session: a JSON object, and the samples (N, P).
+
+        An interrupted round is left out. The next session repeats the interrupted round with other seeds.
+        """
+        turns = [turn for turn in self.turns if turn < rounds]
+        entry = {"name": self.name, "config": dump(self.config), "taken": self.taken, "turns": turns,
+                 "seconds": self.seconds[: len(set(turns))], "message": self.message, "cold": self.cold,
+                 "end": self.end and vars(self.end)}  # fmt: skip
+        return entry, np.array(self.rows[: len(turns)], np.float32)
+
+    def restore(self, entry: dict[str, Any], rows: np.ndarray) -> None:
+        """Restore the result of `kept`. Members that have ended are not tried again."""
+        for name in ("taken", "turns", "seconds", "message", "cold"):
+            setattr(self, name, entry[name])
+        self.rows, self.end = list(rows), entry["end"] and Ended(**entry["end"])
+        if self.end is not None:
+            self.close()
+
+
+def share_turns(members: list[Member], fixed: bool) -> None:
+    """Set the number of steps per turn of each member so that turns take about equal times.
+
+    With `fixed`, each member takes the `FIXED` number of steps for its role.
+    """
+    if fixed:
+        for member in members:
+            member.count = FIXED[member.role.value]
+        return
+    cases = [member for member in members if member.role is Role.CASE]
+    turn_s = min(max((member.step_s for member in cases), default=0.0), TURN_S)
+    for member in cases:
+        least = 2 if member.step_s < SHORT_S else 1
+        member.count = _fitting(turn_s, member.step_s, least, MOST_STEPS)
+    together = sum(member.count * member.step_s for member in cases)
+    for member in members:
+        if member.role is not Role.CASE:
+            member.count = _fitting(SHARES[member.role.value] * together, member.step_s, 1, MOST_REFERENCE_STEPS)
+
+
+def _fitting(turn_s: float, step_s: float, least: int, most: int) -> int:
+    return min(max(round(turn_s / max(step_s, 1e-4)), least), most)
 
 
 class Session(Arena[Plan, Member]):
@@ -127,8 +256,7 @@ class Session(Arena[Plan, Member]):
         for case, spp in plan.entries:
             if self._takes_part(case):
                 self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
-        # In older files, which do not record the kinds of paths, the reference named them.
-        reference = plan.settled_reference(facts.get("paths", "light"))
+        reference = plan.settled_reference(facts["paths"])
         known = reference.at(plan.config, plan.config.integrator.max_depth, True)
         self._add(Role.REFERENCE, reference, known, self._noise_free)
         for name in dict.fromkeys(name for name in facts["independent"].values() if name is not None):
@@ -153,7 +281,7 @@ class Session(Arena[Plan, Member]):
             spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
         method = plan.method(case, config, spp, objective != "loss", role is not Role.CASE)
         first = self._first(config, "arrays") | {
-            "mode": {"fixed": "known"}.get(objective, objective),
+            "mode": objective,
             "purpose": f"convergence, {role.value} {method.label}",
         }
         has_all = plan.rounds is not None and self._before >= plan.rounds

@@ -1,28 +1,23 @@
-"""Members of a `convergence` measurement, the facts that precede the measurement (`survey`), and the steps of a member
-(`Sampler`).
-
-Survey and sampler run in separate processes (`workers.py`), which `begin_survey` and `begin_sampling` start.
+"""Processes of a `convergence` (`workers.py`): the facts that precede the measurement (`survey`), and the steps of a
+member (`Sampler`).
 """
 
 from __future__ import annotations
 
-import enum
 import time
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.loader import dump, told
+from reslrb_cli.config.loader import told
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
-from reslrb_cli.measure.processes import Ended, Stepping
 from reslrb_cli.measure.references import CAMERA_PATHS, Situation, choose, of_gradient, of_image
 from reslrb_cli.measure.stepper import Steps, multiple_of
 from reslrb_cli.measure.workers import Begun
@@ -31,140 +26,10 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import View, set_targets, target_arrays, to_tensor
 from reslrb_cli.records.clock import StepTimes, reset_peak
-from reslrb_cli.records.measurements import Method, Reference
+from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
 from reslrb_cli.seeds import seed
-
-#: A turn lasts as long as a step of the slowest method, but at most this many seconds.
-TURN_S = 2.0
-
-#: A turn has at least two steps that are shorter than this many seconds: the first one refills the caches.
-SHORT_S = 1.0
-
-#: Maximum number of steps of one turn.
-MOST_STEPS = 8
-
-#: Turns of references, per turn of the compared methods.
-SHARES = {"reference": 0.5, "independent": 0.35}
-
-#: Steps of a turn if their number must not depend on time.
-FIXED = {"case": 2, "reference": 8, "independent": 4}
-
-#: Maximum number of steps of a reference's turn.
-MOST_REFERENCE_STEPS = 64
-
-
-class Role(str, enum.Enum):
-    """Role of a member."""
-
-    CASE = "case"
-    REFERENCE = "reference"
-    INDEPENDENT = "independent"
-
-
-@dataclass(kw_only=True)
-class Member(Stepping):
-    """Process of one member, with its steps so far and its number of steps per turn.
-
-    `rows` are samples (P,), `turns` are their rounds, and `seconds` has the time of one step in each turn. `count` is
-    the number of steps in a turn. `taken` is the number of all requested steps, which determines the seeds.
-    """
-
-    role: Role
-    method: Method
-    config: Config
-    spp: int
-    out: Path
-    count: int = 1
-    taken: int = 0
-    step_s: float = 0.0
-    rows: list[np.ndarray] = field(default_factory=list)
-    turns: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    message: str = ""
-
-    @property
-    def label(self) -> str:
-        """Name of the method."""
-        return self.method.label
-
-    @property
-    def cold_s(self) -> float | None:
-        """Seconds of the first step, which includes compilation."""
-        return None if self.cold is None else self.cold["step_ms"][0] / 1e3
-
-    @property
-    def name(self) -> str:
-        """Role and label."""
-        return f"{self.role.value} {self.label}"
-
-    def question(self, round: int | None) -> dict[str, Any]:
-        """Return the request for the steps of a turn, with the round's dL/dI. During warm-up, a turn has one step."""
-        start, count = self.taken, 1 if round is None else self.count
-        self.taken += count
-        return {"start": start, "count": count, "spp": self.spp, "image": round or 0, "out": str(self.out)}
-
-    def keep(self, round: int, answer: dict[str, Any]) -> None:
-        """Record a turn's steps."""
-        rows = np.load(self.out)
-        if not np.isfinite(rows).all() and not self.message:
-            self.message = f"{np.count_nonzero(~np.isfinite(rows))} entries of step {len(self.rows) + 1} are not finite"
-        self.rows += list(rows)
-        self.turns += [round] * len(rows)
-        times = answer["step_ms"]
-        self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
-
-    def kept(self, rounds: int) -> tuple[dict[str, Any], np.ndarray]:
-        """Return the data of the first `rounds` rounds for a later session: a JSON object, and the samples (N, P).
-
-        An interrupted round is left out. The next session repeats the interrupted round with other seeds.
-        """
-        turns = [turn for turn in self.turns if turn < rounds]
-        entry = {"name": self.name, "config": dump(self.config), "taken": self.taken, "turns": turns,
-                 "seconds": self.seconds[: len(set(turns))], "message": self.message, "cold": self.cold,
-                 "end": self.end and vars(self.end)}  # fmt: skip
-        return entry, np.array(self.rows[: len(turns)], np.float32)
-
-    def restore(self, entry: dict[str, Any], rows: np.ndarray) -> None:
-        """Restore the result of `kept`. Members that have ended are not tried again."""
-        for name in ("taken", "turns", "seconds", "message", "cold"):
-            setattr(self, name, entry[name])
-        self.rows, self.end = list(rows), entry["end"] and Ended(**entry["end"])
-        if self.end is not None:
-            self.close()
-
-    def means(self, key: slice, groups: int | None = None) -> np.ndarray:
-        """Return the means of the entries `key` for each turn, or for each group of turns: (K, P)."""
-        turns, rows = np.array(self.turns), np.stack(self.rows)[:, key].astype(np.float64)
-        if groups is not None:
-            turns = turns % groups
-        return np.stack([rows[turns == turn].mean(0) for turn in np.unique(turns)])
-
-
-def share_turns(members: list[Member], fixed: bool) -> None:
-    """Set the number of steps per turn of each member so that turns take about equal times.
-
-    With `fixed`, each member takes the `FIXED` number of steps for its role.
-    """
-    for member in members if fixed else ():
-        member.count = FIXED[member.role.value]
-    if fixed:
-        return
-    cases = [member for member in members if member.role is Role.CASE]
-    turn_s = min(max((member.step_s for member in cases), default=0.0), TURN_S)
-    for member in cases:
-        least = 2 if member.step_s < SHORT_S else 1
-        member.count = _fitting(turn_s, member.step_s, least, MOST_STEPS)
-    together = sum(member.count * member.step_s for member in cases)
-    for member in members:
-        if member.role is not Role.CASE:
-            member.count = _fitting(SHARES[member.role.value] * together, member.step_s, 1, MOST_REFERENCE_STEPS)
-
-
-def _fitting(turn_s: float, step_s: float, least: int, most: int) -> int:
-    return min(max(round(turn_s / max(step_s, 1e-4)), least), most)
-
 
 #: Light paths of the target, and of all images with a fixed dL/dI together, without a time limit.
 PATHS = {"fixed": 2**21, "loss": 2**23}
@@ -203,7 +68,7 @@ def survey(
 
     The facts have these keys.
 
-    - `keys` and `shapes`: the keys and shapes of the estimated quantities. A quantity is a parameter or `image`.
+    - `shapes`: the shapes of the estimated quantities by key. A quantity is a parameter or `image`.
     - `independent`: the valid stock integrator for each key, or None. `why`: the reasons against other stock
         integrators for each key.
     - `without`: stock integrators that are valid for no key, with the reason.
@@ -262,7 +127,7 @@ def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.
 
 
 def find_references(problem: Problem, objective: str) -> dict[str, Any]:
-    """Return the keys, the shapes, and the valid stock integrator for each key."""
+    """Return the shape and the valid stock integrator for each key."""
     at = Situation.of_problem(problem, problem.sensors[0])
     keys = ["image"] if objective == "image" else list(problem.selection.keys)
     found: dict[str, dict[Reference, str | None]] = {}
@@ -279,8 +144,7 @@ def find_references(problem: Problem, objective: str) -> dict[str, Any]:
         if all(reasons[name] is not None for reasons in found.values())
     }
     shapes = {key: list(value_shape(problem.selection.value(key))) for key in keys if key != "image"}
-    return {"keys": keys, "shapes": shapes, "independent": independent, "why": why, "without": without,
-            "paths": problem.paths}  # fmt: skip
+    return {"shapes": shapes, "independent": independent, "why": why, "without": without, "paths": problem.paths}
 
 
 def _unlike(config: Config) -> str | None:
@@ -323,7 +187,7 @@ def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
 class Sampler(Steps):
     """Steps of `convergence`.
 
-    `mode` is the sampled quantity. `known` is the gradient with dL/dI fixed at one of `adjoints`. `loss` is the
+    `mode` is the sampled quantity. `fixed` is the gradient with dL/dI fixed at one of `adjoints`. `loss` is the
     gradient of the experiment's loss with its `run.adjoint`. `image` is the image. `arrays` are the arrays of the
     survey.
     """
@@ -345,7 +209,7 @@ class Sampler(Steps):
                 picture = render_image(problem.integrator, problem.scene, self.sensor, seed, spp)
                 dr.eval(picture)
             return (np.array(picture, np.float32) * self.inside).ravel(), times
-        if self.mode == "known":
+        if self.mode == "fixed":
             gradients, times = self.gradient(seed, self.adjoints[image % len(self.adjoints)], spp)
         else:
             gradients, times = self.gradient(seed, lambda seen: masked_loss(self.view, seen, self.mask), spp)
