@@ -79,9 +79,8 @@ class Arena(Generic[Measured, Worker]):
         if earlier is not None:
             earlier.check(self.settings)
         depths = self._set_up(earlier)
-        self._budget_s = max((1 - self.AFTERWARDS) * plan.budget_s - self.AFTERWARDS_S - spent_s, 0.0)
-        self._pace = Pace(self._budget_s, depths, plan.rounds, now, self.MOST_ROUNDS)
-        self._end = now() + self._budget_s
+        budget_s = max((1 - self.AFTERWARDS) * plan.budget_s - self.AFTERWARDS_S - spent_s, 0.0)
+        self._pace = Pace(budget_s, depths, plan.rounds, now, self.MOST_ROUNDS)
 
     def _set_up(self, earlier: Earlier | None) -> int:
         """Set up the parts that are specific to one kind of session. The parts start from the data of an earlier

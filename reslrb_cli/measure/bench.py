@@ -251,12 +251,10 @@ class Bench(Arena[Sweep, BenchRun]):
         return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
 
     def _needed(self, left: int) -> str:
-        """Describe the estimated total time of the measurement with all remaining values. The total includes the time
-        already spent.
-        """
+        """Describe the budget for all remaining values. The budget includes the time since the command was called."""
         late, warm = sum(run.late for run in self.members), len(self._alive())
         if warm == 0:
             return "; nothing had compiled by then, so allow several times as much"
         # Kernels that are not compiled yet are assumed to take as long as the compiled ones; deeper paths take longer.
         further = late / warm + sum(GROWTH**k for k in range(1, left))
-        return f"; everything takes about {self._pace.spent_s + self._pace.depth_s * further:.0f} s"
+        return f"; everything takes about {self._now() - self._began + self._pace.depth_s * further:.0f} s"

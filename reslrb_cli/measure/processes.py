@@ -298,14 +298,9 @@ class Pace:
         most: int = MAX_ROUNDS,
     ) -> None:
         self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
-        self._start = self._rounds_start = self._depth_start = now()
+        self._rounds_start = self._depth_start = now()
         self._depth_end = self._end
         self._before = 0
-
-    @property
-    def spent_s(self) -> float:
-        """Seconds since the start of the measurement."""
-        return self._now() - self._start
 
     @property
     def depth_s(self) -> float:

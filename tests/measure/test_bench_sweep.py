@@ -193,8 +193,19 @@ def test_the_budget_covers_compilation(budget_s: float, measured: dict[int, list
         assert said[0].endswith("; nothing had compiled by then, so allow several times as much")
 
 
-def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
-    """Return the measured methods for each depth, the messages, and the time of a session with this budget."""
+def test_the_named_budget_includes_the_time_before_the_session() -> None:
+    """A command imports packages and checks its arguments before the session starts."""
+    (found, [line], _), (_, [without], _) = spent(170.0, before_s=40.0), spent(130.0)
+    enough, less = (float(said.partition("about ")[2].removesuffix(" s")) for said in (line, without))
+    assert enough == less + 40.0
+    assert found == {2: LIST.split(","), 4: ["ptracer"]}
+    assert spent(enough, before_s=40.0)[0] == {2: LIST.split(","), 4: LIST.split(",")}
+
+
+def spent(budget_s: float, before_s: float = 0.0) -> tuple[dict[int, list[str]], list[str], float]:
+    """Return the measured methods for each depth, the messages, and the time of a session with this budget. The command
+    takes `before_s` before the session.
+    """
     now = [0.0]
 
     class Slow(Pretended):
@@ -205,7 +216,7 @@ def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
                     raise Stopped
             return super().answer(stop)
 
-    rows, said = play(sweep(rounds=None, budget_s=budget_s), Slow, now=lambda: now[0])
+    rows, said = play(sweep(rounds=None, budget_s=budget_s), Slow, now=lambda: now[0], spent_s=before_s)
     found: dict[int, list[str]] = {}
     for row in rows:
         found.setdefault(row.record.max_depth, []).append(row.case.label)
