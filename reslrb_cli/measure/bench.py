@@ -1,6 +1,6 @@
 """Time and memory of a step against path depth, or another quantity, for several integrators side by side.
 
-`sweep` selects the quantity: depth, number of samples, size of the film or of textures. At each value, every case
+`sweep` selects the quantity: depth or number of samples. At each value, every case
 (`BenchRun`) has its own process, and all processes exist at once (`Bench`). Each process takes a cold step. Further
 steps follow until no new kernel is compiled. Then rounds follow. In each round, every process takes one step, and the
 order of the processes changes from round to round. The steps of a round share a seed. Ratios compare steps of the same
@@ -21,7 +21,7 @@ from typing import Any
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.arena import Arena
-from reslrb_cli.measure.methods import WIDTHS, Case, Sweep, paths_in_records
+from reslrb_cli.measure.methods import Case, Sweep, paths_in_records
 from reslrb_cli.measure.processes import GROWTH, MAX_ROUNDS, NO_TIME, Ended, Stepping, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
@@ -229,9 +229,7 @@ class Bench(Arena[Sweep, BenchRun]):
                 run = before.get(case.label) or self._run(case, value)
                 self.members.append(run)
                 if run.end is None:
-                    width = {f"{plan.swept}_width": value} if plan.swept in WIDTHS else {}
-                    first = plan.first(run.config) | {"objective": plan.objective} | width
-                    run.process = self._start(first, "measured_steps")
+                    run.process = self._start(plan.first(run.config) | {"objective": plan.objective}, "measured_steps")
 
     def _measure(self, name: str) -> Iterator[int]:
         for run in self._alive():
