@@ -20,9 +20,9 @@ from typing import Any
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.arena import Arena
+from reslrb_cli.measure.arena import GROWTH, MAX_ROUNDS, NO_TIME, Arena, Contestant
 from reslrb_cli.measure.methods import Case, Sweep, paths_in_records
-from reslrb_cli.measure.processes import GROWTH, MAX_ROUNDS, NO_TIME, Ended, Stepping, Stopped
+from reslrb_cli.measure.processes import Ended, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
@@ -48,7 +48,7 @@ class BenchResult:
 
 
 @dataclass(kw_only=True)
-class BenchRun(Stepping):
+class BenchRun(Contestant):
     """One case at one value. `steps` has its steps by round.
 
     `size` is the film's width and height in pixels, and `texels` the size of all recovered textures.
@@ -126,6 +126,9 @@ def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
     ratios = [own / its for own, its in both if its and run.end is None and baseline.end is None]
     return Spread.of(ratios) if ratios else None
 
+
+#: The function that a process runs.
+STEPS = "reslrb_cli.measure.stepper:begin_steps"
 
 #: First steps that take longer are reported when they are done, in seconds.
 SLOW = 10.0
@@ -229,7 +232,7 @@ class Bench(Arena[Sweep, BenchRun]):
                 run = before.get(case.label) or self._run(case, value)
                 self.members.append(run)
                 if run.end is None:
-                    run.process = self._start(plan.first(run.config) | {"objective": plan.objective}, "measured_steps")
+                    run.process = self._start(plan.first(run.config) | {"objective": plan.objective}, STEPS)
 
     def _measure(self, name: str) -> Iterator[int]:
         for run in self._alive():
@@ -237,7 +240,7 @@ class Bench(Arena[Sweep, BenchRun]):
             if answer is not None:
                 run.size, run.texels = (answer["width"], answer["height"]), answer.get("texels")
         for run in self._alive():
-            run.warm_up(self._tight, self._stop, self._pace.over)
+            self._warm_up(run)
             if run.alive and run.cold is not None and run.cold["step_ms"] > 1e3 * SLOW:
                 self._say(f"{name}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
         if self._tight():
@@ -246,7 +249,7 @@ class Bench(Arena[Sweep, BenchRun]):
             )
         # Rounds continue after those of an earlier session, whose numbers set the seeds, until all have enough.
         first = 1 + max((round for run in self.members for round in run.steps), default=-1)
-        return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
+        return self._take_rounds(first, min((len(run.steps) for run in self._alive()), default=0))
 
     def _needed(self, left: int) -> str:
         """Describe the budget for all remaining values. The budget includes the time since the command was called."""

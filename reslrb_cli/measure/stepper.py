@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import drjit as dr
@@ -13,8 +14,8 @@ from reslrb_cli.config.loader import told
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import whole_of
 from reslrb_cli.integrators.step import gradient_step, known_step
+from reslrb_cli.measure.processes import Begun
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.measure.workers import Begun, scratch_bytes
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
@@ -47,6 +48,33 @@ def shrink(scene: Any, sensor: int, pixels: int) -> None:
     for name, value in (("film.size", size), ("film.crop_size", window), ("film.crop_offset", offset)):
         params[name] = type(params[name])(*value)
     params.update()
+
+
+_BITS = {"i1": 8, "half": 16, "float": 32, "double": 64, "ptr": 64}
+
+#: One array of its entries for all lanes of a vector (LLVM): `alloca float, i32 112`.
+_LLVM_ARRAY = re.compile(r"%arr_\w+ = alloca (\w+), i32 (\d+)")
+_LLVM_LANES = re.compile(r"%index_next = add i64 %index, (\d+)")
+
+#: ... or for one thread (CUDA): `.local .align 4 .b32 arr_12[7];`.
+_PTX_ARRAY = re.compile(r"\.local \.align \d+ \.[a-z]+(\d+) arr_\w+\[(\d+)\]")
+
+
+def scratch_bytes(history: Iterable[dict[str, Any]]) -> int:
+    """Return the largest thread-local memory of a path in bytes, over all kernels of a `dr.kernel_history()`."""
+    texts = [entry["ir"] for entry in history if entry.get("ir") is not None]
+    return max((_of_kernel(text if isinstance(text, str) else str(text.getvalue())) for text in texts), default=0)
+
+
+def _of_kernel(ir: str) -> int:
+    bits = sum(int(size) * int(count) for size, count in _PTX_ARRAY.findall(ir))
+    arrays = _LLVM_ARRAY.findall(ir)
+    if arrays:
+        lanes = _LLVM_LANES.search(ir)
+        assert lanes is not None, "a kernel says how many lanes it handles at a time"
+        sizes = [_BITS.get(kind) or int(kind.removeprefix("i")) for kind, _ in arrays]
+        bits += sum(size * int(count) for size, (_, count) in zip(sizes, arrays, strict=True)) // int(lanes[1])
+    return bits // 8
 
 
 class Steps:

@@ -23,8 +23,7 @@ from reslrb_cli.cli import main
 from reslrb_cli.measure import methods
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
-from reslrb_cli.measure.stepper import Stepper
-from reslrb_cli.measure.workers import scratch_bytes
+from reslrb_cli.measure.stepper import Stepper, scratch_bytes
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.records.measurements import BenchStatus
 

@@ -12,9 +12,10 @@ from measure.pretended_steps import Pretended
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.arena import MAX_ROUNDS, MIN_ROUNDS, Pace
 from reslrb_cli.measure.bench import Bench, BenchResult
 from reslrb_cli.measure.methods import Sweep, depths, parse_cases, sample_counts
-from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, Stopped
+from reslrb_cli.measure.processes import Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
 from reslrb_cli.report.tables import bench_cells, bench_columns

@@ -15,14 +15,16 @@ import numpy as np
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.arena import Arena
+from reslrb_cli.measure.arena import Arena, Contestant
 from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
 from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
 from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Contestant
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
+
+#: The module of the functions that processes run.
+SETUP = "reslrb_cli.measure.convergence.setup"
 
 #: Maximum memory for the samples of all methods, in bytes.
 MEMORY = 2**30
@@ -61,7 +63,7 @@ class Session(Arena[Plan, Member]):
     def _course(self) -> Iterator[int]:
         if self._survey():
             self._begin()
-            self._warm_up()
+            self._warm_up_all()
             yield from self._take_turns()
         self._say_what_it_takes()
 
@@ -109,7 +111,7 @@ class Session(Arena[Plan, Member]):
             self.facts = self._earlier.head["facts"]
             return True
         first = self._first(plan.reference_config, "arrays") | {"objective": plan.objective}
-        self._referee, answer = Contestant(process=self._start(first, "surveyed"), may_refuse=False), None
+        self._referee, answer = Contestant(process=self._start(first, f"{SETUP}:begin_survey"), may_refuse=False), None
         if self._ask_referee(plan) is not None:
             ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
             answer = self._ask_referee(plan, {"out": first["arrays"], "ask": ask})
@@ -158,7 +160,7 @@ class Session(Arena[Plan, Member]):
         }
         has_all = plan.rounds is not None and self._before >= plan.rounds
         member = Member(
-            process=None if has_all else self._start(first, "sampled_steps"),
+            process=None if has_all else self._start(first, f"{SETUP}:begin_sampling"),
             may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
             role=role,
             method=method,
@@ -169,12 +171,12 @@ class Session(Arena[Plan, Member]):
         self.members.append(member)
         return member
 
-    def _warm_up(self) -> None:
+    def _warm_up_all(self) -> None:
         for member in self.members:
             if member.alive:
                 self._open(member)
         for member in self.members:
-            answer = member.warm_up(self._tight, self._stop, self._pace.over) if member.alive else None
+            answer = self._warm_up(member) if member.alive else None
             self._say_end(member, member.label)
             if answer is not None and member.cold is not None:
                 member.step_s = answer["step_ms"][0] / 1e3
@@ -195,7 +197,7 @@ class Session(Arena[Plan, Member]):
             return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
-        rounds = self._take_rounds(self._alive, self._before, self._before)
+        rounds = self._take_rounds(self._before, self._before)
         while self.rounds < most and (now := next(rounds, None)) is not None:
             self.rounds = now
             yield now

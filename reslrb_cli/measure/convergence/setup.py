@@ -1,7 +1,7 @@
 """Members of a `convergence` measurement, the facts that precede the measurement (`survey`), and the steps of a member
 (`Sampler`).
 
-Survey and sampler run in separate processes (`workers.py`), which `begin_survey` and `begin_sampling` start.
+Survey and sampler run in separate processes (`processes.py`), which `begin_survey` and `begin_sampling` start.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from reslrb_cli.config.loader import dump, told
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.step import render_image
+from reslrb_cli.measure.arena import Contestant
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
-from reslrb_cli.measure.processes import Ended, Stepping
+from reslrb_cli.measure.processes import Begun, Ended
 from reslrb_cli.measure.references import CAMERA_PATHS, Situation, choose, of_gradient, of_image
 from reslrb_cli.measure.stepper import Steps, multiple_of
-from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
@@ -64,7 +64,7 @@ class Role(str, enum.Enum):
 
 
 @dataclass(kw_only=True)
-class Member(Stepping):
+class Member(Contestant):
     """Process of one member, with its steps so far and its number of steps per turn.
 
     `rows` are samples (P,), `turns` are their rounds, and `seconds` has the time of one step in each turn. `count` is
