@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from reslrb_cli.backend.installation import python_command
-from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.methods import Case, Measurement, Plan
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
@@ -143,7 +142,7 @@ def start_process(first: dict[str, Any], does: str) -> Process:
     return Process(first, python_command(f"from reslrb_cli.measure.processes import run\nrun({does!r})"))
 
 
-class Arena(Generic[Measured, Worker]):
+class Arena(Generic[Measured, Worker, Item]):
     """Running workers, `members`. The workers write files to `folder`, which the caller removes.
 
     `facts` come from the referee. `spent_s` is the part of the budget that is already spent. Measurements of an
@@ -188,10 +187,16 @@ class Arena(Generic[Measured, Worker]):
         """
         raise NotImplementedError
 
-    def _taking_turns(self, course: Iterator[Item]) -> Iterator[Item]:
-        """Yield the items of `course` until `course` ends or `stop()` returns true. Then all workers have ended."""
+    def _course(self) -> Iterator[Item]:
+        """Measure, as `run` does. `run` ends the workers."""
+        raise NotImplementedError
+
+    def run(self) -> Iterator[Item]:
+        """Measure. Yields an item after each round. Ends early, with the finished results, after `stop()`. Then all
+        workers have ended. Raises Refused if a required worker cannot start.
+        """
         try:
-            yield from course
+            yield from self._course()
         except Stopped:
             return
         finally:
@@ -258,10 +263,6 @@ class Arena(Generic[Measured, Worker]):
             round += 1
             yield round
 
-    def _budget_for(self, seconds: float) -> float:
-        """Return the total budget that leaves `seconds` seconds for measuring."""
-        return (seconds + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
-
     def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
         """Return the referee's answer to `question`. Without a question, return the referee's first message. Returns
         None if the budget is spent. Raises Refused if the referee ended.
@@ -287,32 +288,12 @@ class Arena(Generic[Measured, Worker]):
                 self._say(line)
         return opening
 
-    # --- messages
-    # ---------------------------------------------------------------------------------------------------------
-
-    def _first(self, config: Config, arrays: str) -> dict[str, Any]:
-        """Return the first message to a worker. The message holds the file of the referee's arrays under the name
-        `arrays`.
-        """
-        return self.plan.first(config) | {arrays: str(self.folder / f"{arrays}.npz")}
-
-    def _say_end(self, member: Worker, label: str, more: str = "") -> None:
+    def _say_end(self, member: Worker, label: str) -> None:
         """Print how a worker ended, if it did."""
         if member.refusal is not None:
             self._say(f"left out: {label}: {member.refusal}")
         elif member.end is not None:
-            self._say(f"{label}{more}: {member.end.status.value}: {member.end.reason}")
-
-    def _say_left_out(self) -> None:
-        """Print the methods of the default list that do not support the scene."""
-        for case in self.plan.cases:
-            reason = self._without(case)
-            if reason is not None:
-                self._say(f"left out: {case.label}: {reason}")
-
-    def _takes_part(self, case: Case) -> bool:
-        """Whether a method is measured."""
-        return self._without(case) is None
+            self._say(f"{label}: {member.end.status.value}: {member.end.reason}")
 
     def _without(self, case: Case) -> str | None:
         """Return why a method of the default list is left out, or None if it takes part."""

@@ -134,7 +134,7 @@ STEPS = "reslrb_cli.measure.stepper:begin_steps"
 SLOW = 10.0
 
 
-class Bench(Arena[Sweep, BenchRun]):
+class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
     """Measurement for each value of the sweep (see `Arena`). No process writes into its folder.
 
     `runs` has the runs by value, `done` the finished values, and `left_out` the cases that do not support the scene.
@@ -184,15 +184,10 @@ class Bench(Arena[Sweep, BenchRun]):
         left_out = [case.label for case in self.left_out]
         return resume_store.head(self.plan.KIND, self.settings, values=values, left_out=left_out), {}
 
-    def run(self) -> Iterator[list[BenchResult]]:
-        """Measure. Yields an empty list after each round, and a value's results when the value is finished.
-
-        Ends early, with the finished results, after `stop()`. Prints missing measurements and, once, warnings of
-        loading. Raises Refused if a required case cannot start.
-        """
-        return self._taking_turns(self._course())
-
     def _course(self) -> Iterator[list[BenchResult]]:
+        """Measure. Yields an empty list after each round, and a value's results when the value is finished. Prints
+        missing measurements.
+        """
         plan, values = self.plan, self._to_do
         for number, value in enumerate(values):
             if self._pace.over():

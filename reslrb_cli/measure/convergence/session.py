@@ -33,7 +33,7 @@ MEMORY = 2**30
 INDEPENDENT_PATHS = 2**18
 
 
-class Session(Arena[Plan, Member]):
+class Session(Arena[Plan, Member, int]):
     """Running processes and their samples (see `Arena`).
 
     `judges` maps names of independent stock integrators to their members.
@@ -52,15 +52,8 @@ class Session(Arena[Plan, Member]):
         """Return the members of one role."""
         return [member for member in self.members if member.role is role]
 
-    def run(self) -> Iterator[int]:
-        """Measure. Yields the number of completed rounds after each round. Ends early, with the finished results, after
-        `stop()`.
-
-        Raises Refused if a required member cannot start.
-        """
-        return self._taking_turns(self._course())
-
     def _course(self) -> Iterator[int]:
+        """Measure. Yields the number of completed rounds after each round."""
         if self._survey():
             self._begin()
             self._warm_up_all()
@@ -110,7 +103,7 @@ class Session(Arena[Plan, Member]):
             np.savez(self._arrays, **found)  # type: ignore[arg-type]
             self.facts = self._earlier.head["facts"]
             return True
-        first = self._first(plan.reference_config, "arrays") | {"objective": plan.objective}
+        first = plan.first(plan.reference_config) | {"arrays": str(self._arrays), "objective": plan.objective}
         self._referee, answer = Contestant(process=self._start(first, f"{SETUP}:begin_survey"), may_refuse=False), None
         if self._ask_referee(plan) is not None:
             ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
@@ -125,9 +118,11 @@ class Session(Arena[Plan, Member]):
 
     def _begin(self) -> None:
         plan, facts = self.plan, self.facts
-        self._say_left_out()
+        for case in plan.cases:
+            if (reason := self._without(case)) is not None:
+                self._say(f"left out: {case.label}: {reason}")
         for case, spp in plan.entries:
-            if self._takes_part(case):
+            if self._without(case) is None:
                 self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
         # In older files, which do not record the kinds of paths, the reference named them.
         reference = plan.settled_reference(facts.get("paths", "light"))
@@ -154,7 +149,8 @@ class Session(Arena[Plan, Member]):
         if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
             spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
         method = plan.method(case, config, spp, objective != "loss", role is not Role.CASE)
-        first = self._first(config, "arrays") | {
+        first = plan.first(config) | {
+            "arrays": str(self._arrays),
             "mode": {"fixed": "known"}.get(objective, objective),
             "purpose": f"convergence, {role.value} {method.label}",
         }
@@ -246,4 +242,4 @@ class Session(Arena[Plan, Member]):
     def _budget_of(self, rounds: int, share: float = 1.0) -> float:
         """Return the budget in seconds for `rounds` rounds of this session. `share` scales the measured work."""
         before = self._now() - self._began - (self.rounds - self._before) * self._round_s
-        return self._budget_for(share * (before + rounds * self._round_s))
+        return (share * (before + rounds * self._round_s) + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
