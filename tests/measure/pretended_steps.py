@@ -49,7 +49,7 @@ class Pretended:
         if self.ends.get((self.type, self.depth)) == self.asked:
             raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
         if self.question is None:
-            return {"width": 6, "height": 5}
+            return {"width": 6, "height": 5, "texels": 9}
         ms = float(self.depth * (1 + self.question["round"]) * {"ptracer": 4, "reslrb": 2, "walk_ad": 5}[self.type])
         parts = {"kernel_ms": ms / 2, "codegen_ms": ms / 8, "tracing_ms": 3 * ms / 8}
         answer = {"step_ms": ms, **parts, "new_kernels": 2 if self.asked < 3 else 0}

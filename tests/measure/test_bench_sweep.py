@@ -75,7 +75,13 @@ def test_records() -> None:
     ]
     stack = rows[1].record
     assert (stack.estimator, stack.capacity, stack.rr_depth, stack.spp) == ("stack", None, 7, 4)
-    assert (stack.width, stack.height, stack.status, stack.repeats) == (6, 5, BenchStatus.OK, MIN_ROUNDS)
+    assert (stack.width, stack.height, stack.texels, stack.status, stack.repeats) == (
+        6,
+        5,
+        9,
+        BenchStatus.OK,
+        MIN_ROUNDS,
+    )
     assert stack.step_ms == Spread(12.0, 8.0, 16.0)
     assert stack.kernel_ms == Spread(6.0, 4.0, 8.0)
     assert (stack.codegen_ms, stack.tracing_ms) == (Spread(1.5, 1.0, 2.0), Spread(4.5, 3.0, 6.0))
@@ -109,9 +115,11 @@ def test_times_are_relative_to_ptracer_or_the_first_case(cases: str) -> None:
     assert sweep(cases).baseline.label == ("ptracer" if "ptracer" in cases else "reslrb:stack")
 
 
-def test_all_cases_may_end() -> None:
-    Pretended.ends = {(name, 2): 1 for name in ("ptracer", "reslrb", "walk_ad")}
-    assert {row.record.status for row in run(sweep(values=[2]))} == {BenchStatus.OUT_OF_MEMORY}
+@pytest.mark.parametrize(("question", "width"), [(0, None), (1, 6)], ids=["loading", "cold"])
+def test_all_cases_may_end(question: int, width: int | None) -> None:
+    Pretended.ends = {(name, 2): question for name in ("ptracer", "reslrb", "walk_ad")}
+    found = {(row.record.status, row.record.width) for row in run(sweep(values=[2]))}
+    assert found == {(BenchStatus.OUT_OF_MEMORY, width)}
 
 
 @pytest.mark.parametrize(("after", "kept"), [(5, []), (14, [1, 1, 1]), (13, [1, 1]), (33, [3, 3, 3, 1])])
@@ -420,6 +428,14 @@ def test_refused_cases_stay_left_out() -> None:
     whole = measure(sweep(default=True, rounds=5), again(first))
     assert {name for _, name, _ in Pretended.log} == {"ptracer", "walk_ad"}
     assert {result.record.repeats for result in whole.results()} == {5}
+
+
+def test_a_result_without_its_baseline_is_continued() -> None:
+    """A stop can come after the first step of a case, and before that of the baseline."""
+    what = sweep("reslrb:stack,ptracer", values=[2])
+    stopped = measure(what, stop=lambda: len(Pretended.log) > 7)
+    continued = session(what, again(stopped))
+    assert [(result.case.label, result.step_ratio) for result in continued.results()] == [("reslrb:stack", None)]
 
 
 def test_running_work_is_saved_between_rounds() -> None:
