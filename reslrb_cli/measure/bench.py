@@ -173,7 +173,7 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
         if not any(entries for _, entries in values):
             return None
         content = {"values": values, "left_out": [case.label for case in self.left_out], "size": self.size}
-        return resume_store.head(self.plan.KIND, self.settings, **content), {}
+        return resume_store.kept(self.plan.KIND, self.settings, None, **content)
 
     def _course(self) -> Iterator[list[BenchResult]]:
         """Measure. Yields an empty list after each round, and a value's results when the value is finished. Prints
