@@ -30,8 +30,8 @@ MAX_WARM_UPS = 4
 
 @dataclass(kw_only=True)
 class Contestant:
-    """One of several workers that are compared. `process` is None if no worker runs. `peak_mib` is the worker's peak
-    memory in MiB, and `cold` is its first step, which includes compilation.
+    """One of several workers that are compared. `process` is None if no worker runs. `cold` is the answer for its first
+    step, which includes compilation.
 
     A refusal (`Refused`) ends the measurement, unless `may_refuse` is True.
     """
@@ -41,7 +41,6 @@ class Contestant:
     end: Ended | None = None
     refusal: Refused | None = None
     late: bool = False
-    peak_mib: float = 0.0
     cold: dict[str, Any] | None = None
 
     @property
@@ -211,7 +210,8 @@ class Arena(Generic[Measured, Worker, Item]):
 
     def _tight(self) -> bool:
         """True if workers together use so much memory that each worker must release memory after each step."""
-        return sum(member.peak_mib for member in self._alive()) * MIB > MEMORY_SHARE * self.plan.memory
+        mib = sum(member.cold["peak_mib"] for member in self._alive() if member.cold is not None)
+        return bool(mib * MIB > MEMORY_SHARE * self.plan.memory)
 
     def _answer(self, member: Contestant, over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
         """Wait for a worker's next answer. Returns None if the worker ended, or if the time was up (`over`)."""
@@ -242,7 +242,7 @@ class Arena(Generic[Measured, Worker, Item]):
             if answer is None:
                 return None
             if cold:
-                member.cold, member.peak_mib = answer, answer["peak_mib"]
+                member.cold = answer
             elif not answer["new_kernels"]:
                 break
         return answer

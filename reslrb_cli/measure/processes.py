@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
-import logging
+import logging.handlers
 import os
 import re
 import selectors
@@ -180,18 +180,6 @@ def last_words(text: str) -> str:
 Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
 
 
-class Warnings(logging.Handler):
-    """Collects warnings. All processes load the same scene, and the controlling process prints each warning once."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.lines: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Store one line."""
-        self.lines.append(record.getMessage())
-
-
 def _serve(first: dict[str, Any], does: str, questions: IO[str], answers: IO[str]) -> None:
     os.environ |= {
         # Dr.Jit's folders for compiled kernels: a cold step must find none.
@@ -208,10 +196,12 @@ def _serve(first: dict[str, Any], does: str, questions: IO[str], answers: IO[str
     begin = getattr(importlib.import_module(module), name)
     # Set late, because a library without memory looks like a missing one.
     _limit(first["memory_limit"])
-    warnings = Warnings()
+    # All workers load the same scene, so their warnings are sent, and printed once.
+    warnings = logging.handlers.BufferingHandler(10_000)
+    warnings.setLevel(logging.WARNING)
     logging.getLogger("reslrb_cli").addHandler(warnings)
     opening, answer_to = begin(first)
-    _answer(answers, opening | {"warnings": warnings.lines})
+    _answer(answers, opening | {"warnings": [record.getMessage() for record in warnings.buffer]})
     for line in questions:
         _answer(answers, answer_to(json.loads(line)))
 

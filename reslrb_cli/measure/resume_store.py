@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Kept, read_samples, samples_file
 
@@ -140,9 +140,4 @@ def first_difference(there: Any, here: Any, place: str = "") -> str | None:
     if place.startswith(f"{FILES}."):
         what = "is new" if there == _ABSENT else "has gone" if here == _ABSENT else "has changed"
         return f"{place.removeprefix(f'{FILES}.')} {what}"
-    return f"{place} is {_short(there)} there, {_short(here)} here"
-
-
-def _short(value: Any) -> str:
-    text = " ".join(str(value).split())
-    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+    return f"{place} is {one_line(there, _SHOWN)} there, {one_line(here, _SHOWN)} here"

@@ -148,28 +148,22 @@ RADIANCE = "lamp.emitter.radiance"
 MIDDLE, HALF = (1.0, 0.8, -0.2), 0.3
 
 
-def covered(center: tuple[float, float], side: float, distance: float, size: int) -> Array:
-    """Return the share of each pixel (H, W, 1) that a square covers. The square is parallel to the film, at this
-    distance.
-
-    `center` is in world units, x to the right and y upwards. Uses similar triangles.
-    """
-    pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / size
-    edges = np.arange(size + 1)
-
-    def shares(middle: float) -> Array:
-        low, high = (size / 2 + (middle + sign * side / 2) / pixel for sign in (-1, 1))
-        return np.clip(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0, None)
-
-    return np.outer(shares(-center[1]), shares(center[0]))[..., None]
-
-
 def speck_in_view(side: float, radiance: tuple = (3, 2, 4)) -> KnownScene:
-    """A square lamp on the border of two pixels. The lamp does not light the wall behind it."""
+    """A square lamp on the border of two pixels. The lamp does not light the wall behind it.
+
+    The image is the share of each pixel that the lamp covers, times its radiance. The lamp is parallel to the film, so
+    the share follows from similar triangles.
+    """
     distance = 2.0
     pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / SIZE
     center = (pixel + 0.2 * side, 0.6 * pixel)  # 0.7 of it to the right of a border
-    share = covered(center, side, distance, SIZE)
+    edges = np.arange(SIZE + 1)
+
+    def covered(middle: float) -> Array:
+        low, high = (SIZE / 2 + (middle + sign * side / 2) / pixel for sign in (-1, 1))
+        return np.clip(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0, None)
+
+    share = np.outer(covered(-center[1]), covered(center[0]))[..., None]
 
     def scene() -> dict[str, Any]:
         return {
