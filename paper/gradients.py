@@ -30,8 +30,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, entry_count
 from reslrb_cli.measure.gradients import Case
 from reslrb_cli.measure.participants import ALIKE, NEVER
-from reslrb_cli.measure.processes import Ended, Process
-from reslrb_cli.measure.workers import Begun
+from reslrb_cli.measure.processes import Begun, Ended, Process
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.records.measurements import Comparison, Reference, Verdict
@@ -184,7 +183,7 @@ def sample(kind: Kind, count: int, config: Config, adjoint: np.ndarray, series: 
         np.save(held, adjoint)
         first = {"config": dump(config), "source": str(config.source), "variant": VARIANT, "memory_limit": limit,
                  "by": kind.by, "adjoint": str(held)}  # fmt: skip
-        code = "from paper.gradients import begin\nfrom reslrb_cli.measure.workers import run\nrun(lambda: begin)"
+        code = "from reslrb_cli.measure.processes import run\nrun('paper.gradients:begin')"
         process = Process(first, python_command(code))
         try:
             process.answer(lambda: False)

@@ -47,17 +47,24 @@ class BenchOptions(ComparisonOptions):
     objective: str
 
 
+class Swept(click.Choice[str]):
+    """The quantities that can be varied. Refuses removed quantities with advice."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        if value in ("film", "texture"):
+            self.fail(f"`{value}` was removed; change sizes with --set, and call bench once for each size", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 @click.command("bench")
 @optional_experiment_arguments
-@click.option("--sweep", "swept", type=click.Choice(["depth", "spp", "film", "texture"]), default="depth",
-              show_default=True,
-              help=
-        "Quantity to vary: path depth, samples per pixel, or the width of the film or of recovered textures. "
-        "The path depth is that of CONFIG unless it is varied.")  # fmt: skip
+@click.option("--sweep", "swept", type=Swept(["depth", "spp"]), default="depth", show_default=True,
+              help="Quantity to vary: path depth or samples per pixel. The path depth is that of CONFIG unless it is "
+                   "varied.")  # fmt: skip
 @click.option("--values", type=Counts(), metavar="LIST",
               help=
-        "Values to measure, e.g. 4,16,64. Default: depths by --max-depth, a quarter to four times run.spp, "
-        "film widths 32 to 256, texture widths 16 to 1024.")  # fmt: skip
+        "Values to measure, e.g. 4,16,64. Default: depths by --max-depth, a quarter to four times "
+        "run.spp.")  # fmt: skip
 @click.option("--max-depth", type=click.IntRange(min=2, max=COUNT.max), default=32, show_default=True,
               help="Greatest path depth; the measured depths are 2, 4, 8, ... and this one.")  # fmt: skip
 @click.option("--integrators", metavar="LIST",
@@ -71,7 +78,7 @@ class BenchOptions(ComparisonOptions):
                    "run.adjoint says.")  # fmt: skip
 @comparison_options
 def command(**given: Any) -> int:
-    """Measure time and peak memory of gradient steps against path depth, or another quantity (--sweep).
+    """Measure time and peak memory of gradient steps against path depth or sample count (--sweep).
 
     A step computes the image of CONFIG's first sensor, the loss, and the gradient of every parameter. Without CONFIG,
     the scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in its own processes.
@@ -83,14 +90,14 @@ def command(**given: Any) -> int:
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # before the imports below need them
-    from reslrb_cli.measure.methods import Sweep, depths, machine_of, parse_cases, usual_values
+    from reslrb_cli.measure.methods import Sweep, depths, machine_of, parse_cases, sample_counts
     from reslrb_cli.records.measurements import BenchStatus
 
     config, swept, values, json_file = options.config(), options.swept, options.values, options.json_file
     if (swept != "depth" or values is not None) and is_given("max_depth"):
         reason = "needs --sweep depth" if values is None else "has no effect with --values"
         raise ConfigError("--max-depth", "", f"{reason}; use --set integrator.max_depth={options.max_depth}")
-    usual = depths(options.max_depth) if swept == "depth" else usual_values(swept, config)
+    usual = depths(options.max_depth) if swept == "depth" else sample_counts(config.run.spp)
     check_writable("--json", json_file)
     sweep = Sweep(
         **machine_of(config, None),

@@ -97,7 +97,7 @@ class Keeper:
         return fits
 
 
-A = TypeVar("A", bound="Arena[Any, Any]")
+A = TypeVar("A", bound="Arena[Any, Any, Any]")
 
 
 @contextmanager

@@ -1,51 +1,147 @@
 """Workers that take turns, from the workers' start to their end. `bench` and `convergence` share this code.
 
 Only one worker computes at a time, so drift of the machine affects all workers alike. An additional worker, the
-referee, can make the common reference. If the referee fails, nothing is measured.
+referee, can make the common reference. If the referee fails, nothing is measured. `Contestant` is one worker with its
+results, `Pace` divides the time, and `Arena` asks the workers in turn.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from reslrb_cli.backend.installation import python_command
-from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.methods import Case, Measurement, Plan
-from reslrb_cli.measure.processes import Contestant, Pace, Process, Refused, Stepping, Stopped
+from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.workers import Begin
 from reslrb_cli.records.measurements import BenchStatus
 
 #: If all processes together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
 MIB = 2**20
 
-#: Starts a process from its first message and the name of its task.
+#: Maximum number of steps after the cold one until no new kernel is compiled.
+MAX_WARM_UPS = 4
+
+
+@dataclass(kw_only=True)
+class Contestant:
+    """One of several workers that are compared. `process` is None if no worker runs. `cold` is the answer for its first
+    step, which includes compilation.
+
+    A refusal (`Refused`) ends the measurement, unless `may_refuse` is True.
+    """
+
+    process: Any
+    may_refuse: bool
+    end: Ended | None = None
+    refusal: Refused | None = None
+    late: bool = False
+    cold: dict[str, Any] | None = None
+
+    @property
+    def alive(self) -> bool:
+        """True if the process can answer more questions."""
+        return self.process is not None and self.end is None and self.refusal is None and not self.late
+
+    def question(self, round: int | None) -> dict[str, Any]:
+        """Return the question for a round's steps. For None, the step is not counted."""
+        raise NotImplementedError
+
+    def keep(self, round: int, answer: dict[str, Any]) -> None:
+        """Store the steps of a round."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """End the process, if one is running."""
+        if self.process is not None:
+            self.process.close()
+            self.process = None
+
+
+MIN_ROUNDS = 3
+MAX_ROUNDS = 25
+
+#: Factor on the time for the next depth, whose kernels take longer to compile and to run.
+GROWTH = 1.3
+
+#: Message about measurements that exceed the budget.
+NO_TIME = "the budget was spent; allow more with --budget"
+
+
+class Pace:
+    """Divides the time among depths. Each depth gets GROWTH times as much time as the previous depth.
+
+    Time that one depth leaves unused goes to the remaining depths. While there is time, each depth gets at least
+    MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time does not count. Rounds of earlier sessions
+    count.
+    """
+
+    def __init__(
+        self,
+        budget_s: float,
+        depths: int,
+        rounds: int | None = None,
+        now: Callable[[], float] = time.monotonic,
+        most: int = MAX_ROUNDS,
+    ) -> None:
+        self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
+        self._rounds_start = self._depth_start = now()
+        self._depth_end = self._end
+        self._before = 0
+
+    @property
+    def depth_s(self) -> float:
+        """Seconds since the start of the depth."""
+        return self._now() - self._depth_start
+
+    def over(self) -> bool:
+        """Whether the time is up."""
+        return self._rounds is None and self._now() >= self._end
+
+    def fits(self, seconds: float) -> bool:
+        """Whether this many seconds are left."""
+        return self._rounds is not None or self._now() + seconds <= self._end
+
+    def begin_depth(self) -> None:
+        """Start a depth."""
+        now = self._depth_start = self._now()
+        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
+        self._left -= 1
+
+    def begin_rounds(self, before: int = 0) -> None:
+        """Start the rounds after the warm-up. Earlier sessions have done `before` rounds."""
+        self._rounds_start, self._before = self._now(), before
+
+    def another(self, done: int) -> bool:
+        """Whether there is time for another round after `done` rounds of this session."""
+        if self._rounds is not None:
+            return self._before + done < self._rounds
+        if self._before + done >= self._most:
+            return False
+        if done == 0:
+            return True
+        now = self._now()
+        return now + (now - self._rounds_start) / done <= (self._end if done < MIN_ROUNDS else self._depth_end)
+
+
+#: Starts a process from its first message and the place of its function (`processes.run`).
 Start = Callable[[dict[str, Any], str], Any]
 Worker = TypeVar("Worker", bound=Contestant)
 Item = TypeVar("Item")
 Measured = TypeVar("Measured", bound=Measurement)
 
 
-def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
-    """Return the workers in the order of a round; the first one changes from round to round."""
-    start = round % max(len(workers), 1)
-    return [*workers[start:], *workers[:start]]
-
-
 def start_process(first: dict[str, Any], does: str) -> Process:
-    """Start a process. The process runs the function that `load` returns for the name `does`. `first` is its first
-    message.
-    """
-    imports = "from reslrb_cli.measure.arena import load\nfrom reslrb_cli.measure.workers import run"
-    return Process(first, python_command(f"{imports}\nrun(lambda: load({does!r}))"))
+    """Start a process that runs `processes.run` with `does`. `first` is its first message."""
+    return Process(first, python_command(f"from reslrb_cli.measure.processes import run\nrun({does!r})"))
 
 
-class Arena(Generic[Measured, Worker]):
+class Arena(Generic[Measured, Worker, Item]):
     """Running workers, `members`. The workers write files to `folder`, which the caller removes.
 
     `facts` come from the referee. `spent_s` is the part of the budget that is already spent. Measurements of an
@@ -79,9 +175,8 @@ class Arena(Generic[Measured, Worker]):
         if earlier is not None:
             earlier.check(self.settings)
         depths = self._set_up(earlier)
-        self._budget_s = max((1 - self.AFTERWARDS) * plan.budget_s - self.AFTERWARDS_S - spent_s, 0.0)
-        self._pace = Pace(self._budget_s, depths, plan.rounds, now, self.MOST_ROUNDS)
-        self._end = now() + self._budget_s
+        budget_s = max((1 - self.AFTERWARDS) * plan.budget_s - self.AFTERWARDS_S - spent_s, 0.0)
+        self._pace = Pace(budget_s, depths, plan.rounds, now, self.MOST_ROUNDS)
 
     def _set_up(self, earlier: Earlier | None) -> int:
         """Set up the parts that are specific to one kind of session. The parts start from the data of an earlier
@@ -91,10 +186,16 @@ class Arena(Generic[Measured, Worker]):
         """
         raise NotImplementedError
 
-    def _taking_turns(self, course: Iterator[Item]) -> Iterator[Item]:
-        """Yield the items of `course` until `course` ends or `stop()` returns true. Then all workers have ended."""
+    def _course(self) -> Iterator[Item]:
+        """Measure, as `run` does. `run` ends the workers."""
+        raise NotImplementedError
+
+    def run(self) -> Iterator[Item]:
+        """Measure. Yields an item after each round. Ends early, with the finished results, after `stop()`. Then all
+        workers have ended. Raises Refused if a required worker cannot start.
+        """
         try:
-            yield from course
+            yield from self._course()
         except Stopped:
             return
         finally:
@@ -109,23 +210,58 @@ class Arena(Generic[Measured, Worker]):
 
     def _tight(self) -> bool:
         """True if workers together use so much memory that each worker must release memory after each step."""
-        return sum(member.peak_mib for member in self._alive()) * MIB > MEMORY_SHARE * self.plan.memory
+        mib = sum(member.cold["peak_mib"] for member in self._alive() if member.cold is not None)
+        return bool(mib * MIB > MEMORY_SHARE * self.plan.memory)
 
-    def _take_rounds(self, workers: Callable[[], Sequence[Stepping]], first: int, before: int) -> Iterator[int]:
+    def _answer(self, member: Contestant, over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
+        """Wait for a worker's next answer. Returns None if the worker ended, or if the time was up (`over`)."""
+        try:
+            result: dict[str, Any] = member.process.answer(lambda: self._stop() or over())
+            return result
+        except Ended as end:
+            member.end = end
+        except Refused as refusal:
+            if not member.may_refuse:
+                raise
+            member.refusal = refusal
+        except Stopped:
+            if self._stop():
+                raise
+            member.late = True
+        member.close()  # releases its resources for the others
+        return None
+
+    def _warm_up(self, member: Worker) -> dict[str, Any] | None:
+        """Take a cold step, then more steps until nothing is compiled. Returns the last answer, or None if the worker
+        ended.
+        """
+        for number in range(1 + MAX_WARM_UPS):
+            cold = number == 0
+            member.process.ask(member.question(None) | {"cold": cold, "release": not cold and self._tight()})
+            answer = self._answer(member, self._pace.over)
+            if answer is None:
+                return None
+            if cold:
+                member.cold = answer
+            elif not answer["new_kernels"]:
+                break
+        return answer
+
+    def _take_rounds(self, first: int, before: int) -> Iterator[int]:
         """Yield the number of completed rounds after each round. Rounds start at number `first`. Earlier sessions
         completed `before` rounds.
         """
-        tight, done = self._tight(), 0
+        tight, round = self._tight(), first
         self._pace.begin_rounds(before)
-        while workers() and self._pace.another(done):
-            for worker in in_turn(workers(), first + done):
-                worker.turn(first + done, tight, self._stop)
-            done += 1
-            yield first + done
-
-    def _budget_for(self, seconds: float) -> float:
-        """Return the total budget that leaves `seconds` seconds for measuring."""
-        return (seconds + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
+        while (workers := self._alive()) and self._pace.another(round - first):
+            start = round % len(workers)  # the first worker changes from round to round
+            for worker in [*workers[start:], *workers[:start]]:
+                worker.process.ask(worker.question(round) | {"cold": False, "release": tight})
+                answer = self._answer(worker)
+                if answer is not None:
+                    worker.keep(round, answer)
+            round += 1
+            yield round
 
     def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
         """Return the referee's answer to `question`. Without a question, return the referee's first message. Returns
@@ -142,49 +278,22 @@ class Arena(Generic[Measured, Worker]):
         return answer
 
     def _open(self, member: Contestant) -> dict[str, Any] | None:
-        """Return the first message of a worker that has loaded its scene. Returns None if the worker ended, or if the
-        time was up.
+        """Return the first message of a worker that has loaded its scene, and print its new warnings. Returns None if
+        the worker ended, or if the time was up.
         """
-        opening = member.answer(self._stop, self._pace.over)
-        self._warn(opening or {})
+        opening = self._answer(member, self._pace.over)
+        for line in (opening or {}).get("warnings", ()):
+            if line not in self._said:  # every process loads the same scene
+                self._said.add(line)
+                self._say(line)
         return opening
 
-    # --- messages
-    # ---------------------------------------------------------------------------------------------------------
-
-    def _first(self, config: Config, arrays: str) -> dict[str, Any]:
-        """Return the first message to a worker. The message holds the file of the referee's arrays under the name
-        `arrays`.
-        """
-        return self.plan.first(config) | {arrays: str(self.folder / f"{arrays}.npz")}
-
-    def _warn(self, opening: dict[str, Any]) -> None:
-        """Print warnings about loading only once, because every process loads the same scene."""
-        for line in opening.get("warnings", ()):
-            self._once(line)
-
-    def _once(self, line: str) -> None:
-        if line not in self._said:
-            self._said.add(line)
-            self._say(line)
-
-    def _say_end(self, member: Worker, label: str, more: str = "") -> None:
+    def _say_end(self, member: Worker, label: str) -> None:
         """Print how a worker ended, if it did."""
         if member.refusal is not None:
             self._say(f"left out: {label}: {member.refusal}")
         elif member.end is not None:
-            self._say(f"{label}{more}: {member.end.status.value}: {member.end.reason}")
-
-    def _say_left_out(self) -> None:
-        """Print the methods of the default list that do not support the scene."""
-        for case in self.plan.cases:
-            reason = self._without(case)
-            if reason is not None:
-                self._say(f"left out: {case.label}: {reason}")
-
-    def _takes_part(self, case: Case) -> bool:
-        """Whether a method is measured."""
-        return self._without(case) is None
+            self._say(f"{label}: {member.end.status.value}: {member.end.reason}")
 
     def _without(self, case: Case) -> str | None:
         """Return why a method of the default list is left out, or None if it takes part."""
@@ -194,16 +303,3 @@ class Arena(Generic[Measured, Worker]):
             return "this scene has only light paths"
         reason: str | None = self.facts["without"].get(case.type)
         return reason
-
-
-def load(does: str) -> Begin:
-    """Return the function, selected by `does`, that starts a process. `load` and the returned function import their
-    modules themselves.
-    """
-    if does == "measured_steps":
-        from reslrb_cli.measure.stepper import begin_steps
-
-        return begin_steps
-    from reslrb_cli.measure.convergence.setup import begin_sampling, begin_survey
-
-    return begin_survey if does == "surveyed" else begin_sampling

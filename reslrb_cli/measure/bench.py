@@ -1,6 +1,6 @@
 """Time and memory of a step against path depth, or another quantity, for several integrators side by side.
 
-`sweep` selects the quantity: depth, number of samples, size of the film or of textures. At each value, every case
+`sweep` selects the quantity: depth or number of samples. At each value, every case
 (`BenchRun`) has its own process, and all processes exist at once (`Bench`). Each process takes a cold step. Further
 steps follow until no new kernel is compiled. Then rounds follow. In each round, every process takes one step, and the
 order of the processes changes from round to round. The steps of a round share a seed. Ratios compare steps of the same
@@ -14,18 +14,21 @@ taken. Each case that has compiled takes part in at least one round.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.arena import Arena
-from reslrb_cli.measure.methods import WIDTHS, Case, Sweep, paths_in_records
-from reslrb_cli.measure.processes import GROWTH, MAX_ROUNDS, NO_TIME, Ended, Stepping, Stopped
+from reslrb_cli.measure.arena import GROWTH, MAX_ROUNDS, NO_TIME, Arena, Contestant
+from reslrb_cli.measure.methods import Case, Sweep, paths_in_records
+from reslrb_cli.measure.processes import Ended, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
+
+#: Sizes that all cases have in common; None until a case has loaded its scene.
+SIZES = ("width", "height", "texels")
 
 #: Measured quantities of every step.
 TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
@@ -48,16 +51,11 @@ class BenchResult:
 
 
 @dataclass(kw_only=True)
-class BenchRun(Stepping):
-    """One case at one value. `steps` has its steps by round.
-
-    `size` is the film's width and height in pixels, and `texels` the size of all recovered textures.
-    """
+class BenchRun(Contestant):
+    """One case at one value. `steps` has its steps by round."""
 
     case: Case
     config: Config
-    size: tuple[int, int] | None = None
-    texels: int | None = None
     steps: dict[int, dict[str, Any]] = field(default_factory=dict)
 
     @property
@@ -75,27 +73,19 @@ class BenchRun(Stepping):
 
     def kept(self) -> dict[str, Any]:
         """Return the data for a later session, for JSON."""
-        return {"case": self.case.label, "size": self.size, "texels": self.texels, "cold": self.cold,
-                "steps": self.steps, "end": self.end and vars(self.end)}  # fmt: skip
+        end = self.end and vars(self.end)
+        return {"case": self.case.label, "cold": self.cold, "steps": self.steps, "end": end}
 
     def restore(self, entry: Mapping[str, Any]) -> None:
         """Restore the result of `kept`."""
-        self.size, self.texels, self.cold = entry["size"] and tuple(entry["size"]), entry["texels"], entry["cold"]
+        self.cold, self.end = entry["cold"], entry["end"] and Ended(**entry["end"])
         self.steps = {int(round): step for round, step in entry["steps"].items()}
-        self.end = entry["end"] and Ended(**entry["end"])
 
 
-def results(runs: Sequence[BenchRun], value: int, sweep: Sweep) -> list[BenchResult]:
-    """Return the results of all cases at one value of the varied quantity."""
-    return [_result(run, value, sweep, runs) for run in runs if run.done]
-
-
-def _result(run: BenchRun, value: int, sweep: Sweep, runs: Sequence[BenchRun]) -> BenchResult:
-    options, figures = run.config.integrator.options(), dict[str, Any]()
-    baseline = next(other for other in runs if other.case == sweep.baseline)
-    width, height = next((other.size for other in runs if other.size is not None), (None, None))
+def _result(run: BenchRun, value: int, baseline: BenchRun, size: Mapping[str, int | None]) -> BenchResult:
+    options, figures = run.config.integrator.options(), dict[str, Any](size)
     if run.end is None:
-        figures = {name: Spread.of([step[name] for step in run.steps.values()]) for name in TIMES}
+        figures |= {name: Spread.of([step[name] for step in run.steps.values()]) for name in TIMES}
         figures["repeats"] = len(run.steps)
         if run.cold:
             figures |= {"cold_ms": run.cold["step_ms"], "cold_codegen_ms": run.cold["codegen_ms"]}
@@ -107,10 +97,7 @@ def _result(run: BenchRun, value: int, sweep: Sweep, runs: Sequence[BenchRun]) -
         max_depth=run.config.integrator.max_depth,
         rr_depth=options["rr_depth"],
         spp=run.config.run.spp,
-        width=width,
-        height=height,
         status=BenchStatus.OK if run.end is None else run.end.status,
-        texels=next((other.texels for other in runs if other.texels is not None), None),
         **paths_in_records(run.config),
         **figures,
     )
@@ -127,35 +114,37 @@ def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
     return Spread.of(ratios) if ratios else None
 
 
-#: First steps that take longer are reported when they are done, in seconds.
-SLOW = 10.0
+#: The function that a process runs.
+STEPS = "reslrb_cli.measure.stepper:begin_steps"
 
 
-class Bench(Arena[Sweep, BenchRun]):
+class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
     """Measurement for each value of the sweep (see `Arena`). No process writes into its folder.
 
     `runs` has the runs by value, `done` the finished values, and `left_out` the cases that do not support the scene.
+    `size` has the `width` and `height` of the film in pixels, and the `texels` of all textures that are parameters.
     """
 
     AFTERWARDS, AFTERWARDS_S, MOST_ROUNDS = 0.0, 0.0, MAX_ROUNDS
 
     def _set_up(self, earlier: Earlier | None) -> int:
         self.runs, self.done, self.left_out = dict[int, list[BenchRun]](), set[int](), list[Case]()
+        self.size: dict[str, int | None] = dict.fromkeys(SIZES)
         if earlier is not None:
             self._restore(earlier)
         self._to_do = [value for value in self.plan.values if value not in self.done]
         return len(self._to_do)
 
     def _restore(self, earlier: Earlier) -> None:
-        plan, most = self.plan, self.plan.rounds or MAX_ROUNDS
+        plan, most, self.size = self.plan, self.plan.rounds or MAX_ROUNDS, earlier.head["size"]
         self.left_out = [case for case in plan.cases if case.label in earlier.head["left_out"]]
         for value, entries in earlier.head["values"]:
             by_label = {entry["case"]: entry for entry in entries}
-            runs = self.runs[value] = [self._run(case, value) for case in plan.cases if case.label in by_label]
+            runs = self.runs[value] = [self._run(case, value) for case in plan.cases if case not in self.left_out]
             for run in runs:
-                run.restore(by_label[run.case.label])
-            whole = len(runs) == len(plan.cases) - len(self.left_out)
-            if whole and all(run.end is not None or len(run.steps) >= most for run in runs):
+                if run.case.label in by_label:
+                    run.restore(by_label[run.case.label])
+            if all(run.end is not None or len(run.steps) >= most for run in runs):
                 self.done.add(value)
 
     def _run(self, case: Case, value: int) -> BenchRun:
@@ -170,26 +159,26 @@ class Bench(Arena[Sweep, BenchRun]):
             result
             for value in self.plan.values
             if value in self.runs and done in (None, value in self.done)
-            for result in results(self.runs[value], value, self.plan)
+            for result in self._results(value)
         ]
+
+    def _results(self, value: int) -> list[BenchResult]:
+        runs = self.runs[value]
+        baseline = next(run for run in runs if run.case == self.plan.baseline)
+        return [_result(run, value, baseline, self.size) for run in runs if run.done]
 
     def kept(self) -> Kept | None:
         """Return the data for a later session, or None if no data exist yet."""
         values = [(value, [run.kept() for run in runs if run.done]) for value, runs in self.runs.items()]
         if not any(entries for _, entries in values):
             return None
-        left_out = [case.label for case in self.left_out]
-        return resume_store.head(self.plan.KIND, self.settings, values=values, left_out=left_out), {}
-
-    def run(self) -> Iterator[list[BenchResult]]:
-        """Measure. Yields an empty list after each round, and a value's results when the value is finished.
-
-        Ends early, with the finished results, after `stop()`. Prints missing measurements and, once, warnings of
-        loading. Raises Refused if a required case cannot start.
-        """
-        return self._taking_turns(self._course())
+        content = {"values": values, "left_out": [case.label for case in self.left_out], "size": self.size}
+        return resume_store.kept(self.plan.KIND, self.settings, None, **content)
 
     def _course(self) -> Iterator[list[BenchResult]]:
+        """Measure. Yields an empty list after each round, and a value's results when the value is finished. Prints
+        missing measurements.
+        """
         plan, values = self.plan, self._to_do
         for number, value in enumerate(values):
             if self._pace.over():
@@ -214,7 +203,7 @@ class Bench(Arena[Sweep, BenchRun]):
                 names = ", ".join(run.case.label for run in late)
                 self._say(f"not measured: {plan.name(value)}, {names}: {NO_TIME}{needed}")
             self.done.add(value)
-            yield results(self.members, value, plan)
+            yield self._results(value)
             if stopped:
                 return
 
@@ -229,34 +218,28 @@ class Bench(Arena[Sweep, BenchRun]):
                 run = before.get(case.label) or self._run(case, value)
                 self.members.append(run)
                 if run.end is None:
-                    width = {f"{plan.swept}_width": value} if plan.swept in WIDTHS else {}
-                    first = plan.first(run.config) | {"objective": plan.objective} | width
-                    run.process = self._start(first, "measured_steps")
+                    run.process = self._start(plan.first(run.config) | {"objective": plan.objective}, STEPS)
 
     def _measure(self, name: str) -> Iterator[int]:
         for run in self._alive():
             answer = self._open(run)
             if answer is not None:
-                run.size, run.texels = (answer["width"], answer["height"]), answer.get("texels")
+                self.size = {name: answer[name] for name in SIZES}
         for run in self._alive():
-            run.warm_up(self._tight, self._stop, self._pace.over)
-            if run.alive and run.cold is not None and run.cold["step_ms"] > 1e3 * SLOW:
-                self._say(f"{name}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
+            self._warm_up(run)
         if self._tight():
             self._say(
                 f"{name}: together the cases need more than the available memory; each releases its memory after a step"
             )
         # Rounds continue after those of an earlier session, whose numbers set the seeds, until all have enough.
         first = 1 + max((round for run in self.members for round in run.steps), default=-1)
-        return self._take_rounds(self._alive, first, min((len(run.steps) for run in self._alive()), default=0))
+        return self._take_rounds(first, min((len(run.steps) for run in self._alive()), default=0))
 
     def _needed(self, left: int) -> str:
-        """Describe the estimated total time of the measurement with all remaining values. The total includes the time
-        already spent.
-        """
+        """Describe the budget for all remaining values. The budget includes the time since the command was called."""
         late, warm = sum(run.late for run in self.members), len(self._alive())
         if warm == 0:
             return "; nothing had compiled by then, so allow several times as much"
         # Kernels that are not compiled yet are assumed to take as long as the compiled ones; deeper paths take longer.
         further = late / warm + sum(GROWTH**k for k in range(1, left))
-        return f"; everything takes about {self._pace.spent_s + self._pace.depth_s * further:.0f} s"
+        return f"; everything takes about {self._now() - self._began + self._pace.depth_s * further:.0f} s"

@@ -17,6 +17,7 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.measure.arena import NO_TIME
 from reslrb_cli.measure.comparison import (
     ROUNDING,
     Family,
@@ -27,7 +28,6 @@ from reslrb_cli.measure.comparison import (
 )
 from reslrb_cli.measure.methods import records_of
 from reslrb_cli.measure.participants import CheckSettings, Way
-from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import NAIVE, Engine, Name, Sampling
 from reslrb_cli.records.measurement_files import Kept

@@ -224,21 +224,13 @@ def depths(max_depth: int) -> list[int]:
     return [*powers, max_depth]
 
 
-#: Quantities that can be swept, and their names in messages.
-SWEPT = {"depth": "depth", "spp": "spp", "film": "film width", "texture": "texture width"}
-
 #: Default sample counts of a sweep, as multiples of the experiment's.
 SHARES = (0.25, 0.5, 1, 2, 4)
 
-#: Default widths of a sweep, in pixels or texels.
-WIDTHS = {"film": (32, 64, 128, 256), "texture": (16, 64, 256, 1024)}
 
-
-def usual_values(swept: str, config: Config) -> list[int]:
-    """Return the default values of a sweep, except for depths."""
-    if swept == "spp":
-        return sorted({max(round(share * config.run.spp), 1) for share in SHARES})
-    return list(WIDTHS[swept])
+def sample_counts(spp: int) -> list[int]:
+    """Return the default sample counts of a sweep, for an experiment with `spp` samples per pixel."""
+    return sorted({max(round(share * spp), 1) for share in SHARES})
 
 
 def with_run(config: Config, **changes: Any) -> Config:
@@ -317,14 +309,14 @@ class Sweep(Measurement):
         return self.default and case != self.baseline
 
     def at(self, case: Case, value: int) -> Config:
-        """Return the experiment of one case, without changing film and texture sizes. Raises ConfigError."""
+        """Return the experiment of one case at one value. Raises ConfigError."""
         config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
         depth = value if self.swept == "depth" else config.integrator.max_depth
         return case.at(config, depth, known=self.objective == "fixed")
 
     def name(self, *values: int) -> str:
         """Format values of the swept quantity, for example `depth 2, 4`."""
-        return f"{SWEPT[self.swept]} {', '.join(map(str, values))}"
+        return f"{self.swept} {', '.join(map(str, values))}"
 
     def check(self) -> None:
         """Raise ConfigError if an integrator of the list is invalid."""

@@ -1,31 +1,31 @@
-"""Worker processes as seen from outside. The end of a worker is detected and reported, and does not end the
-measurement.
+"""Worker processes that take measurements, from outside (`Process`) and from inside (`run`).
 
-- `Process` is one worker, which exchanges lines of JSON with `workers.py`.
-- `Contestant` is one of several compared workers, and records how the worker ended. `Stepping` is a contestant that
-    takes steps.
-- `Pace` divides the time of a sweep among depths and rounds.
+`Process` and `run` exchange JSON objects, one per line, by the standard input and output of the worker. The first
+object describes the case. The worker answers when the case is loaded. Each later object asks for one step. Other
+output of a worker goes to standard error. The end of a worker is detected and reported, and does not end the
+measurement.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
+import logging.handlers
 import os
 import re
 import selectors
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from reslrb_cli.errors import ReslrbError, mentions_memory
+from reslrb_cli.errors import BackendError, ConfigError, ReslrbError, is_out_of_memory, mentions_memory
 from reslrb_cli.records.measurements import BenchStatus
 
 POLL_SECONDS = 0.05
@@ -174,169 +174,85 @@ def last_words(text: str) -> str:
     return (marked[-1].lstrip("> ") if marked else lines[-1] if lines else "")[:300]
 
 
-@dataclass(kw_only=True)
-class Contestant:
-    """One of several workers that are compared. `process` is None if no worker runs. `peak_mib` is the worker's peak
-    memory in MiB.
+# --- inside a worker ------------------------------------------------------------------------------------------------
 
-    A refusal (`Refused`) ends the measurement, unless `may_refuse` is True.
+#: A started case: its first message, and the function that answers each question.
+Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
+
+
+def _serve(first: dict[str, Any], does: str, questions: IO[str], answers: IO[str]) -> None:
+    os.environ |= {
+        # Dr.Jit's folders for compiled kernels: a cold step must find none.
+        "HOME": first["cache"],
+        "DRJIT_CACHE_DIR": first["cache"],
+        "OPTIX_CACHE_PATH": first["cache"],
+        "CUDA_CACHE_DISABLE": "1",
+    }
+    from reslrb_cli.backend.variant import set_variant
+
+    set_variant(first["variant"])
+
+    module, _, name = does.partition(":")
+    begin = getattr(importlib.import_module(module), name)
+    # Set late, because a library without memory looks like a missing one.
+    _limit(first["memory_limit"])
+    # All workers load the same scene, so their warnings are sent, and printed once.
+    warnings = logging.handlers.BufferingHandler(10_000)
+    warnings.setLevel(logging.WARNING)
+    logging.getLogger("reslrb_cli").addHandler(warnings)
+    opening, answer_to = begin(first)
+    _answer(answers, opening | {"warnings": [record.getMessage() for record in warnings.buffer]})
+    for line in questions:
+        _answer(answers, answer_to(json.loads(line)))
+
+
+def _limit(memory_limit: int | None) -> None:
+    """Limit the address space of the whole process to `memory_limit` bytes. A lower hard limit takes precedence."""
+    if memory_limit is not None:
+        import resource
+
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
+        limit = memory_limit if most == resource.RLIM_INFINITY else min(memory_limit, most)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+#: The C++ library's message if a thread cannot be created, because the limit leaves no address space for its stack.
+_NO_THREAD = "Resource temporarily unavailable"
+
+
+def _failure(error: Exception, limited: bool) -> dict[str, Any]:
+    words = " ".join(str(error).split())
+    memory = is_out_of_memory(error) or mentions_memory(words)  # also as the cause of another error
+    memory = memory or (limited and _NO_THREAD in words)
+    refused = isinstance(error, ConfigError | BackendError) and not memory
+    return {
+        "failure": "refused" if refused else "out_of_memory" if memory else "failed",
+        "reason": words if refused else f"{type(error).__name__}: {words}"[:400],
+        "exit_code": int(getattr(error, "exit_code", 1)),
+    }
+
+
+def _answer(answers: IO[str], message: dict[str, Any]) -> None:
+    answers.write(json.dumps(message) + "\n")
+    answers.flush()
+
+
+def run(does: str) -> None:
+    """Answer questions until standard input ends or a failure occurs, then end the process. The last answer describes a
+    failure.
+
+    `does` is the function that starts the case, as `MODULE:FUNCTION`. The function returns `Begun` for the first
+    message.
     """
-
-    process: Any
-    may_refuse: bool
-    end: Ended | None = None
-    refusal: Refused | None = None
-    late: bool = False
-    peak_mib: float = 0.0
-
-    @property
-    def alive(self) -> bool:
-        """True if the process can answer more questions."""
-        return self.process is not None and self.end is None and self.refusal is None and not self.late
-
-    def ask(
-        self, question: dict[str, Any], stop: Callable[[], bool], over: Callable[[], bool] = lambda: False
-    ) -> dict[str, Any] | None:
-        """Ask and wait for one answer. Returns None if the process ended or the time was up. Raises Stopped after
-        `stop()`.
-        """
-        self.process.ask(question)
-        return self.answer(stop, over)
-
-    def answer(self, stop: Callable[[], bool], over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
-        """Wait for the next answer, as `ask` does. After its start, a process sends its first answer without waiting
-        for a question.
-        """
-        try:
-            result: dict[str, Any] = self.process.answer(lambda: stop() or over())
-            return result
-        except Ended as end:
-            self.end = end
-        except Refused as refusal:
-            if not self.may_refuse:
-                raise
-            self.refusal = refusal
-        except Stopped:
-            if stop():
-                raise
-            self.late = True
-        self.close()  # releases its resources for the others
-        return None
-
-    def close(self) -> None:
-        """End the process, if one is running."""
-        if self.process is not None:
-            self.process.close()
-            self.process = None
-
-
-#: Maximum number of steps after the cold one until no new kernel is compiled.
-MAX_WARM_UPS = 4
-
-
-@dataclass(kw_only=True)
-class Stepping(Contestant):
-    """A contestant that takes steps in rounds after its warm-up. `cold` is the first step, which includes
-    compilation.
-    """
-
-    cold: dict[str, Any] | None = None
-
-    def question(self, round: int | None) -> dict[str, Any]:
-        """Return the question for a round's steps. For None, the step is not counted."""
-        raise NotImplementedError
-
-    def keep(self, round: int, answer: dict[str, Any]) -> None:
-        """Store the steps of a round."""
-        raise NotImplementedError
-
-    def warm_up(self, tight: Callable[[], bool], stop: Callable[[], bool], over: Callable[[], bool]) -> dict | None:
-        """Take a cold step, then more steps until nothing is compiled. Returns the last answer, or None if the process
-        ended.
-        """
-        answer = self.ask(self.question(None) | {"cold": True, "release": False}, stop, over)
-        if answer is not None:
-            self.cold, self.peak_mib = answer, answer["peak_mib"]
-        for _ in range(MAX_WARM_UPS):
-            if answer is not None:
-                answer = self.ask(self.question(None) | {"cold": False, "release": tight()}, stop, over)
-            if answer is None or not answer["new_kernels"]:
-                break
-        return answer
-
-    def turn(self, round: int, release: bool, stop: Callable[[], bool]) -> None:
-        """Take the steps of a round. Then free memory if `release` is True. Raises Stopped."""
-        answer = self.ask(self.question(round) | {"cold": False, "release": release}, stop)
-        if answer is not None:
-            self.keep(round, answer)
-
-
-MIN_ROUNDS = 3
-MAX_ROUNDS = 25
-
-#: Factor on the time for the next depth, whose kernels take longer to compile and to run.
-GROWTH = 1.3
-
-#: Message about measurements that exceed the budget.
-NO_TIME = "the budget was spent; allow more with --budget"
-
-
-class Pace:
-    """Divides the time among depths. Each depth gets GROWTH times as much time as the previous depth.
-
-    Time that one depth leaves unused goes to the remaining depths. While there is time, each depth gets at least
-    MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time does not count. Rounds of earlier sessions
-    count.
-    """
-
-    def __init__(
-        self,
-        budget_s: float,
-        depths: int,
-        rounds: int | None = None,
-        now: Callable[[], float] = time.monotonic,
-        most: int = MAX_ROUNDS,
-    ) -> None:
-        self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
-        self._start = self._rounds_start = self._depth_start = now()
-        self._depth_end = self._end
-        self._before = 0
-
-    @property
-    def spent_s(self) -> float:
-        """Seconds since the start of the measurement."""
-        return self._now() - self._start
-
-    @property
-    def depth_s(self) -> float:
-        """Seconds since the start of the depth."""
-        return self._now() - self._depth_start
-
-    def over(self) -> bool:
-        """Whether the time is up."""
-        return self._rounds is None and self._now() >= self._end
-
-    def fits(self, seconds: float) -> bool:
-        """Whether this many seconds are left."""
-        return self._rounds is not None or self._now() + seconds <= self._end
-
-    def begin_depth(self) -> None:
-        """Start a depth."""
-        now = self._depth_start = self._now()
-        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
-        self._left -= 1
-
-    def begin_rounds(self, before: int = 0) -> None:
-        """Start the rounds after the warm-up. Earlier sessions have done `before` rounds."""
-        self._rounds_start, self._before = self._now(), before
-
-    def another(self, done: int) -> bool:
-        """Whether there is time for another round after `done` rounds of this session."""
-        if self._rounds is not None:
-            return self._before + done < self._rounds
-        if self._before + done >= self._most:
-            return False
-        if done == 0:
-            return True
-        now = self._now()
-        return now + (now - self._rounds_start) / done <= (self._end if done < MIN_ROUNDS else self._depth_end)
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    limited, code = False, 0
+    try:
+        first = json.loads(sys.stdin.readline())
+        limited = first["memory_limit"] is not None
+        _serve(first, does, sys.stdin, answers)
+    except Exception as error:
+        _answer(answers, _failure(error, limited))
+        code = 1
+    sys.stderr.flush()
+    os._exit(code)  # the remaining cleanup may take long, or fail if memory is exhausted

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Kept, read_samples, samples_file
 
@@ -111,22 +111,19 @@ class Earlier:
         return ConfigError("--json", "", f"{self.source} belongs to another measurement: {reason}; {advice}")
 
 
-def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:
-    """Return the head of stored samples."""
-    return {"version": VERSION, "kind": kind, "settings": settings, **content}
-
-
 def kept(
-    kind: str, settings: Mapping[str, Any], samples: Mapping[Any, Sequence[np.ndarray]], **content: Any
+    kind: str, settings: Mapping[str, Any], samples: Mapping[Any, Sequence[np.ndarray]] | None, **content: Any
 ) -> Kept | None:
-    """Return the data to store for `samples`, or None if there are no samples. `samples` maps each `Name` to samples in
-    the order of their seeds.
+    """Return the data to store, or None if `samples` is empty. `samples` maps each `Name` to samples in the order of
+    their seeds, or is None if the `content` has all results.
     """
     import numpy as np  # the help of a command does not need it
 
-    taken = {name: rows for name, rows in samples.items() if len(rows)}
-    arrays = {f"samples/{number}": np.stack(rows) for number, rows in enumerate(taken.values())}
-    return (head(kind, settings, samples=list(taken), **content), arrays) if taken else None
+    taken = {name: rows for name, rows in (samples or {}).items() if len(rows)}
+    if samples is not None and not taken:
+        return None
+    head = {"version": VERSION, "kind": kind, "settings": settings, "samples": list(taken), **content}
+    return head, {f"samples/{number}": np.stack(rows) for number, rows in enumerate(taken.values())}
 
 
 def first_difference(there: Any, here: Any, place: str = "") -> str | None:
@@ -143,9 +140,4 @@ def first_difference(there: Any, here: Any, place: str = "") -> str | None:
     if place.startswith(f"{FILES}."):
         what = "is new" if there == _ABSENT else "has gone" if here == _ABSENT else "has changed"
         return f"{place.removeprefix(f'{FILES}.')} {what}"
-    return f"{place} is {_short(there)} there, {_short(here)} here"
-
-
-def _short(value: Any) -> str:
-    text = " ".join(str(value).split())
-    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+    return f"{place} is {one_line(there, _SHOWN)} there, {one_line(here, _SHOWN)} here"

@@ -1,9 +1,9 @@
-"""Single measured steps of one experiment (`Steps`), and changes of film and texture sizes."""
+"""Single measured steps of one experiment (`Steps`), and their sizes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from fnmatch import fnmatchcase
+import re
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import drjit as dr
@@ -11,16 +11,13 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.loader import told
-from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import whole_of
 from reslrb_cli.integrators.step import gradient_step, known_step
+from reslrb_cli.measure.processes import Begun
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.measure.workers import Begun, scratch_bytes
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.loading import choose_sensors, load_configured
-from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.seeds import seed
 
@@ -36,17 +33,11 @@ def shrink(scene: Any, sensor: int, pixels: int) -> None:
 
     A crop window shrinks with it.
     """
-    width, height = (int(n) for n in scene.sensors()[sensor].film().size())
-    factor = (pixels / (width * height)) ** 0.5
-    if factor < 1:
-        scale(scene, sensor, factor)
-
-
-def scale(scene: Any, sensor: int, factor: float) -> None:
-    """Multiply width and height of a sensor's film and of its crop window by `factor`. `sensor` is the index of the
-    sensor.
-    """
     params = mi.traverse(scene.sensors()[sensor])
+    width, height = (int(n) for n in params["film.size"])
+    factor = (pixels / (width * height)) ** 0.5
+    if factor >= 1:
+        return
 
     def scaled(name: str, least: int) -> list[int]:
         return [max(round(n * factor), least) for n in params[name]]
@@ -59,41 +50,31 @@ def scale(scene: Any, sensor: int, factor: float) -> None:
     params.update()
 
 
-def with_textures(problem: Problem, width: int) -> Config:
-    """Return the experiment of `problem` with textures and heightmaps of this width. Aspect ratios stay the same.
+_BITS = {"i1": 8, "half": 16, "float": 32, "double": 64, "ptr": 64}
 
-    Parameters with several keys keep their size. Raises ConfigError if no texture can be resampled.
-    """
-    parameters, found = [], False
-    for spec in problem.config.parameters:
-        shape = None if len(spec.keys) > 1 else _shape_of(spec, problem)
-        if shape is not None:
-            found = True
-            size = (width, max(round(width * shape[0] / shape[1]), 1))
-            if spec.heightmap is None:
-                changes: dict[str, Any] = {"resolution": size}
-            else:
-                changes = {"heightmap": spec.heightmap.model_copy(update={"resolution": size})}
-            parameters.append(spec.model_copy(update=changes))
-        else:
-            parameters.append(spec)
-    if not found:
-        raise ConfigError("--sweep", "", "texture: no parameter is a texture that can be resampled")
-    return problem.config.model_copy(update={"parameters": parameters})
+#: One array of its entries for all lanes of a vector (LLVM): `alloca float, i32 112`.
+_LLVM_ARRAY = re.compile(r"%arr_\w+ = alloca (\w+), i32 (\d+)")
+_LLVM_LANES = re.compile(r"%index_next = add i64 %index, (\d+)")
+
+#: ... or for one thread (CUDA): `.local .align 4 .b32 arr_12[7];`.
+_PTX_ARRAY = re.compile(r"\.local \.align \d+ \.[a-z]+(\d+) arr_\w+\[(\d+)\]")
 
 
-def _shape_of(spec: ParameterSpec, problem: Problem) -> tuple[int, ...] | None:
-    """Return the shape of the first texture that `spec` names, directly or by a glob."""
-    for key, shape in texture_shapes(problem).items():
-        if any(name == key or fnmatchcase(key, name) for name in spec.names):
-            return shape
-    return None
+def scratch_bytes(history: Iterable[dict[str, Any]]) -> int:
+    """Return the largest thread-local memory of a path in bytes, over all kernels of a `dr.kernel_history()`."""
+    texts = [entry["ir"] for entry in history if entry.get("ir") is not None]
+    return max((_of_kernel(text if isinstance(text, str) else str(text.getvalue())) for text in texts), default=0)
 
 
-def texture_shapes(problem: Problem) -> dict[str, tuple[int, ...]]:
-    """Return the shapes (H, W, C) of all parameters that are textures or heightmaps, by key."""
-    shapes = {key: problem.selection.array(key).shape for key in problem.selection.keys}
-    return {key: shape for key, shape in shapes.items() if len(shape) == 3}
+def _of_kernel(ir: str) -> int:
+    bits = sum(int(size) * int(count) for size, count in _PTX_ARRAY.findall(ir))
+    arrays = _LLVM_ARRAY.findall(ir)
+    if arrays:
+        lanes = _LLVM_LANES.search(ir)
+        assert lanes is not None, "a kernel says how many lanes it handles at a time"
+        sizes = [_BITS.get(kind) or int(kind.removeprefix("i")) for kind, _ in arrays]
+        bits += sum(size * int(count) for size, (_, count) in zip(sizes, arrays, strict=True)) // int(lanes[1])
+    return bits // 8
 
 
 class Steps:
@@ -140,24 +121,17 @@ class Stepper(Steps):
     """The steps of `bench`.
 
     `objective` is `fixed` or `l2`. `fixed` is sum(G * I) with an image G that is known before the image I. `l2` is the
-    mean of (I - G)^2 with `run.adjoint`. G is noise, because its content does not affect the time. `film_width` in
-    pixels and `texture_width` in texels replace the widths of the film and of all textures that are parameters.
+    mean of (I - G)^2 with `run.adjoint`. G is noise, because its content does not affect the time.
     """
 
-    def __init__(
-        self, config: Config, objective: str, film_width: int | None = None, texture_width: int | None = None
-    ) -> None:
-        if texture_width is not None:
-            config = with_textures(assemble_scene(config, _load(config)), texture_width)
-        scene = _load(config)
-        if film_width is not None:
-            sensor = choose_sensors(config, scene)[0]
-            scale(scene, sensor, film_width / int(scene.sensors()[sensor].film().crop_size()[0]))
-        super().__init__(config, scene)
+    def __init__(self, config: Config, objective: str) -> None:
+        built_in = config.scene.file == small.FILE
+        super().__init__(config, small.build(config.scene.options) if built_in else load_configured(config))
         film = self.problem.scene.sensors()[self.sensor].film()
         width, height = film.crop_size()
         self.size = (int(width), int(height))
-        self.texels = sum(shape[0] * shape[1] for shape in texture_shapes(self.problem).values())
+        shapes = [self.problem.selection.array(key).shape for key in self.problem.selection.keys]
+        self.texels = sum(shape[0] * shape[1] for shape in shapes if len(shape) == 3)
         image = _noise(*self.size, int(film.base_channels_count()))
         self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(whole_of(seen) - image).array)
 
@@ -191,17 +165,9 @@ def begin_steps(first: dict[str, Any]) -> Begun:
     """Start the process. The process first reports the size of film and textures. Each question then asks for a
     step.
     """
-    config = told(first)
-    stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
+    stepper = Stepper(told(first), first["objective"])
     size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
     return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
-
-
-def _load(config: Config) -> Any:
-    """Load the scene of an experiment, which may be the built-in one."""
-    if config.scene.file == small.FILE:
-        return small.build(config.scene.options)
-    return load_configured(config)
 
 
 def _noise(width: int, height: int, channels: int) -> Any:

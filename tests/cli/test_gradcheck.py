@@ -134,16 +134,15 @@ def test_finished_cases_are_not_repeated(
            "kind": Kind.EXPECTATION, "seeds": 3, "verdict": Verdict.HOLDS}  # fmt: skip
     run: list[str] = []
 
-    def pretended(names: list[str], *_others: object) -> Iterator[GradcheckRecord]:
-        for name in names:
-            run.append(name)
-            yield GradcheckRecord(case=name, **row)
-            if name == "stopped":
-                os.kill(os.getpid(), signal.SIGINT)
-            yield GradcheckRecord(case=name, **row)
+    def pretended(name: str, *_others: object) -> Iterator[GradcheckRecord]:
+        run.append(name)
+        yield GradcheckRecord(case=name, **row)
+        if name == "stopped":
+            os.kill(os.getpid(), signal.SIGINT)
+        yield GradcheckRecord(case=name, **row)
 
-    monkeypatch.setattr(extreme, "run_suite", pretended)
-    monkeypatch.setattr(extreme, "CASES", dict.fromkeys(["first", "stopped", "last"]))
+    monkeypatch.setattr(extreme, "run_case", pretended)
+    monkeypatch.setattr(extreme, "CASES", {name: name for name in ("first", "stopped", "last")})
     file = tmp_path / "a.jsonl"
     assert call("--suite", "extreme", "--json", str(file)) == 130
     assert [row["case"] for row in read(file)] == ["first"] * 2

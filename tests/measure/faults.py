@@ -18,7 +18,8 @@ import pytest
 from reslrb_cli.config.loader import loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators.stack import Stack
-from reslrb_cli.measure.extreme import run_suite
+from reslrb_cli.measure.extreme import CASES
+from reslrb_cli.measure.extreme.suite import run_case
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.methods import parse_estimators
 from reslrb_cli.measure.participants import CheckSettings
@@ -71,7 +72,7 @@ def moving(name: str, key: str) -> Check:
 
 def extreme(case: str, *estimators: str) -> Check:
     """Return a check with a case of the extreme suite, for these estimators or for all."""
-    return lambda: run_suite([case], estimators or None)
+    return lambda: run_case(CASES[case], estimators or None)
 
 
 CHECKS: dict[str, Check] = {

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config.loader import loads
+from reslrb_cli.measure.bench import STEPS
 from reslrb_cli.measure.convergence.judgement import ConvergenceResults, Judgement
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.methods import Plan, parse_cases
@@ -29,7 +30,7 @@ class Pretended:
     alive = 0
 
     def __init__(self, first: dict[str, Any], does: str) -> None:
-        assert does == "measured_steps"
+        assert does == STEPS
         config = loads(first["config"], "x.yaml")
         self.type, self.depth = config.integrator.type, config.integrator.max_depth
         self.asked, self.closed = 0, False
@@ -48,7 +49,7 @@ class Pretended:
         if self.ends.get((self.type, self.depth)) == self.asked:
             raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
         if self.question is None:
-            return {"width": 6, "height": 5}
+            return {"width": 6, "height": 5, "texels": 9}
         ms = float(self.depth * (1 + self.question["round"]) * {"ptracer": 4, "reslrb": 2, "walk_ad": 5}[self.type])
         parts = {"kernel_ms": ms / 2, "codegen_ms": ms / 8, "tracing_ms": 3 * ms / 8}
         answer = {"step_ms": ms, **parts, "new_kernels": 2 if self.asked < 3 else 0}
@@ -141,7 +142,7 @@ class Player:
         self.stage, self.first, self.does, self.closed, self.questions = stage, first, does, False, 0
         self.question: dict[str, Any] | None = None
         self.name = first.get("purpose", "").removeprefix("convergence, ")
-        self.played = None if does == "surveyed" else stage.pretence(self.name)
+        self.played = None if does.endswith(":begin_survey") else stage.pretence(self.name)
 
     def ask(self, question: dict[str, Any]) -> None:
         self.question, self.questions = question, self.questions + 1

@@ -24,7 +24,6 @@ from reslrb_cli.measure.scenes.analytic import (
     furnace,
     furnace_scene,
     plane_points,
-    point_through_surface,
     refraction_scene,
     slab_scene,
 )
@@ -110,9 +109,9 @@ def test_fresnel():
 
 
 def test_a_medium_of_index_one_has_no_effect():
-    through = point_through_surface(0.5, 2.0, 1.0, 1.0, (0.3, 1.6, -0.2), 1.0, 0.9, 60, 4)
-    alone = 2.0 * irradiance((0.3, 1.6, -0.2), 0.9, 60, 4)
-    assert through.image[..., :1] == pytest.approx(alone * 0.5 / np.pi, rel=1e-9)
+    alone = np.array([9, 6, 5]) * irradiance((0.3, 1.6, -0.2), 0.9, 60, SIZE)
+    transmitted = alone * np.array([0.9, 0.8, 0.6])
+    assert refraction_scene(1.0).known.image == pytest.approx(transmitted * np.array(ALBEDO) / np.pi, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["albedo", "radiance", "transmittance", "reflectance"])

@@ -23,8 +23,7 @@ from reslrb_cli.cli import main
 from reslrb_cli.measure import methods
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
-from reslrb_cli.measure.stepper import Stepper
-from reslrb_cli.measure.workers import scratch_bytes
+from reslrb_cli.measure.stepper import Stepper, scratch_bytes
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.records.measurements import BenchStatus
 
@@ -133,6 +132,10 @@ def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureF
         ),
         (["--memory-limit", "2GiB"], "--memory-limit was removed; the shell's `ulimit -v KIB` limits every process"),
         (["--max-depth", "1"], "--max-depth"),
+        (
+            ["--sweep", "film"],
+            "`film` was removed; change sizes with --set, and call bench once for each size",
+        ),
         (["--integrators", "pt"], "--integrators pt: integrator.type"),
         (["--json", "no/such/folder.json"], "--json: cannot write"),
         (["--plot", "a.png"], "--plot was removed; `reslrb report FILE -o page.html` plots results of --json FILE"),

@@ -12,9 +12,10 @@ from measure.pretended_steps import Pretended
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.arena import MAX_ROUNDS, MIN_ROUNDS, Pace
 from reslrb_cli.measure.bench import Bench, BenchResult
-from reslrb_cli.measure.methods import Sweep, depths, parse_cases, usual_values
-from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, Stopped
+from reslrb_cli.measure.methods import Sweep, depths, parse_cases, sample_counts
+from reslrb_cli.measure.processes import Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
 from reslrb_cli.report.tables import bench_cells, bench_columns
@@ -33,7 +34,7 @@ LIST = "ptracer,reslrb:stack,walk_ad"
 
 @pytest.fixture(autouse=True)
 def _clean() -> None:
-    Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive, Sized.firsts = [], {}, set(), 0, []
+    Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive = [], {}, set(), 0
 
 
 def sweep(list_of: str = LIST, **changes: Any) -> Sweep:
@@ -74,7 +75,13 @@ def test_records() -> None:
     ]
     stack = rows[1].record
     assert (stack.estimator, stack.capacity, stack.rr_depth, stack.spp) == ("stack", None, 7, 4)
-    assert (stack.width, stack.height, stack.status, stack.repeats) == (6, 5, BenchStatus.OK, MIN_ROUNDS)
+    assert (stack.width, stack.height, stack.texels, stack.status, stack.repeats) == (
+        6,
+        5,
+        9,
+        BenchStatus.OK,
+        MIN_ROUNDS,
+    )
     assert stack.step_ms == Spread(12.0, 8.0, 16.0)
     assert stack.kernel_ms == Spread(6.0, 4.0, 8.0)
     assert (stack.codegen_ms, stack.tracing_ms) == (Spread(1.5, 1.0, 2.0), Spread(4.5, 3.0, 6.0))
@@ -108,9 +115,11 @@ def test_times_are_relative_to_ptracer_or_the_first_case(cases: str) -> None:
     assert sweep(cases).baseline.label == ("ptracer" if "ptracer" in cases else "reslrb:stack")
 
 
-def test_all_cases_may_end() -> None:
-    Pretended.ends = {(name, 2): 1 for name in ("ptracer", "reslrb", "walk_ad")}
-    assert {row.record.status for row in run(sweep(values=[2]))} == {BenchStatus.OUT_OF_MEMORY}
+@pytest.mark.parametrize(("question", "width"), [(0, None), (1, 6)], ids=["loading", "cold"])
+def test_all_cases_may_end(question: int, width: int | None) -> None:
+    Pretended.ends = {(name, 2): question for name in ("ptracer", "reslrb", "walk_ad")}
+    found = {(row.record.status, row.record.width) for row in run(sweep(values=[2]))}
+    assert found == {(BenchStatus.OUT_OF_MEMORY, width)}
 
 
 @pytest.mark.parametrize(("after", "kept"), [(5, []), (14, [1, 1, 1]), (13, [1, 1]), (33, [3, 3, 3, 1])])
@@ -193,8 +202,19 @@ def test_the_budget_covers_compilation(budget_s: float, measured: dict[int, list
         assert said[0].endswith("; nothing had compiled by then, so allow several times as much")
 
 
-def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
-    """Return the measured methods for each depth, the messages, and the time of a session with this budget."""
+def test_the_named_budget_includes_the_time_before_the_session() -> None:
+    """A command imports packages and checks its arguments before the session starts."""
+    (found, [line], _), (_, [without], _) = spent(170.0, before_s=40.0), spent(130.0)
+    enough, less = (float(said.partition("about ")[2].removesuffix(" s")) for said in (line, without))
+    assert enough == less + 40.0
+    assert found == {2: LIST.split(","), 4: ["ptracer"]}
+    assert spent(enough, before_s=40.0)[0] == {2: LIST.split(","), 4: LIST.split(",")}
+
+
+def spent(budget_s: float, before_s: float = 0.0) -> tuple[dict[int, list[str]], list[str], float]:
+    """Return the measured methods for each depth, the messages, and the time of a session with this budget. The command
+    takes `before_s` before the session.
+    """
     now = [0.0]
 
     class Slow(Pretended):
@@ -205,7 +225,7 @@ def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
                     raise Stopped
             return super().answer(stop)
 
-    rows, said = play(sweep(rounds=None, budget_s=budget_s), Slow, now=lambda: now[0])
+    rows, said = play(sweep(rounds=None, budget_s=budget_s), Slow, now=lambda: now[0], spent_s=before_s)
     found: dict[int, list[str]] = {}
     for row in rows:
         found.setdefault(row.record.max_depth, []).append(row.case.label)
@@ -290,85 +310,55 @@ def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool
     assert Pretended.alive == 0
 
 
-# What `bench --sweep` varies: sample counts, film sizes and texture sizes. The processes only pretend to measure.
+# Sweeps of sample counts.
 
 
-class Sized(Pretended):
-    """Process whose steps cost as many milliseconds as the product of samples, film width and texture width."""
-
-    firsts: list[dict[str, Any]] = []  # noqa: RUF012 (shared by all)
-
-    def __init__(self, first: dict[str, Any], does: str) -> None:
-        super().__init__(first, does)
-        self.first, self.spp = first, loads(first["config"], "x.yaml").run.spp
-        Sized.firsts.append(first)
-
-    def answer(self, stop: Any) -> dict[str, Any]:
-        answer = super().answer(stop)
-        width, texture = self.first.get("film_width", 6), self.first.get("texture_width", 3)
-        if "width" in answer:
-            return {"width": width, "height": width - 1, "texels": texture**2}
-        return answer | {"step_ms": float(self.spp * width * texture)}
-
-
-def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[BenchResult], list[str]]:
+def run_swept(values: list[int], **changes: Any) -> tuple[list[BenchResult], list[str]]:
     cases = parse_cases(LIST, deep=False)
     settings: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"]), "variant": "llvm_ad_rgb", "cases": cases,
         "values": values, "objective": "fixed", "memory_limit": None,
-        "memory": 2**40, "budget_s": 0.0, "rounds": 3, "swept": swept,
+        "memory": 2**40, "budget_s": 0.0, "rounds": 3, "swept": "spp",
     }  # fmt: skip
     what = Sweep(**(settings | changes))
     what.check()
-    return play(what, Sized)
+    return play(what)
 
 
-@pytest.mark.parametrize(
-    ("swept", "expected"),
-    [
-        ("spp", [(2, 5, 6, 9, 36.0), (8, 5, 6, 9, 144.0)]),
-        ("film", [(4, 5, 2, 9, 24.0), (4, 5, 8, 9, 96.0)]),
-        ("texture", [(4, 5, 6, 4, 48.0), (4, 5, 6, 64, 192.0)]),
-    ],
-)
-def test_one_quantity_varies_and_the_rest_stays(swept: str, expected: list[tuple[Any, ...]]) -> None:
-    rows, said = run_swept(swept, [2, 8])
+def test_the_sample_count_varies_and_the_depth_stays() -> None:
+    rows, said = run_swept([2, 8])
     assert said == []
     assert [row.value for row in rows] == [2] * 3 + [8] * 3
-    of_one = [row.record for row in rows if row.case.type == "walk_ad"]
-    assert [(r.spp, r.max_depth, r.width, r.texels, r.step_ms and r.step_ms.median) for r in of_one] == expected
-    names = {"spp": set(), "film": {"film_width"}, "texture": {"texture_width"}}[swept]
-    assert all({name for name in first if name.endswith("_width")} == names for first in Sized.firsts)
+    records = [row.record for row in rows if row.case.type == "walk_ad"]
+    assert [(record.spp, record.max_depth, record.width) for record in records] == [(2, 5, 6), (8, 5, 6)]
 
 
 def test_the_table_starts_with_the_varied_quantity() -> None:
     Pretended.ends = {("walk_ad", 5): 2}
-    rows, _ = run_swept("film", [16, 128])
+    rows, _ = run_swept([16, 128])
     labels = LIST.split(",")
-    table = bench_columns(labels, "film")
-    assert table.head().split()[:2] == ["film", "step"]
+    table = bench_columns(labels, "spp")
+    assert table.head().split()[:2] == ["spp", "step"]
     lines = [table.line(bench_cells(row)) for row in rows]
-    assert [line.split()[:2] for line in lines] == [[str(width), name] for width in (16, 128) for name in labels]
+    assert [line.split()[:2] for line in lines] == [[str(spp), name] for spp in (16, 128) for name in labels]
     assert lines[2].endswith("out_of_memory")
     assert {row.record.status for row in rows} == {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}
 
 
 def test_unmeasured_rows_are_named_by_the_varied_quantity() -> None:
-    assert run_swept("texture", [8, 64], rounds=None)[1] == [
-        "not measured: texture width 8, 64: the budget was spent; allow more with --budget"
+    assert run_swept([8, 64], rounds=None)[1] == [
+        "not measured: spp 8, 64: the budget was spent; allow more with --budget"
     ]
 
 
 def test_impossible_sample_counts_are_located() -> None:
     with pytest.raises(ConfigError, match=r"--integrators ptracer: integrator.samples_per_pass: 2 does not divide"):
-        run_swept("spp", [4, 3])
+        run_swept([4, 3])
 
 
 def test_default_values() -> None:
-    config = loads(CONFIG, Path("x.yaml"))
-    assert usual_values("spp", config) == [1, 2, 4, 8, 16]
-    assert usual_values("spp", loads(CONFIG, Path("x.yaml"), ["run.spp=2"])) == [1, 2, 4, 8]
-    assert usual_values("film", config) == [32, 64, 128, 256]
+    assert sample_counts(4) == [1, 2, 4, 8, 16]
+    assert sample_counts(2) == [1, 2, 4, 8]
 
 
 # A `bench` that continues an earlier one: which measurements count, which are repeated, and what is refused.
@@ -438,6 +428,14 @@ def test_refused_cases_stay_left_out() -> None:
     whole = measure(sweep(default=True, rounds=5), again(first))
     assert {name for _, name, _ in Pretended.log} == {"ptracer", "walk_ad"}
     assert {result.record.repeats for result in whole.results()} == {5}
+
+
+def test_a_result_without_its_baseline_is_continued() -> None:
+    """A stop can come after the first step of a case, and before that of the baseline."""
+    what = sweep("reslrb:stack,ptracer", values=[2])
+    stopped = measure(what, stop=lambda: len(Pretended.log) > 7)
+    continued = session(what, again(stopped))
+    assert [(result.case.label, result.step_ratio) for result in continued.results()] == [("reslrb:stack", None)]
 
 
 def test_running_work_is_saved_between_rounds() -> None:

@@ -17,13 +17,16 @@ import numpy as np
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.arena import Arena
+from reslrb_cli.measure.arena import Arena, Contestant
 from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Contestant, Ended, Stepping
+from reslrb_cli.measure.processes import Ended
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import Method
+
+#: The module of the functions that processes run.
+SETUP = "reslrb_cli.measure.convergence.setup"
 
 #: Maximum memory for the samples of all methods, in bytes.
 MEMORY = 2**30
@@ -65,7 +68,7 @@ class Role(str, enum.Enum):
 
 
 @dataclass(kw_only=True)
-class Member(Stepping):
+class Member(Contestant):
     """Process of one member, with its steps so far and its number of steps per turn.
 
     `rows` are samples (P,), `turns` are their rounds, and `seconds` has the time of one step in each turn. `count` is
@@ -160,7 +163,7 @@ def _fitting(turn_s: float, step_s: float, least: int, most: int) -> int:
     return min(max(round(turn_s / max(step_s, 1e-4)), least), most)
 
 
-class Session(Arena[Plan, Member]):
+class Session(Arena[Plan, Member, int]):
     """Running processes and their samples (see `Arena`).
 
     `judges` maps names of independent stock integrators to their members.
@@ -179,18 +182,11 @@ class Session(Arena[Plan, Member]):
         """Return the members of one role."""
         return [member for member in self.members if member.role is role]
 
-    def run(self) -> Iterator[int]:
-        """Measure. Yields the number of completed rounds after each round. Ends early, with the finished results, after
-        `stop()`.
-
-        Raises Refused if a required member cannot start.
-        """
-        return self._taking_turns(self._course())
-
     def _course(self) -> Iterator[int]:
+        """Measure. Yields the number of completed rounds after each round."""
         if self._survey():
             self._begin()
-            self._warm_up()
+            self._warm_up_all()
             yield from self._take_turns()
         self._say_what_it_takes()
 
@@ -237,8 +233,8 @@ class Session(Arena[Plan, Member]):
             np.savez(self._arrays, **found)  # type: ignore[arg-type]
             self.facts = self._earlier.head["facts"]
             return True
-        first = self._first(plan.reference_config, "arrays") | {"objective": plan.objective}
-        self._referee, answer = Contestant(process=self._start(first, "surveyed"), may_refuse=False), None
+        first = plan.first(plan.reference_config) | {"arrays": str(self._arrays), "objective": plan.objective}
+        self._referee, answer = Contestant(process=self._start(first, f"{SETUP}:begin_survey"), may_refuse=False), None
         if self._ask_referee(plan) is not None:
             ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
             answer = self._ask_referee(plan, {"out": first["arrays"], "ask": ask})
@@ -252,9 +248,11 @@ class Session(Arena[Plan, Member]):
 
     def _begin(self) -> None:
         plan, facts = self.plan, self.facts
-        self._say_left_out()
+        for case in plan.cases:
+            if (reason := self._without(case)) is not None:
+                self._say(f"left out: {case.label}: {reason}")
         for case, spp in plan.entries:
-            if self._takes_part(case):
+            if self._without(case) is None:
                 self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
         reference = plan.settled_reference(facts["paths"])
         known = reference.at(plan.config, plan.config.integrator.max_depth, True)
@@ -280,13 +278,14 @@ class Session(Arena[Plan, Member]):
         if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
             spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
         method = plan.method(case, config, spp, objective != "loss", role is not Role.CASE)
-        first = self._first(config, "arrays") | {
+        first = plan.first(config) | {
+            "arrays": str(self._arrays),
             "mode": objective,
             "purpose": f"convergence, {role.value} {method.label}",
         }
         has_all = plan.rounds is not None and self._before >= plan.rounds
         member = Member(
-            process=None if has_all else self._start(first, "sampled_steps"),
+            process=None if has_all else self._start(first, f"{SETUP}:begin_sampling"),
             may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
             role=role,
             method=method,
@@ -297,12 +296,12 @@ class Session(Arena[Plan, Member]):
         self.members.append(member)
         return member
 
-    def _warm_up(self) -> None:
+    def _warm_up_all(self) -> None:
         for member in self.members:
             if member.alive:
                 self._open(member)
         for member in self.members:
-            answer = member.warm_up(self._tight, self._stop, self._pace.over) if member.alive else None
+            answer = self._warm_up(member) if member.alive else None
             self._say_end(member, member.label)
             if answer is not None and member.cold is not None:
                 member.step_s = answer["step_ms"][0] / 1e3
@@ -323,7 +322,7 @@ class Session(Arena[Plan, Member]):
             return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
-        rounds = self._take_rounds(self._alive, self._before, self._before)
+        rounds = self._take_rounds(self._before, self._before)
         while self.rounds < most and (now := next(rounds, None)) is not None:
             self.rounds = now
             yield now
@@ -372,4 +371,4 @@ class Session(Arena[Plan, Member]):
     def _budget_of(self, rounds: int, share: float = 1.0) -> float:
         """Return the budget in seconds for `rounds` rounds of this session. `share` scales the measured work."""
         before = self._now() - self._began - (self.rounds - self._before) * self._round_s
-        return self._budget_for(share * (before + rounds * self._round_s))
+        return (share * (before + rounds * self._round_s) + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)

@@ -1,4 +1,4 @@
-"""Processes of a `convergence` (`workers.py`): the facts that precede the measurement (`survey`), and the steps of a
+"""Processes of a `convergence` (`processes.py`): the facts that precede the measurement (`survey`), and the steps of a
 member (`Sampler`).
 """
 
@@ -18,9 +18,9 @@ from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
+from reslrb_cli.measure.processes import Begun
 from reslrb_cli.measure.references import CAMERA_PATHS, Situation, choose, of_gradient, of_image
 from reslrb_cli.measure.stepper import Steps, multiple_of
-from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets

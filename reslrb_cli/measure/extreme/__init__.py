@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from itertools import takewhile
 
 from reslrb_cli.measure.extreme import geometry, light
@@ -25,19 +25,8 @@ LISTED = (
 CASES = {case.name: case for case in LISTED}
 
 
-def run_suite(
-    names: Iterable[str] | None = None, estimators: Iterable[str] | None = None, seeds: int | None = None
-) -> Iterator[GradcheckRecord]:
-    """Run the named cases, by default all, and yield one record per comparison.
-
-    Raises KeyError if a case does not exist.
-    """
-    for name in CASES if names is None else names:
-        yield from run_case(CASES[name], estimators, seeds)
-
-
 def case_records(
     stop: Callable[[], bool], name: str, estimators: Iterable[str] | None, seeds: int | None
 ) -> list[GradcheckRecord]:
     """Return the records of one case. Some records are missing if `stop()` became true."""
-    return list(takewhile(lambda _: not stop(), run_suite([name], estimators, seeds)))
+    return list(takewhile(lambda _: not stop(), run_case(CASES[name], estimators, seeds)))

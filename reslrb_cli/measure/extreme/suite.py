@@ -281,7 +281,7 @@ def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckReco
     if not cases:
         return None
     rows = {case: [asdict(record) for record in records] for case, records in cases.items()}
-    return resume_store.head(KIND, settings, cases=rows), {}
+    return resume_store.kept(KIND, settings, None, cases=rows)
 
 
 #: Number of comparisons for the correction of all z scores of the suite; slightly more than it has.
@@ -297,18 +297,17 @@ def run_case(
     """Run a case with these estimators, by default all. `seeds` replaces the case's number of seeds."""
     case = case if seeds is None else replace(case, seeds=seeds)
     setup = case.setup()
-    plain, groups = np.array(setup.weights), dict[str, list[tuple[str, dict[str, Any]]]]()
+    plain, groups = np.array(setup.weights), dict[str, tuple[dict[str, Any], dict[str, str]]]()
     for label in (*ESTIMATORS, *WAYS) if estimators is None else estimators:
         estimator, way = split(label)
-        groups.setdefault(str(way), []).append((label, {"estimator": estimator} | way))
-    for members in groups.values():
-        way = {name: value for name, value in members[0][1].items() if name != "estimator"}
+        groups.setdefault(str(way), (way, {}))[1][label] = estimator
+    for way, members in groups.values():
         setup.weights = type(setup.weights)(plain)
         if way and case.moves is not None:
             continue  # moving light has derivatives only on light paths
         reason = _hidden_from(case, setup) if way.get("paths") == "camera" else None
         if reason is not None:
-            for label, _ in members:
+            for label in members:
                 none = Comparison(Verdict.NO_REFERENCE, message=reason)
                 yield _record(case, label, None, Reference.PRB, Kind.EXPECTATION, none)
             continue
@@ -356,10 +355,8 @@ def _seen_by(case: ExtremeCase, setup: Case, way: Mapping[str, Any]) -> ExtremeC
     return replace(case, **changed)
 
 
-def _run_way(
-    case: ExtremeCase, setup: Case, members: Sequence[tuple[str, Mapping[str, Any]]]
-) -> Iterator[GradcheckRecord]:
-    """Run estimators that trace the same kinds of paths. `members` are their labels and options."""
+def _run_way(case: ExtremeCase, setup: Case, members: Mapping[str, str]) -> Iterator[GradcheckRecord]:
+    """Run estimators that trace the same kinds of paths. `members` has the name of each estimator by its label."""
     weights = np.array(setup.weights) if case.weights is None else case.weights(np.array(setup.weights))
     # Refused values of dL/dI count as zero, and references never get them.
     setup.weights = type(setup.weights)(np.where(np.isfinite(weights), weights, 0))
@@ -372,8 +369,7 @@ def _run_way(
         tracer = integrator(case.image, **without_roulette(case))
         stock = np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
     setup.weights = type(setup.weights)(weights)
-    for label, options in members:
-        name = options["estimator"]
+    for label, name in members.items():
         if case.moves is not None and name not in ATTACHED:
             continue
         gradients, images, refused = _steps(case, setup, name)

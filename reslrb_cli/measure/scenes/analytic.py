@@ -76,20 +76,44 @@ def furnace_scene(albedo: tuple, emission: tuple, max_depth: int, size: int = SI
 
 
 def refraction_scene(ior: float = 1.5) -> KnownScene:
-    """A point light over a pool. The camera is in the water and sees the bottom."""
-    intensity, tau, light = (9, 6, 5), (0.9, 0.8, 0.6), (0.3, 1.6, -0.2)
+    """A point light over a medium of index `ior` with a flat surface at y = `depth`.
+
+    The light refracts once and reaches the diffuse bottom at y = 0. A camera in the medium, straight above the origin,
+    sees the bottom. Light that leaves at an angle theta_1 from the vertical meets the bottom at a distance x from the
+    point below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior sin(theta_2). Light
+    emitted into a ring of directions lands in a ring on the bottom.
+
+        E = I (1 - R(theta_1)) tau sin(theta_1) / (x dx/dtheta_1),   L = rho / pi * E
+
+    The formula for E follows from Snell's law, Fresnel's equations and conservation of flux. See Born and Wolf,
+    Principles of Optics, Sections 1.5 and 3.1. Light that the surface reflects back to the bottom is left out, as with
+    max_depth 3.
+    """
+    intensity, transmittance, light, depth, camera_height = (9, 6, 5), (0.9, 0.8, 0.6), (0.3, 1.6, -0.2), 1.0, 0.9
 
     def scene() -> dict:
         return {
             "type": "scene",
-            "camera": pinhole([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 60),
+            "camera": pinhole([0, camera_height, 0], [0, 0, 0], [0, 0, -1], 60),
             "light": {"type": "point", "position": list(light), "intensity": rgb(*intensity)},
             "plane": rectangle(diffuse(*ALBEDO), translate=[0, 0, 0], rotate=UP, scale=2),
-            "surface": rectangle(glass(ior, specular_transmittance=rgb(*tau)), translate=[0, 1, 0], rotate=UP, scale=2),
-        }
+            "surface": rectangle(glass(ior, specular_transmittance=rgb(*transmittance)), translate=[0, depth, 0],
+                                 rotate=UP, scale=2),
+        }  # fmt: skip
 
-    known = point_through_surface(ALBEDO, intensity, tau, ior, light, 1.0, 0.9, 60, SIZE)
-    return KnownScene(scene, known, POOL, 3)
+    points, weights = plane_points(camera_height, 60, SIZE)
+    height = light[1] - depth
+    theta = _refracted_angle(np.hypot(points[..., 0] - light[0], points[..., 2] - light[2]), height, depth, ior)
+    sin_2 = np.sin(theta) / ior
+    cos_1, cos_2 = np.cos(theta), np.sqrt(1 - sin_2**2)
+    slope = height / cos_1**2 + depth * cos_1 / (ior * cos_2**3)  # dx/dtheta_1
+    # sin(theta_1) / x, which stays finite below the light
+    ratio = 1 / (height / cos_1 + depth / (ior * cos_2))
+    per_pi = np.sum((1 - fresnel(theta, ior)) * ratio / slope * weights, -1)[..., None] / np.pi
+    rho, power, tau = (np.array(value, np.float64) for value in (ALBEDO, intensity, transmittance))
+    image = per_pi * (rho * power)
+    derivatives = {"albedo": per_pi * power * tau, "intensity": per_pi * rho * tau, "transmittance": image}
+    return KnownScene(scene, Known(image * tau, derivatives), POOL, 3)
 
 
 def slab_scene(ior: float = 1.5, degrees: float = 40, max_depth: int = 6) -> KnownScene:
@@ -124,28 +148,22 @@ RADIANCE = "lamp.emitter.radiance"
 MIDDLE, HALF = (1.0, 0.8, -0.2), 0.3
 
 
-def covered(center: tuple[float, float], side: float, distance: float, size: int) -> Array:
-    """Return the share of each pixel (H, W, 1) that a square covers. The square is parallel to the film, at this
-    distance.
-
-    `center` is in world units, x to the right and y upwards. Uses similar triangles.
-    """
-    pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / size
-    edges = np.arange(size + 1)
-
-    def shares(middle: float) -> Array:
-        low, high = (size / 2 + (middle + sign * side / 2) / pixel for sign in (-1, 1))
-        return np.clip(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0, None)
-
-    return np.outer(shares(-center[1]), shares(center[0]))[..., None]
-
-
 def speck_in_view(side: float, radiance: tuple = (3, 2, 4)) -> KnownScene:
-    """A square lamp on the border of two pixels. The lamp does not light the wall behind it."""
+    """A square lamp on the border of two pixels. The lamp does not light the wall behind it.
+
+    The image is the share of each pixel that the lamp covers, times its radiance. The lamp is parallel to the film, so
+    the share follows from similar triangles.
+    """
     distance = 2.0
     pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / SIZE
     center = (pixel + 0.2 * side, 0.6 * pixel)  # 0.7 of it to the right of a border
-    share = covered(center, side, distance, SIZE)
+    edges = np.arange(SIZE + 1)
+
+    def covered(middle: float) -> Array:
+        low, high = (SIZE / 2 + (middle + sign * side / 2) / pixel for sign in (-1, 1))
+        return np.clip(np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1]), 0, None)
+
+    share = np.outer(covered(-center[1]), covered(center[0]))[..., None]
 
     def scene() -> dict[str, Any]:
         return {
@@ -220,41 +238,6 @@ def furnace(albedo: ArrayLike, emission: ArrayLike, max_depth: int, size: int) -
         derivative = np.sum(powers * rho ** np.maximum(powers - 1, 0), 0)
     image = np.ones((size, size, 1))
     return Known(image * (Le * series), {"albedo": image * (Le * derivative), "emission": image * series})
-
-
-def point_through_surface(
-    albedo: ArrayLike, intensity: ArrayLike, transmittance: ArrayLike, ior: float, light: ArrayLike, depth: float,
-    camera_height: float, fov: float, size: int,
-) -> Known:  # fmt: skip
-    """A point light at `light` (3,) over a medium of index `ior` with a flat surface at y = `depth`.
-
-    The light refracts once and reaches the diffuse bottom at y = 0. A camera in the medium, straight above the origin,
-    sees the bottom. Light that leaves at an angle theta_1 from the vertical meets the bottom at a distance x from the
-    point below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior sin(theta_2). Light
-    emitted into a ring of directions lands in a ring on the bottom.
-
-        E = I (1 - R(theta_1)) tau sin(theta_1) / (x dx/dtheta_1),   L = rho / pi * E
-
-    The formula for E follows from Snell's law, Fresnel's equations and conservation of flux. See Born and Wolf,
-    Principles of Optics, Sections 1.5 and 3.1. Light that the surface reflects back to the bottom is left out, as with
-    max_depth 3.
-    """
-    points, weights = plane_points(camera_height, fov, size)
-    light = np.asarray(light, np.float64)
-    height = light[1] - depth
-    offset = np.hypot(points[..., 0] - light[0], points[..., 2] - light[2])
-    theta = _refracted_angle(offset, height, depth, ior)
-    sin_2 = np.sin(theta) / ior
-    cos_1, cos_2 = np.cos(theta), np.sqrt(1 - sin_2**2)
-    slope = height / cos_1**2 + depth * cos_1 / (ior * cos_2**3)  # dx/dtheta_1
-    # sin(theta_1) / x, which stays finite below the light
-    ratio = 1 / (height / cos_1 + depth / (ior * cos_2))
-    passed = 1 - fresnel(theta, ior)
-    per_pi = np.sum(passed * ratio / slope * weights, -1)[..., None] / np.pi
-    rho, power, tau = (np.broadcast_to(np.asarray(v, np.float64), 3) for v in (albedo, intensity, transmittance))
-    image = per_pi * (rho * power)
-    derivatives = {"albedo": per_pi * power * tau, "intensity": per_pi * rho * tau, "transmittance": image}
-    return Known(image * tau, derivatives)
 
 
 def beam_through_slab(

@@ -27,17 +27,16 @@ def waves(x: Array, z: Array) -> Array:
     return sum((a * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, a in WAVES), np.zeros_like(x))
 
 
-def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array | None = None) -> Any:
-    """A mesh of vertices (V, 3) and triangles (F, 3) with interpolated normals."""
+def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array) -> Any:
+    """A mesh of vertices (V, 3) and triangles (F, 3) with interpolated normals and texture coordinates (V, 2)."""
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(bsdf)
-    shape = mi.Mesh("mesh", len(positions), len(faces), has_vertex_normals=True,
-                    has_vertex_texcoords=texcoords is not None, props=properties)  # fmt: skip
+    shape = mi.Mesh("mesh", len(positions), len(faces), has_vertex_normals=True, has_vertex_texcoords=True,
+                    props=properties)  # fmt: skip
     params = mi.traverse(shape)
     params["vertex_positions"] = np.ravel(positions).astype(np.float32)
     params["faces"] = np.ravel(faces).astype(np.uint32)
-    if texcoords is not None:
-        params["vertex_texcoords"] = np.ravel(texcoords).astype(np.float32)
+    params["vertex_texcoords"] = np.ravel(texcoords).astype(np.float32)
     params.update()
     shape.recompute_vertex_normals()
     return shape
@@ -60,13 +59,13 @@ def grid(cells: int, height: Callable[[Array, Array], Array], half: float = 1.0,
     return np.stack([x, height(x, z), z], -1).reshape(-1, 3), faces, np.stack([u, v], -1).reshape(-1, 2)
 
 
-def smooth_fields(positions: Array, count: int, span: float, seed: int = 5) -> Array:
+def smooth_fields(positions: Array, count: int, span: float) -> Array:
     """Return random smooth displacements of unit size in all three directions, (count, V, 3).
 
     Each field is a cosine wave with a random wave vector and a random direction of displacement. The wave's phase
     changes by 1.5 to 5 radians over the length `span`.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(5)
     found = []
     for _ in range(count):
         direction, wave = random.normal(size=3), random.normal(size=3)
