@@ -60,8 +60,6 @@ class Reversed:
 class Replayed(Reversed):
     """Mitsuba integrator whose gradient is a separate pass, such as `prb`."""
 
-    image_apart = True
-
     def __init__(self, plugin: mi.Integrator) -> None:
         self.plugin = plugin
         self._scene: mi.Scene | None = None  # kept alive, so that no other scene gets its address
@@ -129,8 +127,6 @@ class NaiveAD(Replayed):
     Mitsuba's light tracer is differentiable only in evaluated loops.
     """
 
-    image_apart = False
-
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         self.correlated(job, lambda image: gradient)  # as in Mitsuba, which raises if no path hits anything
 
@@ -159,7 +155,6 @@ class WalkAd(LightTracer, Reversed):
         "paths": "light",
         "light_share": 0.5,
     }
-    image_apart = False
 
     def __init__(
         self, attached: bool = False, filter_normalization: str = "attached", paths: str = "light",

@@ -25,9 +25,6 @@ class OwnIntegrator(Reversed):
     The file runs when an image or a gradient is first needed, or in `ready`.
     """
 
-    #: The gradient takes a separate pass; if only `render` is differentiable, Mitsuba does naive AD.
-    image_apart = True
-
     def __init__(
         self, file: str, max_depth: int, rr_depth: int, hide_emitters: bool, arguments: dict[str, Any] | None = None,
         paths: str = "camera", allowed: bool = False,

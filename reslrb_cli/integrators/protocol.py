@@ -36,9 +36,6 @@ class StepIntegrator(Protocol):
     parameters.
     """
 
-    #: Whether `correlated` evaluates the image and dL/dI before the rest of its work; naive AD does not.
-    image_apart: bool
-
     def image(self, job: Job) -> mi.TensorXf:
         """Return the image, without derivatives."""
         ...
@@ -68,28 +65,3 @@ def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
     index = lane // count * channels + lane % count
     flat = dr.gather(type(image.array), image.array, index, True, dr.ReduceMode.Permute)
     return type(image)(flat, (*pixels, count))
-
-
-def halves_of(image: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
-    """Return the images (H, W, C) of the two halves of a set of samples (2, H, W, C). For a single image, returns it
-    twice.
-    """
-    if len(image.shape) == 3:
-        return image, image
-    shape = image.shape[1:]
-    lane = dr.arange(mi.UInt32, math.prod(shape))
-    first, second = (
-        dr.gather(type(image.array), image.array, lane + half * math.prod(shape), True, dr.ReduceMode.Permute)
-        for half in (0, 1)
-    )
-    return type(image)(first, shape), type(image)(second, shape)
-
-
-def whole_of(image: mi.TensorXf) -> mi.TensorXf:
-    """Return the image (H, W, C) of a set of samples. If the set has two halves (2, H, W, C), the returned image is the
-    mean of the halves.
-    """
-    if len(image.shape) == 3:
-        return image
-    first, second = halves_of(image)
-    return 0.5 * (first + second)

@@ -53,7 +53,6 @@ class LightTracer:
         "hide_emitters": False,
         "samples_per_pass": None,
     }
-    image_apart = True
     #: Kinds of paths, and the share of light paths in the samples if there are both.
     paths: str = "light"
     light_share: float = 0.5

@@ -119,8 +119,6 @@ def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
         found = [(0, "", Purpose.IMAGE), (1, "", gradient)]
     else:
         found = [(0, "", Purpose.IMAGE), *((b, "", Purpose.BOTH) for b in range(1, options["batches"]))]
-    if options.get("halves"):
-        return [(2 * place + half, word, purpose) for place, word, purpose in found for half in (0, 1)]
     return found
 
 

@@ -14,7 +14,6 @@ from reslrb_cli.config.loader import told
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators.protocol import whole_of
 from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.workers import Begun, scratch_bytes
@@ -159,7 +158,7 @@ class Stepper(Steps):
         self.size = (int(width), int(height))
         self.texels = sum(shape[0] * shape[1] for shape in texture_shapes(self.problem).values())
         image = _noise(*self.size, int(film.base_channels_count()))
-        self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(whole_of(seen) - image).array)
+        self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(seen - image).array)
 
     def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
         """Take one step and measure it. For a `cold` step, memory is measured as well. Every step that is not `cold`
