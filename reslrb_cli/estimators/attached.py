@@ -45,13 +45,11 @@ from reslrb_cli.estimators.base import (
     STACK_SIZE,
     Estimator,
     Pass,
+    SurfacePoint,
     VertexHooks,
     at_least_one,
-    entry_bytes,
-    places,
 )
-from reslrb_cli.estimators.kept import SurfacePoint
-from reslrb_cli.estimators.stack import Ring, StackState, walk_back
+from reslrb_cli.estimators.stack import Ring, StackState, entry_bytes, places, walk_back
 from reslrb_cli.transport.bsdf import Hit, Scattering, evaluate, stays_behind
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
