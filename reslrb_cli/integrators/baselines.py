@@ -17,7 +17,7 @@ import mitsuba as mi
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.forward import reverse_recorded, splat_tracked
-from reslrb_cli.integrators.protocol import Derivative, Job
+from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.transport.samples import Samples, in_passes
@@ -35,29 +35,7 @@ def _no_word_of_signals() -> Iterator[None]:
         logger.set_log_level(level)
 
 
-class Reversed:
-    """Integrator whose gradient is a separate pass, `backward`."""
-
-    def image(self, job: Job) -> mi.TensorXf:
-        """Return the image (H, W, C), without derivatives."""
-        raise NotImplementedError
-
-    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Add the gradient of the objective. `gradient` (H, W, C) is dL/dI."""
-        raise NotImplementedError
-
-    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
-        image = self.image(job)
-        self.backward(job, derivative(image))
-        return image
-
-    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the image. Adds the gradient for a dL/dI that is known before the image."""
-        return self.correlated(job, lambda image: gradient)
-
-
-class Replayed(Reversed):
+class Replayed(StepIntegrator):
     """Mitsuba integrator whose gradient is a separate pass, such as `prb`."""
 
     def __init__(self, plugin: mi.Integrator) -> None:
@@ -145,7 +123,7 @@ class NaiveAD(Replayed):
 _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
-class WalkAd(LightTracer, Reversed):
+class WalkAd(LightTracer):
     """Naive AD of the light paths that `reslrb` traces, for comparisons at equal seeds."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
@@ -188,7 +166,7 @@ class WalkAd(LightTracer, Reversed):
             return dr.forward_to(self.graph(job))
 
 
-class Trajectory(LightTracer, Reversed):
+class Trajectory(LightTracer):
     """The light paths of `reslrb`, traced in a loop that Dr.Jit reverses. Dr.Jit records the loop state in thread-local
     memory.
     """

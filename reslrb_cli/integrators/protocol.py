@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -31,26 +31,30 @@ class Job:
     plans: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
 
-class StepIntegrator(Protocol):
-    """Interface for images and gradients. Images and dL/dI are tensors (H, W, C). Gradients are added to the job's
+class StepIntegrator:
+    """Integrator of images and gradients. Images and dL/dI are tensors (H, W, C). Gradients are added to the job's
     parameters.
+
+    `correlated` and `known` suit integrators whose gradient is a separate pass, `backward`.
     """
 
     def image(self, job: Job) -> mi.TensorXf:
         """Return the image, without derivatives."""
-        ...
+        raise NotImplementedError
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         """Add the gradient of the objective. `gradient` is dL/dI."""
-        ...
+        raise NotImplementedError
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
-        ...
+        image = self.image(job)
+        self.backward(job, derivative(image))
+        return image
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
         """Return the image. Adds the gradient of the same samples for a dL/dI that is known before the image."""
-        ...
+        return self.correlated(job, lambda image: gradient)
 
 
 def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:

@@ -33,7 +33,7 @@ from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.context import Preparation, sensor_number
 from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.forward import splat_tangents
-from reslrb_cli.integrators.protocol import Derivative, Job
+from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.film import AdjointImage, PixelShares
 from reslrb_cli.transport.plan import Plan
@@ -44,7 +44,7 @@ from reslrb_cli.transport.walk import Splat, walk
 PATHS = ("light", "camera", "both")
 
 
-class LightTracer:
+class LightTracer(StepIntegrator):
     """Light tracer with derivatives in forward mode only. OPTIONS are the names and defaults of `ptracer`'s options."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
