@@ -187,7 +187,7 @@ class Trajectory(LightTracer):
             adjoint = parts[0].film.adjoint(gradient)
 
             def differentiate(part: Samples, block: mi.ImageBlock | None) -> None:
-                with dr.isolate_grad():  # as in `replay_all`; without it, the derivatives of textures are lost
+                with dr.isolate_grad():  # as in `replay_stored`; without it, the derivatives of textures are lost
                     reverse_recorded(part, adjoint)
 
             in_passes(parts, differentiate, None, job.params)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -341,17 +341,17 @@ class Reslrb(LightTracer):
         """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH)
-            traced = Trace(parts, *self.launch("trace", parts, partial(trace_image, self.estimator)))
-        gradient = derivative(traced.image)
-        self._replay(traced, gradient, job.params)
+            image, state = self.launch("trace", parts, partial(trace_image, self.estimator))
+        gradient = derivative(image)
+        self._replay(parts, gradient, job.params, state)
         self.learn(job, gradient)
-        return traced.image
+        return image
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         """Add the gradient of the objective. `gradient` (H, W, C) is dL/dI."""
         with dr.suspend_grad():
-            trace = Trace(self.passes(job, delta=gradient))
-        self._replay(trace, gradient, job.params)
+            parts = self.passes(job, delta=gradient)
+        self._replay(parts, gradient, job.params)
         self.learn(job, gradient)
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
@@ -361,14 +361,20 @@ class Reslrb(LightTracer):
         """
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH, gradient)
-            image = self.launch("fused", parts, partial(fused, self.estimator), gradient, params=job.params)
+            image = self.launch("fused", parts, partial(fused, self.estimator, True), gradient, params=job.params)
         self.learn(job, gradient)
         return image
 
-    def _replay(self, trace: Trace, gradient: mi.TensorXf, params: mi.SceneParameters | None) -> None:
-        kind, state = ("trace and replay", []) if trace.state is None else ("replay", [trace.state])
+    def _replay(
+        self, parts: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None, state: Any = None
+    ) -> None:
+        """Add the gradient. If `state` is None, the paths are traced again, otherwise `state` has their stored data."""
         with dr.suspend_grad():
-            self.launch(kind, trace.samples, partial(replay_all, self.estimator), gradient, *state, params=params)
+            if state is None:
+                work = partial(fused, self.estimator, False)
+                self.launch("trace and replay", parts, work, gradient, params=params)
+            else:
+                self.launch("replay", parts, partial(replay_stored, self.estimator), gradient, state)
 
 
 def _no_attached(estimator: str) -> str:
@@ -416,15 +422,6 @@ def forward(
     return state
 
 
-@dataclass
-class Trace:
-    """Traced samples: their image, and the stored data of their paths if they fit in one pass."""
-
-    samples: list[Samples]
-    image: mi.TensorXf | None = None
-    state: Any = None
-
-
 def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.TensorXf, Any]:
     """Return the image of all passes, and the estimator's stored data of each path.
 
@@ -460,44 +457,27 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
             differentiate_camera_paths(p, estimator.stack_size)
 
 
-def replay_all(
-    estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any = None,
-    params: mi.SceneParameters | None = None,
-) -> None:  # fmt: skip
-    """Add the gradient of the objective to `params`. `gradient` (H, W, C) is dL/dI. With one pass, `params` may be
-    None.
-
-    `state` is the data that one pass has stored for each path. If `state` is None, the paths are traced again.
-    """
-    adjoint = samples[0].film.adjoint(gradient)
-    if state is None:
-        differentiate_passes(samples, estimator, None, adjoint, params)
-        return
+def replay_stored(estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any) -> None:
+    """Add the gradient. `gradient` (H, W, C) is dL/dI, and `state` is the stored data of the paths of the only pass."""
+    [part] = samples
+    adjoint = part.film.adjoint(gradient)
     # Isolated: on their way to the parameters, gradients are evaluated with everything they depend on, which must be
     # one kernel. They start together at the end.
     with dr.isolate_grad():
-        replay(samples[0], estimator, state, adjoint)
+        replay(part, estimator, state, adjoint)
 
 
 def fused(
-    estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None = None
-) -> mi.TensorXf:
-    """Return the image, and add the gradient. dL/dI is known before the image."""
-    film = samples[0].film
-    block = film.block()
-    differentiate_passes(samples, estimator, block, film.adjoint(gradient), params)
-    return film.develop(block)
+    estimator: Estimator, with_image: bool, samples: list[Samples], gradient: mi.TensorXf,
+    params: mi.SceneParameters | None = None,
+) -> mi.TensorXf | None:  # fmt: skip
+    """Trace samples with a known dL/dI, `gradient` (H, W, C), and add the gradient. Return the image if requested.
 
-
-def differentiate_passes(
-    samples: list[Samples], estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage,
-    params: mi.SceneParameters | None,
-) -> None:  # fmt: skip
-    """Trace samples with known dL/dI. Adds the samples' derivatives. If there is a block, also adds the samples'
-    contributions to the block.
-
-    The data of a path stay within the kernel, and take no memory.
+    The data of a path stay within the kernel, and take no memory. With one pass, `params` may be None.
     """
+    film = samples[0].film
+    block = film.block() if with_image else None
+    adjoint = film.adjoint(gradient)
 
     def differentiate(part: Samples, own: mi.ImageBlock | None) -> None:
         with dr.isolate_grad():  # as above
@@ -508,3 +488,4 @@ def differentiate_passes(
                 finish_pass(image)
 
     in_passes(samples, differentiate, block, params)
+    return None if block is None else film.develop(block)
