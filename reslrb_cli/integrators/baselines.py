@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators.context import Sampling
 from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.forward import reverse_recorded, splat_tracked
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
@@ -139,8 +140,8 @@ class WalkAd(LightTracer):
         light_share: float = 0.5, **common: Any,
     ) -> None:  # fmt: skip
         """Make the integrator. If `attached`, rays and film positions also have derivatives."""
-        super().__init__(motion=Motion(attached, filter_normalization), **common)
-        self.have_paths(paths, light_share)
+        sampling = Sampling(paths=paths, light_share=light_share)
+        super().__init__(motion=Motion(attached, filter_normalization), sampling=sampling, **common)
 
     def graph(self, job: Job) -> mi.TensorXf:
         """Return the image (H, W, C) with its whole graph. Call it with enabled gradients."""

@@ -21,16 +21,13 @@ from typing_extensions import Self
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import Estimator, Pass, one_of
-from reslrb_cli.estimators.camera import (
-    differentiate_camera_paths,
-    splat_camera_paths,
-)
+from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.estimators.stack import stack_bytes
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.context import Preparation, sensor_number
+from reslrb_cli.integrators.context import Preparation, Sampling, sensor_number
 from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.forward import splat_tangents
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
@@ -40,8 +37,6 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
 from reslrb_cli.transport.visible import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.walk import Splat, walk
-
-PATHS = ("light", "camera", "both")
 
 
 class LightTracer(StepIntegrator):
@@ -53,19 +48,15 @@ class LightTracer(StepIntegrator):
         "hide_emitters": False,
         "samples_per_pass": None,
     }
-    #: Kinds of paths, and the share of light paths in the samples if there are both.
-    paths: str = "light"
-    light_share: float = 0.5
 
     def __init__(
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
-        freeze: bool = False, motion: Motion | None = None, guided: bool = False, low_discrepancy: bool = False,
+        freeze: bool = False, motion: Motion | None = None, sampling: Sampling | None = None,
     ) -> None:  # fmt: skip
         """Make the tracer. Raises ValueError, which names the option, for an invalid value.
 
         `freeze` tells whether launches are recorded (`freezing.py`), and `motion` has the options of attached
-        derivatives. `guided` tells whether emission is guided (`tables.py`). `low_discrepancy` tells whether the first
-        numbers of a path are low-discrepancy numbers (`sobol.py`).
+        derivatives.
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -75,7 +66,8 @@ class LightTracer(StepIntegrator):
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
+        motion, sampling = motion or Motion(), sampling or Sampling()
+        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion, sampling)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
         """Return a copy of the tracer with other values of `samples_per_pass` and `freeze`. Both tracers share the
@@ -85,21 +77,26 @@ class LightTracer(StepIntegrator):
         other.samples_per_pass, other.freeze = samples_per_pass, freeze
         return other
 
-    def afresh(
-        self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
-        light_share: float | None = None,
-    ) -> Self:  # fmt: skip
-        """Return a copy of the tracer with no facts about any scene, and with other sampling options. None keeps a
-        value.
+    @property
+    def paths(self) -> str:
+        """Kinds of paths: light, camera or both."""
+        return self.preparation.sampling.paths
 
-        `guided` turns guiding on or off, and `images` the guiding of images. `low_discrepancy` selects low-discrepancy
-        or independent numbers. If `light_share` is given, the copy traces light paths and camera paths, with this share
-        of light paths. Images then have the same film border for any share.
+    @property
+    def light_share(self) -> float:
+        """Share of light paths in the samples if there are both kinds."""
+        return self.preparation.sampling.light_share
+
+    def afresh(self, light_share: float | None = None, **changes: Any) -> Self:
+        """Return a copy of the tracer with no facts about any scene, and with `changes` of its sampling (`Sampling`).
+
+        If `light_share` is given, the copy traces light paths and camera paths, with this share of light paths. Images
+        then have the same film border for any share.
         """
         other = copy.copy(self)
-        other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
         if light_share is not None:
-            other.have_paths("both", light_share, whole=True)
+            changes = {"paths": "both", "whole": True} | changes | {"light_share": light_share}
+        other.preparation = self.preparation.afresh(**changes)
         return other
 
     def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
@@ -108,10 +105,7 @@ class LightTracer(StepIntegrator):
 
         The keys of the densities (`note_pixels`) are sensor numbers.
         """
-        other = self.afresh()
-        other.preparation.shares_out = True
-        other.preparation.given = {int(number): density for number, density in noted.items()}
-        return other
+        return self.afresh(shares_out=True, given={int(number): density for number, density in noted.items()})
 
     def to_measure(self) -> Self:
         """Return this tracer. If the tracer is guided, return a copy with separate tables instead.
@@ -126,23 +120,7 @@ class LightTracer(StepIntegrator):
 
         A run calls this method so that its tables have the same cells after a start and after a resume.
         """
-        self.preparation.expected = spp
-
-    def have_paths(self, paths: str, light_share: float, whole: bool = False) -> None:
-        """Use light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
-        only one kind of paths remains.
-
-        If `whole` is true, images of light paths alone have the same film border as images with camera paths.
-        """
-        one_of("paths", paths, PATHS)
-        if not 0 <= light_share <= 1:
-            raise ValueError(f'"light_share" must lie in [0, 1], not {light_share}')
-        if paths == "both" and light_share in (0, 1):
-            paths = "light" if light_share else "camera"
-        self.paths, self.light_share = paths, light_share
-        self.preparation.paths, self.preparation.whole = paths, whole or paths != "light"
-        if paths == "camera":  # no path starts from a table
-            self.preparation.guiding = None
+        self.preparation.sampling = replace(self.preparation.sampling, expected=spp)
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """Return the plan for tracing this scene, with derivatives of `params` if given. Raises UnsupportedScene."""
@@ -182,10 +160,10 @@ class LightTracer(StepIntegrator):
         The tracer measures an unknown distribution once, for the differentiated parameters.
         """
         preparation = self.preparation
-        if plan.paths == "light" or not preparation.shares_out:
+        if plan.paths == "light" or not preparation.sampling.shares_out:
             return None
         number, size = sensor_number(job.scene, job.sensor), job.sensor.film().crop_size()
-        known = preparation.given
+        known = preparation.sampling.given
         if job.params is not None and number not in known:
             known = preparation.noted(job.params)
             if number not in known:
@@ -286,13 +264,12 @@ class Reslrb(LightTracer):
         self.estimator = estimator
 
     @classmethod
-    def of(
-        cls, estimator: str | None = None, attached: bool | str = "auto", filter_normalization: str = "attached",
-        attached_sampling: str = "auto", guiding: str = "off", sequence: str = "independent", paths: str = "light",
-        light_share: float = 0.5, pixels: str = "even", **options: Any,
-    ) -> Reslrb:  # fmt: skip
-        """Make the tracer from the estimator's name and all options. Raises ValueError if one is wrong."""
-        estimator = estimator or ("stack" if paths == "camera" else cls.OPTIONS["estimator"])
+    def of(cls, **given: Any) -> Reslrb:
+        """Make the tracer from its options (OPTIONS, and those of the estimator). Raises ValueError if one is wrong."""
+        options = {**cls.OPTIONS, **given}
+        if options["paths"] == "camera" and not given.get("estimator"):
+            options["estimator"] = "stack"
+        estimator = options.pop("estimator") or cls.OPTIONS["estimator"]
         if estimator == "auto":
             raise ValueError(
                 '"estimator" auto needs an experiment to measure on (`reslrb optimize`); for the plugin, name one of '
@@ -300,29 +277,34 @@ class Reslrb(LightTracer):
             )
         if estimator not in ESTIMATORS:
             raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
-        own = {name: options.pop(name) for name in options_of(estimator) if name in options}
-        if paths == "camera" and estimator != "stack":
+        if options["paths"] == "camera" and estimator != "stack":
             raise ValueError(
                 f'"estimator" {estimator} needs the connections of light paths, and paths: camera has none; remove it, '
                 "or use stack"
             )
         obstacle = None if estimator in ATTACHED else _no_attached(estimator)
-        motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
-        for name, value, values in (
-            ("guiding", guiding, ("on", "off")),
-            ("sequence", sequence, ("independent", "low_discrepancy")),
-            ("pixels", pixels, ("even", "measured")),
+        motion = Motion(
+            options.pop("attached"), options.pop("filter_normalization"), obstacle, options.pop("attached_sampling")
+        )
+        for name, values in (
+            ("guiding", ("on", "off")),
+            ("sequence", ("independent", "low_discrepancy")),
+            ("pixels", ("even", "measured")),
         ):
-            if value == "auto":
+            if options[name] == "auto":
                 raise ValueError(
                     f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); use {" or ".join(values)}'
                 )
-            one_of(name, value, values)
-        options |= {"guided": guiding == "on", "low_discrepancy": sequence == "low_discrepancy"}
-        made = cls(make_estimator(estimator, own), motion=motion, **options)
-        made.have_paths(paths, light_share)
-        made.preparation.shares_out = pixels == "measured"
-        return made
+            one_of(name, options[name], values)
+        sampling = Sampling(
+            guided=options.pop("guiding") == "on",
+            low_discrepancy=options.pop("sequence") == "low_discrepancy",
+            paths=options.pop("paths"),
+            light_share=options.pop("light_share"),
+            shares_out=options.pop("pixels") == "measured",
+        )
+        own = {name: options.pop(name) for name in options_of(estimator) if name in options}
+        return cls(make_estimator(estimator, own), motion=motion, sampling=sampling, **options)
 
     def share_of_light(self, plan: Plan) -> float:
         """Return the share of the samples that are light paths."""

@@ -483,7 +483,7 @@ def _parts(
         shared["sequence"] = "independent" if own.plan(scene, sensor).sequence is None else "low_discrepancy"
     tracer = Reslrb.of(estimator="gather", **shared)
     if isinstance(own, Reslrb):
-        tracer.have_paths(own.paths, own.light_share, own.preparation.whole)
+        tracer = tracer.afresh(own.light_share, paths=own.paths, whole=own.preparation.sampling.whole)
     # For moving light, only contributions are checked: `gather` has no derivatives of them.
     params = None if is_attached(problem) else problem.selection.params
     options = problem.config.step_options(shard=True)
