@@ -119,11 +119,6 @@ class Differentiable(Protocol[A]):
         """
 
 
-def places(plan: Plan, stack_size: int) -> int:
-    """Return the capacity of a vertex stack: `stack_size`, but at least one and at most the vertex count of a path."""
-    return min(stack_size, max(vertices(plan), 1))
-
-
 @dataclass(frozen=True)
 class Ring:
     """Map from vertex numbers to places on the stack. The ring has one extra place with number `size`, which receives
@@ -135,8 +130,8 @@ class Ring:
 
     @staticmethod
     def of(plan: Plan, stack_size: int) -> Ring:
-        """Return a ring of at most `stack_size` places, for the paths of a plan."""
-        size = places(plan, stack_size)
+        """Return a ring of at most `stack_size` places, but at least one, for the paths of a plan."""
+        size = min(stack_size, max(vertices(plan), 1))
         return Ring(size, vertices(plan) > size)
 
     def place(self, number: mi.UInt32) -> mi.UInt32:
@@ -419,4 +414,4 @@ def stack_bytes(plan: Plan, stack_size: int) -> int:
     """Return the thread-local bytes of each traced path."""
     if not plan.differentiate_bsdfs:
         return 0
-    return sum(entry_bytes(Frame.blank(plan))) * (places(plan, stack_size) + 1)
+    return sum(entry_bytes(Frame.blank(plan))) * (Ring.of(plan, stack_size).size + 1)
