@@ -15,13 +15,19 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.estimators.camera import splat_camera_paths
 from reslrb_cli.integrators.context import Sampling
 from reslrb_cli.integrators.differentiated import Motion
-from reslrb_cli.integrators.forward import reverse_recorded, splat_tracked
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.scene.deformation import Surroundings
+from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.samples import Samples, in_passes
+from reslrb_cli.transport.visible import differentiate_visible_emission, moving_splats, splat_visible_emission
+from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
 
 
 @contextmanager
@@ -124,6 +130,32 @@ class NaiveAD(Replayed):
 _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
+class TrackedSplat(Splat):
+    """Hooks that splat every connection with tracked derivatives of its factors. If `attached`, rays and film positions
+    have derivatives, too.
+    """
+
+    tracked = True
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock, attached: bool) -> None:
+        super().__init__(samples, block)
+        self.attached = attached
+
+
+def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
+    """Splat the contributions to the block with tracked derivatives, for naive AD. Memory is proportional to depth."""
+    with dr.resume_grad():
+        splat_visible_emission(samples, block, "evaluated")
+        for u, C, active in moving_splats(samples):  # twice, so that the image stays the same
+            samples.film.put(block, u, C, active, samples.plan.attached_normalization)
+            samples.film.put(block, dr.detach(u), -dr.detach(C), active)
+        for side in samples.sides():
+            if side.plan.camera:
+                splat_camera_paths(side, block, tracked=True)
+            else:
+                walk(side, TrackedSplat(side, block, side.plan.attached))
+
+
 class WalkAd(LightTracer):
     """Naive AD of the light paths that `reslrb` traces, for comparisons at equal seeds."""
 
@@ -167,6 +199,29 @@ class WalkAd(LightTracer):
             return dr.forward_to(self.graph(job))
 
 
+class RecordedObjective(Hooks):
+    """Hooks that sum each path's share of the objective, S = sum_i delta_i C_i, with tracked derivatives.
+
+    A splat in a reversed loop would have no derivative, because side effects are not part of the loop's state.
+    """
+
+    tracked = True
+
+    def __init__(self, samples: Samples, adjoint: AdjointImage) -> None:
+        self.samples, self.adjoint = samples, adjoint
+        self.max_iterations = max(samples.plan.max_depth - 1, 1)
+
+    def start(self, product: Product) -> mi.Float:
+        return mi.Float(0)
+
+    def vertex(
+        self, state: mi.Float, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> mi.Float:  # fmt: skip
+        C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
+        delta = self.adjoint.lookup(connection.u, connection.active)
+        return state + dr.select(connection.active, dr.dot(delta, C), 0)
+
+
 class Trajectory(LightTracer):
     """The light paths of `reslrb`, traced in a loop that Dr.Jit reverses. Dr.Jit records the loop state in thread-local
     memory.
@@ -189,6 +244,8 @@ class Trajectory(LightTracer):
 
             def differentiate(part: Samples, block: mi.ImageBlock | None) -> None:
                 with dr.isolate_grad():  # as in `replay_stored`; without it, the derivatives of textures are lost
-                    reverse_recorded(part, adjoint)
+                    differentiate_visible_emission(part, adjoint)
+                    with dr.resume_grad():
+                        dr.backward_from(walk(part, RecordedObjective(part, adjoint)), flags=_MAY_LACK)
 
             in_passes(parts, differentiate, None, job.params)

@@ -282,7 +282,12 @@ class Reslrb(LightTracer):
                 f'"estimator" {estimator} needs the connections of light paths, and paths: camera has none; remove it, '
                 "or use stack"
             )
-        obstacle = None if estimator in ATTACHED else _no_attached(estimator)
+        obstacle = None
+        if estimator not in ATTACHED:
+            obstacle = (
+                f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
+                f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
+            )
         motion = Motion(
             options.pop("attached"), options.pop("filter_normalization"), obstacle, options.pop("attached_sampling")
         )
@@ -357,13 +362,6 @@ class Reslrb(LightTracer):
                 self.launch("trace and replay", parts, work, gradient, params=params)
             else:
                 self.launch("replay", parts, partial(replay_stored, self.estimator), gradient, state)
-
-
-def _no_attached(estimator: str) -> str:
-    return (
-        f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
-        f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
-    )
 
 
 def image_of(samples: list[Samples]) -> mi.TensorXf:
