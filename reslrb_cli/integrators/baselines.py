@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.camera import splat_camera_paths
-from reslrb_cli.integrators.context import Sampling
+from reslrb_cli.integrators.context import SamplingOptions
 from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
@@ -172,7 +172,7 @@ class WalkAd(LightTracer):
         light_share: float = 0.5, **common: Any,
     ) -> None:  # fmt: skip
         """Make the integrator. If `attached`, rays and film positions also have derivatives."""
-        sampling = Sampling(paths=paths, light_share=light_share)
+        sampling = SamplingOptions(paths=paths, light_share=light_share)
         super().__init__(motion=Motion(attached, filter_normalization), sampling=sampling, **common)
 
     def graph(self, job: Job) -> mi.TensorXf:

@@ -140,7 +140,7 @@ class AboutScene:
 
 
 @dataclass(frozen=True)
-class Sampling:
+class SamplingOptions:
     """Options of a light tracer for its choice of paths. Raises ValueError, which names the option, for a wrong value.
 
     - `guided` tells whether emission is guided (`tables.py`). `images` tells whether samples that serve only an image
@@ -182,7 +182,7 @@ class Preparation:
     """Options of a light tracer, and facts about the last scene."""
 
     def __init__(
-        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, sampling: Sampling
+        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, sampling: SamplingOptions
     ) -> None:  # fmt: skip
         self.sampling = sampling
         self.guiding = Guiding(sampling.images) if sampling.guided else None
@@ -259,7 +259,7 @@ class Preparation:
         made = self._found.shares
 
         def shares(paths: int) -> PixelShares | None:
-            key = number, paths, id(known)  # held by `Sampling.given` or `AboutParameters`
+            key = number, paths, id(known)  # held by `SamplingOptions.given` or `AboutParameters`
             if key not in made:
                 rows, columns = (np.arange(n) * m // n for n, m in zip(size[::-1], known.shape, strict=True))
                 made[key] = PixelShares.of(known[np.ix_(rows, columns)].ravel(), paths)

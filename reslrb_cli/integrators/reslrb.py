@@ -27,7 +27,7 @@ from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.context import Preparation, Sampling, sensor_number
+from reslrb_cli.integrators.context import Preparation, SamplingOptions, sensor_number
 from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.forward import splat_tangents
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
@@ -51,7 +51,7 @@ class LightTracer(StepIntegrator):
 
     def __init__(
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
-        freeze: bool = False, motion: Motion | None = None, sampling: Sampling | None = None,
+        freeze: bool = False, motion: Motion | None = None, sampling: SamplingOptions | None = None,
     ) -> None:  # fmt: skip
         """Make the tracer. Raises ValueError, which names the option, for an invalid value.
 
@@ -66,7 +66,7 @@ class LightTracer(StepIntegrator):
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        motion, sampling = motion or Motion(), sampling or Sampling()
+        motion, sampling = motion or Motion(), sampling or SamplingOptions()
         self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion, sampling)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
@@ -88,7 +88,7 @@ class LightTracer(StepIntegrator):
         return self.preparation.sampling.light_share
 
     def afresh(self, light_share: float | None = None, **changes: Any) -> Self:
-        """Return a copy of the tracer with no facts about any scene, and with `changes` of its sampling (`Sampling`).
+        """Return a copy of the tracer with no facts about any scene, and with changed `SamplingOptions`.
 
         If `light_share` is given, the copy traces light paths and camera paths, with this share of light paths. Images
         then have the same film border for any share.
@@ -301,7 +301,7 @@ class Reslrb(LightTracer):
                     f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); use {" or ".join(values)}'
                 )
             one_of(name, options[name], values)
-        sampling = Sampling(
+        sampling = SamplingOptions(
             guided=options.pop("guiding") == "on",
             low_discrepancy=options.pop("sequence") == "low_discrepancy",
             paths=options.pop("paths"),
