@@ -36,22 +36,13 @@ weight r_i.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import (
-    STACK_SIZE,
-    Estimator,
-    Pass,
-    VertexHooks,
-    at_least_one,
-    entry_bytes,
-    places,
-)
-from reslrb_cli.estimators.kept import SurfacePoint
-from reslrb_cli.estimators.stack import Ring, StackState, walk_back
+from reslrb_cli.estimators.base import Pass, SurfacePoint, VertexHooks
+from reslrb_cli.estimators.stack import Ring, Stack, StackState, entry_bytes, walk_back
 from reslrb_cli.transport.bsdf import Hit, Scattering, evaluate, stays_behind
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
@@ -126,11 +117,11 @@ def reach(
 
 def segment_again(
     samples: Samples, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, numbers: Numbers,
-    connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True, parameters: bool = True,
+    connected: mi.Bool, scattered: mi.Bool,
 ) -> tuple[Segment, mi.Spectrum]:  # fmt: skip
     """Return the segment from a vertex with attached derivatives, and the factor that `reach` returns."""
-    hit, factor = reach(samples.plan, before, ray, pi, connected | scattered, parameters)
-    return segment(samples, hit, numbers, connected, scattered, evaluates, attached=True), factor
+    hit, factor = reach(samples.plan, before, ray, pi, connected | scattered)
+    return segment(samples, hit, numbers, connected, scattered, attached=True), factor
 
 
 # ---- The stack of segments ----
@@ -275,33 +266,25 @@ class AttachedSweep(VertexHooks):
         return (state.stack.count > 0) | (mi.Bool(True) if concerns_emission(plan) else begins(plan, vertex))
 
 
-class AttachedStack(Estimator):
+class AttachedStack(Stack):
     """The estimator `stack` with attached derivatives."""
-
-    exact = True
-
-    OPTIONS: ClassVar[dict[str, Any]] = {"stack_size": STACK_SIZE}
-
-    def __init__(self, stack_size: int = STACK_SIZE) -> None:
-        at_least_one("stack_size", stack_size)
-        self.stack_size = stack_size
 
     def forward(self, p: Pass) -> Any:
         if p.adjoint is not None:
-            return self._sweep(p)
+            return self._differentiate(p)
         assert p.block is not None
         return p.walk(Splat(p.samples, p.block))  # no path is kept; the path is traced again
 
     def backward(self, p: Pass, state: Any) -> None:
-        differentiate_start(p, state if isinstance(state, Adjoint) else self._sweep(p))
+        differentiate_start(p, state if isinstance(state, Adjoint) else self._differentiate(p))
 
     def kept(self, plan: Plan) -> Any:
         return []
 
     def scratch_bytes(self, plan: Plan) -> int:
-        return sum(entry_bytes(AttachedFrame.blank(plan))) * (places(plan, self.stack_size) + 1)
+        return sum(entry_bytes(AttachedFrame.blank(plan))) * (Ring.of(plan, self.stack_size).size + 1)
 
-    def _sweep(self, p: Pass) -> Adjoint:
+    def _differentiate(self, p: Pass) -> Adjoint:
         """Trace the paths, splat them if there is an image, and walk back. Returns the adjoint at the emitter."""
         ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
         state: AttachedState = p.walk(AttachedSweep(p, ring))

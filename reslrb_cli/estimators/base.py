@@ -1,17 +1,20 @@
-"""Interface of all estimators, and the step that all estimators share. The step turns the adjoint of a path
-contribution into derivatives at a vertex.
+"""Interface of all estimators, and two parts that they share.
+
+One part turns the adjoint of a path contribution into derivatives at a vertex. The other part stores the data of a
+vertex or a sampled event from which its BSDF can be evaluated again.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection, stand_in, transmittance
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import NO_ZERO, Product, showing
@@ -20,7 +23,6 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
-T = TypeVar("T")
 STACK_SIZE = 64  # vertices
 
 
@@ -101,50 +103,6 @@ class Estimator(ABC):
     def scratch_bytes(self, plan: Plan) -> int:
         """Return the thread-local bytes that each traced path uses. The allocator does not count these bytes."""
         return 0
-
-
-def arrays(tree: Any) -> list[dr.ArrayBase]:
-    """Return all arrays of a PyTree of dataclasses and lists, in order."""
-    if is_dataclass(tree):
-        tree = [getattr(tree, field.name) for field in fields(tree)]
-    return [array for part in tree for array in arrays(part)] if isinstance(tree, (list, tuple)) else [tree]
-
-
-def like(form: T, values: Iterator[dr.ArrayBase]) -> T:
-    """Return a PyTree of the same form as `form`, filled with the next arrays from `values`."""
-    made: Any = type(form)
-    if isinstance(form, list):
-        return made(like(part, values) for part in form)
-    if is_dataclass(form):
-        return made(*(like(getattr(form, field.name), values) for field in fields(form)))
-    return next(values)
-
-
-def entry_bytes(tree: Any) -> list[int]:
-    """Return the entry size in bytes for each array in a PyTree."""
-    found = arrays(tree)
-    parts = [list(array) if dr.depth_v(array) > 1 else [] for array in found]
-    return [n for array, own in zip(found, parts, strict=True) for n in (entry_bytes(own) or [dr.itemsize_v(array)])]
-
-
-def allocate(form: Any, size: int) -> list[dr.Local]:
-    """Return thread-local memory for `size` PyTrees like `form`, plus one place for discarded values.
-
-    No place may be written twice, even if the first write is masked. Otherwise the second write is lost (Dr.Jit 1.5,
-    LLVM).
-    """
-    return [dr.alloc_local(type(array), size + 1) for array in arrays(form)]
-
-
-def write(stack: list[dr.Local], value: Any, place: mi.UInt32, active: mi.Bool) -> None:
-    """Write a PyTree to one place of the thread-local memory."""
-    for array, member in zip(stack, arrays(value), strict=True):
-        array.write(member, place, active)
-
-
-def read(stack: list[dr.Local], form: T, place: mi.UInt32) -> T:
-    """Return the PyTree at a place."""
-    return like(form, (array.read(place) for array in stack))
 
 
 def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]) -> None:
@@ -246,9 +204,92 @@ def vertices(plan: Plan) -> int:
     return max(plan.max_depth - 1, 0)
 
 
-def places(plan: Plan, stack_size: int) -> int:
-    """Return the capacity of a vertex stack: `stack_size`, but at least one and at most the vertex count of a path."""
-    return min(stack_size, max(vertices(plan), 1))
+# ---- Stored data of a vertex ----
+
+
+@dataclass
+class SurfacePoint:
+    """Vertex data that the BSDF reads, as plain numbers. Pointers are stored as indices.
+
+    If BSDFs read only texture coordinates and directions, the data are `[uv, wi, bsdf]`. If just one BSDF is
+    differentiated, `bsdf` is left out. Otherwise the data identify the interaction: `[t, prim_uv, prim_index, shape,
+    instance, o, d]`.
+    """
+
+    numbers: list[dr.ArrayBase]
+
+    @staticmethod
+    def of(plan: Plan, vertex: Vertex) -> SurfacePoint:
+        """Return the data of a walk's current vertex."""
+        if not plan.keep_geometry:
+            pointer = [] if plan.sole_bsdf is not None else [_index(vertex.bsdf)]
+            return SurfacePoint([vertex.si.uv, vertex.si.wi, *pointer])
+        pi, ray = vertex.pi, vertex.ray
+        pointers = [_index(pi.shape), _index(pi.instance)]
+        return SurfacePoint([pi.t, pi.prim_uv, pi.prim_index, *pointers, ray.o, ray.d])
+
+    @staticmethod
+    def blank(plan: Plan) -> SurfacePoint:
+        """Return data of zeros of the same form."""
+        if not plan.keep_geometry:
+            pointer = [] if plan.sole_bsdf is not None else [mi.UInt32(0)]
+            return SurfacePoint([mi.Point2f(0), mi.Vector3f(0), *pointer])
+        indices = [mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)]
+        return SurfacePoint([mi.Float(0), mi.Point2f(0), *indices, mi.Point3f(0), mi.Vector3f(0)])
+
+    def ray(self) -> mi.Ray3f:
+        """Return the ray that reached the vertex. The ray is stored only in scenes whose BSDFs read geometry."""
+        return mi.Ray3f(*self.numbers[-2:])
+
+    def hit(self) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
+        """Return the intersection and its ray. Both are stored only in scenes whose BSDFs read geometry."""
+        pi = dr.zeros(mi.PreliminaryIntersection3f)
+        pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to local memory crashes the process
+        pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
+        pi.shape = dr.reinterpret_array(mi.ShapePtr, shape)
+        pi.instance = dr.reinterpret_array(mi.ShapePtr, instance)
+        return pi, mi.Ray3f(o, d)
+
+    def interaction(self, plan: Plan, active: mi.Bool | bool = True) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
+        """Return the surface interaction with all data that BSDFs read, and the BSDF."""
+        if not plan.keep_geometry:
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.uv, si.wi, *pointer = self.numbers
+            si.t = mi.Float(0)  # valid
+            return si, dr.reinterpret_array(mi.BSDFPtr, pointer[0]) if pointer else plan.sole_bsdf
+        pi, ray = self.hit()
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        return si, si.bsdf()
+
+
+def event(wo: mi.Vector3f, lobe: list[mi.UInt32 | mi.Float | mi.Point2f]) -> Scattering:
+    """Return a sampled event from its stored direction and `lobe`. The event has all data that its factor needs."""
+    kind, sample_1, sample_2 = lobe or [mi.UInt32(0), None, None]
+    return Scattering(
+        weight=None, f=None, wo=wo, d=None, pdf=None, eta=None, correction=None,
+        is_delta=kind == 1, is_null=kind == 2, sample_1=sample_1, sample_2=sample_2, active=None,
+    )  # fmt: skip
+
+
+def _index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
+    return dr.reinterpret_array(mi.UInt32, pointer)
+
+
+def lobe(plan: Plan, scattering: Scattering | None) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
+    """Return the kind of the sampled lobe (1: delta, 2: null) and its random numbers. The result is empty if only
+    smooth lobes matter.
+
+    Without an event (None), the function returns zeros of the same form.
+    """
+    if not (plan.differentiate_delta or plan.differentiate_null):
+        return []
+    if scattering is None:
+        return [mi.UInt32(0), mi.Float(0), mi.Point2f(0)]
+    kind = dr.select(scattering.is_delta, mi.UInt32(1), 0) + dr.select(scattering.is_null, mi.UInt32(2), 0)
+    return [kind, scattering.sample_1, scattering.sample_2]
+
+
+# ---- Options ----
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -28,7 +28,10 @@ _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 class Radiance(CameraHooks):
-    """Radiance that arrives along each path, (C,)."""
+    """Radiance (C,) that arrives along each path. If `tracked`, all factors have derivatives, for naive AD."""
+
+    def __init__(self, tracked: bool) -> None:
+        self.tracked = tracked
 
     def start(self, first: FilmRay) -> mi.Spectrum:
         return mi.Spectrum(0)
@@ -44,15 +47,9 @@ class Radiance(CameraHooks):
         return state
 
 
-class TrackedRadiance(Radiance):
-    """Radiance of camera paths with derivatives of all factors, for naive AD."""
-
-    tracked = True
-
-
 def splat_camera_paths(samples: Samples, block: mi.ImageBlock, tracked: bool = False) -> None:
     """Add the image of camera paths to the block."""
-    first, L = camera_walk(samples, TrackedRadiance() if tracked else Radiance())
+    first, L = camera_walk(samples, Radiance(tracked))
     samples.film.put(block, first.u, L * first.weight, first.active)
 
 

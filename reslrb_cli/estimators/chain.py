@@ -45,6 +45,7 @@ from reslrb_cli.estimators.attached import (
     concerns_emission,
     differentiate_start,
     is_staying,
+    reach,
     segment_again,
 )
 from reslrb_cli.estimators.base import Estimator, Pass, PathAdjoint, VertexHooks, adjoint_of_factor, contribution
@@ -61,7 +62,7 @@ from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Numbers, Samples
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.walk import Vertex, segment
 
 #: Nonspecular vertices in one block of a chain.
 BLOCK = 10
@@ -445,9 +446,8 @@ def segment_jacobian(
         ray = mi.Ray3f(vertex.ray)
         ray.o = ray.o + frame.s * p[0] + frame.t * p[1] + vertex.ray.d * dr.select(stays, p[2], 0)
         ray.d = dr.normalize(ray.d + dr.select(stays, 0, frame.s * p[2] + frame.t * p[3]))
-        this, reached = segment_again(
-            samples, before, ray, vertex.pi, numbers, connected, scattered, evaluates, parameters=False
-        )
+        hit, reached = reach(samples.plan, before, ray, vertex.pi, connected | scattered, parameters=False)
+        this = segment(samples, hit, numbers, connected, scattered, evaluates, attached=True)
         following, scattering, connection = this.next_ray(attached=True), this.scattering, this.connection
         factors = [reached * scattering.weight]
         if evaluates:

@@ -13,8 +13,16 @@ from typing import Any, Protocol, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import Pass, PathAdjoint, VertexHooks, adjoint_of_factor, differentiate_passage
-from reslrb_cli.estimators.kept import SurfacePoint, event, lobe
+from reslrb_cli.estimators.base import (
+    Pass,
+    PathAdjoint,
+    SurfacePoint,
+    VertexHooks,
+    adjoint_of_factor,
+    differentiate_passage,
+    event,
+    lobe,
+)
 from reslrb_cli.transport.bsdf import Scattering, tracked_factor
 from reslrb_cli.transport.connection import Connection, connect, stand_in
 from reslrb_cli.transport.factors import Product

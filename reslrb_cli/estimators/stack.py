@@ -28,8 +28,8 @@ gradient, without shadow rays.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import drjit as dr
@@ -40,21 +40,17 @@ from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
     PathAdjoint,
+    SurfacePoint,
     VertexHooks,
-    allocate,
     at_least_one,
     contribution,
     differentiate_emission,
     differentiate_passage,
-    entry_bytes,
-    places,
-    read,
+    event,
     vertices,
-    write,
 )
+from reslrb_cli.estimators.base import lobe as kept_lobe
 from reslrb_cli.estimators.gather import Gathering, Visibility
-from reslrb_cli.estimators.kept import SurfacePoint, event
-from reslrb_cli.estimators.kept import lobe as kept_lobe
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, Seen
 from reslrb_cli.transport.factors import Product, showing
@@ -62,6 +58,54 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
 A = TypeVar("A")
+T = TypeVar("T")
+
+# ---- Thread-local memory ----
+
+
+def arrays(tree: Any) -> list[dr.ArrayBase]:
+    """Return all arrays of a PyTree of dataclasses and lists, in order."""
+    if is_dataclass(tree):
+        tree = [getattr(tree, field.name) for field in fields(tree)]
+    return [array for part in tree for array in arrays(part)] if isinstance(tree, (list, tuple)) else [tree]
+
+
+def like(form: T, values: Iterator[dr.ArrayBase]) -> T:
+    """Return a PyTree of the same form as `form`, filled with the next arrays from `values`."""
+    made: Any = type(form)
+    if isinstance(form, list):
+        return made(like(part, values) for part in form)
+    if is_dataclass(form):
+        return made(*(like(getattr(form, field.name), values) for field in fields(form)))
+    return next(values)
+
+
+def entry_bytes(tree: Any) -> list[int]:
+    """Return the entry size in bytes for each array in a PyTree."""
+    found = arrays(tree)
+    parts = [list(array) if dr.depth_v(array) > 1 else [] for array in found]
+    return [n for array, own in zip(found, parts, strict=True) for n in (entry_bytes(own) or [dr.itemsize_v(array)])]
+
+
+def allocate(form: Any, size: int) -> list[dr.Local]:
+    """Return thread-local memory for `size` PyTrees like `form`, plus one place for discarded values.
+
+    No place may be written twice, even if the first write is masked. Otherwise the second write is lost (Dr.Jit 1.5,
+    LLVM).
+    """
+    return [dr.alloc_local(type(array), size + 1) for array in arrays(form)]
+
+
+def write(stack: list[dr.Local], value: Any, place: mi.UInt32, active: mi.Bool) -> None:
+    """Write a PyTree to one place of the thread-local memory."""
+    for array, member in zip(stack, arrays(value), strict=True):
+        array.write(member, place, active)
+
+
+def read(stack: list[dr.Local], form: T, place: mi.UInt32) -> T:
+    """Return the PyTree at a place."""
+    return like(form, (array.read(place) for array in stack))
+
 
 # ---- The stack ----
 
@@ -86,8 +130,8 @@ class Ring:
 
     @staticmethod
     def of(plan: Plan, stack_size: int) -> Ring:
-        """Return a ring of at most `stack_size` places, for the paths of a plan."""
-        size = places(plan, stack_size)
+        """Return a ring of at most `stack_size` places, but at least one, for the paths of a plan."""
+        size = min(stack_size, max(vertices(plan), 1))
         return Ring(size, vertices(plan) > size)
 
     def place(self, number: mi.UInt32) -> mi.UInt32:
@@ -370,4 +414,4 @@ def stack_bytes(plan: Plan, stack_size: int) -> int:
     """Return the thread-local bytes of each traced path."""
     if not plan.differentiate_bsdfs:
         return 0
-    return sum(entry_bytes(Frame.blank(plan))) * (places(plan, stack_size) + 1)
+    return sum(entry_bytes(Frame.blank(plan))) * (Ring.of(plan, stack_size).size + 1)

@@ -41,7 +41,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.estimators.base import allocate, write
+from reslrb_cli.estimators.stack import allocate, write
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time

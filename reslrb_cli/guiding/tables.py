@@ -214,8 +214,8 @@ class Guiding:
     counts the updates of all tables together.
     """
 
-    def __init__(self) -> None:
-        self.images, self.held, self.lessons = True, False, 0
+    def __init__(self, images: bool = True) -> None:
+        self.images, self.held, self.lessons = images, False, 0
         self.grid: Grid | None = None
         self._emission: tuple[list[bool], list[float], int] | None = None  # scene data that `grid_for` needs
         self.box = np.zeros((2, 3), np.float32)  # of the scene, as first seen

@@ -15,12 +15,19 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.estimators.camera import splat_camera_paths
+from reslrb_cli.integrators.context import SamplingOptions
 from reslrb_cli.integrators.differentiated import Motion
-from reslrb_cli.integrators.forward import reverse_recorded, splat_tracked
-from reslrb_cli.integrators.protocol import Derivative, Job
+from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.scene.deformation import Surroundings
+from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.samples import Samples, in_passes
+from reslrb_cli.transport.visible import differentiate_visible_emission, moving_splats, splat_visible_emission
+from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
 
 
 @contextmanager
@@ -35,32 +42,8 @@ def _no_word_of_signals() -> Iterator[None]:
         logger.set_log_level(level)
 
 
-class Reversed:
-    """Integrator whose gradient is a separate pass, `backward`."""
-
-    def image(self, job: Job) -> mi.TensorXf:
-        """Return the image (H, W, C), without derivatives."""
-        raise NotImplementedError
-
-    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Add the gradient of the objective. `gradient` (H, W, C) is dL/dI."""
-        raise NotImplementedError
-
-    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
-        image = self.image(job)
-        self.backward(job, derivative(image))
-        return image
-
-    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the image. Adds the gradient for a dL/dI that is known before the image."""
-        return self.correlated(job, lambda image: gradient)
-
-
-class Replayed(Reversed):
+class Replayed(StepIntegrator):
     """Mitsuba integrator whose gradient is a separate pass, such as `prb`."""
-
-    image_apart = True
 
     def __init__(self, plugin: mi.Integrator) -> None:
         self.plugin = plugin
@@ -129,8 +112,6 @@ class NaiveAD(Replayed):
     Mitsuba's light tracer is differentiable only in evaluated loops.
     """
 
-    image_apart = False
-
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         self.correlated(job, lambda image: gradient)  # as in Mitsuba, which raises if no path hits anything
 
@@ -149,7 +130,33 @@ class NaiveAD(Replayed):
 _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
-class WalkAd(LightTracer, Reversed):
+class TrackedSplat(Splat):
+    """Hooks that splat every connection with tracked derivatives of its factors. If `attached`, rays and film positions
+    have derivatives, too.
+    """
+
+    tracked = True
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock, attached: bool) -> None:
+        super().__init__(samples, block)
+        self.attached = attached
+
+
+def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
+    """Splat the contributions to the block with tracked derivatives, for naive AD. Memory is proportional to depth."""
+    with dr.resume_grad():
+        splat_visible_emission(samples, block, "evaluated")
+        for u, C, active in moving_splats(samples):  # twice, so that the image stays the same
+            samples.film.put(block, u, C, active, samples.plan.attached_normalization)
+            samples.film.put(block, dr.detach(u), -dr.detach(C), active)
+        for side in samples.sides():
+            if side.plan.camera:
+                splat_camera_paths(side, block, tracked=True)
+            else:
+                walk(side, TrackedSplat(side, block, side.plan.attached))
+
+
+class WalkAd(LightTracer):
     """Naive AD of the light paths that `reslrb` traces, for comparisons at equal seeds."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
@@ -159,15 +166,14 @@ class WalkAd(LightTracer, Reversed):
         "paths": "light",
         "light_share": 0.5,
     }
-    image_apart = False
 
     def __init__(
         self, attached: bool = False, filter_normalization: str = "attached", paths: str = "light",
         light_share: float = 0.5, **common: Any,
     ) -> None:  # fmt: skip
         """Make the integrator. If `attached`, rays and film positions also have derivatives."""
-        super().__init__(motion=Motion(attached, filter_normalization), **common)
-        self.have_paths(paths, light_share)
+        sampling = SamplingOptions(paths=paths, light_share=light_share)
+        super().__init__(motion=Motion(attached, filter_normalization), sampling=sampling, **common)
 
     def graph(self, job: Job) -> mi.TensorXf:
         """Return the image (H, W, C) with its whole graph. Call it with enabled gradients."""
@@ -193,7 +199,30 @@ class WalkAd(LightTracer, Reversed):
             return dr.forward_to(self.graph(job))
 
 
-class Trajectory(LightTracer, Reversed):
+class RecordedObjective(Hooks):
+    """Hooks that sum each path's share of the objective, S = sum_i delta_i C_i, with tracked derivatives.
+
+    A splat in a reversed loop would have no derivative, because side effects are not part of the loop's state.
+    """
+
+    tracked = True
+
+    def __init__(self, samples: Samples, adjoint: AdjointImage) -> None:
+        self.samples, self.adjoint = samples, adjoint
+        self.max_iterations = max(samples.plan.max_depth - 1, 1)
+
+    def start(self, product: Product) -> mi.Float:
+        return mi.Float(0)
+
+    def vertex(
+        self, state: mi.Float, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> mi.Float:  # fmt: skip
+        C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
+        delta = self.adjoint.lookup(connection.u, connection.active)
+        return state + dr.select(connection.active, dr.dot(delta, C), 0)
+
+
+class Trajectory(LightTracer):
     """The light paths of `reslrb`, traced in a loop that Dr.Jit reverses. Dr.Jit records the loop state in thread-local
     memory.
     """
@@ -214,7 +243,9 @@ class Trajectory(LightTracer, Reversed):
             adjoint = parts[0].film.adjoint(gradient)
 
             def differentiate(part: Samples, block: mi.ImageBlock | None) -> None:
-                with dr.isolate_grad():  # as in `replay_all`; without it, the derivatives of textures are lost
-                    reverse_recorded(part, adjoint)
+                with dr.isolate_grad():  # as in `replay_stored`; without it, the derivatives of textures are lost
+                    differentiate_visible_emission(part, adjoint)
+                    with dr.resume_grad():
+                        dr.backward_from(walk(part, RecordedObjective(part, adjoint)), flags=_MAY_LACK)
 
             in_passes(parts, differentiate, None, job.params)

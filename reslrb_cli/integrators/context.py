@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from reslrb_cli.estimators.base import one_of
 from reslrb_cli.guiding.collect import bsdf_groups
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.differentiated import Differentiated, Motion, attach, bounces, with_shading_normals
@@ -138,45 +139,65 @@ class AboutScene:
     met: int = 0
 
 
+@dataclass(frozen=True)
+class SamplingOptions:
+    """Options of a light tracer for its choice of paths. Raises ValueError, which names the option, for a wrong value.
+
+    - `guided` tells whether emission is guided (`tables.py`). `images` tells whether samples that serve only an image
+        are guided, too. Camera paths alone are never guided.
+    - `low_discrepancy` tells whether the first numbers of a path are low-discrepancy numbers (`sobol.py`).
+    - `paths` are light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
+        only one kind of paths remains.
+    - If `whole` is true, images of light paths alone have the same film border as images with camera paths.
+    - `shares_out` tells whether camera paths are distributed over the pixels by need. The distribution by sensor,
+        (H, W), may be `given` for all scenes with the same sensors. Otherwise it is stored for each scene and its
+        parameters.
+    - `expected` is the sample count of the passes that tables learn from. If it is None, each pass uses its own count.
+    """
+
+    guided: bool = False
+    images: bool = True
+    low_discrepancy: bool = False
+    paths: str = "light"
+    light_share: float = 0.5
+    whole: bool = False
+    shares_out: bool = False
+    given: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+    expected: int | None = None
+
+    def __post_init__(self) -> None:
+        one_of("paths", self.paths, ("light", "camera", "both"))
+        if not 0 <= self.light_share <= 1:
+            raise ValueError(f'"light_share" must lie in [0, 1], not {self.light_share}')
+        paths = self.paths
+        if paths == "both" and self.light_share in (0, 1):
+            paths = "light" if self.light_share else "camera"
+        guided = self.guided and paths != "camera"  # no camera path starts from a table
+        settled = {"paths": paths, "whole": self.whole or paths != "light", "guided": guided}
+        for name, value in {**settled, "images": self.images or not guided}.items():
+            object.__setattr__(self, name, value)
+
+
 class Preparation:
     """Options of a light tracer, and facts about the last scene."""
 
     def __init__(
-        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False,
-        low_discrepancy: bool = False,
+        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, sampling: SamplingOptions
     ) -> None:  # fmt: skip
-        #: Whether camera paths are distributed over the pixels by need. The distribution by sensor, (H, W), may be
-        #: `given` for all scenes with the same sensors; otherwise it is kept for each scene and its parameters.
-        self.shares_out = False
-        self.given: dict[int, NDArray[np.float32]] = {}
-        self.guiding = Guiding() if guided else None
-        #: Samples per pixel of the passes that tables learn from, if set; otherwise those of the passes.
-        self.expected: int | None = None
-        self._low_discrepancy = low_discrepancy
+        self.sampling = sampling
+        self.guiding = Guiding(sampling.images) if sampling.guided else None
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
         self._found = AboutScene([])
-        self.paths, self.whole = "light", False
 
     @property
     def recordings(self) -> Recordings:
         """Recordings of launches on the scene."""
         return self._found.recordings
 
-    def afresh(self, guided: bool | None, images: bool | None, low_discrepancy: bool | None) -> Preparation:
-        """Return a new object with the same options, except for the given ones. None keeps an option.
-
-        `images` tells whether samples that serve only an image are guided, too.
-        """
-        own = self.guiding
-        guided = own is not None if guided is None else guided
-        low_discrepancy = self._low_discrepancy if low_discrepancy is None else low_discrepancy
-        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy)
-        made.shares_out, made.given = self.shares_out, self.given
-        if made.guiding is not None:
-            made.guiding.images = (own is None or own.images) if images is None else images
-        made.expected, made.paths, made.whole = self.expected, self.paths, self.whole
-        return made
+    def afresh(self, **changes: Any) -> Preparation:
+        """Return a new object with the same options, except for changes of its `sampling`."""
+        return Preparation(*self._depths, self._hide_emitters, self._motion, replace(self.sampling, **changes))
 
     def draw_from(self, guiding: Guiding, scene: mi.Scene) -> None:
         """Sample guided paths of this scene from shared tables."""
@@ -198,7 +219,9 @@ class Preparation:
             self._meet(spp, params is not None and not image)
         about = None if params is None else self._look_through(params)
         moves = about is not None and bool(about.which.shapes or about.which.emitters or self._motion.attached is True)
-        paths, whole = ("light", self.whole and self.paths == "light") if moves else (self.paths, self.whole)
+        paths, whole = self.sampling.paths, self.sampling.whole
+        if moves:
+            paths, whole = "light", whole and paths == "light"
         if (sensor, paths) not in self._found.plans:
             self._found.plans[sensor, paths] = self._first_plan(scene, sensor, paths, whole)
         assert self._found.renewal is not None
@@ -236,7 +259,7 @@ class Preparation:
         made = self._found.shares
 
         def shares(paths: int) -> PixelShares | None:
-            key = number, paths, id(known)  # held by `given` or `AboutParameters`
+            key = number, paths, id(known)  # held by `SamplingOptions.given` or `AboutParameters`
             if key not in made:
                 rows, columns = (np.arange(n) * m // n for n, m in zip(size[::-1], known.shape, strict=True))
                 made[key] = PixelShares.of(known[np.ix_(rows, columns)].ravel(), paths)
@@ -270,10 +293,10 @@ class Preparation:
         renewal = self._found.renewal = self._found.renewal or Renewal(scene)
         settle(scene)
         plan = make_plan(needs, *self._depths, self._hide_emitters)
-        plan = replace(plan, paths=paths, whole=whole, shares_out=self.shares_out and paths != "light")
+        plan = replace(plan, paths=paths, whole=whole, shares_out=self.sampling.shares_out and paths != "light")
         if plan.weighs:
             plan = renewal.renew(plan, scene)  # the horizon
-        if plan.paths == "camera" or (self.guiding is None and not self._low_discrepancy):
+        if plan.paths == "camera" or (self.guiding is None and not self.sampling.low_discrepancy):
             return plan
         [samples] = passes(renewal.renew(plan, scene), scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
         return self._with_numbers(plan, samples)
@@ -301,14 +324,14 @@ class Preparation:
         """Return the plan after setting its kind of random numbers."""
         grid, aims = None, False
         if self.guiding is not None:
-            spp, sensors = self.expected or self._found.met, samples.scene.sensors()
+            spp, sensors = self.sampling.expected or self._found.met, samples.scene.sensors()
             pixels = max((int(dr.prod(one.film().size())) for one in sensors), default=samples.width)
             grid = self.guiding.grid_of(samples, spp * pixels or None)
             if worthwhile(plan.needs, plan.max_depth):
                 number = sensor_number(samples.scene, samples.sensor)
                 aims = self.guiding.aims(number, film_blocks(samples.sensor))
         plan = replace(plan, aims=aims)
-        if not self._low_discrepancy:
+        if not self.sampling.low_discrepancy:
             return replace(plan, grid=grid)
         sequence = make_coordinates(used_numbers(samples), len(plan.needs.emitters), plan.max_depth)
         return replace(plan, grid=grid, sequence=sequence)
@@ -319,7 +342,7 @@ class Preparation:
         The first pass, and gradients with more samples, refine the cells. Images with more paths do not refine the
         cells, because tables do not learn from images.
         """
-        if self.expected is None and (self._found.met == 0 or (differentiated and spp > self._found.met)):
+        if self.sampling.expected is None and (self._found.met == 0 or (differentiated and spp > self._found.met)):
             self._found.met = spp
             self._found.plans.clear()  # they contain the grid
 

@@ -1,9 +1,7 @@
-"""Forward mode and naive AD: hooks of walks that store no data of a path.
+"""Forward mode: hooks of walks that add the derivative of the image along the parameters' tangents.
 
-- `TrackedSplat` computes the image with tracked derivatives, and `RecordedObjective` computes the objective. Naive AD
-    and Dr.Jit's reversal use these classes.
-- `TangentSplat` computes the forward-mode derivative of the image from light paths. `CameraTangents` computes the
-    derivative from camera paths.
+`TangentSplat` computes the derivative from light paths, and `CameraTangents` from camera paths. They store no data of a
+path.
 """
 
 from __future__ import annotations
@@ -14,59 +12,18 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.attached import Before, segment_again
-from reslrb_cli.estimators.camera import splat_camera_paths
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.samples import Numbers, Samples
 from reslrb_cli.transport.visible import (
-    differentiate_visible_emission,
-    moving_splats,
     primary_ray,
     small_splat,
-    splat_visible_emission,
     visible_tangent,
 )
-from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
-
-
-class TrackedSplat(Splat):
-    """Hooks that splat every connection with tracked derivatives of its factors. If `attached`, rays and film positions
-    have derivatives, too.
-    """
-
-    tracked = True
-
-    def __init__(self, samples: Samples, block: mi.ImageBlock, attached: bool) -> None:
-        super().__init__(samples, block)
-        self.attached = attached
-
-
-class RecordedObjective(Hooks):
-    """Hooks that sum each path's share of the objective, S = sum_i delta_i C_i, with tracked derivatives.
-
-    `trajectory` uses them. A splat in a reversed loop would have no derivative, because side effects are not part of
-    the loop's state.
-    """
-
-    tracked = True
-
-    def __init__(self, samples: Samples, adjoint: AdjointImage) -> None:
-        self.samples, self.adjoint = samples, adjoint
-        self.max_iterations = max(samples.plan.max_depth - 1, 1)
-
-    def start(self, product: Product) -> mi.Float:
-        return mi.Float(0)
-
-    def vertex(
-        self, state: mi.Float, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
-    ) -> mi.Float:  # fmt: skip
-        C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
-        delta = self.adjoint.lookup(connection.u, connection.active)
-        return state + dr.select(connection.active, dr.dot(delta, C), 0)
+from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 
 @dataclass
@@ -225,14 +182,6 @@ def tangent_of_scattering(scattering: Scattering, df: mi.Spectrum) -> mi.Spectru
     return dr.select(scattering.active, df * (scattering.correction / scattering.pdf), 0)
 
 
-def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
-    """Add the derivatives by Dr.Jit's reversal of the walk. Dr.Jit records the loop state during the walk."""
-    differentiate_visible_emission(samples, adjoint)
-    with dr.resume_grad():
-        S = walk(samples, RecordedObjective(samples, adjoint))
-        dr.backward_from(S, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-
-
 def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
     """Add the forward-mode derivative of the samples' contributions to the block. The derivative is exact and needs one
     traversal.
@@ -256,17 +205,3 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             side.film.put(block, first.u, state.d_radiance * first.weight, first.active)
         else:
             walk(side, TangentSplat(side, block, dE))
-
-
-def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
-    """Splat the contributions to the block with tracked derivatives, for naive AD. Memory is proportional to depth."""
-    with dr.resume_grad():
-        splat_visible_emission(samples, block, "evaluated")
-        for u, C, active in moving_splats(samples):  # twice, so that the image stays the same
-            samples.film.put(block, u, C, active, samples.plan.attached_normalization)
-            samples.film.put(block, dr.detach(u), -dr.detach(C), active)
-        for side in samples.sides():
-            if side.plan.camera:
-                splat_camera_paths(side, block, tracked=True)
-            else:
-                walk(side, TrackedSplat(side, block, side.plan.attached))

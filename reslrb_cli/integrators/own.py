@@ -15,18 +15,15 @@ import mitsuba as mi
 from reslrb_cli.config.base import code_file
 from reslrb_cli.config.code import Guard, load_named
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators.baselines import Replayed, Reversed
-from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.integrators.baselines import Replayed
+from reslrb_cli.integrators.protocol import Job, StepIntegrator
 
 
-class OwnIntegrator(Reversed):
+class OwnIntegrator(StepIntegrator):
     """User's integrator in a step. An exception or a wrong image is reported in one line that names the class.
 
     The file runs when an image or a gradient is first needed, or in `ready`.
     """
-
-    #: The gradient takes a separate pass; if only `render` is differentiable, Mitsuba does naive AD.
-    image_apart = True
 
     def __init__(
         self, file: str, max_depth: int, rr_depth: int, hide_emitters: bool, arguments: dict[str, Any] | None = None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -31,29 +31,30 @@ class Job:
     plans: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
 
-class StepIntegrator(Protocol):
-    """Interface for images and gradients. Images and dL/dI are tensors (H, W, C). Gradients are added to the job's
+class StepIntegrator:
+    """Integrator of images and gradients. Images and dL/dI are tensors (H, W, C). Gradients are added to the job's
     parameters.
-    """
 
-    #: Whether `correlated` evaluates the image and dL/dI before the rest of its work; naive AD does not.
-    image_apart: bool
+    `correlated` and `known` suit integrators whose gradient is a separate pass, `backward`.
+    """
 
     def image(self, job: Job) -> mi.TensorXf:
         """Return the image, without derivatives."""
-        ...
+        raise NotImplementedError
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         """Add the gradient of the objective. `gradient` is dL/dI."""
-        ...
+        raise NotImplementedError
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
-        ...
+        image = self.image(job)
+        self.backward(job, derivative(image))
+        return image
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
         """Return the image. Adds the gradient of the same samples for a dL/dI that is known before the image."""
-        ...
+        return self.correlated(job, lambda image: gradient)
 
 
 def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
@@ -68,28 +69,3 @@ def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
     index = lane // count * channels + lane % count
     flat = dr.gather(type(image.array), image.array, index, True, dr.ReduceMode.Permute)
     return type(image)(flat, (*pixels, count))
-
-
-def halves_of(image: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
-    """Return the images (H, W, C) of the two halves of a set of samples (2, H, W, C). For a single image, returns it
-    twice.
-    """
-    if len(image.shape) == 3:
-        return image, image
-    shape = image.shape[1:]
-    lane = dr.arange(mi.UInt32, math.prod(shape))
-    first, second = (
-        dr.gather(type(image.array), image.array, lane + half * math.prod(shape), True, dr.ReduceMode.Permute)
-        for half in (0, 1)
-    )
-    return type(image)(first, shape), type(image)(second, shape)
-
-
-def whole_of(image: mi.TensorXf) -> mi.TensorXf:
-    """Return the image (H, W, C) of a set of samples. If the set has two halves (2, H, W, C), the returned image is the
-    mean of the halves.
-    """
-    if len(image.shape) == 3:
-        return image
-    first, second = halves_of(image)
-    return 0.5 * (first + second)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -21,19 +21,16 @@ from typing_extensions import Self
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import Estimator, Pass, one_of
-from reslrb_cli.estimators.camera import (
-    differentiate_camera_paths,
-    splat_camera_paths,
-)
+from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.estimators.stack import stack_bytes
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.context import Preparation, sensor_number
+from reslrb_cli.integrators.context import Preparation, SamplingOptions, sensor_number
 from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.forward import splat_tangents
-from reslrb_cli.integrators.protocol import Derivative, Job
+from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.film import AdjointImage, PixelShares
 from reslrb_cli.transport.plan import Plan
@@ -41,10 +38,8 @@ from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
 from reslrb_cli.transport.visible import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.walk import Splat, walk
 
-PATHS = ("light", "camera", "both")
 
-
-class LightTracer:
+class LightTracer(StepIntegrator):
     """Light tracer with derivatives in forward mode only. OPTIONS are the names and defaults of `ptracer`'s options."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
@@ -53,20 +48,15 @@ class LightTracer:
         "hide_emitters": False,
         "samples_per_pass": None,
     }
-    image_apart = True
-    #: Kinds of paths, and the share of light paths in the samples if there are both.
-    paths: str = "light"
-    light_share: float = 0.5
 
     def __init__(
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
-        freeze: bool = False, motion: Motion | None = None, guided: bool = False, low_discrepancy: bool = False,
+        freeze: bool = False, motion: Motion | None = None, sampling: SamplingOptions | None = None,
     ) -> None:  # fmt: skip
         """Make the tracer. Raises ValueError, which names the option, for an invalid value.
 
         `freeze` tells whether launches are recorded (`freezing.py`), and `motion` has the options of attached
-        derivatives. `guided` tells whether emission is guided (`tables.py`). `low_discrepancy` tells whether the first
-        numbers of a path are low-discrepancy numbers (`sobol.py`).
+        derivatives.
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -76,7 +66,8 @@ class LightTracer:
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
+        motion, sampling = motion or Motion(), sampling or SamplingOptions()
+        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion, sampling)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
         """Return a copy of the tracer with other values of `samples_per_pass` and `freeze`. Both tracers share the
@@ -86,21 +77,26 @@ class LightTracer:
         other.samples_per_pass, other.freeze = samples_per_pass, freeze
         return other
 
-    def afresh(
-        self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
-        light_share: float | None = None,
-    ) -> Self:  # fmt: skip
-        """Return a copy of the tracer with no facts about any scene, and with other sampling options. None keeps a
-        value.
+    @property
+    def paths(self) -> str:
+        """Kinds of paths: light, camera or both."""
+        return self.preparation.sampling.paths
 
-        `guided` turns guiding on or off, and `images` the guiding of images. `low_discrepancy` selects low-discrepancy
-        or independent numbers. If `light_share` is given, the copy traces light paths and camera paths, with this share
-        of light paths. Images then have the same film border for any share.
+    @property
+    def light_share(self) -> float:
+        """Share of light paths in the samples if there are both kinds."""
+        return self.preparation.sampling.light_share
+
+    def afresh(self, light_share: float | None = None, **changes: Any) -> Self:
+        """Return a copy of the tracer with no facts about any scene, and with changed `SamplingOptions`.
+
+        If `light_share` is given, the copy traces light paths and camera paths, with this share of light paths. Images
+        then have the same film border for any share.
         """
         other = copy.copy(self)
-        other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
         if light_share is not None:
-            other.have_paths("both", light_share, whole=True)
+            changes = {"paths": "both", "whole": True} | changes | {"light_share": light_share}
+        other.preparation = self.preparation.afresh(**changes)
         return other
 
     def shared_out(self, noted: Mapping[str, NDArray[np.float32]]) -> Self:
@@ -109,10 +105,7 @@ class LightTracer:
 
         The keys of the densities (`note_pixels`) are sensor numbers.
         """
-        other = self.afresh()
-        other.preparation.shares_out = True
-        other.preparation.given = {int(number): density for number, density in noted.items()}
-        return other
+        return self.afresh(shares_out=True, given={int(number): density for number, density in noted.items()})
 
     def to_measure(self) -> Self:
         """Return this tracer. If the tracer is guided, return a copy with separate tables instead.
@@ -127,23 +120,7 @@ class LightTracer:
 
         A run calls this method so that its tables have the same cells after a start and after a resume.
         """
-        self.preparation.expected = spp
-
-    def have_paths(self, paths: str, light_share: float, whole: bool = False) -> None:
-        """Use light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
-        only one kind of paths remains.
-
-        If `whole` is true, images of light paths alone have the same film border as images with camera paths.
-        """
-        one_of("paths", paths, PATHS)
-        if not 0 <= light_share <= 1:
-            raise ValueError(f'"light_share" must lie in [0, 1], not {light_share}')
-        if paths == "both" and light_share in (0, 1):
-            paths = "light" if light_share else "camera"
-        self.paths, self.light_share = paths, light_share
-        self.preparation.paths, self.preparation.whole = paths, whole or paths != "light"
-        if paths == "camera":  # no path starts from a table
-            self.preparation.guiding = None
+        self.preparation.sampling = replace(self.preparation.sampling, expected=spp)
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """Return the plan for tracing this scene, with derivatives of `params` if given. Raises UnsupportedScene."""
@@ -183,10 +160,10 @@ class LightTracer:
         The tracer measures an unknown distribution once, for the differentiated parameters.
         """
         preparation = self.preparation
-        if plan.paths == "light" or not preparation.shares_out:
+        if plan.paths == "light" or not preparation.sampling.shares_out:
             return None
         number, size = sensor_number(job.scene, job.sensor), job.sensor.film().crop_size()
-        known = preparation.given
+        known = preparation.sampling.given
         if job.params is not None and number not in known:
             known = preparation.noted(job.params)
             if number not in known:
@@ -287,13 +264,12 @@ class Reslrb(LightTracer):
         self.estimator = estimator
 
     @classmethod
-    def of(
-        cls, estimator: str | None = None, attached: bool | str = "auto", filter_normalization: str = "attached",
-        attached_sampling: str = "auto", guiding: str = "off", sequence: str = "independent", paths: str = "light",
-        light_share: float = 0.5, pixels: str = "even", **options: Any,
-    ) -> Reslrb:  # fmt: skip
-        """Make the tracer from the estimator's name and all options. Raises ValueError if one is wrong."""
-        estimator = estimator or ("stack" if paths == "camera" else cls.OPTIONS["estimator"])
+    def of(cls, **given: Any) -> Reslrb:
+        """Make the tracer from its options (OPTIONS, and those of the estimator). Raises ValueError if one is wrong."""
+        options = {**cls.OPTIONS, **given}
+        if options["paths"] == "camera" and not given.get("estimator"):
+            options["estimator"] = "stack"
+        estimator = options.pop("estimator") or cls.OPTIONS["estimator"]
         if estimator == "auto":
             raise ValueError(
                 '"estimator" auto needs an experiment to measure on (`reslrb optimize`); for the plugin, name one of '
@@ -301,29 +277,39 @@ class Reslrb(LightTracer):
             )
         if estimator not in ESTIMATORS:
             raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
-        own = {name: options.pop(name) for name in options_of(estimator) if name in options}
-        if paths == "camera" and estimator != "stack":
+        if options["paths"] == "camera" and estimator != "stack":
             raise ValueError(
                 f'"estimator" {estimator} needs the connections of light paths, and paths: camera has none; remove it, '
                 "or use stack"
             )
-        obstacle = None if estimator in ATTACHED else _no_attached(estimator)
-        motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
-        for name, value, values in (
-            ("guiding", guiding, ("on", "off")),
-            ("sequence", sequence, ("independent", "low_discrepancy")),
-            ("pixels", pixels, ("even", "measured")),
+        obstacle = None
+        if estimator not in ATTACHED:
+            obstacle = (
+                f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
+                f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
+            )
+        motion = Motion(
+            options.pop("attached"), options.pop("filter_normalization"), obstacle, options.pop("attached_sampling")
+        )
+        for name, values in (
+            ("guiding", ("on", "off")),
+            ("sequence", ("independent", "low_discrepancy")),
+            ("pixels", ("even", "measured")),
         ):
-            if value == "auto":
+            if options[name] == "auto":
                 raise ValueError(
                     f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); use {" or ".join(values)}'
                 )
-            one_of(name, value, values)
-        options |= {"guided": guiding == "on", "low_discrepancy": sequence == "low_discrepancy"}
-        made = cls(make_estimator(estimator, own), motion=motion, **options)
-        made.have_paths(paths, light_share)
-        made.preparation.shares_out = pixels == "measured"
-        return made
+            one_of(name, options[name], values)
+        sampling = SamplingOptions(
+            guided=options.pop("guiding") == "on",
+            low_discrepancy=options.pop("sequence") == "low_discrepancy",
+            paths=options.pop("paths"),
+            light_share=options.pop("light_share"),
+            shares_out=options.pop("pixels") == "measured",
+        )
+        own = {name: options.pop(name) for name in options_of(estimator) if name in options}
+        return cls(make_estimator(estimator, own), motion=motion, sampling=sampling, **options)
 
     def share_of_light(self, plan: Plan) -> float:
         """Return the share of the samples that are light paths."""
@@ -342,17 +328,17 @@ class Reslrb(LightTracer):
         """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH)
-            traced = Trace(parts, *self.launch("trace", parts, partial(trace_image, self.estimator)))
-        gradient = derivative(traced.image)
-        self._replay(traced, gradient, job.params)
+            image, state = self.launch("trace", parts, partial(trace_image, self.estimator))
+        gradient = derivative(image)
+        self._replay(parts, gradient, job.params, state)
         self.learn(job, gradient)
-        return traced.image
+        return image
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         """Add the gradient of the objective. `gradient` (H, W, C) is dL/dI."""
         with dr.suspend_grad():
-            trace = Trace(self.passes(job, delta=gradient))
-        self._replay(trace, gradient, job.params)
+            parts = self.passes(job, delta=gradient)
+        self._replay(parts, gradient, job.params)
         self.learn(job, gradient)
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
@@ -362,21 +348,20 @@ class Reslrb(LightTracer):
         """
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH, gradient)
-            image = self.launch("fused", parts, partial(fused, self.estimator), gradient, params=job.params)
+            image = self.launch("fused", parts, partial(fused, self.estimator, True), gradient, params=job.params)
         self.learn(job, gradient)
         return image
 
-    def _replay(self, trace: Trace, gradient: mi.TensorXf, params: mi.SceneParameters | None) -> None:
-        kind, state = ("trace and replay", []) if trace.state is None else ("replay", [trace.state])
+    def _replay(
+        self, parts: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None, state: Any = None
+    ) -> None:
+        """Add the gradient. If `state` is None, the paths are traced again, otherwise `state` has their stored data."""
         with dr.suspend_grad():
-            self.launch(kind, trace.samples, partial(replay_all, self.estimator), gradient, *state, params=params)
-
-
-def _no_attached(estimator: str) -> str:
-    return (
-        f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
-        f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
-    )
+            if state is None:
+                work = partial(fused, self.estimator, False)
+                self.launch("trace and replay", parts, work, gradient, params=params)
+            else:
+                self.launch("replay", parts, partial(replay_stored, self.estimator), gradient, state)
 
 
 def image_of(samples: list[Samples]) -> mi.TensorXf:
@@ -417,15 +402,6 @@ def forward(
     return state
 
 
-@dataclass
-class Trace:
-    """Traced samples: their image, and the stored data of their paths if they fit in one pass."""
-
-    samples: list[Samples]
-    image: mi.TensorXf | None = None
-    state: Any = None
-
-
 def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.TensorXf, Any]:
     """Return the image of all passes, and the estimator's stored data of each path.
 
@@ -461,44 +437,27 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
             differentiate_camera_paths(p, estimator.stack_size)
 
 
-def replay_all(
-    estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any = None,
-    params: mi.SceneParameters | None = None,
-) -> None:  # fmt: skip
-    """Add the gradient of the objective to `params`. `gradient` (H, W, C) is dL/dI. With one pass, `params` may be
-    None.
-
-    `state` is the data that one pass has stored for each path. If `state` is None, the paths are traced again.
-    """
-    adjoint = samples[0].film.adjoint(gradient)
-    if state is None:
-        differentiate_passes(samples, estimator, None, adjoint, params)
-        return
+def replay_stored(estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any) -> None:
+    """Add the gradient. `gradient` (H, W, C) is dL/dI, and `state` is the stored data of the paths of the only pass."""
+    [part] = samples
+    adjoint = part.film.adjoint(gradient)
     # Isolated: on their way to the parameters, gradients are evaluated with everything they depend on, which must be
     # one kernel. They start together at the end.
     with dr.isolate_grad():
-        replay(samples[0], estimator, state, adjoint)
+        replay(part, estimator, state, adjoint)
 
 
 def fused(
-    estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None = None
-) -> mi.TensorXf:
-    """Return the image, and add the gradient. dL/dI is known before the image."""
-    film = samples[0].film
-    block = film.block()
-    differentiate_passes(samples, estimator, block, film.adjoint(gradient), params)
-    return film.develop(block)
+    estimator: Estimator, with_image: bool, samples: list[Samples], gradient: mi.TensorXf,
+    params: mi.SceneParameters | None = None,
+) -> mi.TensorXf | None:  # fmt: skip
+    """Trace samples with a known dL/dI, `gradient` (H, W, C), and add the gradient. Return the image if requested.
 
-
-def differentiate_passes(
-    samples: list[Samples], estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage,
-    params: mi.SceneParameters | None,
-) -> None:  # fmt: skip
-    """Trace samples with known dL/dI. Adds the samples' derivatives. If there is a block, also adds the samples'
-    contributions to the block.
-
-    The data of a path stay within the kernel, and take no memory.
+    The data of a path stay within the kernel, and take no memory. With one pass, `params` may be None.
     """
+    film = samples[0].film
+    block = film.block() if with_image else None
+    adjoint = film.adjoint(gradient)
 
     def differentiate(part: Samples, own: mi.ImageBlock | None) -> None:
         with dr.isolate_grad():  # as above
@@ -509,3 +468,4 @@ def differentiate_passes(
                 finish_pass(image)
 
     in_passes(samples, differentiate, block, params)
+    return None if block is None else film.develop(block)

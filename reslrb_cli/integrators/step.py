@@ -7,9 +7,6 @@
 - `batched`: the samples are divided into batches. Each batch takes dL/dI from the image of the earlier batches
     (`_batched`).
 
-With `halves`, each set of samples has two halves, and images are (2, H, W, C). A loss that multiplies an image by
-itself uses both halves, because the halves have independent noise (`Halves`).
-
 Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would turn the gradients of
 all parameters on that pixel's paths into NaN. Some estimators would lose the NaN. The kernel that computes dL/dI also
 counts the non-finite entries. Only code that reads the count waits for the kernel.
@@ -32,7 +29,7 @@ from reslrb_cli.integrators.baselines import NaiveAD, Projective, Replayed
 from reslrb_cli.integrators.context import resolve_sensor
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.plugin import TRACERS, make_tracer
-from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator, halves_of, whole_of
+from reslrb_cli.integrators.protocol import Job, StepIntegrator
 
 Adjoint = Literal["correlated", "independent", "batched"]
 Objective: TypeAlias = "Callable[[mi.TensorXf], mi.Float | mi.TensorXf]"
@@ -40,7 +37,6 @@ Objective: TypeAlias = "Callable[[mi.TensorXf], mi.Float | mi.TensorXf]"
 #: Called with an image and the dL/dI with which its samples were differentiated.
 OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"
 BATCH_STREAM = 0xBA7C4E5  # separates the batches' seeds from those of passes and of the second samples
-HALF_STREAM = 0x4A1F5  # separates the seeds of halves from all of these
 NONE = 0xFFFFFFFF
 
 
@@ -49,7 +45,7 @@ class Refused:
     """Entries of dL/dI that were not finite.
 
     `count` is the number of entries that are not finite. `first` is the flat index of the first non-finite entry.
-    `count` and `first` are arrays of width 1. `shape` is the shape of dL/dI: (H, W, C), or (2, H, W, C) with halves.
+    `count` and `first` are arrays of width 1. `shape` is the shape (H, W, C) of dL/dI.
     """
 
     count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32, 1))
@@ -75,8 +71,8 @@ class Refused:
         index = int(self.first[0])
         if index == NONE:
             return None
-        height, width, channels = self.shape[-3:]
-        return index // channels % width, index // channels // width % height, index % channels
+        _, width, channels = self.shape
+        return index // channels % width, index // channels // width, index % channels
 
 
 @dataclass
@@ -84,13 +80,12 @@ class StepResult:
     """Result of a step, without gradients: the image (H, W, C) and the loss (width 1), both detached.
 
     Entries of dL/dI that are not finite count as 0. `refused` holds the number of non-finite entries, and the index of
-    the first one. `seen` is the image that the objective received, (2, H, W, C) with halves.
+    the first one.
     """
 
     image: mi.TensorXf
     loss: mi.Float | mi.TensorXf
     refused: Refused = field(default_factory=Refused)
-    seen: mi.TensorXf | None = None
 
 
 def make_integrator(type: str, **options: Any) -> StepIntegrator:
@@ -128,89 +123,11 @@ def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
     return Projective(integrator) if hasattr(integrator, "proj_detail") else Replayed(integrator)
 
 
-class Halves:
-    """Step interface for two independent halves of a job's samples. Images are (2, H, W, C), and their mean is the
-    image.
-
-    dL/dI has the same shape, with the derivatives with respect to the image of each half. Raises ValueError for an odd
-    number of samples per pixel.
-    """
-
-    def __init__(self, work: StepIntegrator) -> None:
-        self.work, self.image_apart = work, work.image_apart
-
-    def image(self, job: Job) -> mi.TensorXf:
-        """Return the images, without derivatives."""
-        return _both(*(self.work.image(half) for half in half_jobs(job)))
-
-    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Add the gradient of the objective. `gradient` is dL/dI."""
-        for half, own in zip(half_jobs(job), _apart(gradient), strict=True):
-            self.work.backward(half, own)
-
-    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """Return the images. Adds the gradient from the same samples as the images, with dL/dI =
-        `derivative(images)`.
-        """
-        first, second = half_jobs(job)
-        images: list[mi.TensorXf] = []
-
-        def of_first(image: mi.TensorXf) -> mi.TensorXf:
-            gradients: list[mi.TensorXf] = []
-
-            def of_second(other: mi.TensorXf) -> mi.TensorXf:
-                images.append(_both(image, other))
-                gradients.extend(_apart(derivative(images[0])))
-                return gradients[1]
-
-            self.work.correlated(second, of_second)
-            return gradients[0]
-
-        self.work.correlated(first, of_first)  # trace the first half, then the second, then differentiate both
-        return images[0]
-
-    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """Return the images. Adds the gradient from the same samples as the images. dL/dI is known before the
-        images.
-        """
-        parts = zip(half_jobs(job), _apart(gradient), strict=True)
-        return _both(*(self.work.known(half, own) for half, own in parts))
-
-
-def half_jobs(job: Job) -> tuple[Job, Job]:
-    """Return the two halves of a job. Raises ValueError for an odd number of samples per pixel."""
-    if job.spp < 2 or job.spp % 2:
-        raise ValueError(f"the samples per pixel of a set ({job.spp}) must be even, because they are halved")
-    first, second = (replace(job, seed=seed, spp=job.spp // 2) for seed in half_seeds(job.seed))
-    return first, second
-
-
-def half_seeds(seed: mi.UInt32 | int) -> list[mi.UInt32]:
-    """Return the seeds of the two halves of a set of samples."""
-    seeds = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(HALF_STREAM + half))[0] for half in (0, 1)]
-    dr.make_opaque(seeds)
-    return seeds
-
-
-def _both(first: mi.TensorXf, second: mi.TensorXf) -> mi.TensorXf:
-    """Return two images (H, W, C) as one tensor (2, H, W, C), detached."""
-    flat = dr.concat((dr.detach(first.array), dr.detach(second.array)))
-    return type(first)(flat, (2, *first.shape))
-
-
-def _apart(gradient: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
-    parts = halves_of(gradient)
-    dr.eval(parts)
-    return parts
-
-
-def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int,
-                 halves: bool = False) -> mi.TensorXf:  # fmt: skip
-    """Return the image (H, W, C) without derivatives. With `halves`, returns the images (2, H, W, C) of two halves of
-    the samples.
-    """
-    work = Halves(integrator) if halves else integrator
-    return work.image(Job(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp))
+def render_image(
+    integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int
+) -> mi.TensorXf:
+    """Return the image (H, W, C) without derivatives."""
+    return integrator.image(Job(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp))
 
 
 def gradient_step(
@@ -223,10 +140,8 @@ def gradient_step(
     spp: int,
     adjoint: Adjoint = "correlated",
     params: mi.SceneParameters | None = None,
-    on_image: Callable[[], None] | None = None,
     batches: int = 4,
     on_samples: OnSamples | None = None,
-    halves: bool = False,
 ) -> StepResult:
     """Render, evaluate `objective(image)`, and add its gradient to the scene's parameters that track derivatives.
 
@@ -236,11 +151,8 @@ def gradient_step(
     - `spp` is a sample count. 0 means the sensor's sample count.
     - `batches` is the number of batches for `adjoint="batched"`. The returned loss then belongs to the image of all
         samples.
-    - `on_image` is called after the image and the loss are evaluated, if the step evaluates them before the gradient.
     - `on_samples` is called for each differentiated set of samples, with the set's image and dL/dI. The callback can
         then differentiate a factor of the image with the same samples.
-    - With `halves`, `objective` and `on_samples` receive the images (2, H, W, C) of two halves of the samples.
-        `protocol.whole_of` returns their mean. Every set must then have an even number of samples.
 
     Raises ValueError for invalid arguments, and BackendError under an unsupported variant of Mitsuba.
     """
@@ -251,8 +163,6 @@ def gradient_step(
     if isinstance(seed, Integral):
         _check_number("seed", seed, 0, 2**32 - 1)
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
-    if halves:
-        work = Halves(work)
     if adjoint == "batched":
         return _batched(work, job, objective, batches, on_samples)
     losses: list[mi.Float | mi.TensorXf] = []
@@ -260,8 +170,7 @@ def gradient_step(
     refused = Refused()
 
     def derivative(image: mi.TensorXf) -> mi.TensorXf:
-        together = adjoint == "correlated" and not work.image_apart
-        loss, gradient = derivative_of(objective, image, refused, None if together else on_image)
+        loss, gradient = derivative_of(objective, image, refused)
         losses.append(loss)
         gradients.append(gradient)
         return gradient
@@ -273,7 +182,7 @@ def gradient_step(
     else:
         image = work.image(job)
         _differentiate(work, replace(job, seed=second_seed(job.seed)), derivative(image), on_samples)
-    return StepResult(whole_of(image), losses[0], refused, image)
+    return StepResult(image, losses[0], refused)
 
 
 def known_step(
@@ -295,15 +204,12 @@ def known_step(
 def given_step(
     integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, gradient: mi.TensorXf, *,
     seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
-    halves: bool = False,
 ) -> None:  # fmt: skip
-    """Add the gradient estimated from the samples with the seed `seed`. `gradient` is dL/dI, (H, W, C) or, with halves,
-    (2, H, W, C).
+    """Add the gradient estimated from the samples with the seed `seed`. `gradient` (H, W, C) is dL/dI.
 
     `gradient` must be finite and come from other samples. The other arguments are those of `gradient_step`.
     """
-    work = interface_of(integrator)
-    _differentiate(Halves(work) if halves else work, _job(scene, sensor, seed, spp, params), gradient, on_samples)
+    _differentiate(interface_of(integrator), _job(scene, sensor, seed, spp, params), gradient, on_samples)
 
 
 def _check_number(name: str, value: object, least: int, most: int) -> None:
@@ -351,11 +257,11 @@ def _batched(
             on_samples(own, gradient * share)
         image = image + (own - image) / (b + 1)
         dr.eval(image)
-    return StepResult(whole_of(image), dr.detach(objective(image)), refused, image)
+    return StepResult(image, dr.detach(objective(image)), refused)
 
 
 def derivative_of(
-    objective: Objective, image: mi.TensorXf, refused: Refused, on_image: Callable[[], None] | None = None
+    objective: Objective, image: mi.TensorXf, refused: Refused
 ) -> tuple[mi.Float | mi.TensorXf, mi.TensorXf]:
     """Return loss and dL/dI, evaluated together. Entries of dL/dI that are not finite are set to 0 and counted."""
     with dr.resume_grad(), dr.isolate_grad():
@@ -366,8 +272,6 @@ def derivative_of(
         gradient = dr.grad(leaf)
     loss, gradient = dr.detach(loss), refused.take(dr.detach(gradient))
     dr.eval(loss, gradient, refused)
-    if on_image is not None:
-        on_image()
     return loss, gradient
 
 
@@ -376,12 +280,6 @@ def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, mi.UInt32
     number of samples per pixel.
     """
     spp, adjoint = options["spp"], options["adjoint"]
-    if options.get("halves"):
-        return [
-            (f"{name}, half {half + 1}", own, each // 2)
-            for name, whole, each in sample_sets(seed, options | {"halves": False})
-            for half, own in enumerate(half_seeds(whole))
-        ]
     if adjoint == "batched":
         seeds = batch_seeds(seed, options["batches"])
         return [(f"batch {b + 1}", batch, spp // len(seeds)) for b, batch in enumerate(seeds)]

@@ -12,7 +12,6 @@ import numpy as np
 
 from reslrb_cli.config.loader import told
 from reslrb_cli.config.schema import Config
-from reslrb_cli.integrators.protocol import whole_of
 from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.processes import Begun
 from reslrb_cli.measure.scenes import small
@@ -133,7 +132,7 @@ class Stepper(Steps):
         shapes = [self.problem.selection.array(key).shape for key in self.problem.selection.keys]
         self.texels = sum(shape[0] * shape[1] for shape in shapes if len(shape) == 3)
         image = _noise(*self.size, int(film.base_channels_count()))
-        self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(whole_of(seen) - image).array)
+        self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(seen - image).array)
 
     def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
         """Take one step and measure it. For a `cold` step, memory is measured as well. Every step that is not `cold`

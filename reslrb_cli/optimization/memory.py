@@ -21,7 +21,7 @@ from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.integrators import divisors, passes_obstacle
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.estimators.base import entry_bytes
+from reslrb_cli.estimators.stack import entry_bytes
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.problem import Problem

@@ -148,7 +148,7 @@ def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> 
             # One view's kernels must not wait for the next one's.
             dr.eval(step.loss, problem.gradients())
             refused = int(step.refused.count[0]), int(step.refused.first[0]), tuple(step.refused.shape)
-            found.append((float(step.loss[0]), refused, np.array(step.seen) if task.images else None))
+            found.append((float(step.loss[0]), refused, np.array(step.image) if task.images else None))
         gradients = {key: to_array(value) for key, value in problem.gradients().items()}
         _clear(problem)
     losses, refused_parts, images = zip(*found, strict=True) if found else ((), (), ())

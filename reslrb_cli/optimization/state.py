@@ -124,7 +124,7 @@ def noted_of(problem: Problem) -> dict[str, Array]:
 
     The recorded densities are the argument of `LightTracer.shared_out`.
     """
-    given = problem.integrator.preparation.given if isinstance(problem.integrator, Reslrb) else {}
+    given = problem.integrator.preparation.sampling.given if isinstance(problem.integrator, Reslrb) else {}
     return {str(number): density for number, density in given.items()}
 
 

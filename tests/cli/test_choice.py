@@ -17,7 +17,7 @@ from turns import a_few, taking_turns
 
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
-from reslrb_cli.estimators.base import entry_bytes
+from reslrb_cli.estimators.stack import entry_bytes
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.optimization import loop, sensitivity
 from reslrb_cli.optimization.assemble import assemble, assemble_scene

@@ -15,7 +15,6 @@ from conformance.gradient_cases import CASES
 
 from reslrb_cli.guiding.tables import Guiding, Learned, Purpose
 from reslrb_cli.integrators import context
-from reslrb_cli.integrators import reslrb as lt
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator, seeds
@@ -142,10 +141,10 @@ def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) ->
     """Let the replay use the table that `other` makes from its own table."""
     right = Reslrb._replay
 
-    def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
-        [samples] = trace.samples
+    def wrong(self: Reslrb, parts: Any, gradient: Any, params: Any, state: Any = None) -> None:
+        [samples] = parts
         again = replace(samples, guide=replace(samples.guide, table=other(samples.guide.table)))
-        right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
+        right(self, [again], gradient, params, state)
 
     patch.setattr(Reslrb, "_replay", wrong)
 

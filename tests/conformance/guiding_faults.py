@@ -13,7 +13,6 @@ import pytest
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.tables import Purpose
 from reslrb_cli.integrators import reslrb
-from reslrb_cli.integrators import reslrb as lt
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.transport import guide
 
@@ -106,14 +105,14 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     """
     right = Reslrb._replay
 
-    def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
+    def wrong(self: Reslrb, parts: Any, gradient: Any, params: Any, state: Any = None) -> None:
         tables = self.preparation.guiding
         assert tables is not None
-        [samples] = trace.samples
+        [samples] = parts
         with dr.suspend_grad():
             tables.learn(0, samples.width, hear(samples, gradient))
         again = replace(samples, guide=replace(samples.guide, table=tables.table(0, Purpose.BOTH)))
-        right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
+        right(self, [again], gradient, params, state)
 
     patch.setattr(Reslrb, "_replay", wrong)
 

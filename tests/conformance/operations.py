@@ -43,7 +43,7 @@ def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) ->
         dr.make_opaque(gradient)
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.suspend_grad():
-        lt.fused(integrator.estimator, [samples], gradient)
+        lt.fused(integrator.estimator, True, [samples], gradient)
         dr.eval()
         dr.sync_thread()
         history = dr.kernel_history((dr.KernelType.JIT,))

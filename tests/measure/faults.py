@@ -231,7 +231,7 @@ FAULTS = [
           by("stack", "walk_ad", "finite_difference")),
     Fault("opacity_not_differentiated", "opacity", "estimators.base:differentiate_passage",
           "differentiate if p.plan.differentiate_null else None", "None", by("stack", "walk_ad", "finite_difference")),
-    Fault("instance_forgotten", "instance", "estimators.kept:SurfacePoint.of",
+    Fault("instance_forgotten", "instance", "estimators.base:SurfacePoint.of",
           "_index(pi.instance)", "mi.UInt32(0)", by("stack", "walk_ad")),
     Fault("mask_in_view_not_differentiated", "glow", "transport.visible:differentiate_visible_radiance",
           "adjoint * behind", "mi.Spectrum(0)", by("event stack", "walk_ad", "forward_mode")),

@@ -149,9 +149,9 @@ def test_only_light_paths_that_find_everything_are_guided(monkeypatch: pytest.Mo
     assert min(paths.seconds, guiding.seconds) > 0
     assert problem.measured_s == paths.seconds + guiding.seconds
     assert problem.integrator.paths == "light"
-    assert problem.integrator.preparation.whole
+    assert problem.integrator.preparation.sampling.whole
     assert problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).whole
-    assert as_decided(problem.integrator, problem.decisions).preparation.whole
+    assert as_decided(problem.integrator, problem.decisions).preparation.sampling.whole
 
 
 def test_light_paths_find_all_except_mirrors_and_light_hidden_by_lamps():
@@ -304,8 +304,8 @@ def test_auto_distributes_paths_only_for_l2(monkeypatch: pytest.MonkeyPatch):
         found = decision(problem, "pixels")
         assert (found is None) == (pixels == "measured")
         assert found is None or found.value == ("measured" if shared else "even")
-        assert problem.integrator.preparation.shares_out is shared
-        densities += [problem.integrator.preparation.given[0]] if shared else []
+        assert problem.integrator.preparation.sampling.shares_out is shared
+        densities += [problem.integrator.preparation.sampling.given[0]] if shared else []
         assert not shared or bool(densities[-1][:4].any()) == (mask not in settings)
     assert not np.allclose(densities[1], densities[2], rtol=0.1)
 

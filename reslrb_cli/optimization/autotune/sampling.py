@@ -249,7 +249,7 @@ def _measure_pixels(tuner: Tuner) -> None:
     distributes them.
     """
     problem, tracer = tuner.problem, tuner.problem.integrator
-    if not isinstance(tracer, Tracer) or not tracer.preparation.shares_out or tracer.paths == "light":
+    if not isinstance(tracer, Tracer) or not tracer.preparation.sampling.shares_out or tracer.paths == "light":
         return
     problem.apply()
     scene, params = problem.scene, problem.selection.params
@@ -259,13 +259,6 @@ def _measure_pixels(tuner: Tuner) -> None:
     noted = {str(sensor): tracer.note_pixels(job, curvatures[sensor]) for sensor, job in jobs.items()}
     tuner.problem = replace(problem, integrator=tracer.shared_out(noted))
     tuner.set_aside(sum(map(PixelShares.bytes, pixels_of(scene, list(jobs)))))
-
-
-def _with_pixels(tracer: Any, value: str) -> Any:
-    """Return `tracer` with or without a distribution over the pixels."""
-    other = tracer.afresh()
-    other.preparation.shares_out = value == "measured"
-    return other
 
 
 # --- guiding ----------------------------------------------------------------------------------------------------------
@@ -283,15 +276,15 @@ def _guiding(tuner: Tuner) -> None:
         if needed > free:
             tuner.take(replace(off, why=f"run.memory_budget has no room for tables of {in_words(needed)}"))
             return
-    even = False if is_auto(config, "sequence") else None
-    if even is not None and is_attached(problem):
+    independent = {"low_discrepancy": False} if is_auto(config, "sequence") else {}
+    if independent and is_attached(problem):
         tuner.take(replace(off, why="for moving light, low-discrepancy numbers help most"))
         return
     plan = sizes(problem, GUIDING_LONGER)
 
     def measure(limit_s: float) -> Decision:
         plain, share = problem.integrator.afresh(), 1.0 if alone else None
-        guided = problem.integrator.afresh(guided=True, light_share=share, low_discrepancy=even)
+        guided = problem.integrator.afresh(guided=True, light_share=share, **independent)
         found = StepTrial(problem, "guiding", plain, guided).race(plan, limit_s, guides=True)
         if alone and found.other and not found.images and plan.alone:
             found = replace(found, other=False, note="images would have less")
@@ -303,7 +296,7 @@ def _guiding(tuner: Tuner) -> None:
     if decision.value == "off":
         tuner.take(decision)
         return
-    others = [] if even is None else [_independent()]
+    others = [_independent()] if independent else []
     if alone:
         why = f"guided, they have {decision.gain:.2g} times the efficiency"
         others += [replace(each, value="light", why=why, gain=None, low=None, high=None)
@@ -358,7 +351,10 @@ OPTIONS = {
         ("light", "both"), SEQUENCE,
     ),
     "paths": Option(_paths, lambda tracer, value: tracer.afresh(light_share=SHARES[value]), ("both",), PATHS_FROM),
-    "pixels": Option(_pixels, _with_pixels, ("camera", "both"), PIXELS, _measure_pixels),
+    "pixels": Option(
+        _pixels, lambda tracer, value: tracer.afresh(shares_out=value == "measured"),
+        ("camera", "both"), PIXELS, _measure_pixels,
+    ),
     "guiding": Option(
         _guiding,
         lambda tracer, value: tracer.afresh(guided=value != "off", images=value == "on"),
