@@ -353,8 +353,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
     from reslrb_cli.integrators.plan_report import plan_rows
     from reslrb_cli.integrators.reslrb import Reslrb
     from reslrb_cli.optimization.autotune.sampling import as_decided, decided, explained, open_settings
-    from reslrb_cli.optimization.loading import choose_sensors, make_configured, pass_spp, paths_of
-    from reslrb_cli.optimization.moving import moves_anything
+    from reslrb_cli.optimization.loading import choose_sensors, make_configured, moves_anything, pass_spp, paths_of
     from reslrb_cli.records.decisions import Decision
 
     config = subject.config

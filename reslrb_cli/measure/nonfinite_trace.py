@@ -22,7 +22,6 @@ from reslrb_cli.guiding.tables import Guiding, Purpose
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import gradient_step, sample_sets
 from reslrb_cli.optimization.loading import LIGHT_TRACERS, pass_spp
-from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.shards import make_tasks
 from reslrb_cli.optimization.state import guiding_of
@@ -455,7 +454,7 @@ def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offende
     step = _take_step(problem, view, step_seed)
     if problem.config.integrator.type not in LIGHT_TRACERS:
         return _of_step(step, view, None)  # their paths are not ours
-    if not is_attached(problem):
+    if not problem.moves:
         _set_tangents(problem)
     pixel = None if step.refused is None else step.refused[:2]
     parts = _parts(problem, view, step_seed, witness)
@@ -487,7 +486,7 @@ def _parts(
     if isinstance(own, Reslrb):
         tracer.have_paths(own.paths, own.light_share, own.preparation.whole)
     # For moving light, only contributions are checked: `gather` has no derivatives of them.
-    params = None if is_attached(problem) else problem.selection.params
+    params = None if problem.moves else problem.selection.params
     options = problem.config.step_options(shard=True)
     if problem.config.in_rounds:
         options["adjoint"] = "correlated"  # both rounds have the same samples

@@ -91,7 +91,7 @@ def test_values_and_paths(tmp_path: Path) -> None:
     }  # fmt: skip
     assert config.views is not None
     assert [view.target for view in config.views] == [tmp_path / "t0.exr", Path("/abs/t1.png")]
-    masks = [view.mask and (view.mask.file, view.mask.clipped) for view in config.views]
+    masks = [view.mask and (view.mask.file, "clipped" in view.mask.kinds) for view in config.views]
     assert masks == [None, (tmp_path / "weights.png", False)]
     first, second, third, fourth = config.parameters
     assert first.initial == 1.0

@@ -42,7 +42,6 @@ from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sets_of, sizes
 from reslrb_cli.optimization.losses import QUADRATIC
 from reslrb_cli.optimization.memory import pixels_of
-from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.decisions import Decision, DecisionCache, key_of
@@ -284,7 +283,7 @@ def _guiding(tuner: Tuner) -> None:
             tuner.take(replace(off, why=f"run.memory_budget has no room for tables of {in_words(needed)}"))
             return
     even = False if is_auto(config, "sequence") else None
-    if even is not None and is_attached(problem):
+    if even is not None and problem.moves:
         tuner.take(replace(off, why="for moving light, low-discrepancy numbers help most"))
         return
     plan = sizes(problem, GUIDING_LONGER)
