@@ -203,7 +203,10 @@ def begin_as(problem: Problem, stored: Stored) -> None:
 def decide_as(problem: Problem, stored: Stored) -> Problem:
     """Return `problem` with the run's decisions about the samples per pass and the sampling methods."""
     settled = stored.read(Settled)
-    decisions = decided(problem.config, settled.decisions)
+    try:
+        decisions = decided(problem.config, settled.decisions)
+    except TypeError as error:
+        raise stored.wrong("decisions", str(error)) from None
     if problem.memory is not None and settled.memory is not None:
         before = settled.memory  # the passes determine the order of the sums
         plan = MemoryPlan(problem.memory.budget_bytes, before.samples_per_pass, before.passes, before.expected_bytes)

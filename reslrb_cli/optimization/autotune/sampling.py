@@ -336,13 +336,14 @@ class Option:
     """Automatic setting of the integrator.
 
     - `decide` takes the decision.
-    - `apply` returns an integrator with a decided value.
+    - `values` are the possible decisions. `apply` returns an integrator with one of them.
     - `paths` are the kinds of paths that leave the setting open: those that can render the scene (`Problem.paths`).
     - `feature` is the row of the plan that shows the reason.
     - `prepare` measures what the value needs, decided or configured.
     """
 
     decide: Callable[[Tuner], None]
+    values: tuple[str, ...]
     apply: Callable[[Any, str], Any]
     paths: tuple[str, ...]
     feature: str
@@ -352,14 +353,16 @@ class Option:
 #: The options by setting, in the order of the decisions.
 OPTIONS = {
     "sequence": Option(
-        _sequence,
+        _sequence, ("low_discrepancy", "independent"),
         lambda tracer, value: tracer.afresh(low_discrepancy=value == "low_discrepancy"),
         ("light", "both"), SEQUENCE,
     ),
-    "paths": Option(_paths, lambda tracer, value: tracer.afresh(light_share=SHARES[value]), ("both",), PATHS_FROM),
-    "pixels": Option(_pixels, _with_pixels, ("camera", "both"), PIXELS, _measure_pixels),
+    "paths": Option(
+        _paths, tuple(SHARES), lambda tracer, value: tracer.afresh(light_share=SHARES[value]), ("both",), PATHS_FROM
+    ),
+    "pixels": Option(_pixels, ("even", "measured"), _with_pixels, ("camera", "both"), PIXELS, _measure_pixels),
     "guiding": Option(
-        _guiding,
+        _guiding, ("off", "on", "on for gradients"),
         lambda tracer, value: tracer.afresh(guided=value != "off", images=value == "on"),
         ("light", "both"), GUIDED,
     ),
@@ -390,8 +393,12 @@ def open_settings(config: Config, paths: str) -> list[str]:
 
 
 def decided(config: Config, decisions: Iterable[Decision]) -> list[Decision]:
-    """Return the decisions on settings that `config` leaves to `auto`."""
-    return [each for each in decisions if each.setting in OPTIONS and is_auto(config, each.setting)]
+    """Return the decisions on settings that `config` leaves to `auto`. Raises TypeError for an unknown value."""
+    found = [each for each in decisions if each.setting in OPTIONS and is_auto(config, each.setting)]
+    for each in found:
+        if each.value not in (values := OPTIONS[each.setting].values):
+            raise TypeError(f"{each.setting} is `{each.value}`; possible are {', '.join(values)}")
+    return found
 
 
 def as_decided(integrator: Any, decisions: Iterable[Decision]) -> Any:
