@@ -71,6 +71,7 @@ REMOVED = {
     "regularizers.type: laplacian": "take total_variation, or set `precondition`",
     "run.adjoint: others": "take auto, which does the same",
     "run.first_batch": "the first batch always gives an image alone; remove it",
+    "run.memory_budget": "set integrator.samples_per_pass; `reslrb optimize --dry-run` prints the memory of a step",
     "run.reach_spp": "it is always 64; remove it",
     "run.stages": "start from the values of a coarser run, by initial: {run: RUN}",
 }

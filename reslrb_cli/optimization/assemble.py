@@ -30,7 +30,7 @@ from reslrb_cli.optimization.loading import (
     paths_of,
     samples_per_pass,
 )
-from reslrb_cli.optimization.memory import check_announced, check_described, check_films, fit_memory, plans
+from reslrb_cli.optimization.memory import check_announced, check_described, check_films, check_step, plans
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
@@ -65,7 +65,7 @@ def assemble(
         problem.integrator.ready()
     if settled is not None:
         begin_as(problem, settled)
-    problem = fit_memory(problem)
+    check_step(problem)
     problem = make_targets(problem, say)
     for view in problem.views if to_run else ():
         for own in view.codes:

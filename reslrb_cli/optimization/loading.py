@@ -219,9 +219,7 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
 
 
 def pass_spp(config: Config) -> int:
-    """Return the samples per pixel of each pass of a step's gradient. If `run.memory_budget` chooses the passes, the
-    result is the maximum.
-    """
+    """Return the samples per pixel of each pass of a step's gradient."""
     call = config.set_spp
     return min(samples_per_pass(config) or call, call)
 

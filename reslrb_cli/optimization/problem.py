@@ -21,7 +21,7 @@ from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
 from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
-from reslrb_cli.records.decisions import Decision, MemoryPlan
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 
@@ -69,7 +69,6 @@ class Problem:
     moves: bool = False
     #: Decisions on settings of the integrator that are `auto` (`autotune/sampling.py`).
     decisions: list[Decision] = field(default_factory=list)
-    memory: MemoryPlan | None = None
     #: Regularizers of the values, by key and type.
     regularizers: dict[str, dict[str, Cost | Plate]] = field(default_factory=dict)
     #: Computes the shards of a step (`shards.Engine`); None: this process, one by one.
