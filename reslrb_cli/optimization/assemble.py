@@ -171,8 +171,6 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         problem.integrator.expect(pass_spp(config))
     problem.apply()
     _check_moving(problem)
-    if values is None:
-        _check_plates(problem)
     return problem
 
 
@@ -205,20 +203,6 @@ def _check_moving(problem: Problem) -> None:
             reason = f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a "
             reason += "pixel; use a smooth filter, such as gaussian, for derivatives of moving light"
             raise ConfigError(config.source, "scene.file", reason)
-
-
-def _check_plates(problem: Problem) -> None:
-    """Raise ConfigError if two free faces start closer to each other than their minimum distance."""
-    for key, plate in problem.plates.items():
-        thin = float(plate.thickness(*(problem.selection.array(each).astype(np.float64) for each in (key, plate.other)))
-                     .min())  # fmt: skip
-        if thin < plate.settings.thinnest:
-            index = next(i for i, spec in enumerate(problem.config.parameters) if key in spec.names)
-            reason = (
-                f"`{key}` and `{plate.other}` start {thin:.3g} apart at their nearest point, but must stay "
-                f"{plate.settings.thinnest:.3g} apart, a tenth of `least`; lower `least`, or thicken the plate"
-            )
-            raise ConfigError(problem.config.source, f"parameters[{index}].regularizers", reason)
 
 
 def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:

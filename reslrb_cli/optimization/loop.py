@@ -105,7 +105,6 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         for key in found.gradients if config.run.on_nonfinite == "zero" else ():
             zero_nonfinite(optimizer[key])
         found.updates = optimizer.step(factor, skip=held)
-        problem.hold_apart()
         problem.apply()
     standstill = state.standstill + 1 if held or found.updates else 0
     state = replace(
