@@ -29,10 +29,10 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import explained
+from reslrb_cli.optimization.loop import Watch
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Best, Images, Least, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
-from reslrb_cli.optimization.stopping import Watch
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
