@@ -26,7 +26,6 @@ from reslrb_cli.integrators.step import Refused, gradient_step
 from reslrb_cli.optimization.losses import own_losses
 from reslrb_cli.optimization.nonfinite import (
     Findings,
-    RefusedAt,
     count_nonfinite,
     finite_square_norm,
     held_back,
@@ -245,7 +244,7 @@ def _findings(
     for sensor, view in refused:
         first = view.entry()
         if first is not None:
-            found.refused[sensor] = RefusedAt(int(view.count[0]), first)
+            found.refused[sensor] = int(view.count[0]), first
     return found
 
 
