@@ -91,10 +91,11 @@ def step_parts(
 def _stored_paths(problem: Problem, integrator: Reslrb) -> list[int]:
     """Return the bytes of each array that a step stores for its paths, for the view with the most bytes."""
     config, samples = problem.config, pass_spp(problem.config)
+    planned = plans(problem, integrator)  # always, because it raises UnsupportedScene before anything is rendered
     if config.adjoint != "correlated" or samples != config.share_spp:
         return []  # dL/dI is known before the paths are traced, and nothing of them outlives the kernel
     found: list[int] = []
-    for plan, count in zip(plans(problem, integrator), pixels_of(problem.scene, problem.sensors), strict=True):
+    for plan, count in zip(planned, pixels_of(problem.scene, problem.sensors), strict=True):
         width = round(samples * count * integrator.share_of_light(plan))
         found = max(found, [size * width for size in entry_bytes(integrator.kept(plan))], key=sum)
     return found
