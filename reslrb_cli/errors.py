@@ -169,7 +169,7 @@ def tell(error: BaseException) -> tuple[str, int] | None:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", ExitCode.INTERRUPTED
     if is_out_of_memory(error):
-        advice = "lower run.spp or the size of the film, or set run.memory_budget or integrator.samples_per_pass"
+        advice = "lower run.spp or the size of the film, or set integrator.samples_per_pass"
         return f"out of memory ({one_line(error, QUOTED_LENGTH) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
     if isinstance(error, OSError) and (error.filename is not None or is_machine_fault(error)):
         code = ExitCode.MACHINE if is_machine_fault(error) else ExitCode.USAGE

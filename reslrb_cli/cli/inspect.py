@@ -23,7 +23,7 @@ from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
 from reslrb_cli.errors import ConfigError, UnsupportedScene
-from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.manifest import MANIFEST_FILE, read_manifest
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.format import table
 
@@ -353,8 +353,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
     from reslrb_cli.integrators.plan_report import plan_rows
     from reslrb_cli.integrators.reslrb import Reslrb
     from reslrb_cli.optimization.autotune.sampling import as_decided, decided, explained, open_settings
-    from reslrb_cli.optimization.loading import choose_sensors, make_configured, pass_spp, paths_of
-    from reslrb_cli.optimization.moving import moves_anything
+    from reslrb_cli.optimization.loading import choose_sensors, make_configured, moves_anything, pass_spp, paths_of
     from reslrb_cli.records.decisions import Decision
 
     config = subject.config
@@ -364,8 +363,8 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
         return f"integrator.type is {config.integrator.type}; only `reslrb` has a plan"
     try:
         decisions = decided(config, map(Decision.from_json, (subject.run or {}).get("decisions", ())))
-    except TypeError:  # the manifest is damaged
-        decisions = []
+    except TypeError as error:
+        raise ConfigError(config.source.parent / MANIFEST_FILE, "decisions", str(error)) from None
     try:
         [sensor, *_] = sensors = choose_sensors(config, scene)
         paths = paths_of(config.integrator, scene, sensors, moves_anything(config, selection))

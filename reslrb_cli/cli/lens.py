@@ -62,7 +62,6 @@ class LensOptions:
     tilt: tuple[float, float]
     light_distance: float | None
     sun: float
-    both: bool
     floor: float | None
     pixels: int
 
@@ -74,11 +73,9 @@ class LensOptions:
             raise ConfigError("--sun", "", f"is {self.sun:g} degrees; it must be from 0 to below 10 (the sun: 0.53)")
         if self.sun and self.light_distance is not None:
             raise ConfigError("--sun", "", "needs parallel light, --light-distance a point light; remove one")
-        if self.both and self.mirror is not None:
-            raise ConfigError("--both", "", "needs a lens: a mirror has one face")
         if self.output.exists() and not self.output.is_dir():
             raise ConfigError("--output", "", f"{self.output} is a file; name a folder")
-        names = ("lens.yaml", "scene.xml", "face.ply", "back.ply", "target.exr", "picture.exr", "start.exr")
+        names = ("lens.yaml", "scene.xml", "face.ply", "target.exr", "picture.exr", "start.exr")
         taken = next((path for name in names if (path := self.output / name).exists()), None)
         if taken is not None:
             raise ConfigError("--output", "", f"{taken} exists; give another folder, or remove it")
@@ -115,7 +112,6 @@ class LensOptions:
     metavar="DEGREES",
     help="Angular diameter of parallel light; that of the sun is 0.53.",
 )
-@click.option("--both", is_flag=True, help="Make both faces of a lens free; the second one starts flat.")
 @click.option(
     "--floor",
     type=float,
@@ -139,9 +135,7 @@ def command(**given: Any) -> None:
 
     options = LensOptions(**given)
     options.check()
-    picture, output, pixels, size, sun, both = (
-        options.picture, options.output, options.pixels, options.size, options.sun, options.both
-    )  # fmt: skip
+    picture, output, pixels, size, sun = options.picture, options.output, options.pixels, options.size, options.sun
     set_variant("auto")
 
     from reslrb_cli.records.images import write_file
@@ -191,11 +185,9 @@ def command(**given: Any) -> None:
             write_file(output / name, np.repeat(seen.astype(np.float32)[:, :, None], 3, 2), linear=True)
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
-            "scene.xml": experiment.scene_xml(surface, film, columns, power, sun, both).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun, both).encode(),
+            "scene.xml": experiment.scene_xml(surface, film, columns, power, sun).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun).encode(),
         }
-        if both:
-            texts["back.ply"] = experiment.face_ply(setting, nx, ny, back=True)
         for name, content in texts.items():
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]
     echo(f"{output / 'lens.yaml'}: {nx}x{ny} heights, a picture of {columns}x{rows} pixels")

@@ -51,7 +51,6 @@ def show_forecast(config: Config) -> None:
         {"bytes": in_words, "time": duration},
         source=config.source,
         forecast=forecast,
-        budget=config.run.budget_bytes,
         resident=resident_bytes(),
         sums=sums,
     )

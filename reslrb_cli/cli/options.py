@@ -237,6 +237,7 @@ REMOVED = {
         ("init", "--recover", "all other parameters are comments of the file; remove the # of those that you want"),
         ("inspect", "--samples", "--conditioning takes 8 gradients"),
         ("doctor", "--json", "the lines of `reslrb doctor` have the same content"),
+        ("lens", "--both", "the back is flat: a second free face made pictures worse"),
         ("lens", "--margin", "the film sees an eighth of the picture's longer side around it"),
         ("lens", "--incidence", "--mirror DEGREES gives the angle"),
         ("lens", "--through", "exchange left and right of the picture, for a view from behind"),

@@ -26,7 +26,7 @@ from reslrb_cli.cluster.connection import Place, connected
 from reslrb_cli.cluster.worker import Workload, set_threads
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.memory import fit_memory
+from reslrb_cli.optimization.memory import check_step
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.shards import Task, make_tasks, shard_gradient, shard_image
 from reslrb_cli.optimization.state import Settled, begin_as, decide_as, guiding_of, restore_tables
@@ -84,7 +84,8 @@ def assembled(folder: Path, threads: int | None, allows_code: bool) -> tuple[Pro
         config, initial = read_bundle(folder)
         problem = assemble_scene(config.with_code(allows_code), values=initial)
         begin_as(problem, stored)
-        problem = decide_as(fit_memory(problem), stored)
+        check_step(problem)
+        problem = decide_as(problem, stored)
         set_targets(problem.views, dict(targets))
     set_threads(threads)
     return problem, _warmed(problem)

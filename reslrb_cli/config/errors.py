@@ -69,8 +69,10 @@ REMOVED = {
     "optimizer.type: rmsprop": "take adam with beta_1: 0",
     "regularizers.type: slope": "take total_variation, or curvature",
     "regularizers.type: laplacian": "take total_variation, or set `precondition`",
+    "regularizers.opposite": "only one face is free; the face on the other side is flat",
     "run.adjoint: others": "take auto, which does the same",
     "run.first_batch": "the first batch always gives an image alone; remove it",
+    "run.memory_budget": "set integrator.samples_per_pass; `reslrb optimize --dry-run` prints the memory of a step",
     "run.reach_spp": "it is always 64; remove it",
     "run.stages": "start from the values of a coarser run, by initial: {run: RUN}",
 }

@@ -268,20 +268,11 @@ class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness"
     plate keeps a tenth of `least`."""
     thickness: Positive = Field(description="Thickness of the plate where the heightmap is 0, in scene units.")
     least: Positive = Field(description="Smallest thickness without a cost, in scene units.")
-    opposite: Annotated[str, Field(min_length=1)] | None = None
-    """Id of the mesh on the other side, if it has a heightmap as well. Its heights (positive outwards) at the place of
-    each texel are added to the thickness, and both heightmaps are penalised and clamped. null: the other side is
-    flat."""
-
-    @property
-    def thinnest(self) -> float:
-        """The smallest thickness of the plate after clamping."""
-        return _HELD * self.least
 
     @property
     def lowest(self) -> float:
-        """The smallest height of the plate after clamping, if the back is flat."""
-        return self.thinnest - self.thickness
+        """The smallest height of the plate after clamping."""
+        return _HELD * self.least - self.thickness
 
 
 #: Fraction of `least` that a plate keeps at all times.
@@ -397,8 +388,8 @@ class ParameterSpec(Section):
 
     @property
     def _plates(self) -> list[Thickness]:
-        """The thickness regularizers of plates with a flat back. A plate's thickness bounds the heights."""
-        return [each for each in self.regularizers if isinstance(each, Thickness) and each.opposite is None]
+        """The thickness regularizers. A plate's thickness bounds the heights."""
+        return [each for each in self.regularizers if isinstance(each, Thickness)]
 
     def at(self, option: str, word: str) -> str:
         """Return the key that sets `option` for the part `word`, relative to this section."""

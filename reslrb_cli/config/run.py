@@ -8,10 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BeforeValidator,
     Field,
     SerializerFunctionWrapHandler,
-    WithJsonSchema,
     model_serializer,
     model_validator,
 )
@@ -44,44 +42,6 @@ def check_name(name: str) -> str:
     if len(folder.encode()) > NAME_BYTES:
         raise wrong(f"must have at most {NAME_BYTES} bytes in UTF-8, not {len(folder.encode())}")
     return name
-
-
-MIB = 2**20
-_UNITS = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": MIB, "gib": 2**30}
-_SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
-
-
-def memory_bytes(value: int | float | str) -> int:
-    """Return the bytes of a number of MiB, or of text such as "512 MiB", "2GiB" or "500 MB".
-
-    Raises ValueError for other values, and for amounts below one byte.
-    """
-    number, unit = float("nan"), "mib"
-    if isinstance(value, str):
-        match = _SIZE.fullmatch(value.strip())
-        if match:
-            number, unit = float(match[1]), match[2].lower()
-    elif not isinstance(value, bool):
-        number = float(value) if abs(value) < 2**63 else float("inf")  # larger integers overflow a float
-    if unit not in _UNITS or not 1 <= number * _UNITS[unit] < 2**63:
-        raise ValueError(f"{value!r} is not an amount of memory")
-    return int(number * _UNITS[unit])
-
-
-def _check_memory(value: Any) -> Any:
-    try:
-        memory_bytes(value)
-    except (TypeError, ValueError):
-        raise wrong("must be a number of MiB, or text such as 512 MiB or 2GiB, and more than 0") from None
-    return value
-
-
-#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB), stored as written.
-Memory = Annotated[
-    int | float | str,
-    BeforeValidator(_check_memory),
-    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"type": "string"}]}),
-]
 
 
 class CheckpointEvery(Section):
@@ -158,12 +118,6 @@ class RunConfig(Section):
     each shard. Gradients of shards are summed in order, in double precision. `auto`: 16, or the largest number below 16
     that the settings allow; whole views if only `scene.cameras` tells their number. 1: no shards. Not used for single
     steps (`bench`, `gradcheck`, `convergence`, `inspect`, the measurement of automatic settings, `certainty`)."""
-    memory_budget: Memory | None = None
-    """Memory limit of the iterations: a number of MiB, or text such as 512 MiB or 2GiB. The samples of a step are split
-    into passes that fit. The limit covers thread-local memory and all memory from the backend's allocator
-    (`peak_mib` in `metrics.jsonl`): the scene's textures and buffers, targets, images of a step, parameters and the
-    state of the optimiser, and stored paths. It does not cover Python, libraries, kernel code, the acceleration
-    structure, and the rendering of targets and saved images. null: the free memory. Only with integrator `reslrb`."""
     on_nonfinite: Literal["stop", "skip", "zero"] = "skip"
     """Action if a loss, its derivative, or a gradient is not finite. `stop`: end the run (exit code 5). `skip`: leave
     the parameter, or all parameters, unchanged in this iteration. `zero`: replace such entries of a gradient or of the
@@ -211,11 +165,6 @@ class RunConfig(Section):
         if self.adjoint not in ("auto", "batched"):
             del values["batches"]
         return values
-
-    @property
-    def budget_bytes(self) -> int | None:
-        """`memory_budget` in bytes."""
-        return None if self.memory_budget is None else memory_bytes(self.memory_budget)
 
     @property
     def folder_name(self) -> str:

@@ -30,7 +30,7 @@ from reslrb_cli.config.base import (
     must,
     wrong,
 )
-from reslrb_cli.config.integrators import AnyIntegrator, Integrator, Own, largest_pass, passes_obstacle
+from reslrb_cli.config.integrators import AnyIntegrator, Integrator, Own, passes_obstacle
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.optimizers import (
     L2,
@@ -243,8 +243,6 @@ class Config(Section):
         """Return why the samples of a step cannot be traced with films of `pixels` pixels, and what to change."""
         run, own = self.run, self.integrator.options().get("samples_per_pass")
         spp = self.set_spp
-        if run.memory_budget is not None:
-            own = largest_pass(spp, pixels)  # a run chooses the passes
         obstacle = passes_obstacle(spp, own, pixels, splits=self.integrator.type in ("reslrb", "walk_ad", "trajectory"))
         return None if obstacle is None else f"{run.spp} {obstacle}"
 
@@ -310,11 +308,6 @@ class Config(Section):
                 "`adjoint` needs dL/dI before the paths are traced; run.adjoint: correlated has it later; "
                 "set run.adjoint to auto, or the weight to luminance",
             )
-        if self.run.memory_budget is not None:
-            if not isinstance(self.integrator, ReslrbConfig):
-                raise located("run.memory_budget", f"needs integrator `reslrb`, not `{self.integrator.type}`")
-            if self.integrator.samples_per_pass is not None:
-                raise located("integrator.samples_per_pass", "is chosen by run.memory_budget; remove one of the two")
         if self.target.render is not None:
             own = self.target.render.integrator
             key = "integrator" if own is None else "target.render.integrator"

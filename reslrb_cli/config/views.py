@@ -46,26 +46,6 @@ class Mask(Section):
     files with the largest possible value in any channel, and the pixels that the film's reconstruction filter mixes
     with them. `alpha`: pixels with an alpha of 0."""
 
-    @property
-    def specular(self) -> bool:
-        """Whether pixels are left out that see smooth glass or mirrors."""
-        return "specular" in self.kinds
-
-    @property
-    def border(self) -> bool:
-        """Whether pixels are left out at the border of the film."""
-        return "border" in self.kinds
-
-    @property
-    def clipped(self) -> bool:
-        """Whether pixels are left out that are clipped, or mixed with clipped ones."""
-        return "clipped" in self.kinds
-
-    @property
-    def alpha(self) -> bool:
-        """Whether pixels are left out with an alpha of 0."""
-        return "alpha" in self.kinds
-
 
 def _mask(value: Any) -> Any:
     if value == "auto":

@@ -186,12 +186,10 @@ def _half_cone(surface: Surface) -> float:
     return float(np.mean(angles) if is_round else np.max(angles))
 
 
-def scene_xml(
-    surface: Surface, film: tuple[int, int], pixels: int, power: float, sun: float = 0.0, both: bool = False
-) -> str:
+def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, power: float, sun: float = 0.0) -> str:
     """Return the XML of a face's scene. `pixels` is the picture's width in pixels on `film`, which also has a margin.
 
-    `power` and `sun` are as for `lamps`. With `both`, the back is a mesh as well, `back.ply`.
+    `power` and `sun` are as for `lamps`.
     """
     setting, rays = surface.setting, Rays(surface.setting)
     is_lens = setting.kind == "lens"
@@ -212,12 +210,6 @@ def scene_xml(
                    np.array([0.0, 1, 0]), '<ref id="glass"/>')
         if is_lens else ""
     )  # fmt: skip
-    if both:
-        back = """    <shape type="ply" id="back">
-        <string name="filename" value="back.ply"/>
-        <boolean name="face_normals" value="true"/>
-        <ref id="glass"/>
-    </shape>"""
     beside, across = reach - mesh[0], reach - mesh[1]
     edges = [(beside, 2 * reach, sign * (reach + mesh[0]) / 2, 0.0) for sign in (1, -1)]
     edges += [(2 * mesh[0], across, 0.0, sign * (reach + mesh[1]) / 2) for sign in (1, -1)]
@@ -278,23 +270,12 @@ def scene_xml(
 """
 
 
-def lens_yaml(
-    surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float = 0.0, both: bool = False
-) -> str:
-    """Return the configuration. The run starts at `heights` (ny, nx), which are stored in `start.exr`. A free back
-    starts flat.
-    """
+def lens_yaml(surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float = 0.0) -> str:
+    """Return the configuration. The run starts at `heights` (ny, nx), which are stored in `start.exr`."""
     s, (ny, nx) = surface.setting, heights.shape
     least = min(_LEAST * max(s.size), float(heights.min()) + s.thickness)
     plate = f"type: thickness, thickness: {s.thickness:.9g}, least: {least:.4g}, weight: {1e6 / max(s.size) ** 4:.4g}"
-    more = (
-        f"""  - heightmap: {{mesh: back, resolution: [{nx}, {ny}]}}  # mm along -z
-    precondition: 0.03
-"""
-        if both
-        else ""
-    )
-    also = ("\n   faces: [face, back]," if both else "") + (f" sun: {sun:g}," if sun else "")
+    also = f" sun: {sun:g}," if sun else ""
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
 # Start with
 #     reslrb optimize lens.yaml
@@ -307,8 +288,8 @@ parameters:
   - heightmap: {{mesh: face, resolution: [{nx}, {ny}]}}  # mm along +z
     initial: {{file: start.exr}}  # by transport of light: docs/lens.md
     precondition: 0.03  # smooth steps: without them the finest ripples decide how long one may be
-    regularizers: [{{{plate}{", opposite: back" if both else ""}}}]  # mm; faces never cross
-{more}integrator:
+    regularizers: [{{{plate}}}]  # mm; faces never cross
+integrator:
   type: reslrb
   max_depth: {4 if surface.setting.kind == "lens" else 3}
 loss: {{type: l2}}

@@ -30,7 +30,6 @@ from reslrb_cli.integrators.step import (
     sample_sets,
 )
 from reslrb_cli.optimization.loading import LIGHT_TRACERS
-from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.shards import make_tasks
 from reslrb_cli.optimization.state import guiding_of
@@ -416,7 +415,7 @@ def _of_view(problem: Problem, view: View, step_seed: int, word: str) -> Offende
     step = _take_step(problem, view, step_seed, noted)
     if problem.config.integrator.type not in LIGHT_TRACERS:
         return _of_step(step, view, None)  # their paths are not ours
-    if not is_attached(problem):
+    if not problem.moves:
         _set_tangents(problem)
     pixel = None if step.refused is None else step.refused[:2]
     parts = _parts(problem, view, step_seed, noted)
@@ -461,7 +460,7 @@ def _sets_of_others(problem: Problem, view: View, sets: list[tuple[str, mi.UInt3
     shared = {name: given[name] for name in ("max_depth", "rr_depth", "hide_emitters") if name in given}
     tracer = Reslrb.of(estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
     # For moving light, only contributions are checked: `gather` has no derivatives of them.
-    params = None if is_attached(problem) else problem.selection.params
+    params = None if problem.moves else problem.selection.params
     scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
     return [(int(own[0]), tracer.passes(Job(scene, sensor, own, spp, params))) for _, own, spp in sets]
 

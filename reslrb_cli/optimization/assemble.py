@@ -13,7 +13,8 @@ import numpy as np
 
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, UnsupportedScene
+from reslrb_cli.integrators.baselines import Projective
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization.autotune.sampling import settle
@@ -24,18 +25,19 @@ from reslrb_cli.optimization.loading import (
     choose_sensors,
     load_configured,
     make_configured,
+    moves_anything,
     pass_spp,
     paths_of,
     samples_per_pass,
 )
-from reslrb_cli.optimization.memory import check_announced, check_described, check_films, fit_memory
-from reslrb_cli.optimization.moving import check_moving, moves_anything
+from reslrb_cli.optimization.memory import check_announced, check_described, check_films, check_step, plans
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import expose, make_views
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.tree import Stored
+from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.parameters import Selection, select_parameters
 
 Array = np.ndarray[Any, Any]
@@ -63,7 +65,7 @@ def assemble(
         problem.integrator.ready()
     if settled is not None:
         begin_as(problem, settled)
-    problem = fit_memory(problem)
+    check_step(problem)
     problem = make_targets(problem, say)
     for view in problem.views if to_run else ():
         for own in view.codes:
@@ -168,24 +170,39 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     if isinstance(problem.integrator, LightTracer):
         problem.integrator.expect(pass_spp(config))
     problem.apply()
-    check_moving(problem)
-    if values is None:
-        _check_plates(problem)
+    _check_moving(problem)
     return problem
 
 
-def _check_plates(problem: Problem) -> None:
-    """Raise ConfigError if two free faces start closer to each other than their minimum distance."""
-    for key, plate in problem.plates.items():
-        thin = float(plate.thickness(*(problem.selection.array(each).astype(np.float64) for each in (key, plate.other)))
-                     .min())  # fmt: skip
-        if thin < plate.settings.thinnest:
-            index = next(i for i, spec in enumerate(problem.config.parameters) if key in spec.names)
-            reason = (
-                f"`{key}` and `{plate.other}` start {thin:.3g} apart at their nearest point, but must stay "
-                f"{plate.settings.thinnest:.3g} apart, a tenth of `least`; lower `least`, or thicken the plate"
-            )
-            raise ConfigError(problem.config.source, f"parameters[{index}].regularizers", reason)
+def _check_moving(problem: Problem) -> None:
+    """Raise ConfigError at the faulty setting if the integrator cannot differentiate a moving parameter."""
+    if not problem.moves:
+        return
+    config, moved = problem.config, where_moved(problem.selection.params, problem.selection.scene_keys)
+    kind, tracer = config.integrator.type, problem.integrator
+    if moved and kind in ("prb", "trajectory"):
+        reason = f"{kind} has no derivatives of moving light, which `{moved[0].key}` needs; use reslrb, ptracer or "
+        reason += "prb_projective"
+        raise ConfigError(config.source, "integrator.type", reason)
+    if isinstance(tracer, Projective):
+        sensors = [problem.scene.sensors()[index] for index in problem.sensors]
+        wrong = tracer.obstacle(problem.scene, sensors, [item.node for item in moved])
+        if wrong is not None:
+            raise ConfigError(config.source, "integrator.type", wrong)
+        return
+    if isinstance(tracer, LightTracer):
+        try:
+            plans(problem, tracer)
+        except UnsupportedScene as error:
+            key = f"integrator.{error.option}" if error.option else "scene.file"
+            raise ConfigError(config.source, key, str(error)) from error
+        return
+    for index in problem.sensors:  # splats of Mitsuba's own light tracer have no derivative through a box filter
+        sensor = problem.scene.sensors()[index]
+        if sensor.film().rfilter().is_box_filter():
+            reason = f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a "
+            reason += "pixel; use a smooth filter, such as gaussian, for derivatives of moving light"
+            raise ConfigError(config.source, "scene.file", reason)
 
 
 def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:

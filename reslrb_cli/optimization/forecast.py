@@ -1,18 +1,12 @@
-"""Forecast of the memory and time of a run. A few of the run's steps, and a target with few samples, give the forecast.
-
-If a step takes long, steps with two smaller sample counts per pixel are measured instead. Time and memory are a
-constant plus a part proportional to the samples. Two sample counts determine both parts. Memory is allocated in powers
-of two, so the linear model is not exact. If full steps do not take long, the memory is measured with two full steps.
-"""
+"""Forecast of the memory and time of a run, measured with a few of the run's steps and a target with few samples."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, pairwise
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +16,7 @@ from reslrb_cli.backend.memory import free_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.race import lessons, sets_of
+from reslrb_cli.optimization.autotune.race import lessons
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem, progress_spp, saved_spp
@@ -32,100 +26,44 @@ from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.metrics import Record
 
-#: Seconds of a step above which steps with fewer samples are measured instead, and the seconds for them.
-LONG_STEP, SHORT_STEP = 2.0, 0.7
-
-#: Seconds of a step up to which two steps are run to measure their memory.
-WAIT = 15.0
-
 #: Maximum number of steps until everything is compiled and recorded; minimum and maximum number of timed steps, and
 #: their seconds.
 WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 
+#: Number of steps that suffices if they take this many seconds.
+FEW, LONG = 3, 15.0
 
-@dataclass(frozen=True)
-class Steps:
-    """Steps of `spp` samples per pixel. Each iteration takes one step.
 
-    `iteration_s` is the time of one step. `start_s` is the additional time of the first steps with cached kernels.
-    `compile_s` is the current time for compiling. `peak` is in bytes, and corresponds to `peak_mib` in `metrics.jsonl`.
+def measure_steps(problem: Problem) -> tuple[float, float, float, int]:
+    """Take a few steps of `problem`, which then has other values.
+
+    Returns the seconds of one step, the additional seconds of the first steps with cached kernels, the current seconds
+    for compiling, and the peak in bytes, which corresponds to `peak_mib` in `metrics.jsonl`.
     """
-
-    spp: int
-    iteration_s: float
-    start_s: float
-    compile_s: float
-    peak: int
-
-
-def measure_steps(problem: Problem) -> Steps:
-    """Measure a step of `problem`, or extrapolate from two smaller steps."""
-    config = problem.config
-    unit, whole = sets_of(config) * (problem.samples_per_pass or 1), config.run.spp
-    if unit >= whole:
-        return _measure(problem, whole)
-    first = _measure(problem, unit)
-    if first.iteration_s * whole / unit <= LONG_STEP:
-        steps = _measure(problem, whole)
-        return replace(steps, compile_s=first.compile_s + steps.compile_s)
-    small = max(min(int(SHORT_STEP / max(first.iteration_s, 1e-6)), whole // unit // 2), 1) * unit
-    one, two = _measure(problem, small), _measure(problem, 2 * small)
-    share = (whole - small) / small
-    iteration_s = one.iteration_s + share * max(two.iteration_s - one.iteration_s, 0.0)
-    peak = _peak(problem, whole) if iteration_s <= WAIT else int(one.peak + share * max(two.peak - one.peak, 0))
-    return Steps(two.spp, iteration_s, two.start_s, first.compile_s + one.compile_s + two.compile_s, peak)
-
-
-def _peak(problem: Problem, spp: int) -> int:
-    """Return the peak memory in bytes of two iterations with `spp` samples per pixel. The second iteration is
-    recorded.
-    """
-    with trial(problem, spp) as tried:
-        return _highest(problem, list(islice(optimize(tried), 2)))
-
-
-@contextmanager
-def trial(problem: Problem, spp: int) -> Iterator[Problem]:
-    """Provide the problem in its state before the first iteration, with `spp` samples per pixel. Restores the scene
-    afterwards.
-    """
-    run = problem.config.run
-    enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST), "max_seconds": None}
+    run, guiding = problem.config.run, guiding_of(problem)
+    enough = {"iterations": max(run.iterations, WARM_UP + MOST), "max_seconds": None}
     config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
-    try:
-        yield replace(problem.afresh(problem.values()), config=config)
-    finally:
-        problem.apply()
-
-
-def _highest(problem: Problem, records: Sequence[Record]) -> int:
-    """Return the peak in bytes. Kernels that run only when values change, for example to 0, do not count."""
-    return int(records[: problem.config.run.iterations][-1].peak_mib * MIB)
-
-
-def _measure(problem: Problem, spp: int) -> Steps:
-    """Measure a few iterations of `spp` samples per pixel."""
     records: list[Record] = []
     taught: list[int] = []  # number of table updates after each
-    begin = time.perf_counter()
-    with trial(problem, spp) as tried:
-        guiding = guiding_of(tried)
-        for record in optimize(tried):
-            records.append(record)
-            taught.append(0 if guiding is None else guiding.lessons)
-            if len(records) == WARM_UP:
-                begin = time.perf_counter()
-            timed = len(records) - WARM_UP
-            if timed >= MOST or (timed >= LEAST and time.perf_counter() - begin > SECONDS):
-                break
+    for record in optimize(replace(problem, config=config)):
+        records.append(record)
+        taught.append(0 if guiding is None else guiding.lessons)
+        timed = len(records) - WARM_UP
+        if len(records) >= FEW and record.elapsed_s > LONG:
+            break
+        if timed >= MOST or (timed >= LEAST and record.elapsed_s - records[WARM_UP - 1].elapsed_s > SECONDS):
+            break
     times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
-    steady = statistics.median(times[WARM_UP:])
+    first = min(WARM_UP, len(records) - 1)
+    steady = statistics.median(times[first:])
     if guiding is not None:
         learned = [b - a for a, b in pairwise(taught)]
-        steady = _with_learning(times[WARM_UP:], learned[WARM_UP - 1 :], lessons(problem))
-    extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
-    compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
-    return Steps(spp, steady, extra - compiled, compiled, _highest(problem, records))
+        steady = _with_learning(times[first:], learned[first - 1 :], lessons(problem))
+    extra = sum(max(seconds - steady, 0.0) for seconds in times[:first])
+    compiled = min(sum(record.codegen_ms for record in records[:first]) / 1e3, extra)
+    # Kernels that run only when values change, for example to 0, do not count.
+    peak = int(records[: run.iterations][-1].peak_mib * MIB)
+    return steady, extra - compiled, compiled, peak
 
 
 def _with_learning(times: Sequence[float], learned: Sequence[int], mean: float) -> float:
@@ -146,14 +84,20 @@ VERDICTS = 30
 
 
 @dataclass(frozen=True)
-class Forecast(Steps):
-    """Measured steps, and the resulting forecast of the run.
+class Forecast:
+    """Forecast of a run.
 
-    `parts` has the bytes of each part. The parts sum to `peak`. `scratch` is thread-local memory, and `free` the free
-    memory. The fields `before_s`, `measuring_s`, `target_s`, `images_s` and `verdicts_s` are seconds outside the
-    iterations. `kept` is true if a run finds the decisions in the cache. They took `measuring_s` now.
+    `iteration_s` is the time of one step, `start_s` the additional time of the first steps with cached kernels, and
+    `compile_s` the current time for compiling. `parts` has the bytes of each part. The parts sum to `peak`. `scratch`
+    is thread-local memory, and `free` the free memory. The fields `before_s`, `measuring_s`, `target_s`, `images_s` and
+    `verdicts_s` are seconds outside the iterations. `kept` is true if a run finds the decisions in the cache. They took
+    `measuring_s` now.
     """
 
+    iteration_s: float
+    start_s: float
+    compile_s: float
+    peak: int
     parts: dict[str, int]
     scratch: int
     free: int
@@ -195,20 +139,24 @@ def make_forecast(
     before(problem)
     before_s = time.perf_counter() - begin
     say("measuring a few steps")
-    steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
+    iteration_s, start_s, compile_s, peak = measure_steps(problem)
+    scratch, integrator = 0, problem.integrator
     if isinstance(integrator, Reslrb):  # of all paths traced at a time
         scratch = max(integrator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
     run = config.run
     iterations = run.iterations
     if run.max_seconds is not None:
-        left_s = run.max_seconds - problem.measured_s - steps.start_s
-        iterations = min(iterations, max(int(left_s / max(steps.iteration_s, 1e-6)), 1))
+        left_s = run.max_seconds - problem.measured_s - start_s
+        iterations = min(iterations, max(int(left_s / max(iteration_s, 1e-6)), 1))
     parts = _parts(problem)
-    rest = max(steps.peak - sum(parts.values()), 0)
+    rest = max(peak - sum(parts.values()), 0)
     parts["images of a step, gradients, stored paths (reservoir)"] = rest
     has_verdicts = run.certainty and config.by_pixel and run.iterations >= LEAST_ITERATIONS
     return Forecast(
-        **{**vars(steps), "peak": sum(parts.values())},
+        iteration_s=iteration_s,
+        start_s=start_s,
+        compile_s=compile_s,
+        peak=sum(parts.values()),
         parts=parts,
         scratch=scratch,
         free=free_bytes(mi.variant()),
@@ -218,7 +166,7 @@ def make_forecast(
         kept=cache is not None and cache.keeps,
         target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
         images_s=image_s * 2 * saved_spp(problem) * views,
-        verdicts_s=VERDICTS * steps.iteration_s if has_verdicts else 0.0,
+        verdicts_s=VERDICTS * iteration_s if has_verdicts else 0.0,
     )
 
 

@@ -22,6 +22,7 @@ from reslrb_cli.integrators.freezing import MOST_PATHS_APART
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import make_integrator, render_image
+from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.grids import make_grid
 from reslrb_cli.scene.load import load_scene, warn_once
 from reslrb_cli.scene.needs import (
@@ -32,6 +33,7 @@ from reslrb_cli.scene.needs import (
     scene_needs,
     stock_clip,
 )
+from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.values import Place
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.seeds import seed
@@ -144,6 +146,12 @@ def are_upright(config: Config) -> bool:
     return config.scene.cameras is None
 
 
+def moves_anything(config: Config, selection: Selection) -> bool:
+    """True if the selected parameters move surfaces or lights, or if the integrator option `attached` is true."""
+    attached = config.integrator.options().get("attached", "auto")
+    return attached is True or bool(where_moved(selection.params, selection.scene_keys))
+
+
 def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False) -> str:
     """Return the kind of paths that render the images of `integrator`: `light`, `camera`, or `both`. If anything
     `moves`, it is `light`.
@@ -211,9 +219,7 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
 
 
 def pass_spp(config: Config) -> int:
-    """Return the samples per pixel of each pass of a step's gradient. If `run.memory_budget` chooses the passes, the
-    result is the maximum.
-    """
+    """Return the samples per pixel of each pass of a step's gradient."""
     call = config.set_spp
     return min(samples_per_pass(config) or call, call)
 

@@ -1,4 +1,4 @@
-"""Memory of a run: the memory that a step needs, passes that keep within a budget, and limits.
+"""Limits of a run's memory: films, textures and steps that need more memory than is free are refused.
 
 Sizes in the configuration and the scene file are checked before anything is built (`check_announced`,
 `check_described`). Films and textures of a hundred million entries would take a minute to make. The memory estimates
@@ -8,25 +8,20 @@ are lower bounds, so the checks refuse nothing that fits into the machine's memo
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.backend.doctor import resident_paths
 from reslrb_cli.backend.memory import free_bytes, local_bytes
 from reslrb_cli.config.files import in_words
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
-from reslrb_cli.config.integrators import divisors, passes_obstacle
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators.stack import entry_bytes
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.records.clock import MIB, peak_mib, reset_peak
-from reslrb_cli.records.decisions import Estimate, MemoryPlan
 from reslrb_cli.scene.xml.check import film_sizes
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.transport.plan import Plan
@@ -78,98 +73,37 @@ def plans(problem: Problem, integrator: LightTracer) -> list[Plan]:
     return [integrator.plan(problem.scene, sensors[index], params) for index in problem.sensors]
 
 
-def standing() -> int:
-    """Return the currently allocated bytes."""
-    reset_peak()
-    return int(peak_mib(dr.backend_v(mi.Float)) * MIB)
-
-
-def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> Estimate:
-    """Estimate the memory of a step whose passes have `samples` samples per pixel. `fixed` is allocated before it.
-
-    The argument `fixed` does not contain the targets, which may not exist yet. The `fixed` part of the result contains
-    the targets.
+def step_parts(
+    config: Config, blocks: Sequence[int], parameters: Iterable[int], paths: Iterable[int] = ()
+) -> dict[str, int]:
+    """Return the minimum bytes of a step, by part. `blocks` has the entries of each view's block, `parameters` those of
+    each parameter, and `paths` the bytes of each array that is stored for the paths of a pass.
     """
-    paths = images = targets = scratch = 0
-    pixels = pixels_of(problem.scene, problem.sensors)
-    for index, plan, count in zip(problem.sensors, plans(problem, integrator), pixels, strict=True):
-        film, width = problem.scene.sensors()[index].film(), samples * count
-        if problem.config.adjoint == "correlated" and samples == problem.config.share_spp:
-            # Otherwise dL/dI is known before the paths are traced, and nothing of them outlives the kernel.
-            width = round(width * integrator.share_of_light(plan))
-            paths = max(paths, sum(allocated(size * width) for size in entry_bytes(integrator.kept(plan))))
-        block = int(dr.prod(film.crop_size())) * (film.base_channels_count() + 1)
-        images = max(images, FILM_IMAGES * allocated(4 * block), 2 * allocated(4 * block) + _replicas(block))
-        targets += allocated(4 * block)
-        scratch = max(scratch, integrator.scratch_bytes(plan))
-    for key in problem.selection.keys:
-        size = int(dr.prod(dr.shape(problem.selection.value(key))))
-        images += PARAMETER_COPIES * allocated(4 * size) + _replicas(size)
-    guiding = integrator.preparation.guiding
-    tables = 0 if guiding is None else guiding.bytes(len(problem.sensors))
-    return Estimate(fixed + targets + tables, images, scratch * resident_paths(), paths)
+    parts = {
+        "images and parameters": FILM_IMAGES * allocated(4 * max(blocks))
+        + sum(PARAMETER_COPIES * allocated(4 * size) for size in parameters),
+        "targets": sum(allocated(4 * block) for block in blocks),
+        "stored paths": sum(map(allocated, paths)),
+    }
+    return {part: int(SURE[config.adjoint] * size) for part, size in parts.items()}
 
 
-def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:
-    """Return the largest divisor of `samples` for which the memory fits into the budget. Also return the divisor's
-    memory estimate.
-
-    If no divisor fits, returns 0 and the estimate for the smallest divisor. `samples` is the sample count of a batch,
-    or of a step.
-    """
-    pixels = max(pixels_of(problem.scene, problem.sensors))
-    for size in reversed([size for size in divisors(samples) if passes_obstacle(samples, size, pixels) is None]):
-        expected = estimate(problem, integrator, size, fixed)
-        if expected.total <= budget:
-            return size, expected
-    return 0, expected
-
-
-def fit_memory(problem: Problem) -> Problem:
-    """Return `problem` with passes that keep within `run.memory_budget`. Without a budget, the passes do not change.
-
-    The problem needs no targets. Raises ConfigError if one sample per pixel exceeds the budget. Without a budget,
-    raises ConfigError if a step exceeds the free memory.
-    """
-    config, integrator, budget = problem.config, problem.integrator, problem.config.run.budget_bytes
-    if not isinstance(integrator, Reslrb):
-        check_baseline(problem)
-        return problem
-    check_memory(problem, integrator)
-    if budget is None:
-        return problem
-    samples = config.set_spp
-    size, expected = choose_samples(problem, integrator, samples, budget, standing())
-    if size == 0:
-        mib = -(-expected.total // MIB)
-        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
-        reason += f"; allow at least {mib:.0f} MiB, not counting Python, libraries and kernels"
-        raise ConfigError(config.source, "run.memory_budget", reason)
-    return in_passes(problem, MemoryPlan(budget, size, samples // size, expected))
-
-
-def in_passes(problem: Problem, memory: MemoryPlan) -> Problem:
-    """Return `problem` with the passes of the plan `memory`."""
-    size = memory.samples_per_pass
-    integrator = problem.integrator.with_options(
-        samples_per_pass=size if memory.passes > 1 else None, freeze=problem.integrator.freeze
-    )
-    return replace(problem, memory=memory, integrator=integrator, samples_per_pass=size)
+def _stored_paths(problem: Problem, integrator: Reslrb) -> list[int]:
+    """Return the bytes of each array that a step stores for its paths, for the view with the most bytes."""
+    config, samples = problem.config, pass_spp(problem.config)
+    planned = plans(problem, integrator)  # always, because it raises UnsupportedScene before anything is rendered
+    if config.adjoint != "correlated" or samples != config.share_spp:
+        return []  # dL/dI is known before the paths are traced, and nothing of them outlives the kernel
+    found: list[int] = []
+    for plan, count in zip(planned, pixels_of(problem.scene, problem.sensors), strict=True):
+        width = round(samples * count * integrator.share_of_light(plan))
+        found = max(found, [size * width for size in entry_bytes(integrator.kept(plan))], key=sum)
+    return found
 
 
 def allocated(size: int) -> int:
     """Return the bytes that the allocator uses for an array: a power of two."""
     return max(1 << (size - 1).bit_length(), 64) if size else 0
-
-
-def _replicas(entries: int) -> int:
-    """Return the bytes of the copies for scattering into an array. On a CPU, each thread has a copy of a small array.
-    Large arrays, and arrays on a GPU, have no copies.
-    """
-    threads = dr.thread_count() + 1
-    if dr.backend_v(mi.Float) != dr.JitBackend.LLVM or entries * threads > dr.expand_threshold():
-        return 0
-    return allocated(4 * entries * threads)
 
 
 # --- checks of memory -------------------------------------------------------------------------------------------------
@@ -199,11 +133,9 @@ def check_described(config: Config, description: Description) -> None:
     _check_samples(config, film.width * film.height)
     textures, pixels = _textures(config), film.cropped * PIXEL_BYTES
     texels = {name: width * height * ENTRY_BYTES for name, (width, height) in textures.items()}
-    if (
-        isinstance(config.integrator, ReslrbConfig) and config.run.memory_budget is None
-    ):  # otherwise passes are not estimated
+    if isinstance(config.integrator, ReslrbConfig):
+        pixels = sum(step_parts(config, [film.cropped * (film.channels + 1)], ()).values())
         sure = SURE[config.adjoint]
-        pixels = int((FILM_IMAGES + 1) * allocated(4 * film.cropped * (film.channels + 1)) * sure)  # with one target
         texels = {name: int(PARAMETER_COPIES * allocated(4 * w * h) * sure) for name, (w, h) in textures.items()}
     needed = pixels + sum(texels.values())
     free = free_for(needed)
@@ -271,32 +203,29 @@ def free_for(needed: int) -> int:
     return needed if needed < SMALL else free_bytes(mi.variant())
 
 
-def check_memory(problem: Problem, integrator: Reslrb) -> None:
-    """Raise ConfigError if a step takes more memory than is free.
-
-    With a `memory_budget`, the function checks nothing, because the passes keep within the budget.
-    """
-    config = problem.config
-    if config.run.memory_budget is not None:
+def check_step(problem: Problem) -> None:
+    """Raise ConfigError if a step takes more memory than is free. The problem needs no targets."""
+    config, integrator = problem.config, problem.integrator
+    if not isinstance(integrator, Reslrb):
+        _check_baseline(problem)
         return
-    expected = estimate(problem, integrator, pass_spp(config), 0)  # existing arrays are allocated already
-    free = free_for(expected.total)
-    if expected.total * SURE[config.adjoint] <= free:
+    films = [problem.scene.sensors()[index].film() for index in problem.sensors]
+    blocks = [int(dr.prod(film.crop_size())) * (film.base_channels_count() + 1) for film in films]
+    sizes = (int(dr.prod(dr.shape(problem.selection.value(key)))) for key in problem.selection.keys)
+    parts = step_parts(config, blocks, sizes, _stored_paths(problem, integrator))
+    needed = sum(parts.values())
+    free = free_for(needed)
+    if needed <= free:
         return
-    parts = {"images and parameters": expected.images, "targets": expected.fixed, "stored paths":
-             expected.paths, "thread-local memory": expected.scratch}  # fmt: skip
     largest = max(parts, key=lambda name: parts[name])
     key, advice = "scene.file", COARSER
-    if expected.paths > expected.total // 2:
-        key, advice = (
-            "run.spp",
-            "set run.memory_budget, or leave run.adjoint at auto, which stores no paths",
-        )
-    reason = f"a step takes about {in_words(expected.total)} ({largest} {in_words(parts[largest])}), and "
+    if largest == "stored paths":
+        key, advice = "run.spp", "set integrator.samples_per_pass, or leave run.adjoint at auto, which stores no paths"
+    reason = f"a step takes at least {in_words(needed)} ({largest} {in_words(parts[largest])}), and "
     raise ConfigError(config.source, key, f"{reason}{in_words(free)} are free; {advice}")
 
 
-def check_baseline(problem: Problem) -> None:
+def _check_baseline(problem: Problem) -> None:
     """Raise ConfigError if an integrator other than `reslrb` stores more path data than fits into memory."""
     config = problem.config
     kind, depth = config.integrator.type, config.integrator.max_depth

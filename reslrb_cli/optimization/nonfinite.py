@@ -23,24 +23,17 @@ PATIENCE = 10
 
 
 @dataclass
-class RefusedAt:
-    """Non-finite entries of one view's dL/dI: the entry count, and the first entry as (x, y, channel)."""
-
-    count: int
-    first: tuple[int, int, int]
-
-
-@dataclass
 class Findings:
     """Values of one iteration that were not finite.
 
     Non-finite values can be the iteration's loss, entries of dL/dI for each sensor, or entries of gradients and updates
-    for each parameter. `lost` lists the parameters whose gradient has no finite entry. `own` names the user's losses.
+    for each parameter. `refused` has the number of entries of dL/dI, and the first one as (x, y, channel). `lost` lists
+    the parameters whose gradient has no finite entry. `own` names the user's losses.
     """
 
     iteration: int
     loss: bool = False
-    refused: dict[int, RefusedAt] = field(default_factory=dict)
+    refused: dict[int, tuple[int, tuple[int, int, int]]] = field(default_factory=dict)
     gradients: dict[str, int] = field(default_factory=dict)
     lost: list[str] = field(default_factory=list)
     updates: dict[str, int] = field(default_factory=dict)
@@ -52,7 +45,7 @@ class Findings:
     @property
     def total(self) -> int:
         """Number of all non-finite values. A non-finite loss counts as one value."""
-        return int(self.loss) + sum(at.count for at in self.refused.values()) + sum(self.by_parameter.values())
+        return int(self.loss) + sum(count for count, _ in self.refused.values()) + sum(self.by_parameter.values())
 
     @property
     def by_parameter(self) -> dict[str, int]:
@@ -68,10 +61,9 @@ class Findings:
 
     def __str__(self) -> str:
         parts = [self.whose_loss] if self.loss else []
-        for sensor, at in self.refused.items():
-            x, y, channel = at.first
+        for sensor, (count, (x, y, channel)) in self.refused.items():
             place = f"the first at pixel ({x}, {y}), channel {channel}, of sensor {sensor}"
-            parts.append(f"dL/dI in {_entries(at.count)}, {place}")
+            parts.append(f"dL/dI in {_entries(count)}, {place}")
         parts += [f"the gradient of {key} in {_entries(count)}" for key, count in self.gradients.items()]
         parts += [f"the update of {key} in {_entries(count)}" for key, count in self.updates.items()]
         return f"not finite in iteration {self.iteration}: {'; '.join(parts)}"

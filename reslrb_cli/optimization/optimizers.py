@@ -202,10 +202,6 @@ class Optimizer:
     def set_value(self, key: str, value: Any) -> None:
         """Set another initial value of the scene. Call this before the first step."""
         self.stands_at = None
-        self.move(key, value)
-
-    def move(self, key: str, value: Any) -> None:
-        """Set another value of the scene between two steps. The moments do not change."""
         variable = self._variables.get(key)
         if variable is None:
             self._own[key][key] = value

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import HEIGHTMAP, Thickness
+from reslrb_cli.config.parameters import Thickness
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
@@ -19,9 +19,9 @@ from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.precondition import make_smoother
-from reslrb_cli.optimization.regularizers import Cost, Plate, Span, make_cost, make_plate, spans_of
+from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
-from reslrb_cli.records.decisions import Decision, MemoryPlan
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 
@@ -69,9 +69,8 @@ class Problem:
     moves: bool = False
     #: Decisions on settings of the integrator that are `auto` (`autotune/sampling.py`).
     decisions: list[Decision] = field(default_factory=list)
-    memory: MemoryPlan | None = None
     #: Regularizers of the values, by key and type.
-    regularizers: dict[str, dict[str, Cost | Plate]] = field(default_factory=dict)
+    regularizers: dict[str, dict[str, Cost]] = field(default_factory=dict)
     #: Computes the shards of a step (`shards.Engine`); None: this process, one by one.
     engine: Callable[..., Any] | None = None
 
@@ -124,11 +123,7 @@ class Problem:
         for key, costs in self.regularizers.items():
             told[key] = {}
             for name, cost in costs.items():
-                if isinstance(cost, Plate):
-                    told[key][name], own, there = cost.cost(values[key], values[cost.other])
-                    gradients[cost.other] = gradients.get(cost.other, 0.0) + there
-                else:
-                    told[key][name], own = cost(values[key])
+                told[key][name], own = cost(values[key])
                 gradients[key] = gradients.get(key, 0.0) + own
         return told, gradients
 
@@ -149,46 +144,18 @@ class Problem:
 
     def _heights(self) -> dict[str, Array]:
         """Return the values of parameters with regularizers, by key."""
-        others = [cost.other for costs in self.regularizers.values() for cost in costs.values()
-                  if isinstance(cost, Plate)]  # fmt: skip
-        return {key: np.array(dr.detach(self.optimizer[key]), dtype=np.float64)
-                for key in dict.fromkeys([*self.regularizers, *others])}  # fmt: skip
-
-    @property
-    def plates(self) -> dict[str, Plate]:
-        """Plates between two free faces, each under the key of the parameter that defines the plate."""
-        found = {key: costs.get("thickness") for key, costs in self.regularizers.items()}
-        return {key: each for key, each in found.items() if isinstance(each, Plate)}
-
-    def hold_apart(self) -> None:
-        """Keep free faces apart by at least a tenth of the minimum thickness. For a flat back, bounds do this."""
-        for key, plate in self.plates.items():
-            before = {each: np.array(dr.detach(self.optimizer[each])) for each in (key, plate.other)}
-            after = plate.held(*(each.astype(np.float64) for each in before.values()))
-            for (each, old), new in zip(before.items(), after, strict=True):
-                if np.any(new > old):
-                    low, high = self.selection.spec(each).bounds or (-np.inf, np.inf)
-                    self.optimizer.move(each, _handed(self.optimizer[each], np.clip(new, low, high)))
+        return {key: np.array(dr.detach(self.optimizer[key]), dtype=np.float64) for key in self.regularizers}
 
     def held(self) -> dict[str, int]:
         """Return the number of heights at the minimum thickness for each heightmap that has a minimum thickness, by
         key.
         """
         counts = {}
-        for key, costs in self.regularizers.items():
-            plate = costs.get("thickness")
-            if plate is None:
-                continue
-            height = np.array(dr.detach(self.optimizer[key]))
-            if isinstance(plate, Plate):
-                there = np.array(dr.detach(self.optimizer[plate.other]))
-                rounding = 1e-5 * plate.settings.thickness  # sums of two single-precision values
-                thin = plate.thickness(height, there) <= plate.settings.thinnest + rounding
-            else:
-                lowest = next(each.lowest for each in self.selection.spec(key).regularizers
-                              if isinstance(each, Thickness))  # fmt: skip
-                thin = height <= np.float32(lowest)
-            counts[key] = int(np.count_nonzero(thin))
+        for key in self.regularizers:
+            for each in self.selection.spec(key).regularizers:
+                if isinstance(each, Thickness):
+                    height = np.array(dr.detach(self.optimizer[key]))
+                    counts[key] = int(np.count_nonzero(height <= np.float32(each.lowest)))
         return counts
 
     @property
@@ -292,19 +259,12 @@ def _handed(value: Any, array: Array) -> Any:
     return type(value)(np.ascontiguousarray(array, dtype=np.float32)) + dr.opaque(mi.Float, 0)
 
 
-def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost | Plate]]:
+def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost]]:
     """Return the regularizers of `selection`, by key and type."""
-    found: dict[str, dict[str, Cost | Plate]] = {}
+    found: dict[str, dict[str, Cost]] = {}
     for key in selection.keys:
         for each in selection.spec(key).regularizers:
-            cost: Cost | Plate
-            if isinstance(each, Thickness) and each.opposite is not None:
-                name = f"{each.opposite}.{HEIGHTMAP}"
-                own, there = ((*selection.deformation.laid_over(k), selection.array(k).shape) for k in (key, name))
-                cost = make_plate(each, own, there, name)
-            else:
-                flat = selection.kind(key) == "bitmap"
-                spans = (Span(), Span()) if flat else spans_of(*selection.deformation.laid_over(key))
-                cost = make_cost(each, spans)
-            found.setdefault(key, {})[each.type] = cost
+            flat = selection.kind(key) == "bitmap"
+            spans = (Span(), Span()) if flat else spans_of(*selection.deformation.laid_over(key))
+            found.setdefault(key, {})[each.type] = make_cost(each, spans)
     return found

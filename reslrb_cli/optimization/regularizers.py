@@ -9,8 +9,7 @@ Differences are taken between neighbouring texels. The integration weights sum t
                      w² = 1 + hx² + hy²     (do Carmo, Differential Geometry of Curves and Surfaces, 3.3)
     total variation  the mean over the four pairs of differences (hx below or above, hy left or right) between four
                      texels, so that no chequerboard is overlooked
-    thickness        thickness + h; between two free faces thickness + h + B g, g the other map, bilinearly where the
-                     texels of h stand (`Plate`)
+    thickness        thickness + h
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix
 
 from reslrb_cli.config.parameters import Curvature, Regularizer, Thickness, TotalVariation
 
@@ -28,9 +26,6 @@ Array = np.ndarray[Any, Any]
 
 #: Takes a parameter's value as an array; returns the cost and its derivative, of the same shape.
 Cost = Callable[[Array], tuple[float, Array]]
-
-#: A map: positions (N, 3) and texture coordinates (N, 2) of the mesh below it, and its shape (H, W, ...).
-Map = tuple[Array, Array, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -75,72 +70,6 @@ def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
     else:
         raise TypeError(f"{regularizer.type} is not a cost of a map")
     return _weighed(function, regularizer.weight)
-
-
-@dataclass(frozen=True)
-class Plate:
-    """Plate between two free faces. The maps h and g are the outward heights of the two faces. g belongs to the
-    parameter `other`.
-
-    `across` (texels of h, texels of g) interpolates g at the texels of h, and `back` interpolates h at the texels of g.
-    """
-
-    settings: Thickness
-    spans: Spans
-    other: str
-    across: csr_matrix
-    back: csr_matrix
-
-    def cost(self, h: Array, g: Array) -> tuple[float, Array, Array]:
-        """Return the cost of h and g, and the cost's derivatives with respect to h and g. The cost includes the
-        weight.
-        """
-        value, slope = _hinge(-self.thickness(h, g), -self.settings.least)
-        area = self.settings.weight * _area(self.spans, h.shape, 0.5)
-        by_h = -area * slope
-        return float(np.sum(area * value)), by_h, (self.across.T @ by_h.ravel()).reshape(g.shape)
-
-    def thickness(self, h: Array, g: Array) -> Array:
-        """Return the thickness of the plate at each texel of h."""
-        there = self.across @ np.asarray(g, np.float64).ravel()
-        return np.asarray(self.settings.thickness + h + there.reshape(h.shape))
-
-    def held(self, h: Array, g: Array) -> tuple[Array, Array]:
-        """Return h and g after raising both equally where the plate is thinner than `thinnest`. The function tests the
-        texels of both maps.
-        """
-        least, thickness = self.settings.thinnest, self.settings.thickness
-        h = h + np.maximum(least - self.thickness(h, g), 0) / 2
-        between = thickness + g + (self.back @ h.ravel()).reshape(g.shape)
-        g = g + np.maximum(least - between, 0)
-        return h + np.maximum(least - self.thickness(h, g), 0), g
-
-
-def make_plate(settings: Thickness, own: Map, other: Map, key: str) -> Plate:
-    """Return the plate between two maps. The map `other` belongs to the parameter `key`."""
-    return Plate(settings, spans_of(*own[:2]), key, _sampling(own, other), _sampling(other, own))
-
-
-def _sampling(own: Map, other: Map) -> csr_matrix:
-    """Return the matrix that interpolates the texels of `other` (flat) bilinearly at the texels of `own`."""
-    (slopes, origin), (slopes_there, origin_there) = _laid(*own[:2]), _laid(*other[:2])
-    height, width = own[2][:2]
-    u, v = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
-    points = np.stack([u.ravel(), v.ravel()], axis=1) @ slopes + origin
-    uv = (points - origin_there) @ np.linalg.pinv(slopes_there)
-    rows, columns, weights = [], [], []
-    corners: list[list[tuple[Array, Array]]] = []
-    for axis, count in ((0, other[2][1]), (1, other[2][0])):
-        at = np.clip(uv[:, axis] * count - 0.5, 0, count - 1)
-        low = np.minimum(at.astype(np.int64), max(count - 2, 0))
-        corners.append([(low, 1 - (at - low)), (np.minimum(low + 1, count - 1), at - low)])
-    for x, by_x in corners[0]:
-        for y, by_y in corners[1]:
-            rows.append(np.arange(len(uv)))
-            columns.append(y * other[2][1] + x)
-            weights.append(by_x * by_y)
-    shape = height * width, other[2][0] * other[2][1]
-    return coo_matrix((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=shape).tocsr()
 
 
 def _weighed(cost: Cost, weight: float) -> Cost:
@@ -267,14 +196,8 @@ def spans_of(positions: Array, texcoords: Array) -> Spans:
 
     The best affine map from texture coordinates to positions defines the unit of each axis.
     """
-    slopes, _ = _laid(positions, texcoords)
+    matrix = np.column_stack([texcoords, np.ones(len(texcoords))]).astype(np.float64)
+    slopes = np.linalg.lstsq(matrix, positions.astype(np.float64), rcond=None)[0]
     low, high = np.clip(texcoords.min(axis=0), 0, 1), np.clip(texcoords.max(axis=0), 0, 1)
     x, y = (Span(float(np.linalg.norm(slopes[k])), float(low[k]), float(high[k])) for k in range(2))
     return x, y
-
-
-def _laid(positions: Array, texcoords: Array) -> tuple[Array, Array]:
-    """Return the best affine map from texture coordinates to positions: uv @ slopes (2, 3) + origin (3,)."""
-    matrix = np.column_stack([texcoords, np.ones(len(texcoords))]).astype(np.float64)
-    found = np.linalg.lstsq(matrix, positions.astype(np.float64), rcond=None)[0]
-    return found[:2], found[2]

@@ -3,7 +3,7 @@
 - `State` has everything that determines the next iteration. Equal states lead to equal next states.
 - `standing` returns the current state of a problem, and `put` sets a problem to a state.
 - `load` reads a stored state if it fits the problem.
-- `Settled` has the data common to all processes of a run: initial values, estimator, passes, masks, ways of sampling.
+- `Settled` has the data common to all processes of a run: initial values, estimator, masks, ways of sampling.
     `begin_as`, `decide_as` and `reach_as` assemble a problem from it.
 
 Dr.Jit and Mitsuba change some data in place: the parameters of the scene, the optimiser's leaves, and the tables of
@@ -22,10 +22,9 @@ import drjit as dr
 from reslrb_cli.guiding.tables import KNOWN, Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.autotune.sampling import as_decided, decided
-from reslrb_cli.optimization.memory import in_passes
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.checkpoint import entries_below
-from reslrb_cli.records.decisions import Decision, MemoryPlan, Scaled
+from reslrb_cli.records.decisions import Decision, Scaled
 from reslrb_cli.records.tree import PASSING, Array, Arrays, Stored, entry, expected, like, to_array
 
 
@@ -183,7 +182,6 @@ class Settled:
     variant: str
     files: dict[str, str] = field(default_factory=dict)
     decisions: list[Decision] = field(default_factory=list)
-    memory: MemoryPlan | None = None
     initial: Arrays = field(default_factory=dict, metadata=entry("initial"))
     initial_halo: Arrays = field(default_factory=dict, metadata=entry("initial with halo"))
     masks: Arrays = field(default_factory=dict, metadata=entry("mask"))
@@ -201,13 +199,12 @@ def begin_as(problem: Problem, stored: Stored) -> None:
 
 
 def decide_as(problem: Problem, stored: Stored) -> Problem:
-    """Return `problem` with the run's decisions about the samples per pass and the sampling methods."""
+    """Return `problem` with the run's decisions about the sampling methods."""
     settled = stored.read(Settled)
-    decisions = decided(problem.config, settled.decisions)
-    if problem.memory is not None and settled.memory is not None:
-        before = settled.memory  # the passes determine the order of the sums
-        plan = MemoryPlan(problem.memory.budget_bytes, before.samples_per_pass, before.passes, before.expected_bytes)
-        problem = in_passes(problem, plan)
+    try:
+        decisions = decided(problem.config, settled.decisions)
+    except TypeError as error:
+        raise stored.wrong("decisions", str(error)) from None
     integrator = as_decided(problem.integrator, decisions)
     if shares := entries_below(stored.arrays, "pixels/"):
         integrator = integrator.shared_out(shares)

@@ -58,20 +58,20 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
     mask, sensor, found = view.mask, scene.sensors()[view.sensor], Masked()
     width, height = (int(n) for n in sensor.film().crop_size())
     if lacking:
-        if mask.specular:
+        if "specular" in mask.kinds:
             seen = sees_specular(scene, sensor)
             found.left_out["specular"] = seen.alone
             if (count := int(seen.mixed.sum())) > 0:
                 found.stay["mixed"] = count
-        if mask.border:
+        if "border" in mask.kinds:
             found.left_out["border"] = ~interior((height, width), sensor)
     if photo is not None:
-        if mask.clipped:
+        if "clipped" in mask.kinds:
             # The image contains the filter's spread of the lamp itself; the file, that of a lamp clipped to white.
             # Beside a lamp 45 times as bright as white, the file is half as bright as it should be.
             found.left_out["clipped"] = photo.clipped
             found.left_out["beside"] = spread(photo.clipped, sensor) & ~photo.clipped
-        if mask.alpha:
+        if "alpha" in mask.kinds:
             found.left_out["alpha"] = photo.transparent
         found.left_out["nonfinite"] = photo.nonfinite
     if mask.file is not None:

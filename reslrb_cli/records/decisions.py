@@ -1,8 +1,7 @@
-"""Decisions, plans and measurements from before the first iteration, as manifest, checkpoints and cache store them.
+"""Decisions and measurements from before the first iteration, as manifest, checkpoints and cache store them.
 
 Decision                setting that was `auto`: its value, and why
 DecisionCache           decisions of earlier runs, for the next run of the same scene and parameters
-Estimate, MemoryPlan    memory budget of a run
 Sensitivity, Scaled     measured sensitivity of a parameter
 """
 
@@ -19,7 +18,6 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from typing_extensions import Self
 
 from reslrb_cli.records.atomic import write_atomically
-from reslrb_cli.records.clock import MIB
 
 
 class Jsonable:
@@ -129,48 +127,7 @@ class DecisionCache:
         return content if isinstance(content, dict) else {}
 
 
-# --- memory and sensitivities -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Expected bytes of a step, in four parts.
-
-    `fixed` is data before the step and targets, `images` is images and parameters, `scratch` is thread-local memory,
-    and `paths` is the stored data of the paths of one pass.
-    """
-
-    fixed: int
-    images: int
-    scratch: int
-    paths: int
-
-    @property
-    def total(self) -> int:
-        """Sum of all parts."""
-        return self.fixed + self.images + self.scratch + self.paths
-
-
-@dataclass
-class MemoryPlan(Jsonable):
-    """Memory budget, samples per pass and expected bytes. After the first iterations, also the peak."""
-
-    budget_bytes: int
-    samples_per_pass: int
-    passes: int
-    expected_bytes: Estimate
-    peak_mib: float | None = None
-    exceeded: bool = False
-
-    def check(self, peak: float) -> str | None:
-        """Record the allocator's peak in MiB. Returns a warning when the used memory first exceeds the budget."""
-        self.peak_mib = peak
-        used, before = peak * MIB + self.expected_bytes.scratch, self.exceeded
-        self.exceeded = used > self.budget_bytes
-        if not self.exceeded or before:
-            return None
-        allowed = f"{self.budget_bytes / MIB:.1f} MiB"
-        return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the budget of {allowed}"
+# --- sensitivities ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,6 @@ class Manifest:
     - `plan`: the parts of a step.
     - `decisions`: settings of the integrator that were `auto` (`Decision`).
     - `incomplete`: the missing share of the derivative, for each parameter that moves light (`MissingRecord`).
-    - `memory`: how the run keeps its memory budget.
     - `scaling`: the measurements of each parameter for `scale: auto`.
     - `shared`: the time of workers (`SharedTime`).
     - `views`: for each view, the share of the loss, the excluded pixels of each kind, and the factor for viewing
@@ -88,7 +87,6 @@ class Manifest:
     error: str | None = None
     plan: dict[str, Any] | None = None
     decisions: list[dict[str, Any]] = field(default_factory=list)
-    memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
     views: list[dict[str, Any]] | None = None
     incomplete: list[dict[str, Any]] = field(default_factory=list)

@@ -29,8 +29,7 @@ from reslrb_cli.lens.solid import (
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
 from reslrb_cli.measure.tolerance import OpticalBench
-from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of
-from reslrb_cli.optimization.moving import moves_anything
+from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, moves_anything, paths_of
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite

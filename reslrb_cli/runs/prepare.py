@@ -29,10 +29,10 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import explained
+from reslrb_cli.optimization.loop import Watch
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Best, Images, Least, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
-from reslrb_cli.optimization.stopping import Watch
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
@@ -160,7 +160,6 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
         lamps = sees_lamps(problem.scene, sensor) if unsupported_part(problem.scene, sensor) is None else None
         record["shown"] = exposure_for(np.array(view.target), lamps)
     manifest.decisions = [each.to_json() for each in problem.decisions]
-    manifest.memory = None if problem.memory is None else problem.memory.to_json()
     return manifest
 
 
@@ -172,7 +171,7 @@ def settled_of(problem: Problem, variant: str) -> Settled:
     """
     initial, halo = on_file(problem, standing(problem).values)
     return Settled(
-        dump(problem.config), variant, digests(problem.config), problem.decisions, problem.memory, initial, halo,
+        dump(problem.config), variant, digests(problem.config), problem.decisions, initial, halo,
         problem.masks, noted_of(problem),
     )  # fmt: skip
 

@@ -155,7 +155,6 @@ class Recording:
                 metrics.write(record)  # first, because a checkpoint needs the lines of its iterations
                 self.course.add(state, record)
                 yield record
-                self._note_memory(record.peak_mib)
                 if (fault := self.folder.fault) is not None:  # the folder may have been removed or replaced
                     raise fault
                 if stop():
@@ -182,13 +181,6 @@ class Recording:
             scale = self.problem.config.optimizer.scale
             line = curvature_line(row, rate) if scale == "curvature" else step_line(row, spec.transform, rate)
             logger.log(level, f"scale {scale}: {line}")
-
-    def _note_memory(self, peak: float) -> None:
-        """Record the memory use if there is a budget. Warn when the memory use first exceeds the budget."""
-        if (plan := self.problem.memory) is not None:
-            if (warning := plan.check(peak)) is not None:
-                logger.warning(warning)
-            self.manifest.memory = plan.to_json()
 
     def _on_nonfinite(self, found: Findings) -> None:
         """Save the state before the first step with a non-finite value, and explain how to inspect the state."""

@@ -13,10 +13,10 @@ from reslrb_cli.config.loader import OVERRIDDEN, Override, dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.loop import OUT_OF_TIME
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.optimization.state import load as load_state
-from reslrb_cli.optimization.stopping import OUT_OF_TIME
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, PREVIOUS_FILE_NAME, STATE_FILE
 from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records

@@ -322,19 +322,6 @@ class Deformation:
         moved = next(each for each in self._moved.values() if each.heightmap == name)
         return np.array(moved.base).T, np.array(moved.texcoords).T
 
-    def displaced(self, name: str) -> tuple[mi.Mesh, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the first mesh of the heightmap `name`, with its current geometry.
-
-        The geometry consists of positions (N, 3) as float64, texture coordinates (N, 2), and directions (N, 3) of the
-        heights.
-        """
-        moved = next(each for each in self._moved.values() if each.heightmap == name)
-        positions = np.array(self.params[moved.item.key], dtype=np.float64).reshape(-1, 3)
-        texcoords, normals = (np.array(each, dtype=np.float64).T for each in (moved.texcoords, moved.normals))
-        if moved.motion is not None:
-            normals = normals @ np.array(moved.motion.matrix(self.values).matrix).reshape(4, 4)[:3, :3].T
-        return moved.item.node, positions, texcoords, normals
-
     def place(self) -> list[Any]:
         """Set the scene's parameters from the values. Call `params.update()` afterwards. Returns the arrays to
         evaluate.

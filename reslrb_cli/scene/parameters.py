@@ -82,21 +82,6 @@ class Selection:
             if each.type in seen:
                 raise place.fail(at, f"{each.type} is given twice; give it once, with the sum of the weights")
             seen.add(each.type)
-            if isinstance(each, Thickness) and each.opposite is not None:
-                self._check_opposite(key, each.opposite, place, f"regularizers[{number}].opposite")
-
-    def _check_opposite(self, key: str, mesh: str, place: Place, at: str) -> None:
-        """Raise ConfigError if the mesh `mesh` has no heightmap that faces away from the heightmap `key`."""
-        name = f"{mesh}.{HEIGHTMAP}"
-        maps = [each for each in self.deformation.values if each.endswith(f".{HEIGHTMAP}") and each != key]
-        if name not in maps:
-            meshes = [f"`{each.rpartition('.')[0]}`" for each in maps]
-            hint = f"; use for example {' or '.join(meshes)}" if meshes else ""
-            raise place.fail(at, f"`{mesh}` has no opposite heightmap in `parameters`{hint}")
-        own, there = (self.deformation.displaced(each)[3].mean(axis=0) for each in (key, name))
-        if own @ there > -0.99 * np.linalg.norm(own) * np.linalg.norm(there):
-            raise place.fail(at, f"the outsides of `{mesh}` and of `{key.rpartition('.')[0]}` do not face away from "
-                                 "each other; thickness is defined for a plate with opposite faces")  # fmt: skip
 
     def value(self, key: str) -> Any:
         """Return the current value of `key` as a Dr.Jit value."""
@@ -210,7 +195,7 @@ def select_parameters(
         if values is not None and key in values and values[key].shape == value.shape:
             value = values[key]
         if settings.bounds is not None:
-            plate = any(isinstance(each, Thickness) and each.opposite is None for each in settings.regularizers)
+            plate = any(isinstance(each, Thickness) for each in settings.regularizers)
             held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
             check_bounds(slot, value, settings.bounds, held)
         check_transform(slot, value, settings, place)

@@ -191,6 +191,26 @@ def test_a_run_folder_shows_its_progress(scene):
         assert found[-1] == "next: `reslrb optimize runs/c/config.yaml` runs it again"
 
 
+def test_an_edited_decision_is_one_located_line(scene):
+    Path("run").mkdir()
+    text = "scene: {file: ../scene.xml}\nparameters: [{key: Sphere_1.emitter.radiance.value}]\n"
+    Path("run/config.yaml").write_text(text)
+
+    def decide(**decision: str) -> None:
+        content = {"program": "reslrb", "decisions": [{"setting": "paths", **decision}]}
+        Path("run/manifest.json").write_text(json.dumps(content))
+
+    for decision, said in (
+        ({"value": "sideways", "why": "edited"}, "paths is `sideways`; possible are light, camera, both"),
+        ({"value": "camera"}, "no Decision: "),
+    ):
+        decide(**decision)
+        code, _, err = outcome("inspect", "run")
+        assert (code, f"run/manifest.json: decisions: {said}" in err) == (2, True), err
+    decide(value="camera", why="edited by hand")
+    assert "paths: auto, edited by hand" in " ".join(lines_of("run"))
+
+
 STIFF = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 
 

@@ -29,7 +29,7 @@ parameters:
 integrator: {type: reslrb, max_depth: -1, rr_depth: 3, hide_emitters: true, estimator: event, capacity: 2}
 loss: {type: relative_l2, epsilon: 1e-3}
 optimizer: {type: adam, learning_rate: 1e-1, schedule: cosine, final_fraction: 1e-2, beta_1: 0, scale: auto}
-run: {name: "Fläche: rot/blau", output: out, iterations: 3, spp: 16, adjoint: batched, batches: 4, memory_budget: 2GiB}
+run: {name: "Fläche: rot/blau", output: out, iterations: 3, spp: 16, adjoint: batched, batches: 4}
 """
 RENDERED = """\
 scene: &s {file: a.xml}
@@ -153,7 +153,7 @@ def _depth(data: Any) -> int:
 _OVERRIDES = (
     *("run.spp=16", "run.name=x", "scene.options.a.b=3", "parameters[0].bounds=[0, 1]", "parameters.0.key=a"),
     *("integrator={type: prb}", "parameters[1].key=b", "target={render: {}}", "optimizer.type=sgd", "loss=l1"),
-    *("target.render.parameters.x.y={file: a.png}", "run.memory_budget=64 MiB", "views=[{sensor: 1}]", "variant=auto"),
+    *("target.render.parameters.x.y={file: a.png}", "views=[{sensor: 1}]", "variant=auto"),
     "run.output=/tmp/x",
 )
 

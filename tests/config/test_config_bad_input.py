@@ -63,9 +63,6 @@ ADDED: dict[str, str | tuple[str, ...]] = {
     "integrator: {capacity: 0}": "integrator.capacity: must be at least 1",
     "integrator: {weight: adjont}": "integrator.weight: must be luminance or adjoint (did you mean adjoint?)",
     "integrator: {estimator: event, weight: adjoint}\nrun: {adjoint: correlated}": "`adjoint` needs dL/dI before",
-    "run: {memory_budget: 2 floppies}": "run.memory_budget: must be a number of MiB, or text such as 512 MiB or 2GiB",
-    "integrator: {type: ptracer}\nrun: {memory_budget: 64}": "run.memory_budget: needs integrator `reslrb`, not",
-    "integrator: {samples_per_pass: 4}\nrun: {memory_budget: 64}": "integrator.samples_per_pass: is chosen by",
     "optimizer: {type: sgd, beta_1: 0.5}": "optimizer.beta_1: not an option of sgd but of adam",
     "loss: {epsilon: 1}": "loss.epsilon: not an option of l2 but of relative_l2",
     "loss: {type: relative_l2, epsilon: 0}": "loss.epsilon: must be above 0",
@@ -168,7 +165,6 @@ FILES: dict[str, tuple[str | bytes, ...]] = {
     "control character in a key": (GOOD + 'run: {"\\e[31m": 1}\n', ":5: run.", "must not hold control"),
     "half a surrogate pair": (GOOD + 'run: {name: "\\ud800"}\n', ":5: ", "half of a surrogate pair"),
     "a byte of a path": (scene('"\\udcff.xml"'), ":1: ", "half of a surrogate pair"),
-    "memory of 400 digits": (GOOD + f"run: {{memory_budget: {'9' * 400}}}\n", ":5: the integer 99", "64 bits"),
     "tag of other data": (GOOD + "run: {name: !!binary aGFsbG8=}\n", ":5: not valid YAML: the tag !!binary"),
     "glob without quotes": (
         changed("floor.reflectance.data", "*.data"),

@@ -17,7 +17,6 @@ from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb
 from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
 from reslrb_cli.config.optimizers import SGD, Adam
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
-from reslrb_cli.config.run import memory_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS, options_of
 
@@ -91,7 +90,7 @@ def test_values_and_paths(tmp_path: Path) -> None:
     }  # fmt: skip
     assert config.views is not None
     assert [view.target for view in config.views] == [tmp_path / "t0.exr", Path("/abs/t1.png")]
-    masks = [view.mask and (view.mask.file, view.mask.clipped) for view in config.views]
+    masks = [view.mask and (view.mask.file, "clipped" in view.mask.kinds) for view in config.views]
     assert masks == [None, (tmp_path / "weights.png", False)]
     first, second, third, fourth = config.parameters
     assert first.initial == 1.0
@@ -313,20 +312,6 @@ def test_impossible_paths(options: dict[str, Any], words: str) -> None:
 
 def test_auto_is_stack() -> None:
     assert Reslrb(max_depth=4).undecided_off().options() == Reslrb(estimator="stack", max_depth=4).options()
-
-
-@pytest.mark.parametrize(
-    ("written", "bytes_"),
-    [(0.5, 2**19), ("512 MiB", 2**29), ("1.5 gb", 1_500_000_000)],
-)
-def test_amounts_of_memory(written: int | float | str, bytes_: int) -> None:
-    assert memory_bytes(written) == bytes_
-
-
-@pytest.mark.parametrize("written", ["", "512", "-1 MiB", "1 XiB", 0, float("nan"), True])
-def test_invalid_amounts_of_memory(written: int | float | str) -> None:
-    with pytest.raises(ValueError, match="not an amount of memory"):
-        memory_bytes(written)
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,6 @@ OPTIONS = {
     "point": ["--light-distance", "300", "--thickness", "50"],
     "round_point": ["--light-distance", "300", "--thickness", "50", "--outline", "round"],
     "sun": ["--sun", "0.53"],
-    "both": ["--both"],
     "mirror_point": ["--mirror", "30", "--light-distance", "300"],
     "mirror_tilt": ["--mirror", "30", "--tilt", "0", "15"],
 }
@@ -105,7 +104,7 @@ def test_a_pattern_finer_than_the_pixels_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "lens").exists()
 
 
-@pytest.mark.parametrize("kind", a_few(OPTIONS, ["lens", "portrait", "round_point", "tilt", "both", "mirror_tilt"]))
+@pytest.mark.parametrize("kind", a_few(OPTIONS, ["lens", "portrait", "round_point", "tilt", "mirror_tilt"]))
 def test_the_start_casts_the_picture_upright_with_the_right_brightness(kind: str, tmp_path: Path) -> None:
     wanted = picture(32, 24 if kind == "portrait" else 32)
     write_file(tmp_path / "p.exr", np.repeat(wanted[:, :, None], 3, 2).astype(np.float32), linear=True)
@@ -140,7 +139,6 @@ BAD = {
     "light": (["--light-distance", "20"], "--light-distance: is 20 mm, at which no lens was found"),
     "sun": (["--sun", "40"], "--sun: is 40 degrees; it must be from 0 to below 10"),
     "sun of a point": (["--sun", "0.5", "--light-distance", "300"], "--sun: needs parallel light"),
-    "two faces": (["--mirror", "30", "--both"], "--both: needs a lens"),
     "round": (["--mirror", "30", "--outline", "round", "--light-distance", "300"], "--outline: round needs parallel"),
     "one colour": ([], "p.exr: has only one colour"),
     "dithered": ([], "p.exr: has only one colour"),

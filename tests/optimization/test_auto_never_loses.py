@@ -28,7 +28,7 @@ from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.race import Finding, Turns
 from reslrb_cli.optimization.autotune.sampling import is_auto, settle
-from reslrb_cli.optimization.memory import fit_memory
+from reslrb_cli.optimization.memory import check_step
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.records.images import write_file
@@ -63,7 +63,8 @@ def alone() -> None:
 def decided(config: Config, case: ExtremeCase | None) -> Problem:
     """Return the problem, in the scene of a case if one is given, after all decisions by measurement."""
     problem = assemble_scene(config, None if case is None else load_scene(case.scene()))
-    problem = make_targets(fit_memory(problem), lambda line: None)
+    check_step(problem)
+    problem = make_targets(problem, lambda line: None)
     return SETTLE["settle"](problem, lambda line: None)
 
 

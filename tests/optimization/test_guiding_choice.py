@@ -36,7 +36,7 @@ from reslrb_cli.optimization.autotune.race import (
     lessons,
     sizes,
 )
-from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER, table_bytes
+from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER
 from reslrb_cli.optimization.forecast import _with_learning
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.checkpoint import STATE_FILE, read_state
@@ -128,22 +128,19 @@ def test_the_sequence_follows_a_rule(experiment: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.usefixtures("llvm")
 def test_nothing_remains_of_guiding_that_does_not_pay(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither the kernels nor the memory plan contains any part of guiding. The kept decision gives the same result."""
+    """The kernels contain no part of guiding. The kept decision gives the same result."""
     fix_times(monkeypatch, {"guiding": 1000.0})
-    counts, plans, budget = [], [], "run.memory_budget=64"
+    counts = []
     for settings in ([*AUTO, "integrator.sequence=auto"], [*SMALL, "integrator.sequence=low_discrepancy"]):
-        problem = assemble(load("tiny.yaml", [*settings, budget]), cache=DecisionCache())
+        problem = assemble(load("tiny.yaml", settings), cache=DecisionCache())
         counts.append(operations(problem))
-        assert problem.memory is not None
-        plans.append(problem.memory.expected_bytes)
         assert is_even(problem)
         assert problem.integrator.preparation.guiding is None
         del problem
         gc.collect()
     assert counts[0] == counts[1]
-    assert plans[0].total == pytest.approx(plans[1].total, rel=0.01)
     monkeypatch.setattr(StepTrial, "take", lambda *args: pytest.fail("measured"))
-    again = assemble(load("tiny.yaml", [*AUTO, "integrator.sequence=auto", budget]), cache=DecisionCache())
+    again = assemble(load("tiny.yaml", [*AUTO, "integrator.sequence=auto"]), cache=DecisionCache())
     assert [(each.setting, each.value, each.cached) for each in again.decisions] == [
         ("sequence", "low_discrepancy", False),
         ("guiding", "off", True),
@@ -306,23 +303,6 @@ def test_a_resumed_run_keeps_the_decision_bit_by_bit(tmp_path: Path, monkeypatch
     assert values == {"sequence": "independent", "guiding": "on"}
     assert differences(whole, left) == []
     assert left_over(left) == []
-
-
-@pytest.mark.usefixtures("llvm")
-def test_a_memory_budget_too_small_for_tables_disables_guiding(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    budget = "run.memory_budget={}"
-    roomy = decided(monkeypatch, 1.0, budget.format(64))
-    assert [each.value for each in roomy.decisions] == ["on"]
-    assert roomy.memory is not None
-    plain = assemble(load("tiny.yaml", [*AUTO[1:], budget.format(64)]))
-    assert plain.memory is not None
-    more = roomy.memory.expected_bytes.total - plain.memory.expected_bytes.total
-    assert more == pytest.approx(table_bytes(roomy), rel=0.05)
-    tight = decided(monkeypatch, 1.0, budget.format(4))
-    assert tight.decisions[0].why.startswith("run.memory_budget has no room for tables of ")
-    assert tight.integrator.preparation.guiding is None
 
 
 @pytest.mark.usefixtures("llvm")

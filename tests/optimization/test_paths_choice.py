@@ -25,7 +25,6 @@ from reslrb_cli.optimization.views import View
 from reslrb_cli.records.decisions import Decision, DecisionCache
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
-from reslrb_cli.transport.film import PixelShares
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -322,21 +321,6 @@ def test_the_curvature_of_relative_l2_is_the_inverse_squared_target(epsilon: flo
     expected = weights / (np.square(target[:, :, 0]) + epsilon)
     np.testing.assert_allclose(view.curvature(True), expected / expected.mean(), rtol=1e-4)
     np.testing.assert_allclose(view.curvature(False), weights / weights.mean(), rtol=1e-4)
-
-
-def test_a_memory_budget_includes_the_distribution_of_paths():
-    """The film is so large that other allocations count little."""
-
-    def expected(pixels: str) -> int:
-        integrator = f"integrator={{estimator: stack, paths: both, pixels: {pixels}}}"
-        settings = [integrator, "run.memory_budget=256", "run.spp=4", "scene.size=[256, 256]"]
-        problem = assemble(load("tiny.yaml", settings))
-        assert problem.memory is not None
-        return problem.memory.expected_bytes.total
-
-    expected("even")  # creates everything that is made once
-    more = expected("measured") - expected("even")
-    assert more == pytest.approx(PixelShares.bytes(256 * 256), rel=0.1)
 
 
 def test_impossible_paths_are_located():

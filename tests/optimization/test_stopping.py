@@ -14,8 +14,8 @@ from runs.going_on import begin_alone, differences, optimize, run_and_kill
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization.loop import Watch
 from reslrb_cli.optimization.state import State
-from reslrb_cli.optimization.stopping import Watch
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.metrics import Record
 

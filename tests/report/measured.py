@@ -88,10 +88,6 @@ def write_convergence(path, parameter="all"):
 # A run folder as `reslrb optimize` leaves it, made without rendering.
 
 FLOOR, LAMP = "floor.reflectance.data", "lamp.intensity.value"
-MEMORY = {
-    "budget_bytes": 2**30, "samples_per_pass": 8, "passes": 2, "peak_mib": 612.5, "exceeded": False,
-    "expected_bytes": {"fixed": 2**20, "images": 2**20, "scratch": 0, "paths": 2**21},
-}  # fmt: skip
 SCALING = [{"key": LAMP, "entries": 3, "value": 3e6, "gradient": 7e-9, "noise": 2e-10, "change": 1e-7,
             "curvature": 4e-15, "length": 7.76e6, "own_length": 7.76e6, "first_step": 7.76e5}]  # fmt: skip
 

@@ -15,7 +15,6 @@ import pytest
 from report.measured import (
     FLOOR,
     LAMP,
-    MEMORY,
     SCALING,
     make_run,
     write_bench,
@@ -199,9 +198,8 @@ def test_swatches_have_the_colours_of_the_values(tmp_path):
 
 
 def test_scaling_memory_and_run_are_tables(tmp_path):
-    page = page_of(make_run(tmp_path / "lamp", memory=MEMORY, scaling=SCALING))
+    page = page_of(make_run(tmp_path / "lamp", scaling=SCALING))
     assert page.row("Scale of the parameters", LAMP)[1] == "3e+06"
-    assert page.row("Memory budget", "budget")[1] == "1024 MiB"
     assert page.row("Run", "time per iteration")[1] == "90 ms (median)"
     assert page.row("Run", "device")[1] == "a machine"
     everything = "".join(page.sections.values())
@@ -346,7 +344,7 @@ LONG = "wall_of_the_north_western_corridor_behind_the_second_door_0123456789_" *
 NOISY = {"start": {"mean": 1.31e-7, "error": 4e-9}, "end": {"mean": 1.33e-7, "error": 4e-9}, "change": "flat"}
 EVERYTHING = "all of them, and measurements"
 RUNS = {
-    "textures and colours": {"memory": MEMORY, "scaling": SCALING, "shared": asdict(SHARED)},
+    "textures and colours": {"scaling": SCALING, "shared": asdict(SHARED)},
     "three sensors": {"sensors": 3, "size": (240, 320)},
     "no truth": {"truth": False},
     "failed": {"status": Status.FAILED, "error": "x" * 400, "iterations": 0},

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from report.measured import (
     LAMP,
-    MEMORY,
     ORIGIN,
     SCALING,
     convergence_lines,
@@ -66,13 +65,13 @@ def test_all_runs_are_in_one_picture(tmp_path):
 
 def test_every_record_of_each_run_is_shown(tmp_path):
     guiding = Decision(setting="guiding", value="off", why="not measured").to_json()
-    records = {"decisions": [guiding], "memory": MEMORY, "scaling": SCALING, "plan": PLAN}
+    records = {"decisions": [guiding], "scaling": SCALING, "plan": PLAN}
     page = page_of(
         make_run(tmp_path / "a", iterations=0, **records),
         make_run(tmp_path / "b", iterations=0, command_line=["reslrb", "optimize", "b"]),
     )
     own = page.sections["Run a"]
-    for words in ("Plan", "the scene has masks", "Choice of the samples", "not measured", "Memory budget",
+    for words in ("Plan", "the scene has masks", "Choice of the samples", "not measured", 
                   "Scale of the parameters", "Configuration", "versions", "mitsuba"):  # fmt: skip
         assert words in own
     assert page.row("Run b", "command line")[1] == "reslrb optimize b"
@@ -236,9 +235,7 @@ def damage(folder, change):
     [
         lambda manifest: manifest.update(results={"parameters": {"a": 3}, "seen": {"": 7}}),
         lambda manifest: manifest.update(results={"parameters": 5, "rmse": 3}),
-        lambda manifest: manifest.update(
-            decisions=[{"rows": 3}], memory={"budget": "x"}, scaling=[{}], plan={"rows": "no"}
-        ),
+        lambda manifest: manifest.update(decisions=[{"rows": 3}], scaling=[{}], plan={"rows": "no"}),
         lambda manifest: manifest.update(started="soon", views=[{"sensor": "x"}], versions={}),
     ],
 )

@@ -135,7 +135,7 @@ MOVING = {"verdict": "still moving", "shares": {"still moving": 1.0}, "spread": 
 def judged(about, **measured):
     """Return results of a lamp with the verdict of `MOVING | about`."""
     lamp = {"quantity": "radiance", "shape": [3], "initial": {"value": [5.0]}, "final": {"value": [7.9]}, "true": None}
-    common = {"gradients": 3, "changes": 1, "probes": 0, "measure_s": 1.0, "share": 0.1, "iterations": 200,
+    common = {"measure_s": 1.0, "share": 0.1, "iterations": 200,
               "scale": "none", "learning_rate": 0.03, "target_noise": "measured", "target_spp": 64}  # fmt: skip
     certainty = common | {"parameters": {"lamp.radiance.value": MOVING | about}} | measured
     trend = measured.pop("trend", None)

@@ -81,7 +81,6 @@ CASES: dict[str, list[str]] = {
     "shards": ["run.spp=8", "run.shards=4", "integrator.guiding=on", "optimizer.scale=auto"],
     "shards of views": [*BATCHED, VIEWS, "run.shards=2"],
     "passes": [*BATCHED, "integrator.samples_per_pass=1"],
-    "budget": [*BATCHED, "run.memory_budget=8"],
     "a list of losses": ["loss=[{type: l1}, {type: l2, weight: 0.5}]"],
     "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
 }

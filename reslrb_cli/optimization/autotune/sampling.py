@@ -33,7 +33,6 @@ from typing import Any
 import mitsuba as mi
 
 from reslrb_cli.backend.doctor import device_name
-from reslrb_cli.config.files import in_words
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.pixels import noted_part
 from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, PlanRow, with_reason
@@ -42,14 +41,12 @@ from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sets_of, sizes
 from reslrb_cli.optimization.losses import QUADRATIC
 from reslrb_cli.optimization.memory import pixels_of
-from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.decisions import Decision, DecisionCache, key_of
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
-from reslrb_cli.transport.film import PixelShares
 
 #: Maximum time of a guided step, and of a step of camera paths alone, relative to another.
 GUIDING_LONGER, PATHS_LONGER = 3.0, 2.0
@@ -83,12 +80,6 @@ class Tuner:
         if integrator.paths != self.problem.integrator.paths:
             self._times = None  # iterations with other paths take another time
         self.problem = replace(self.problem, decisions=[*kept, *decisions], integrator=integrator)
-
-    def set_aside(self, size: int) -> None:
-        """Add `size` bytes to the expected memory of all steps, if there is a memory budget."""
-        if (memory := self.problem.memory) is not None:
-            expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + size)
-            self.problem = replace(self.problem, memory=replace(memory, expected_bytes=expected))
 
     def tell(self) -> None:
         """Print the decisions in one line, or each with its reason in verbose runs."""
@@ -168,7 +159,7 @@ def situation(problem: Problem) -> dict[str, Any]:
         "sensors": problem.sensors,
         "views": [[view.share, view.held_out, *(own.token for own in view.codes)] for view in problem.views],
         "parameters": {key: list(problem.selection.array(key).shape) for key in problem.selection.keys},
-        "run": config.step_options() | {"memory_budget": config.run.memory_budget},
+        "run": config.step_options(),
         "versions": versions(),
         "variant": mi.variant(),
         "device": device_name(mi.variant()),
@@ -258,7 +249,6 @@ def _measure_pixels(tuner: Tuner) -> None:
     curvatures = {view.sensor: view.curvature(known) for view in problem.trained}
     noted = {str(sensor): tracer.note_pixels(job, curvatures[sensor]) for sensor, job in jobs.items()}
     tuner.problem = replace(problem, integrator=tracer.shared_out(noted))
-    tuner.set_aside(sum(map(PixelShares.bytes, pixels_of(scene, list(jobs)))))
 
 
 # --- guiding ----------------------------------------------------------------------------------------------------------
@@ -271,13 +261,8 @@ def _guiding(tuner: Tuner) -> None:
     if problem.integrator.paths == "camera" and not alone:
         return  # no path starts at an emitter
     off = Decision(setting="guiding", value="off", why="it pays in long runs")
-    if problem.memory is not None:
-        free, needed = problem.memory.budget_bytes - problem.memory.expected_bytes.total, table_bytes(problem)
-        if needed > free:
-            tuner.take(replace(off, why=f"run.memory_budget has no room for tables of {in_words(needed)}"))
-            return
     independent = {"low_discrepancy": False} if is_auto(config, "sequence") else {}
-    if independent and is_attached(problem):
+    if independent and problem.moves:
         tuner.take(replace(off, why="for moving light, low-discrepancy numbers help most"))
         return
     plan = sizes(problem, GUIDING_LONGER)
@@ -302,16 +287,6 @@ def _guiding(tuner: Tuner) -> None:
         others += [replace(each, value="light", why=why, gain=None, low=None, high=None)
                    for each in problem.decisions if each.setting == "paths"]  # fmt: skip
     tuner.take(*others, decision)
-    tuner.set_aside(table_bytes(tuner.problem))
-
-
-def table_bytes(problem: Problem) -> int:
-    """Return the size of all sensors' tables in bytes, for `problem.integrator` with guiding."""
-    made = problem.integrator.afresh(guided=True, light_share=1.0 if _guides_light_alone(problem) else None)
-    if made.paths == "camera":
-        return 0
-    made.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # cuts the grid
-    return int(made.preparation.guiding.bytes(len(problem.sensors)))
 
 
 def _guides_light_alone(problem: Problem) -> bool:
@@ -330,13 +305,14 @@ class Option:
     """Automatic setting of the integrator.
 
     - `decide` takes the decision.
-    - `apply` returns an integrator with a decided value.
+    - `values` are the possible decisions. `apply` returns an integrator with one of them.
     - `paths` are the kinds of paths that leave the setting open: those that can render the scene (`Problem.paths`).
     - `feature` is the row of the plan that shows the reason.
     - `prepare` measures what the value needs, decided or configured.
     """
 
     decide: Callable[[Tuner], None]
+    values: tuple[str, ...]
     apply: Callable[[Any, str], Any]
     paths: tuple[str, ...]
     feature: str
@@ -346,17 +322,19 @@ class Option:
 #: The options by setting, in the order of the decisions.
 OPTIONS = {
     "sequence": Option(
-        _sequence,
+        _sequence, ("low_discrepancy", "independent"),
         lambda tracer, value: tracer.afresh(low_discrepancy=value == "low_discrepancy"),
         ("light", "both"), SEQUENCE,
     ),
-    "paths": Option(_paths, lambda tracer, value: tracer.afresh(light_share=SHARES[value]), ("both",), PATHS_FROM),
+    "paths": Option(
+        _paths, tuple(SHARES), lambda tracer, value: tracer.afresh(light_share=SHARES[value]), ("both",), PATHS_FROM
+    ),
     "pixels": Option(
-        _pixels, lambda tracer, value: tracer.afresh(shares_out=value == "measured"),
+        _pixels, ("even", "measured"), lambda tracer, value: tracer.afresh(shares_out=value == "measured"),
         ("camera", "both"), PIXELS, _measure_pixels,
     ),
     "guiding": Option(
-        _guiding,
+        _guiding, ("off", "on", "on for gradients"),
         lambda tracer, value: tracer.afresh(guided=value != "off", images=value == "on"),
         ("light", "both"), GUIDED,
     ),
@@ -387,8 +365,12 @@ def open_settings(config: Config, paths: str) -> list[str]:
 
 
 def decided(config: Config, decisions: Iterable[Decision]) -> list[Decision]:
-    """Return the decisions on settings that `config` leaves to `auto`."""
-    return [each for each in decisions if each.setting in OPTIONS and is_auto(config, each.setting)]
+    """Return the decisions on settings that `config` leaves to `auto`. Raises TypeError for an unknown value."""
+    found = [each for each in decisions if each.setting in OPTIONS and is_auto(config, each.setting)]
+    for each in found:
+        if each.value not in (values := OPTIONS[each.setting].values):
+            raise TypeError(f"{each.setting} is `{each.value}`; possible are {', '.join(values)}")
+    return found
 
 
 def as_decided(integrator: Any, decisions: Iterable[Decision]) -> Any:

@@ -188,8 +188,6 @@ class LossCurvature:
 
     def __init__(self, problem: Problem, spp: int) -> None:
         self.problem, self.spp = problem, spp
-        #: Progress.
-        self.changes = self.probes = 0
         #: Number of image values that show each texture, for textures changed as a whole.
         self.pixels: dict[str, int] = {}
         self.integrator = unrecorded(problem.integrator)
@@ -217,7 +215,6 @@ class LossCurvature:
                 break
             self.problem.selection.set_arrays(change.values)
             images = [see_images(self.problem, self.spp, -1 - half, _PURPOSE) for half in (0, 1)]
-            self.changes += 1
             self.problem.apply()
             for direction in change.directions:
                 directions.append(direction)
@@ -259,15 +256,17 @@ class LossCurvature:
         """
         total: dict[str, Array] = {}
         random = np.random.default_rng(self._seed(0, probes))
+        done = 0
         for probe in range(probes):
             if not go_on():
                 break
+            done += 1
             roots = [np.sqrt(weight) * random.choice([-1.0, 1.0], size=weight.shape) for weight in self._weights]
             self._add_probe(total, roots, 2 * probe)
             for key in total:
                 signs = random.choice([-1.0, 1.0], size=total[key].shape)
                 total[key] = total[key] + signs * self.problem.stiffness(key, signs)
-        return {key: value / self.probes for key, value in total.items()}
+        return {key: value / done for key, value in total.items()}
 
     def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
         """Return the diagonal of B for each parameter as a flat array, unsmoothed. The probes are numbered from `first`
@@ -290,7 +289,6 @@ class LossCurvature:
         a, b = (self._probe(gradients, number + half) for half in (0, 1))
         for key in a:
             total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
-        self.probes += 1
 
     def _target_noises(self) -> list[list[TargetNoise]]:
         config, trained = self.problem.config, self.problem.trained

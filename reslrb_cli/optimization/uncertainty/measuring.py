@@ -188,7 +188,6 @@ class Certainty:
                 if spp < config.run.spp and hides(directions, H, gradients) and go_on():
                     again = LossCurvature(problem, config.run.spp)
                     found = again.along(plan, go_on)
-                    curvature.changes += again.changes
                     if len(found[0]) == len(directions):
                         directions, H, B = found
                 # By entry, if a parameter has no directions for its entries.
@@ -205,11 +204,7 @@ class Certainty:
             render = config.target.render
             return CertaintyRecord(
                 parameters={key: self._with_course(key, about, measured[key]) for key, about in weighed.items()},
-                gradients=count,
-                changes=curvature.changes,
-                probes=curvature.probes,
                 measure_s=measure_s,
-                compile_s=compiled_ms / 1e3,
                 share=measure_s / max(elapsed_s, 1e-9),
                 iterations=iterations,
                 scale=config.optimizer.scale,

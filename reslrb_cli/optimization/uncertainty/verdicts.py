@@ -140,21 +140,16 @@ class ParameterCertainty:
 
 @dataclass(frozen=True)
 class CertaintyRecord(Jsonable):
-    """Certainty of all parameters, by key, and the costs of the estimate.
+    """Certainty of all parameters, by key, and the time of the estimate.
 
-    The costs are the numbers of gradients, renderings along directions and random probes. `measure_s` is the measuring
-    time in seconds without compilation. `compile_s` is the compilation time. `share` is `measure_s` divided by the time
-    of the run's iterations. `iterations`, `scale`, `learning_rate` and `target_spp` repeat the run's settings.
+    `measure_s` is the measuring time in seconds without compilation. `share` is `measure_s` divided by the time of the
+    run's iterations. `iterations`, `scale`, `learning_rate` and `target_spp` repeat the run's settings.
     `learning_rate` is that of `optimizer`. `target_noise` is `measured` if all targets were rendered, `in part` if some
     were, otherwise `left out`. The spreads include only the noise of rendered targets.
     """
 
     parameters: dict[str, ParameterCertainty]
-    gradients: int
-    changes: int
-    probes: int
     measure_s: float
-    compile_s: float
     share: float
     iterations: int
     scale: str

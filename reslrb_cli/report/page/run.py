@@ -139,7 +139,6 @@ def record_parts(run: ShownRun) -> dict[str, Markup]:
             soft(Decision.from_json(each).line(cost=True)) for each in manifest.get("decisions") or ()
         ),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
-        "Memory budget": lambda: lay_out("run.memory", kept) if (kept := manifest.get("memory")) else Markup(),
         "Workers": lambda: workers(manifest.get("shared"), run.last("elapsed_s")),
         "Configuration": lambda: lay_out("pre", _read(run.path / "config.yaml")),
     }
