@@ -264,8 +264,8 @@ class SceneSummary:
     movable: list[MovableSummary]
 
 
-def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
-    """Summarise `scene`. `sensors` are the indices of the described sensors, or None for all."""
+def summarise(scene: Any, hide_emitters: bool = False) -> SceneSummary:
+    """Return the contents of `scene`."""
     graph, params = SceneGraph.of(scene), mi.traverse(scene)
     shapes = graph.shapes()
     return SceneSummary(
@@ -273,10 +273,7 @@ def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | 
         bsdfs=_count(graph.of_type(mi.BSDF)),
         shapes=_count(shapes),
         triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
-        sensors=[
-            _sensor(scene, index, hide_emitters)
-            for index in (range(len(scene.sensors())) if sensors is None else sensors)
-        ],
+        sensors=[_sensor(scene, index, hide_emitters) for index in range(len(scene.sensors()))],
         parameters=list_parameters(params, values=True),
         movable=[
             MovableSummary(item.id, ["motion"] if item.heightmap_obstacle() else ["motion", "heightmap"])
