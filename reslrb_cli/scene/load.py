@@ -19,7 +19,6 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.extent import doubts
-from reslrb_cli.scene.files import option_texts
 from reslrb_cli.scene.xml.build import Owners, build
 from reslrb_cli.scene.xml.check import check, check_files, resize_films
 from reslrb_cli.scene.xml.mend import mend, warnings
@@ -58,7 +57,7 @@ def load_scene(
     and of coincident faces.
     """
     file = Path(file)
-    description = read_description(file, option_texts(options or {}))
+    description = read_description(file, options or {})
     root = description.root
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
