@@ -294,13 +294,6 @@ def moved(z: float, scale: float = 1) -> str:
         (BOTH_SIDES, rectangle("a") + rectangle("b", REF + FLIPPED), None),
         (WHITE, rectangle("a") + rectangle("b", REF + '<emitter type="area"/>'), "`a` and `b`"),
         (WHITE, rectangle("a") + rectangle("b", '<bsdf type="diffuse"/>' + moved(z=-0.1)), None),
-        (WHITE, '<shape type="sphere" id="a"/><shape type="sphere" id="b"/>', "`a` and `b`"),
-        (WHITE, f'<shape type="disk" id="a">{REF}</shape><shape type="disk" id="b">{REF}</shape>', None),
-        (
-            WHITE,
-            f'<shape type="disk" id="a">{REF}</shape><shape type="disk" id="b">{REF}{FLIPPED}</shape>',
-            "`a` and `b`",
-        ),
         (WHITE, obj("a", "both", FLAT), "`a`"),
         (BOTH_SIDES, obj("a", "both", FLAT), None),
         (BOTH_SIDES, obj("a", "both"), "`a`"),  # each corner normal is the mean of both faces' normals, 0
