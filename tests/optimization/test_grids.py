@@ -93,20 +93,6 @@ def test_a_mesh_of_four_vertices_becomes_a_grid(tmp_path, with_quad):
     assert np.allclose(z, -1)
 
 
-def test_a_flat_grid_can_be_refined(tmp_path):
-    """The grid covers the same square, and its normals are unchanged."""
-    from reslrb_cli.optimization.assemble import assemble_scene
-
-    plain = assemble_scene(configured(tmp_path, "mesh: face, resolution: [4, 4]"))
-    problem = assemble_scene(configured(tmp_path, "mesh: face, resolution: [4, 4], grid: 9"))
-    faces = [next(shape for shape in each.scene.shapes() if shape.id() == "face") for each in (plain, problem)]
-    assert faces[1].vertex_count() == 81
-    for name in ("min", "max"):
-        assert np.allclose(*(getattr(face.bbox(), name) for face in faces), atol=1e-6)
-    normals = [np.array(face.vertex_normals_buffer()).reshape(-1, 3).mean(axis=0) for face in faces]
-    assert np.allclose(*normals, atol=1e-5)
-
-
 def test_other_shapes_are_refused_and_missing_grids_reported(tmp_path, with_quad):
     from reslrb_cli.optimization.assemble import assemble_scene
 
