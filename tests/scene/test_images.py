@@ -65,11 +65,11 @@ def test_a_complete_file_is_read(image, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0])
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.25, 0.5, 0.75, 0.9, 0.999])
 def test_a_truncated_file_is_refused(image, share, capfd):
     data = image.read_bytes()
-    image.write_bytes(data[: min(int(share * len(data)), len(data) - 1)])
-    assert refused(image).startswith(("is truncated", "is damaged or truncated", "is not a readable image"))
+    image.write_bytes(data[: int(share * len(data))])
+    assert refused(image).startswith(("is damaged or truncated", "is not a readable image"))
     assert capfd.readouterr() == ("", "")  # libjpeg's messages do not reach the terminal
 
 
@@ -161,13 +161,6 @@ def test_empty_headers(tmp_path, data):
     assert refused(path).startswith("is not a readable image (EXR, PNG")
 
 
-def test_a_jpeg_of_empty_parts_is_read_fast(tmp_path, monkeypatch):
-    monkeypatch.setattr(images, "_MOST_PARTS", 1000)
-    path = tmp_path / "a.jpg"
-    path.write_bytes(b"\xff\xd8" + b"\xff\xe0\0\x02" * 2000)
-    assert refused(path).startswith("is not a readable image")
-
-
 @pytest.mark.parametrize("kind", ["pipe", "device", "sparse"])
 def test_only_regular_files_are_read(tmp_path, kind):
     path = tmp_path / "a.png"
@@ -202,7 +195,7 @@ def test_lines_of_a_radiance_image_are_checked_before_decoding(width, tmp_path):
         (lines[2] + 4, b"\x00"),
     ):
         path.write_bytes(data[:place] + there + data[place + 1 :])
-        assert refused(path).startswith(("is truncated", "is damaged or truncated"))
+        assert refused(path).startswith("is damaged or truncated")
         with pytest.raises(images.DamagedImage):
             images.image_size(path)
 
@@ -302,15 +295,6 @@ def png_with(path, data):
     chunk = struct.pack(">I", len(data)) + b"eXIf" + data + struct.pack(">I", zlib.crc32(b"eXIf" + data))
     path.write_bytes(whole[:head] + chunk + whole[head:])
     return path
-
-
-def test_a_png_with_too_long_exif_is_truncated(tmp_path):
-    path = png_with(tmp_path / "a.png", exif([SIX]))
-    assert orientation_of(path) == 6
-    data = bytearray(path.read_bytes())
-    data[33:37] = b"\x7f\xff\xff\xff"
-    path.write_bytes(data)
-    assert refused(path).startswith("is truncated")
 
 
 def test_a_texture_is_read_unrotated_with_a_message(tmp_path, caplog):
