@@ -244,16 +244,11 @@ class SensorSummary:
 
 
 @dataclass(frozen=True)
-class MovableSummary:
-    """Id of a shape or emitter, and the parameters that can move the object: `motion`, `heightmap`."""
-
-    id: str
-    by: list[str]
-
-
-@dataclass(frozen=True)
 class SceneSummary:
-    """Contents of a scene: class names with counts, sensors, all parameters, and movable objects."""
+    """Contents of a scene: class names with counts, sensors, all parameters, and movable objects.
+
+    `movable` has the `id` of each shape or emitter, and `by`, the parameters that can move it: `motion`, `heightmap`.
+    """
 
     emitters: dict[str, int]
     bsdfs: dict[str, int]
@@ -261,7 +256,7 @@ class SceneSummary:
     triangles: int
     sensors: list[SensorSummary]
     parameters: list[ParameterInfo]
-    movable: list[MovableSummary]
+    movable: list[dict[str, Any]]
 
 
 def summarise(scene: Any, hide_emitters: bool = False) -> SceneSummary:
@@ -276,7 +271,7 @@ def summarise(scene: Any, hide_emitters: bool = False) -> SceneSummary:
         sensors=[_sensor(scene, index, hide_emitters) for index in range(len(scene.sensors()))],
         parameters=list_parameters(params, values=True),
         movable=[
-            MovableSummary(item.id, ["motion"] if item.heightmap_obstacle() else ["motion", "heightmap"])
+            {"id": item.id, "by": ["motion"] if item.heightmap_obstacle() else ["motion", "heightmap"]}
             for item in list_movable(params)
         ],
     )
