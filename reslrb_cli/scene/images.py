@@ -357,16 +357,6 @@ def read_photo(
     )
 
 
-def read_weights(path: Path, size: Size, upright: bool = True) -> Image:
-    """Read an image of weights as float32 (H, W). A weight is the value in the file, or the mean if there are several
-    channels.
-
-    Values of 8 or 16 bits are divided by the largest 8-bit or 16-bit value. Alpha is dropped. `upright` rotates the
-    image by its own EXIF orientation. Like `read_image`, raises a ConfigError that names the file.
-    """
-    return read_photo(path, "linear", size, upright=upright).image.mean(axis=2)
-
-
 def decode_srgb(encoded: Image) -> Image:
     """Return the linear values of sRGB-encoded values (IEC 61966-2-1), with the precision of the input."""
     wide = encoded.astype(np.float64)

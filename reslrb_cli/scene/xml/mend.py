@@ -180,9 +180,8 @@ def _name_objects(root: Element) -> list[Note]:
     """Give every object below `root` an id that is the same at every load. Return notes on changed ids.
 
     The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Some ids cannot be used
-    in a key and are replaced. Ids to be replaced are empty, very long or unprintable, start with `_unnamed_`, or belong
-    to an earlier object. References are updated. Raises ConfigError if a reference names an id that two different
-    objects share.
+    in a key and are replaced. Ids to be replaced are empty, very long or unprintable, or start with `_unnamed_`.
+    References are updated. Raises ConfigError if two objects have one id, which Mitsuba refuses as well.
     """
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
@@ -190,7 +189,6 @@ def _name_objects(root: Element) -> list[Note]:
     taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
     owners: dict[str, Element] = {}
     renamed: dict[str, str] = {}
-    differing: dict[str, Element] = {}
     notes: list[Note] = []
     numbers: Counter[str] = Counter()
     for element in objects:
@@ -198,12 +196,11 @@ def _name_objects(root: Element) -> list[Note]:
         numbers[kind] += 1
         own = element.id
         if own in owners:
-            if not _same(owners[own], element):
-                differing[own] = element
-        elif own.strip() and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED):
+            raise element.fail("", f"id {quoted(own)} is also that of {owners[own].place}; rename one of them")
+        if own.strip() and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED):
             owners[own] = element
             continue
-        elif element in grouped and not own:
+        if element in grouped and not own:
             continue
         name = first = f"{kind}_{numbers[kind]}"
         for number in itertools.count(2):
@@ -212,29 +209,14 @@ def _name_objects(root: Element) -> list[Note]:
             name = f"{first}_{number}"
         taken.add(name)
         element.attributes["id"] = name
-        if own in owners:
-            notes.append(Note(element, f"id {quoted(own)} is also that of {owners[own].place}", f"named {name}"))
-        elif own.strip() and own not in renamed:
+        if own.strip() and own not in renamed:
             renamed[own] = name
             if not own.startswith(_UNNAMED):
                 notes.append(Note(element, f"id {quoted(own)} cannot be part of a key", f"named {name}"))
     for element in root.walk("ref", "alias"):
-        own = element.id
-        if own in differing:
-            places = f"{owners[own].place} and {differing[own].place}"
-            raise element.fail("", f"refers to {quoted(own)}, the id of two objects ({places}); rename one of them")
-        if own in renamed:
-            element.attributes["id"] = renamed[own]
+        if element.id in renamed:
+            element.attributes["id"] = renamed[element.id]
     return notes
-
-
-def _same(a: Element, b: Element) -> bool:
-    """Whether two elements are equal except for their ids."""
-    one, other = ({**element.attributes, "id": ""} for element in (a, b))
-    return (
-        (a.tag, one, len(a.children)) == (b.tag, other, len(b.children))
-        and all(_same(x, y) for x, y in zip(a.children, b.children, strict=True))
-    )  # fmt: skip
 
 
 CURRENT_VERSION = "3.0.0"
