@@ -291,10 +291,9 @@ def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> N
     """
     vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
     if width * height > vertices:
-        hint = f"; `grid: [{width}, {height}]` makes such a mesh from a rectangle" if vertices == 4 * len(items) else ""
         ids = " and ".join(f"`{item.id}`" for item in items)
         warn_once(f"the heightmap of {ids}, {width}x{height}, is finer than the mesh with {vertices} vertices: texels "
-                  f"between vertices have no effect{hint}")  # fmt: skip
+                  "between vertices have no effect")  # fmt: skip
 
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]
