@@ -167,7 +167,7 @@ class Problem:
             after = plate.held(*(each.astype(np.float64) for each in before.values()))
             for (each, old), new in zip(before.items(), after, strict=True):
                 if np.any(new > old):
-                    low, high = self.selection.spec(each).bounds or (-np.inf, np.inf)
+                    low, high = self.selection.specs[each].bounds or (-np.inf, np.inf)
                     self.optimizer.move(each, _handed(self.optimizer[each], np.clip(new, low, high)))
 
     def held(self) -> dict[str, int]:
@@ -185,7 +185,7 @@ class Problem:
                 rounding = 1e-5 * plate.settings.thickness  # sums of two single-precision values
                 thin = plate.thickness(height, there) <= plate.settings.thinnest + rounding
             else:
-                lowest = next(each.lowest for each in self.selection.spec(key).regularizers
+                lowest = next(each.lowest for each in self.selection.specs[key].regularizers
                               if isinstance(each, Thickness))  # fmt: skip
                 thin = height <= np.float32(lowest)
             counts[key] = int(np.count_nonzero(thin))
@@ -268,7 +268,7 @@ class Problem:
 
 def make_optimizer(config: Config, selection: Selection) -> Optimizer:
     """Return a new optimiser for the current values of the parameters."""
-    specs = {key: selection.spec(key) for key in selection.keys}
+    specs = {key: selection.specs[key] for key in selection.keys}
     return Optimizer(
         config.optimizer.type,
         config.optimizer.learning_rate,
@@ -296,7 +296,7 @@ def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost | Plate]
     """Return the regularizers of `selection`, by key and type."""
     found: dict[str, dict[str, Cost | Plate]] = {}
     for key in selection.keys:
-        for each in selection.spec(key).regularizers:
+        for each in selection.specs[key].regularizers:
             cost: Cost | Plate
             if isinstance(each, Thickness) and each.opposite is not None:
                 name = f"{each.opposite}.{HEIGHTMAP}"

@@ -56,10 +56,6 @@ class Selection:
         own = [key for key in self.keys if self._holder(key) is self.params]
         return [*own, *(other for key in own for other in self.tied.get(key, ())), *self.deformation.keys]
 
-    def spec(self, key: str) -> Settings:
-        """Return the settings of the selected `key`."""
-        return self.specs[key]
-
     def kind(self, key: str) -> str:
         """Return the kind of `key` for regularizers: `heightmap`, `bitmap`, `mesh`, or "" for other parameters."""
         slot = self.slot(key)
@@ -101,12 +97,6 @@ class Selection:
     def value(self, key: str) -> Any:
         """Return the current value of `key` as a Dr.Jit value."""
         return self._holder(key)[key]
-
-    def quantity(self, key: str) -> str | None:
-        """Return the quantity of `key`: `length`, `degrees` or `scale` of a motion. For the scene's own parameters,
-        return None.
-        """
-        return self.deformation.quantities.get(key)
 
     def array(self, key: str) -> np.ndarray[Any, Any]:
         """Return the current value of `key`: a texture (H, W, C), a colour (C,), a buffer (N,), or a number ().
