@@ -37,7 +37,7 @@ def files_of(config: Config) -> dict[str, Path]:
     if config.scene.file.is_file():
         description = read_description(config.scene.file, config.scene.options)
         beside += [("scene.file", path) for path in description.files]
-        named = (description.find_file(name) for _, _, name in description.named_files())
+        named = (description.find_file(name) for _, name in description.named_files())
         beside += [("scene.file", path) for path in named if path is not None]
     cameras = config.scene.cameras
     if cameras is not None and cameras.is_file():

@@ -156,7 +156,7 @@ def _size_of(film: Element) -> FilmSize:
 
 def check_files(description: Description) -> None:
     """Raise ConfigError with file and line if a file is missing, damaged or too large."""
-    for _, element, name in description.named_files():
+    for element, name in description.named_files():
         if (wrong := _wrong_file(name, description)) is not None:
             raise element.fail("material" if element.name == "material" else "filename", wrong)
 

@@ -223,19 +223,18 @@ class Description:
         """Return the file or folder that Mitsuba opens for this name, or None. Searches `folders` first."""
         return _find(name, self.folders)
 
-    def named_files(self) -> Iterator[tuple[Element, Element, str]]:
-        """Yield the object, the element and the file name for each file that Mitsuba opens for the scene.
+    def named_files(self) -> Iterator[tuple[Element, str]]:
+        """Yield the element and the file name for each file that Mitsuba opens for the scene.
 
         The `material` of a metal names two of Mitsuba's own tables. The two tables of a metal's `material` are included
         if files in `folders` replace Mitsuba's own tables.
         """
-        for owner in self.root.walk():
-            for element in owner.children:
-                if element.file_attribute:
-                    yield owner, element, element.attributes[element.file_attribute]
-                elif element.tag == "string" and element.name == "material":
-                    tables = (f"data/ior/{element.value}.{table}.spd" for table in ("eta", "k"))
-                    yield from ((owner, element, name) for name in tables if self.find_file(name) is not None)
+        for element in self.root.walk():
+            if element.file_attribute:
+                yield element, element.attributes[element.file_attribute]
+            elif element.tag == "string" and element.name == "material":
+                tables = (f"data/ior/{element.value}.{table}.spd" for table in ("eta", "k"))
+                yield from ((element, name) for name in tables if self.find_file(name) is not None)
 
 
 def read_description(file: Path, options: Mapping[str, Any]) -> Description:
