@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-import time
 import zlib
 from pathlib import Path
 
@@ -231,70 +230,31 @@ def test_orientation_matches_pillow(name, channels, orientation, tmp_path):
             read_bitmap(path, (7, 5), upright=True)
 
 
-def exif(entries, order=">", place=8, count=None):
-    """Return EXIF data with the given entries (tag, type, count, value)."""
-    head = (b"MM\0*" if order == ">" else b"II*\0") + struct.pack(f"{order}I", place)
-    body = struct.pack(f"{order}H", len(entries) if count is None else count)
-    return head + body + b"".join(struct.pack(f"{order}HHIHH", *entry, 0) for entry in entries)
+def orientation(value):
+    """Return EXIF data with one entry, the orientation `value`."""
+    return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, value, 0, 0)
 
 
-def jpeg_with(path, *contents, kind=0xE1):
-    """Write a JPEG of 7x5 pixels with these application segments after its head."""
-    mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
-    data = path.read_bytes()
-    parts = b"".join(b"\xff" + bytes([kind]) + struct.pack(">H", len(content) + 2) + content for content in contents)
-    path.write_bytes(data[:2] + parts + data[2:])
-    return path
-
-
-SIX = (0x0112, 3, 1, 6)
-
-
-@pytest.mark.parametrize("order", "<>")
-def test_other_entries_and_segments_are_skipped(order, tmp_path):
-    entries = [(0x010F, 2, 4, 0x4142), (0x0110, 2, 4, 0x4142), SIX, (0x0112, 3, 1, 3)]
-    data = b"Exif\0\0" + exif(entries, order)
-    path = jpeg_with(tmp_path / "a.jpg", b"http://ns.adobe.com/xap/1.0/\0<x/>", data, b"Exif\0\0" + exif([]))
-    assert orientation_of(path) == 6
-    assert list(read_bitmap(path, upright=True).size()) == [5, 7]
-
-
+@pytest.mark.parametrize("name", ["a.jpg", "a.png"])
 @pytest.mark.parametrize(
-    "data",
+    ("data", "expected"),
     [
-        b"",
-        b"MM\0*",
-        b"XX\0*" + exif([SIX])[4:],
-        exif([SIX])[:-4],  # cut off within the entry
-        exif([SIX], place=2**32 - 1),
-        exif([SIX], place=4),  # a directory inside the pointer to it
-        exif([], count=65535),
-        exif([], count=65535) + bytes(60_000),
-        exif([(0x0112, 3, 1, 0)]),
-        exif([(0x0112, 3, 1, 9)]),
-        exif([(0x0112, 3, 2**32 - 1, 6)]),
-        exif([(0x0112, 2, 1, 6)]),
-        exif([(0x8769, 4, 1, 0), (0x014A, 4, 1, 0)] * 1000),  # nested directories that all point to this one
+        (orientation(6), 6),
+        (orientation(0), 1),
+        (orientation(9), 1),
+        (orientation(6)[:-10], 1),  # cut off within the entry
+        (b"MM\0*\xff\xff\xff\xff", 1),
+        (b"XX\0*" + orientation(6)[4:], 1),
+        (b"MM\0*", 1),
     ],
 )
-def test_exif_without_orientation_rotates_nothing(data, tmp_path):
-    start = time.monotonic()
-    for path in (
-        jpeg_with(tmp_path / "a.jpg", b"Exif\0\0" + data),
-        png_with(tmp_path / "a.png", data),
-    ):
-        assert orientation_of(path) == 1
-        assert list(read_bitmap(path, upright=True).size()) == [7, 5]
-    assert time.monotonic() - start < 5
+def test_damaged_exif_rotates_nothing(name, data, expected, tmp_path, recwarn):
+    from PIL import Image
 
-
-def png_with(path, data):
-    """Write a PNG of 7x5 pixels with this EXIF data after its head."""
-    mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
-    whole, head = path.read_bytes(), 8 + 25
-    chunk = struct.pack(">I", len(data)) + b"eXIf" + data + struct.pack(">I", zlib.crc32(b"eXIf" + data))
-    path.write_bytes(whole[:head] + chunk + whole[head:])
-    return path
+    Image.new("RGB", (7, 5)).save(tmp_path / name, exif=b"Exif\0\0" + data)
+    assert orientation_of(tmp_path / name) == expected
+    assert list(read_bitmap(tmp_path / name, upright=True).size()) == ([5, 7] if expected == 6 else [7, 5])
+    assert not recwarn.list
 
 
 def test_a_texture_is_read_unrotated_with_a_message(tmp_path, caplog):
