@@ -149,13 +149,6 @@ class Selection:
         self.deformation.place()
         self.params.update()
 
-    def is_map(self, key: str) -> bool:
-        """True if `key` is a texture or a heightmap with at least two texels along each axis. Environment maps, whose
-        sides meet, do not count.
-        """
-        slot = self.slot(key)
-        return slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
-
     def faces(self, key: str) -> np.ndarray[Any, Any] | None:
         """Return the triangles (3 m indices) of the mesh whose vertex positions are `key`. For other keys,
         return None.
@@ -204,7 +197,9 @@ def select_parameters(
             held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
             check_bounds(slot, value, settings.bounds, held)
         check_transform(slot, value, settings, place)
-        if settings.smoothing is not None and not (selection.is_map(key) or selection.faces(key) is not None):
+        # The sides of an environment map meet.
+        is_map = slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
+        if settings.smoothing is not None and not (is_map or selection.faces(key) is not None):
             raise place.fail("precondition", f"smooths textures, heightmaps and vertices, but not `{key}`")
         selection.check_regularizers(key, place)
         if values is not None or settings.initial != "scene" or settings.resolution is not None:
