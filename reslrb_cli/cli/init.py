@@ -223,10 +223,11 @@ def command(
     if photo is not None and copied:
         image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
         _check_free(image)
+    depth, missing = find_depth(scene, index)
     text = _first_config(
         path, options, description.variables, sensors, index, proposals, scene=scene_file, target=image,
         is_integer=is_integer, size=size, film=own, reason=reason,
-        hides_emitters=description.hides_emitters, depth=find_depth(scene, index),
+        hides_emitters=description.hides_emitters, depth=depth, missing=missing,
     )  # fmt: skip
     specs = loads(text, path).parameters
     scene = read_as_floats(scene, description, [key for spec in specs for key in spec.keys])

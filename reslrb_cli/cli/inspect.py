@@ -30,7 +30,7 @@ from reslrb_cli.report.format import table
 if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanRow
     from reslrb_cli.optimization.sensitivity import Conditioning
-    from reslrb_cli.scene.catalog import MovableSummary, ParameterInfo, SceneSummary, SensorSummary
+    from reslrb_cli.scene.catalog import ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.needs import SceneNeeds
     from reslrb_cli.scene.parameters import Selection
 
@@ -144,14 +144,14 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
     return lines
 
 
-def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[str]:
+def moving_lines(movable: Sequence[Mapping[str, Any]], everything: bool) -> list[str]:
     """List the movable objects, grouped by the options that move the objects."""
     lines = [f"can be moved: {len(movable) or 'nothing'}"]
     if everything:
-        return lines + [f"  {line}" for line in table([(item.id, ", ".join(item.by)) for item in movable])]
+        return lines + [f"  {line}" for line in table([(item["id"], ", ".join(item["by"])) for item in movable])]
     groups: dict[str, list[str]] = {}
     for item in movable:
-        groups.setdefault(" and ".join(item.by), []).append(item.id)
+        groups.setdefault(" and ".join(item["by"]), []).append(item["id"])
     for by, ids in groups.items():
         more = f" and {len(ids) - _MOVED} more; --all lists them" if len(ids) > _MOVED else ""
         lines.append(f"  by {by}: {', '.join(ids[:_MOVED])}{more}")

@@ -25,7 +25,6 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import write
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.records.atomic import unfinished_folder
-from reslrb_cli.scene.files import option_texts
 from reslrb_cli.scene.xml.read import read_description, tag_lines
 
 CONFIG_FILE, SCENE_FILE, INITIAL_FILE, FILES = "config.yaml", "scene.xml", "initial.npz", "files"
@@ -85,7 +84,7 @@ def bundle_of(config: Config, values: Values) -> Bundle:
 
 def _scene_text(bundle: Bundle, config: Config) -> str:
     """Return the scene description as one file. Paths in the file are replaced by the bundle's paths."""
-    description = read_description(config.scene.file, option_texts(config.scene.options))
+    description = read_description(config.scene.file, config.scene.options)
     for element in description.root.walk():
         key = element.file_attribute
         path = description.find_file(element.attributes[key]) if key else None

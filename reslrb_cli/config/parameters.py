@@ -143,9 +143,9 @@ class HeightmapSpec(Section):
     """[width, height] of the map in texels, at least 2 each. Lookups are bilinear, and constant beyond the centres of
     the outermost texels."""
     grid: _Grid | None = None
-    """Number of vertices along each edge, or [width, height]. Replaces a `rectangle`, or a mesh of four vertices that
-    is a rectangle, by a mesh of this size. The vertices reach from edge to edge. Their texture coordinates are the
-    centres of as many texels. null: the mesh stays as it is."""
+    """Number of vertices along each edge, or [width, height]. Replaces a `rectangle` by a mesh of this size. The
+    vertices reach from edge to edge. Their texture coordinates are the centres of as many texels. null: the mesh stays
+    as it is."""
 
 
 _POINT = must(

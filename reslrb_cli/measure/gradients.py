@@ -186,7 +186,7 @@ def all_directions(case: Case, selection: Selection, moving: int, others: int) -
             rows = smooth_rows(key, case.values.value(key), extent, moving)
             found[key] = [Direction(embed(case, key, row), "both") for row in rows]
             continue
-        bounds = selection.spec(key).bounds
+        bounds = selection.specs[key].bounds
         if bounds is None or not np.all(np.isfinite(bounds)):
             bounds = natural_bounds(parameter_kind(case.params, key), case.initial[key])
         found[key] = directions(case, key, bounds, others)

@@ -151,6 +151,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     if values is not None:
         _check_values(selection, values)
         selection.set_arrays(values)
+    motions = selection.deformation.quantities
     problem = Problem(
         config=config,
         scene=scene,
@@ -163,7 +164,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         samples_per_pass=samples_per_pass(config),
         regularizers=make_regularizers(selection),
         quantities={
-            key: "" if key in selection.factors else selection.quantity(key) or quantity(selection.params, key)
+            key: "" if key in selection.factors else motions.get(key) or quantity(selection.params, key)
             for key in selection.keys
         },
     )

@@ -23,8 +23,7 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import make_integrator, render_image
 from reslrb_cli.scene.deformation import where_moved
-from reslrb_cli.scene.grids import make_grid
-from reslrb_cli.scene.load import load_scene, warn_once
+from reslrb_cli.scene.load import load_scene, make_grid, warn_once
 from reslrb_cli.scene.needs import (
     camera_finds_nothing,
     check_paths,

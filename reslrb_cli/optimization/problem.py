@@ -152,7 +152,7 @@ class Problem:
         """
         counts = {}
         for key in self.regularizers:
-            for each in self.selection.spec(key).regularizers:
+            for each in self.selection.specs[key].regularizers:
                 if isinstance(each, Thickness):
                     height = np.array(dr.detach(self.optimizer[key]))
                     counts[key] = int(np.count_nonzero(height <= np.float32(each.lowest)))
@@ -235,7 +235,7 @@ class Problem:
 
 def make_optimizer(config: Config, selection: Selection) -> Optimizer:
     """Return a new optimiser for the current values of the parameters."""
-    specs = {key: selection.spec(key) for key in selection.keys}
+    specs = {key: selection.specs[key] for key in selection.keys}
     return Optimizer(
         config.optimizer.type,
         config.optimizer.learning_rate,
@@ -263,7 +263,7 @@ def make_regularizers(selection: Selection) -> dict[str, dict[str, Cost]]:
     """Return the regularizers of `selection`, by key and type."""
     found: dict[str, dict[str, Cost]] = {}
     for key in selection.keys:
-        for each in selection.spec(key).regularizers:
+        for each in selection.specs[key].regularizers:
             flat = selection.kind(key) == "bitmap"
             spans = (Span(), Span()) if flat else spans_of(*selection.deformation.laid_over(key))
             found.setdefault(key, {})[each.type] = make_cost(each, spans)

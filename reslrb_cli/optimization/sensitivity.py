@@ -188,7 +188,7 @@ def _probe(
     unchanged.
     """
     key, value = row.key, dr.detach(problem.optimizer[row.key])
-    low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
+    low, high = problem.selection.specs[key].bounds or (-math.inf, math.inf)
     # 1 % of the parameter, in any unit; of its range if it is 0; a guess if it has none.
     step = 0.01 * (rms(np.array(value)) or (high - low if math.isfinite(high - low) else 1.0))
     norm = math.sqrt(sum(float(np.square(r).sum()) for r in reference))
@@ -261,7 +261,7 @@ def rescale(problem: Problem) -> list[Scaled]:
         slope = np.array(unit.chain(unit.from_scene(value), type(value)(size)), dtype=np.float64)
         unit.gain = 1 / rms(slope)
         optimizer.set_variable(row.key, unit)
-        rate = problem.selection.spec(row.key).learning_rate or problem.config.optimizer.learning_rate
+        rate = problem.selection.specs[row.key].learning_rate or problem.config.optimizer.learning_rate
         # One learning rate up or down, whichever moves farther.
         at = unit.from_scene(value)
         up, down = (dr.abs(unit.to_scene(at + side * rate) - value) for side in (1, -1))
@@ -294,7 +294,7 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
         if found > 0:
             unit = replace(variable, gain=1 / (found * len(starts)))
             optimizer.set_variable(key, unit)
-            rate = problem.selection.spec(key).learning_rate or problem.config.optimizer.learning_rate
+            rate = problem.selection.specs[key].learning_rate or problem.config.optimizer.learning_rate
             step = _like(v, gradient * (unit.gain * rate))
             first = rms(np.array(unit.to_scene(v - step)) - np.array(start))
             row = replace(row, curvature=found, own_length=1.0, first_step=first)

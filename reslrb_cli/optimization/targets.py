@@ -27,7 +27,7 @@ from reslrb_cli.optimization.loading import (
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import Array, Masked, View, color_channels
 from reslrb_cli.records.images import luminance
-from reslrb_cli.scene.images import Photo, read_photo, read_weights, turned_line
+from reslrb_cli.scene.images import Photo, read_photo, turned_line
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
@@ -76,7 +76,8 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
         found.left_out["nonfinite"] = photo.nonfinite
     if mask.file is not None:
         try:
-            found.weights = read_weights(mask.file, (width, height), are_upright(config))
+            weights = read_photo(mask.file, "linear", (width, height), are_upright(config))
+            found.weights = weights.image.mean(axis=2)
         except ConfigError as error:
             raise ConfigError(config.source, f"{view.mask_key}.file", error.message) from None
         found.left_out["file"] = found.weights == 0

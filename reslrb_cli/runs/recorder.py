@@ -175,7 +175,7 @@ class Recording:
         """Record the measurements for `scale` in the manifest, and log the resulting steps."""
         self.manifest.scaling = [row.to_json() for row in measured]
         for row in measured:
-            spec = self.problem.selection.spec(row.key)
+            spec = self.problem.selection.specs[row.key]
             rate = spec.learning_rate or self.problem.config.optimizer.learning_rate
             level = logging.WARNING if row.own_length is None else logging.INFO
             scale = self.problem.config.optimizer.scale

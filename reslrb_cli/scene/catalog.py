@@ -26,8 +26,6 @@ from reslrb_cli.scene.needs import (
     unsupported_part,
 )
 
-#: Spectra by wavelength, which RGB variants cannot evaluate: their numbers only describe the scene file.
-_SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
 #: Parameters of a mesh besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
 #: Maximum number of printed values; larger arrays show mean and range.
@@ -195,8 +193,6 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None
     if kind in ("sensor", "film"):
         return f"belongs to the {kind}; {only}"
-    if node.class_name() in _SPECTRA:
-        return "is a constant of a spectrum; give the colour as <rgb>"
     if value is None:
         return "is not in the scene file"
     if kind not in ("bsdf", "emitter", "attribute"):
@@ -244,16 +240,11 @@ class SensorSummary:
 
 
 @dataclass(frozen=True)
-class MovableSummary:
-    """Id of a shape or emitter, and the parameters that can move the object: `motion`, `heightmap`."""
-
-    id: str
-    by: list[str]
-
-
-@dataclass(frozen=True)
 class SceneSummary:
-    """Contents of a scene: class names with counts, sensors, all parameters, and movable objects."""
+    """Contents of a scene: class names with counts, sensors, all parameters, and movable objects.
+
+    `movable` has the `id` of each shape or emitter, and `by`, the parameters that can move it: `motion`, `heightmap`.
+    """
 
     emitters: dict[str, int]
     bsdfs: dict[str, int]
@@ -261,11 +252,11 @@ class SceneSummary:
     triangles: int
     sensors: list[SensorSummary]
     parameters: list[ParameterInfo]
-    movable: list[MovableSummary]
+    movable: list[dict[str, Any]]
 
 
-def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
-    """Summarise `scene`. `sensors` are the indices of the described sensors, or None for all."""
+def summarise(scene: Any, hide_emitters: bool = False) -> SceneSummary:
+    """Return the contents of `scene`."""
     graph, params = SceneGraph.of(scene), mi.traverse(scene)
     shapes = graph.shapes()
     return SceneSummary(
@@ -273,13 +264,10 @@ def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | 
         bsdfs=_count(graph.of_type(mi.BSDF)),
         shapes=_count(shapes),
         triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
-        sensors=[
-            _sensor(scene, index, hide_emitters)
-            for index in (range(len(scene.sensors())) if sensors is None else sensors)
-        ],
+        sensors=[_sensor(scene, index, hide_emitters) for index in range(len(scene.sensors()))],
         parameters=list_parameters(params, values=True),
         movable=[
-            MovableSummary(item.id, ["motion"] if item.heightmap_obstacle() else ["motion", "heightmap"])
+            {"id": item.id, "by": ["motion"] if item.heightmap_obstacle() else ["motion", "heightmap"]}
             for item in list_movable(params)
         ],
     )

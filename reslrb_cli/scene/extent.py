@@ -113,10 +113,10 @@ def _coincident(scene: Any) -> str | None:
     Rounding decides which face a ray meets. For two faces with one BSDF and no emission, the choice of the face does
     not matter in two cases. Either the faces face the same way, or the BSDF is `twosided` and the shading normals are
     the faces' normals. Otherwise, light paths and camera paths show different scenes. The test detects triangles with
-    three common corners, and equal disks and spheres.
+    three common corners.
     """
     shapes = scene.shapes()
-    twins = _twin_faces(shapes) | _twin_shapes(shapes)
+    twins = _twin_faces(shapes)
     if not twins:
         return None
     pairs = {twins[key]: None for key in _met(scene, shapes) if key in twins}
@@ -131,13 +131,11 @@ def _coincident(scene: Any) -> str | None:
     )
 
 
-#: From the number of a shape in `scene.shapes()` and of one of its faces (0 if no mesh), to the numbers of a shape and
-#: face at the same place.
-_Twins = dict[tuple[int, int], tuple[int, int]]
+def _twin_faces(shapes: Sequence[Any]) -> dict[tuple[int, int], tuple[int, int]]:
+    """Return the coincident triangles where it matters which triangle a ray meets.
 
-
-def _twin_faces(shapes: Sequence[Any]) -> _Twins:
-    """Return the coincident mesh triangles where it matters which triangle a ray meets."""
+    The result maps a mesh's number in `scene.shapes()` and a face's number to the numbers of the two meshes.
+    """
     meshes = [index for index, shape in enumerate(shapes) if shape.is_mesh() and shape.face_count()]
     if not meshes:
         return {}
@@ -163,35 +161,13 @@ def _twin_faces(shapes: Sequence[Any]) -> _Twins:
     for index in np.union1d(owner[first], owner[second]).tolist():
         bends[owner == index] = bent_faces(shapes[index], 0.999)
     kinds = np.stack([owner[first], owner[second], turned, bends[first] | bends[second]], 1)
-    found: _Twins = {}
+    found: dict[tuple[int, int], tuple[int, int]] = {}
     for kind in np.unique(kinds, axis=0):
         one, other = sorted(kind[:2].tolist())
         if _differ(shapes[one], shapes[other], bool(kind[2]), bool(kind[3])):
             these = (kinds == kind).all(1)
             both = np.concatenate([first[these], second[these]])
             found |= dict.fromkeys(zip(owner[both].tolist(), number[both].tolist(), strict=True), (one, other))
-    return found
-
-
-def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
-    """Return the coincident disks and spheres where it matters which shape a ray meets."""
-    before: dict[tuple[str, bytes], list[int]] = {}
-    found: _Twins = {}
-    for index, shape in enumerate(shapes):
-        if shape.class_name() not in ("Disk", "Sphere"):
-            continue
-        size = np.array(bounds(shape), np.float32).tobytes()
-        others = before.setdefault((shape.class_name(), size), [])
-        for other in others:
-            turned = shape.has_flipped_normals() != shapes[other].has_flipped_normals()
-            if shape.class_name() == "Disk":
-                one, another = (np.ravel(each.sample_position(0, mi.Point2f(0.5)).n) for each in (shape, shapes[other]))
-                if abs(np.dot(one, another)) < 0.999:
-                    continue  # they cross
-                turned = bool(np.dot(one, another) < 0)
-            if _differ(shape, shapes[other], turned, False):
-                found |= {(index, 0): (other, index), (other, 0): (other, index)}
-        others.append(index)
     return found
 
 
@@ -207,7 +183,7 @@ def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
 
 
 def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
-    """Return the shapes and faces that rays from sensors and lights meet first."""
+    """Return the numbers of the shapes and faces that rays from sensors and lights meet first."""
     place, lane = grid(_RAYS), dr.arange(mi.UInt32, _RAYS**2)
     numbers = [mi.Float(mi.sample_tea_float32(lane, mi.UInt32(k))) for k in range(3)]
     rays = [
@@ -223,7 +199,7 @@ def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
         shape = np.array(dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0))
         for number, face in np.unique(np.stack([shape, np.array(hit.prim_index)]), axis=1).T.tolist():
             if number in index:
-                met.add((index[number], face if shapes[index[number]].is_mesh() else 0))
+                met.add((index[number], face))
     return met
 
 

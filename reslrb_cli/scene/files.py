@@ -21,11 +21,6 @@ from reslrb_cli.scene.xml.read import read_description
 _PART = 2**20
 
 
-def option_texts(options: Mapping[str, Any]) -> dict[str, str]:
-    """Return the values of a scene's variables, spelled as in the scene file."""
-    return {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in options.items()}
-
-
 def files_of(config: Config) -> dict[str, Path]:
     """Return every file that an experiment reads. The keys are the settings that lead to the files.
 
@@ -40,9 +35,9 @@ def files_of(config: Config) -> dict[str, Path]:
     found |= {key: one.path for key, one in config.codes.items() if one.path is not None}
     beside: list[tuple[str, Path]] = []
     if config.scene.file.is_file():
-        description = read_description(config.scene.file, option_texts(config.scene.options))
+        description = read_description(config.scene.file, config.scene.options)
         beside += [("scene.file", path) for path in description.files]
-        named = (description.find_file(name) for _, _, name in description.named_files())
+        named = (description.find_file(name) for _, name in description.named_files())
         beside += [("scene.file", path) for path in named if path is not None]
     cameras = config.scene.cameras
     if cameras is not None and cameras.is_file():

@@ -1,7 +1,7 @@
 """Image files: checked before they are decoded, and read as images to compare with or as textures.
 
-The checks cover the stated size, the end of the file, and the orientation. A file of some kilobytes can claim to be an
-image of gigabytes, and Mitsuba's reader fills missing data of a JPEG with grey. For compressed formats, the checks also
+The checks cover the stated size, the orientation, and missing data. A file of some kilobytes can claim to be an image
+of gigabytes, and Mitsuba's reader fills missing data of a JPEG with grey. For compressed formats, the checks also
 detect files that were truncated and padded. The checks do not detect damage in the last lines of an EXR file, because
 EXR has no checksums. Cameras and phones store pixels in the sensor's orientation. JPEG and PNG files store the rotation
 to an upright image as EXIF metadata. Mitsuba's reader ignores this metadata.
@@ -13,6 +13,7 @@ import logging
 import os
 import re
 import struct
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -28,13 +29,8 @@ from reslrb_cli.errors import ConfigError, is_out_of_memory
 logger = logging.getLogger(__name__)
 FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
 _NO_IMAGE = f"is not a readable image ({FORMATS})"
-_CUT_OFF = "is truncated: the file ends before its image; copy or save it again"
 #: Bytes that contain the size of an image; a preview may come first.
 _HEAD = 2**20
-#: Maximum number of parts of a PNG or JPEG, so that a file with only empty parts is read fast.
-_MOST_PARTS = 2**20
-#: Bytes of EXIF data: a JPEG segment has no more, and the orientation is at its start.
-_EXIF_BYTES = 2**16
 Size = tuple[int, int]
 
 #: Operations that turn the pixels upright, by EXIF's orientation number; 1 is upright.
@@ -134,11 +130,7 @@ def image_size(path: Path) -> Size:
 
 
 def _examine(path: Path) -> _Header:
-    """Return the header of an image.
-
-    Raises a ConfigError that names the file if the file is not an image. Raises ConfigError also for a PNG or JPEG file
-    that lacks its end. For other formats, readers detect a missing end.
-    """
+    """Return the header of an image. Raises a ConfigError that names the file if the file is not an image."""
     header: _Header | None = None
     with open_file(path) as file:
         try:
@@ -156,71 +148,28 @@ def _examine(path: Path) -> _Header:
 # --- formats ----------------------------------------------------------------------------------------------------------
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-#: Start of a JPEG's EXIF segment, and the tag of the camera's orientation, a number of 16 bits.
-_EXIF, _ORIENTATION, _SHORT = b"Exif\0\0", 0x0112, 3
-#: The next marker after compressed data, in which 0xFF is followed by 0 or by the number of a restart.
-_MARKER = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
+#: EXIF's tag of the camera's orientation.
+_ORIENTATION = 0x0112
 
 
-def _png(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
-    if head[12:16] != b"IHDR":
-        return None
-    width, height = struct.unpack(">II", head[16:24])
-    end, position, exif = file.seek(0, os.SEEK_END), len(_PNG), b""
-    for _ in range(_MOST_PARTS):
-        file.seek(position)
-        length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
-        position += 12 + length  # including its checksum
-        if position > end:
-            raise ConfigError(path, "", _CUT_OFF)
-        if kind == b"eXIf" and not exif:
-            exif = file.read(min(length, _EXIF_BYTES))
-        if kind == b"IEND":
-            return _Header((width, height), _orientation(exif))
-    return None
+def _photograph(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
+    """Return the header of a PNG or JPEG file."""
+    from PIL.Image import Exif  # late, because few commands read such files
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
 
-
-def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
+    is_jpeg, exif, orientation = head.startswith(_JPEG), Exif(), None
     file.seek(0)
-    data, position, size, exif = file.read(), 2, None, b""
-    for _ in range(_MOST_PARTS):
-        found = _MARKER.search(data, position)
-        if found is None:
-            raise ConfigError(path, "", _CUT_OFF)
-        kind, position = data[found.end() - 1], found.end()
-        if kind == 0xD9:  # the end of the image
-            return None if size is None else _Header(size, _orientation(exif), is_jpeg=True)
-        if kind == 0x01 or kind == 0xD8:
-            continue
-        if position + 2 > len(data):
-            raise ConfigError(path, "", _CUT_OFF)
-        [length] = struct.unpack_from(">H", data, position)
-        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and position + 7 <= len(data):
-            height, width = struct.unpack_from(">HH", data, position + 3)
-            size = (width, height)
-        content = data[position + 2 : position + length] if kind == 0xE1 and not exif else b""
-        if content.startswith(_EXIF):
-            exif = content[len(_EXIF) :]
-        position += length
-    return None
-
-
-def _orientation(exif: bytes) -> int:
-    """Return the orientation (1 to 8) in EXIF data, or 1 if the orientation is unreadable. EXIF data start like a TIFF
-    file.
-
-    The function reads only the entries of the first directory, each entry once.
-    """
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
-    with suppress(struct.error):  # offsets outside the data
-        if order is not None:
-            [place] = struct.unpack_from(f"{order}I", exif, 4)
-            [count] = struct.unpack_from(f"{order}H", exif, place)
-            for entry in range(place + 2, place + 2 + 12 * count, 12):
-                tag, kind, values, value = struct.unpack_from(f"{order}HHIH", exif, entry)
-                if tag == _ORIENTATION:
-                    return value if kind == _SHORT and values == 1 and 1 <= value <= 8 else 1
-    return 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # damaged EXIF data rotates nothing
+        try:
+            image = JpegImageFile(file) if is_jpeg else PngImageFile(file)
+        except (SyntaxError, OSError):
+            return None
+        with suppress(SyntaxError, ValueError, struct.error):
+            exif.load(image.info.get("exif", b""))
+            orientation = exif.get(_ORIENTATION)
+    return _Header(image.size, orientation if orientation in TURNS else 1, is_jpeg)
 
 
 def _exr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
@@ -287,8 +236,7 @@ def _bmp(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
 
 _READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Header | None]] = {
     b"\x76\x2f\x31\x01": _exr,
-    _PNG: _png,
-    _JPEG: _jpeg,
+    **dict.fromkeys((_PNG, _JPEG), _photograph),
     b"#?": _hdr,
     **dict.fromkeys((b"PF", b"Pf", b"P5", b"P6"), _netpbm),
     b"BM": _bmp,
@@ -407,16 +355,6 @@ def read_photo(
         transparent=nothing if alpha is None else alpha == 0,
         nonfinite=np.logical_not(finite.all(axis=2)),
     )
-
-
-def read_weights(path: Path, size: Size, upright: bool = True) -> Image:
-    """Read an image of weights as float32 (H, W). A weight is the value in the file, or the mean if there are several
-    channels.
-
-    Values of 8 or 16 bits are divided by the largest 8-bit or 16-bit value. Alpha is dropped. `upright` rotates the
-    image by its own EXIF orientation. Like `read_image`, raises a ConfigError that names the file.
-    """
-    return read_photo(path, "linear", size, upright=upright).image.mean(axis=2)
 
 
 def decode_srgb(encoded: Image) -> Image:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,7 +20,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.extent import doubts
-from reslrb_cli.scene.files import option_texts
+from reslrb_cli.scene.values import Place
 from reslrb_cli.scene.xml.build import Owners, build
 from reslrb_cli.scene.xml.check import check, check_files, resize_films
 from reslrb_cli.scene.xml.mend import mend, warnings
@@ -58,7 +59,7 @@ def load_scene(
     and of coincident faces.
     """
     file = Path(file)
-    description = read_description(file, option_texts(options or {}))
+    description = read_description(file, options or {})
     root = description.root
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
@@ -108,6 +109,43 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
     check_variant(mi.variant())
     path = as_path(file, "file", "the path of a scene file")
     return load_scene(path, options, keys=[keys] if isinstance(keys, str) else keys)
+
+
+def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
+    """Replace the rectangle `id` of a description by a mesh, before the scene is built. `size` has the vertex counts
+    along the rectangle's edges.
+
+    The shape's position and material do not change. Raises ConfigError at `place` for any other shape.
+    """
+    element = description.root.by_id().get(id)
+    if element is None or element.tag != "shape":
+        return  # the selection of the parameter reports the reason
+    if element.type != "rectangle":
+        how = "remove `grid`, and write the shape as a rectangle, or as a mesh that is as fine as the map"
+        raise place.fail("heightmap.grid", f"`{id}` is not a `rectangle`; {how}")
+    kept = [item for item in element.children if not item.is_value or item.name in _KEPT_OF_GRID]
+    element.attributes["type"] = "ply"
+    element.children[:] = [element.new("string", name="filename", value=str(_grid_file(*size))), *kept]
+
+
+#: Parameters that a rectangle passes to its grid.
+_KEPT_OF_GRID = ("to_world", "flip_normals", "face_normals")
+
+
+@functools.cache
+def _grid_file(width: int, height: int) -> Path:
+    """Return a temporary file with a grid over [-1, 1] x [-1, 1], facing up. It exists until the process ends."""
+    from reslrb_cli.lens.experiment import face_ply  # late, because SciPy takes a while to load
+    from reslrb_cli.lens.surface import Setting
+
+    path = Path(_grid_folder().name) / f"grid_{width}x{height}.ply"
+    path.write_bytes(face_ply(Setting(size=(2.0, 2.0), thickness=0.0), width, height))
+    return path
+
+
+@functools.cache
+def _grid_folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="reslrb-")
 
 
 def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:

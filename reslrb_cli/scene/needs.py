@@ -175,14 +175,22 @@ def paths_obstacle(scene: Any, sensor: Any, paths: str, hide_emitters: bool = Fa
 
     `paths` is `light`, `camera` or `both`, as in `reslrb`, or `prb` for camera paths of Mitsuba's own integrators.
     """
-    if paths == "light":
-        return _light_obstacle(scene, sensor, hide_emitters)
     if paths == "prb":
         return _camera_obstacle(scene, sensor)
-    obstacle = _film_obstacle(sensor) or _camera_obstacle(scene, sensor, beside_light=paths == "both")
-    if paths == "both" and obstacle is None:
-        obstacle = unsupported_part(scene, sensor) or _unsampled(scene) or scaled_emitter(scene)
-    return obstacle
+    if paths != "light":
+        obstacle = _film_obstacle(sensor) or _camera_obstacle(scene, sensor, beside_light=paths == "both")
+        if paths == "camera" or obstacle is not None:
+            return obstacle
+    obstacle = unsupported_part(scene, sensor) or _unsampled(scene)
+    if paths == "both" or obstacle is not None:
+        return obstacle or scaled_emitter(scene)
+    view = look(scene, sensor)
+    if view.specular > 0 and view.smooth == 0 and (hide_emitters or view.emission == 0):
+        return (
+            f"sensor {sensor.id()} sees only smooth specular surfaces (glass, mirrors), to which light paths cannot "
+            "connect; let it see a rough surface"
+        )
+    return None
 
 
 def scaled_emitter(scene: Any) -> str | None:
@@ -239,21 +247,6 @@ def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> 
 def camera_finds_nothing(scene: Any) -> bool:
     """Whether all emitters of `scene` emit only along their normal. No camera path finds such light."""
     return all(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters())
-
-
-def _light_obstacle(scene: Any, sensor: Any, hide_emitters: bool) -> str | None:
-    """Return the reason why light paths cannot render `scene` for `sensor`, or None if they can."""
-    if (obstacle := unsupported_part(scene, sensor)) is not None:
-        return obstacle
-    if (obstacle := _unsampled(scene)) is not None:
-        return obstacle
-    view, name = look(scene, sensor), sensor.id()
-    if view.specular > 0 and view.smooth == 0 and (hide_emitters or view.emission == 0):
-        return (
-            f"sensor {name} sees only smooth specular surfaces (glass, mirrors), to which light paths cannot connect; "
-            "let it see a rough surface"
-        )
-    return None
 
 
 def _unsampled(scene: Any) -> str | None:

@@ -56,10 +56,6 @@ class Selection:
         own = [key for key in self.keys if self._holder(key) is self.params]
         return [*own, *(other for key in own for other in self.tied.get(key, ())), *self.deformation.keys]
 
-    def spec(self, key: str) -> Settings:
-        """Return the settings of the selected `key`."""
-        return self.specs[key]
-
     def kind(self, key: str) -> str:
         """Return the kind of `key` for regularizers: `heightmap`, `bitmap`, `mesh`, or "" for other parameters."""
         slot = self.slot(key)
@@ -86,12 +82,6 @@ class Selection:
     def value(self, key: str) -> Any:
         """Return the current value of `key` as a Dr.Jit value."""
         return self._holder(key)[key]
-
-    def quantity(self, key: str) -> str | None:
-        """Return the quantity of `key`: `length`, `degrees` or `scale` of a motion. For the scene's own parameters,
-        return None.
-        """
-        return self.deformation.quantities.get(key)
 
     def array(self, key: str) -> np.ndarray[Any, Any]:
         """Return the current value of `key`: a texture (H, W, C), a colour (C,), a buffer (N,), or a number ().
@@ -144,13 +134,6 @@ class Selection:
         self.deformation.place()
         self.params.update()
 
-    def is_map(self, key: str) -> bool:
-        """True if `key` is a texture or a heightmap with at least two texels along each axis. Environment maps, whose
-        sides meet, do not count.
-        """
-        slot = self.slot(key)
-        return slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
-
     def faces(self, key: str) -> np.ndarray[Any, Any] | None:
         """Return the triangles (3 m indices) of the mesh whose vertex positions are `key`. For other keys,
         return None.
@@ -199,7 +182,9 @@ def select_parameters(
             held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
             check_bounds(slot, value, settings.bounds, held)
         check_transform(slot, value, settings, place)
-        if settings.smoothing is not None and not (selection.is_map(key) or selection.faces(key) is not None):
+        # The sides of an environment map meet.
+        is_map = slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
+        if settings.smoothing is not None and not (is_map or selection.faces(key) is not None):
             raise place.fail("precondition", f"smooths textures, heightmaps and vertices, but not `{key}`")
         selection.check_regularizers(key, place)
         if values is not None or settings.initial != "scene" or settings.resolution is not None:
@@ -276,10 +261,9 @@ def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> N
     """
     vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
     if width * height > vertices:
-        hint = f"; `grid: [{width}, {height}]` makes such a mesh from a rectangle" if vertices == 4 * len(items) else ""
         ids = " and ".join(f"`{item.id}`" for item in items)
         warn_once(f"the heightmap of {ids}, {width}x{height}, is finer than the mesh with {vertices} vertices: texels "
-                  f"between vertices have no effect{hint}")  # fmt: skip
+                  "between vertices have no effect")  # fmt: skip
 
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]

@@ -6,9 +6,7 @@ The module also reads the photograph's properties, and writes a copy with fewer 
 
 from __future__ import annotations
 
-import fnmatch
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,14 +134,13 @@ class Proposal:
         return self.bounds is not None and "inf" not in self.bounds
 
 
-def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[str] = ()) -> list[Proposal]:
+def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]:
     """Return the recoverable parameters of `scene`, seen through the sensor with this index. Mesh vertices are
     excluded.
 
-    They are sorted by their shares. `wanted` has globs that select the parameters recovered by default. Without globs,
-    the parameters recovered by default are those that are large in view. By default, lamps are also recovered if the
-    photograph shows the lamps' brightness (`lamps`). At least one parameter is recovered by default if the scene has
-    any recoverable parameter. Raises LookupError with the glob if a glob matches nothing.
+    They are sorted by their shares. The parameters recovered by default are those that are large in view. Lamps are
+    also recovered by default if the photograph shows the lamps' brightness (`lamps`). At least one parameter is
+    recovered by default if the scene has any recoverable parameter.
     """
     params = mi.traverse(scene)
     shares = _shares(scene, sensor)
@@ -158,20 +155,13 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[
                 smooth.add(info.key)
     found.sort(key=lambda pair: -pair[1])
     keys = [info.key for info, _ in found]
-    for glob in wanted:
-        if not fnmatch.filter(keys, glob):
-            raise LookupError(glob)
-    if wanted:
-        first = [key for key in keys if any(fnmatch.fnmatchcase(key, glob) for glob in wanted)]
-    else:
-        # A mask excludes pixels that see mirrors and smooth glass, so only materials that other pixels show are
-        # proposed.
-        shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
-        seen = {info.key for info in shown if _is_foremost(params, info)}
-        if lamps:
-            seen |= {info.key for info, share in found if share >= LEAST_LAMP and _RADIANCE.search(info.key)}
-        emitters = [info.key for info, _ in found if info.kind == "emitter"]
-        first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
+    # A mask excludes pixels that see mirrors and smooth glass, so only materials that other pixels show are proposed.
+    shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
+    seen = {info.key for info in shown if _is_foremost(params, info)}
+    if lamps:
+        seen |= {info.key for info, share in found if share >= LEAST_LAMP and _RADIANCE.search(info.key)}
+    emitters = [info.key for info, _ in found if info.kind == "emitter"]
+    first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
     return [Proposal(info, share, _bounds(info), _resolution(info), info.key in first) for info, share in found]
 
 

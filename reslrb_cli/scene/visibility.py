@@ -8,8 +8,9 @@ would compensate for the missing light (`find_depth`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import zip_longest
 from typing import Any
 
@@ -154,47 +155,42 @@ def visible_texels(
     to_uv = key.removesuffix("data") + "to_uv"
     if not owners or to_uv not in params:
         return np.ones((height, width), dtype=bool)
-    texels = _Texels(owners, np.array(params[to_uv].matrix, dtype=np.float64).tolist(), (width, height))
+    transform = np.array(params[to_uv].matrix, dtype=np.float64).tolist()
+    met = partial(_texels_met, owners, transform, (width, height))
     seen = dr.zeros(mi.UInt32, height * width)
     for sensor, kept in zip_longest(sensors, pixels[: len(sensors)]):
         count = int(np.prod(sensor.film().crop_size()))
         rays = min(_RAYS_PER_CELL * max(count, height * width), _MAX_RAYS)
         for number in range(-(-rays // _RAYS_PER_PASS)):
             random = mi.PCG32(size=min(rays, _RAYS_PER_PASS), initstate=dr.opaque(mi.UInt64, number))
-            _mark_seen(scene, sensor, texels, random, seen, kept, mirrored)
+            _mark_seen(scene, sensor, met, random, seen, kept, mirrored)
             dr.eval(seen)
     return np.array(seen).reshape(height, width) > 0
 
 
-@dataclass(frozen=True)
-class _Texels:
-    """Texels of a texture of `size` (width, height) on surfaces with the BSDFs `owners`. `transform` is the texture's
-    `to_uv`.
+def _texels_met(owners: Sequence[Any], transform: list[list[float]], size: tuple[int, int], si: Any) -> tuple[Any, Any]:
+    """Return the texel at each surface point, and whether the point is in the inner quarter of the texel's cell.
+
+    The texture has `size` (width, height), belongs to the BSDFs `owners`, and has `transform` as its `to_uv`.
     """
-
-    owners: Sequence[Any]
-    transform: list[list[float]]
-    size: tuple[int, int]
-
-    def met(self, si: Any) -> tuple[Any, Any]:
-        """Return the texel at each surface point, and whether the point is in the inner quarter of the texel's cell."""
-        is_owner = mi.Mask(False)
-        for owner in self.owners:
-            is_owner |= si.bsdf() == mi.BSDFPtr(owner)
-        u, v = (row[0] * si.uv.x + row[1] * si.uv.y + row[2] for row in self.transform[:2])
-        cell = mi.Point2f(u, v) * mi.Vector2f(self.size)
-        inside = mi.Vector2f(cell - dr.floor(cell))
-        inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
-        # Twice, because the remainder of a negative number is not positive.
-        x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), self.size, strict=True))
-        return mi.UInt32(y * self.size[0] + x), si.is_valid() & is_owner & inner
+    is_owner = mi.Mask(False)
+    for owner in owners:
+        is_owner |= si.bsdf() == mi.BSDFPtr(owner)
+    u, v = (row[0] * si.uv.x + row[1] * si.uv.y + row[2] for row in transform[:2])
+    cell = mi.Point2f(u, v) * mi.Vector2f(size)
+    inside = mi.Vector2f(cell - dr.floor(cell))
+    inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
+    # Twice, because the remainder of a negative number is not positive.
+    x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), size, strict=True))
+    return mi.UInt32(y * size[0] + x), si.is_valid() & is_owner & inner
 
 
 def _mark_seen(
-    scene: Any, sensor: Any, texels: _Texels, random: Any, seen: Any, kept: np.ndarray[Any, Any] | None, mirrored: bool,
+    scene: Any, sensor: Any, met: Callable[[Any], tuple[Any, Any]], random: Any, seen: Any,
+    kept: np.ndarray[Any, Any] | None, mirrored: bool,
 ) -> None:  # fmt: skip
     """Cast one primary ray per lane through the pixels marked in `kept` (H, W). In `seen`, mark the texels that the
-    rays meet.
+    rays meet, as `met` finds them.
 
     With `mirrored`, rays also pass mirrors and clear glass.
     """
@@ -208,7 +204,7 @@ def _mark_seen(
         x, y = (mi.UInt32(dr.minimum(c * size, size - 1)) for c, size in ((film.x, columns), (film.y, rows)))
         active = dr.gather(mi.UInt32, mi.UInt32(kept.ravel().astype(np.uint32)), y * columns + x) > 0
     for si, reached in surfaces_met(scene, ray, active, random if mirrored else None):
-        texel, inner = texels.met(si)
+        texel, inner = met(si)
         dr.scatter(seen, mi.UInt32(1), texel, reached & inner)
         dr.schedule(seen, random)
 
@@ -221,20 +217,12 @@ LOST = 0.01
 _RAYS, _PATHS = 48, 32
 
 
-@dataclass(frozen=True)
-class Depth:
-    """Path depth in segments, and the mean share of a pixel's light that longer paths would add.
+def find_depth(scene: mi.Scene, sensor: int) -> tuple[int, float | None]:
+    """Return the smallest depth in `DEPTHS`, in segments, whose image lacks at most the share `LOST` of the light.
+    `sensor` is the index of the sensor.
 
-    For the greatest depth, `missing` is None, because there is no greater depth to compare with.
-    """
-
-    segments: int
-    missing: float | None
-
-
-def find_depth(scene: mi.Scene, sensor: int) -> Depth:
-    """Return the smallest depth in `DEPTHS` whose image lacks at most the share `LOST` of the light. `sensor` is the
-    index of the sensor.
+    The function also returns the mean share of a pixel's light that longer paths would add. For the greatest depth,
+    this share is None, because there is no greater depth to compare with.
 
     The function uses camera paths with equal random numbers and without roulette. With equal random numbers and no
     roulette, the paths of one depth are the first parts of the next depth's paths.
@@ -246,8 +234,8 @@ def find_depth(scene: mi.Scene, sensor: int) -> Depth:
         lacking = 1 - _pixels(scene, sensor, segments)[lit] / whole[lit]
         missing = float(lacking.mean()) if lit.any() else 0.0
         if missing <= LOST:
-            return Depth(segments, missing)
-    return Depth(DEPTHS[-1], None)
+            return segments, missing
+    return DEPTHS[-1], None
 
 
 def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:

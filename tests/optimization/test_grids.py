@@ -83,35 +83,10 @@ def with_quad(tmp_path):
     return path
 
 
-def test_a_mesh_of_four_vertices_becomes_a_grid(tmp_path, with_quad):
-    from reslrb_cli.optimization.assemble import assemble_scene
-
-    problem = assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 5", with_quad))
-    x, y, z = positions(problem).reshape(5, 5, 3).transpose(2, 0, 1)
-    assert np.allclose(x, np.linspace(-2, 6, 5), atol=1e-6)
-    assert np.allclose(y, np.linspace(-1, 1, 5)[:, None], atol=1e-6)
-    assert np.allclose(z, -1)
-
-
-def test_a_flat_grid_can_be_refined(tmp_path):
-    """The grid covers the same square, and its normals are unchanged."""
-    from reslrb_cli.optimization.assemble import assemble_scene
-
-    plain = assemble_scene(configured(tmp_path, "mesh: face, resolution: [4, 4]"))
-    problem = assemble_scene(configured(tmp_path, "mesh: face, resolution: [4, 4], grid: 9"))
-    faces = [next(shape for shape in each.scene.shapes() if shape.id() == "face") for each in (plain, problem)]
-    assert faces[1].vertex_count() == 81
-    for name in ("min", "max"):
-        assert np.allclose(*(getattr(face.bbox(), name) for face in faces), atol=1e-6)
-    normals = [np.array(face.vertex_normals_buffer()).reshape(-1, 3).mean(axis=0) for face in faces]
-    assert np.allclose(*normals, atol=1e-5)
-
-
 def test_other_shapes_are_refused_and_missing_grids_reported(tmp_path, with_quad):
     from reslrb_cli.optimization.assemble import assemble_scene
 
-    (tmp_path / "quad.ply").write_text(QUAD.replace("-1 1 0 0 1", "-1 2 0 0 1"))
-    with pytest.raises(ConfigError, match=r"parameters\[0\].heightmap.grid: `back` is neither a rectangle"):
+    with pytest.raises(ConfigError, match=r"parameters\[0\].heightmap.grid: `back` is not a `rectangle`"):
         assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 9", with_quad))
     with pytest.raises(ConfigError, match=r"`back` is a Rectangle.*`grid: 257`"):
         assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4]"))
@@ -130,7 +105,7 @@ def test_a_map_finer_than_its_mesh_gives_one_warning(tmp_path, caplog, with_quad
     found = [line for line in caplog.messages if "finer than the mesh" in line]
     assert len(found) == 2
     assert "25 vertices" in found[0]
-    assert "`grid: [7, 5]`" in found[1]
+    assert "4 vertices" in found[1]
 
 
 def test_a_run_on_a_grid_is_exported_and_continued(tmp_path, monkeypatch):

@@ -97,7 +97,7 @@ def test_axes_move_alone(scene):
     selection = select(scene, motion("box", "x", "y", initial={"x": 0.25, "y": -0.5}))
     assert selection.keys == ["box.x", "box.y"]
     assert np.allclose(positions(selection), before + np.array([0.25, -0.5, 0]), atol=1e-5)
-    assert [selection.quantity(key) for key in selection.keys] == ["length", "length"]
+    assert [selection.deformation.quantities.get(key) for key in selection.keys] == ["length", "length"]
     leaves = {key: mi.Float(selection.value(key)) for key in selection.keys}
     dr.enable_grad(leaves)
     selection.hand_over({key: mi.Float(leaf) for key, leaf in leaves.items()})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-import time
 import zlib
 from pathlib import Path
 
@@ -65,11 +64,11 @@ def test_a_complete_file_is_read(image, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0])
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.25, 0.5, 0.75, 0.9, 0.999])
 def test_a_truncated_file_is_refused(image, share, capfd):
     data = image.read_bytes()
-    image.write_bytes(data[: min(int(share * len(data)), len(data) - 1)])
-    assert refused(image).startswith(("is truncated", "is damaged or truncated", "is not a readable image"))
+    image.write_bytes(data[: int(share * len(data))])
+    assert refused(image).startswith(("is damaged or truncated", "is not a readable image"))
     assert capfd.readouterr() == ("", "")  # libjpeg's messages do not reach the terminal
 
 
@@ -161,13 +160,6 @@ def test_empty_headers(tmp_path, data):
     assert refused(path).startswith("is not a readable image (EXR, PNG")
 
 
-def test_a_jpeg_of_empty_parts_is_read_fast(tmp_path, monkeypatch):
-    monkeypatch.setattr(images, "_MOST_PARTS", 1000)
-    path = tmp_path / "a.jpg"
-    path.write_bytes(b"\xff\xd8" + b"\xff\xe0\0\x02" * 2000)
-    assert refused(path).startswith("is not a readable image")
-
-
 @pytest.mark.parametrize("kind", ["pipe", "device", "sparse"])
 def test_only_regular_files_are_read(tmp_path, kind):
     path = tmp_path / "a.png"
@@ -202,7 +194,7 @@ def test_lines_of_a_radiance_image_are_checked_before_decoding(width, tmp_path):
         (lines[2] + 4, b"\x00"),
     ):
         path.write_bytes(data[:place] + there + data[place + 1 :])
-        assert refused(path).startswith(("is truncated", "is damaged or truncated"))
+        assert refused(path).startswith("is damaged or truncated")
         with pytest.raises(images.DamagedImage):
             images.image_size(path)
 
@@ -238,79 +230,31 @@ def test_orientation_matches_pillow(name, channels, orientation, tmp_path):
             read_bitmap(path, (7, 5), upright=True)
 
 
-def exif(entries, order=">", place=8, count=None):
-    """Return EXIF data with the given entries (tag, type, count, value)."""
-    head = (b"MM\0*" if order == ">" else b"II*\0") + struct.pack(f"{order}I", place)
-    body = struct.pack(f"{order}H", len(entries) if count is None else count)
-    return head + body + b"".join(struct.pack(f"{order}HHIHH", *entry, 0) for entry in entries)
+def orientation(value):
+    """Return EXIF data with one entry, the orientation `value`."""
+    return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, value, 0, 0)
 
 
-def jpeg_with(path, *contents, kind=0xE1):
-    """Write a JPEG of 7x5 pixels with these application segments after its head."""
-    mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
-    data = path.read_bytes()
-    parts = b"".join(b"\xff" + bytes([kind]) + struct.pack(">H", len(content) + 2) + content for content in contents)
-    path.write_bytes(data[:2] + parts + data[2:])
-    return path
-
-
-SIX = (0x0112, 3, 1, 6)
-
-
-@pytest.mark.parametrize("order", "<>")
-def test_other_entries_and_segments_are_skipped(order, tmp_path):
-    entries = [(0x010F, 2, 4, 0x4142), (0x0110, 2, 4, 0x4142), SIX, (0x0112, 3, 1, 3)]
-    data = b"Exif\0\0" + exif(entries, order)
-    path = jpeg_with(tmp_path / "a.jpg", b"http://ns.adobe.com/xap/1.0/\0<x/>", data, b"Exif\0\0" + exif([]))
-    assert orientation_of(path) == 6
-    assert list(read_bitmap(path, upright=True).size()) == [5, 7]
-
-
+@pytest.mark.parametrize("name", ["a.jpg", "a.png"])
 @pytest.mark.parametrize(
-    "data",
+    ("data", "expected"),
     [
-        b"",
-        b"MM\0*",
-        b"XX\0*" + exif([SIX])[4:],
-        exif([SIX])[:-4],  # cut off within the entry
-        exif([SIX], place=2**32 - 1),
-        exif([SIX], place=4),  # a directory inside the pointer to it
-        exif([], count=65535),
-        exif([], count=65535) + bytes(60_000),
-        exif([(0x0112, 3, 1, 0)]),
-        exif([(0x0112, 3, 1, 9)]),
-        exif([(0x0112, 3, 2**32 - 1, 6)]),
-        exif([(0x0112, 2, 1, 6)]),
-        exif([(0x8769, 4, 1, 0), (0x014A, 4, 1, 0)] * 1000),  # nested directories that all point to this one
+        (orientation(6), 6),
+        (orientation(0), 1),
+        (orientation(9), 1),
+        (orientation(6)[:-10], 1),  # cut off within the entry
+        (b"MM\0*\xff\xff\xff\xff", 1),
+        (b"XX\0*" + orientation(6)[4:], 1),
+        (b"MM\0*", 1),
     ],
 )
-def test_exif_without_orientation_rotates_nothing(data, tmp_path):
-    start = time.monotonic()
-    for path in (
-        jpeg_with(tmp_path / "a.jpg", b"Exif\0\0" + data),
-        png_with(tmp_path / "a.png", data),
-    ):
-        assert orientation_of(path) == 1
-        assert list(read_bitmap(path, upright=True).size()) == [7, 5]
-    assert time.monotonic() - start < 5
+def test_damaged_exif_rotates_nothing(name, data, expected, tmp_path, recwarn):
+    from PIL import Image
 
-
-def png_with(path, data):
-    """Write a PNG of 7x5 pixels with this EXIF data after its head."""
-    mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
-    whole, head = path.read_bytes(), 8 + 25
-    chunk = struct.pack(">I", len(data)) + b"eXIf" + data + struct.pack(">I", zlib.crc32(b"eXIf" + data))
-    path.write_bytes(whole[:head] + chunk + whole[head:])
-    return path
-
-
-def test_a_png_with_too_long_exif_is_truncated(tmp_path):
-    path = png_with(tmp_path / "a.png", exif([SIX]))
-    assert orientation_of(path) == 6
-    data = bytearray(path.read_bytes())
-    data[33:37] = b"\x7f\xff\xff\xff"
-    path.write_bytes(data)
-    assert refused(path).startswith("is truncated")
+    Image.new("RGB", (7, 5)).save(tmp_path / name, exif=b"Exif\0\0" + data)
+    assert orientation_of(tmp_path / name) == expected
+    assert list(read_bitmap(tmp_path / name, upright=True).size()) == ([5, 7] if expected == 6 else [7, 5])
+    assert not recwarn.list
 
 
 def test_a_texture_is_read_unrotated_with_a_message(tmp_path, caplog):

@@ -32,7 +32,7 @@ def envmap(height=4, width=8):
 def test_scene_value_is_kept(make_scene):
     selection = select(make_scene(), {"key": TEXTURE, "bounds": [0.1, 0.9]})
     assert selection.keys == [TEXTURE]
-    assert selection.spec(TEXTURE).bounds == (0.1, 0.9)
+    assert selection.specs[TEXTURE].bounds == (0.1, 0.9)
     assert selection.array(TEXTURE)[0, 0, 0] == pytest.approx(0.1)
 
 

@@ -109,7 +109,7 @@ def separates(problem: Problem, key: str) -> bool:
         return False
     array = problem.selection.array(key)
     if array.ndim == 3:
-        return array.shape[2] == 3 and not problem.selection.quantity(key)
+        return array.shape[2] == 3 and not problem.selection.deformation.quantities.get(key)
     return isinstance(problem.optimizer[key], mi.Color3f)
 
 
@@ -132,7 +132,7 @@ def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, mo
 def _entries(problem: Problem, key: str, scale: float, share: float) -> list[ParameterChange]:
     row, together = row_of(problem, key), separates(problem, key)
     directions = [ParameterDirection(key, unit, k if together else None, k) for k, unit in enumerate(np.eye(row.size))]
-    low, high = problem.selection.spec(key).bounds or (-np.inf, np.inf)
+    low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
     changes = []
     for group in [directions] if together else [[direction] for direction in directions]:
         step = sum(direction.vector for direction in group) * scale * share

@@ -242,7 +242,7 @@ class Certainty:
         """
         first, last = self._initial[key], row_of(self.problem, key)
         sizes = [rms(first), rms(last), rms(last - first)]
-        low, high = self.problem.selection.spec(key).bounds or (-np.inf, np.inf)
+        low, high = self.problem.selection.specs[key].bounds or (-np.inf, np.inf)
         emits = self.problem.quantities.get(key, "") in ("radiance", "irradiance", "intensity")
         if np.isfinite(high - low) and (not emits or not any(sizes)):
             sizes.append(0.5 * (high - low))
@@ -273,7 +273,7 @@ class Certainty:
             value = row_of(self.problem, key)
             found[key] = Measured(
                 value=value,
-                bounds=selection.spec(key).bounds or (-np.inf, np.inf),
+                bounds=selection.specs[key].bounds or (-np.inf, np.inf),
                 scale=self.scale(key),
                 gradients=rows,
                 response=np.nan_to_num(optimizer.response(key) * optimizer.rate(key)),

@@ -72,8 +72,6 @@ _PREAMBLE = re.compile(r"^(At|Error while loading|While loading) .*?\(line \d+, 
 _PLACE = re.compile(r"\(line (\d+), col \d+\)")
 #: Mitsuba's message about a mesh without faces.
 _NO_FACES = re.compile(r"Storing new normals in a Mesh that didn't have normals.*")
-#: Maximum number of unused parameters of one object for which similar names are searched.
-_HINTS = 30
 
 
 def _place_textures(root: Element) -> None:
@@ -160,8 +158,7 @@ def _unused(props: mi.Properties, element: Element) -> list[Note]:
             child = unnamed[int(number[1])]
             wrong = f"{element.type} does not use a <{child.tag}> in Mitsuba 3"
         else:
-            likely = likely_parameters(element.type) if len(notes) < _HINTS else []
-            near = difflib.get_close_matches(name, likely, n=1, cutoff=0.75)
+            near = difflib.get_close_matches(name, likely_parameters(element.type), n=1, cutoff=0.75)
             hint = f" (did you mean `{near[0]}`?)" if near else ""
             child = element.find(name) or element
             wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3{hint}"

@@ -42,6 +42,10 @@ LOST_PLUGINS = {
 REFUSED_PLUGINS = {
     ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
+    **dict.fromkeys(
+        ((tag, type) for tag in ("spectrum", "texture") for type in ("regular", "irregular", "blackbody")),
+        'needs wavelengths, which RGB variants lack; write <spectrum value="400:0.1, 700:0.9"/> or <rgb>',
+    ),
     ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; use a `perspective` one",
 }
 
@@ -152,7 +156,7 @@ def _size_of(film: Element) -> FilmSize:
 
 def check_files(description: Description) -> None:
     """Raise ConfigError with file and line if a file is missing, damaged or too large."""
-    for _, element, name in description.named_files():
+    for element, name in description.named_files():
         if (wrong := _wrong_file(name, description)) is not None:
             raise element.fail("material" if element.name == "material" else "filename", wrong)
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
@@ -199,8 +200,6 @@ def _version(text: str) -> tuple[int, ...] | None:
 
 #: An unescaped `$`, and the text after it that may be the name of a variable, at most 256 characters.
 _VARIABLE = re.compile(r"(?<!\\)\$([^$]{0,256})")
-#: Maximum depth of nested includes, as in Mitsuba's parser.
-MAX_INCLUDE_DEPTH = 15
 
 
 @dataclass
@@ -224,33 +223,33 @@ class Description:
         """Return the file or folder that Mitsuba opens for this name, or None. Searches `folders` first."""
         return _find(name, self.folders)
 
-    def named_files(self) -> Iterator[tuple[Element, Element, str]]:
-        """Yield the object, the element and the file name for each file that Mitsuba opens for the scene.
+    def named_files(self) -> Iterator[tuple[Element, str]]:
+        """Yield the element and the file name for each file that Mitsuba opens for the scene.
 
         The `material` of a metal names two of Mitsuba's own tables. The two tables of a metal's `material` are included
         if files in `folders` replace Mitsuba's own tables.
         """
-        for owner in self.root.walk():
-            for element in owner.children:
-                if element.file_attribute:
-                    yield owner, element, element.attributes[element.file_attribute]
-                elif element.tag == "string" and element.name == "material":
-                    tables = (f"data/ior/{element.value}.{table}.spd" for table in ("eta", "k"))
-                    yield from ((owner, element, name) for name in tables if self.find_file(name) is not None)
+        for element in self.root.walk():
+            if element.file_attribute:
+                yield element, element.attributes[element.file_attribute]
+            elif element.tag == "string" and element.name == "material":
+                tables = (f"data/ior/{element.value}.{table}.spd" for table in ("eta", "k"))
+                yield from ((element, name) for name in tables if self.find_file(name) is not None)
 
 
-def read_description(file: Path, options: Mapping[str, str]) -> Description:
+def read_description(file: Path, options: Mapping[str, Any]) -> Description:
     """Read the scene in `file` and all files that it includes. `options` are the values of the scene's `$name`
     variables.
 
     Raises ConfigError if a file cannot be read, a variable has no value, or an option has no variable.
     """
-    reader = _Reader(dict(options), set(options))
+    texts = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in options.items()}
+    reader = _Reader(texts, set(options))
     folders = [file.absolute().parent]
     try:
         root = reader.read(file, folders, None)
     except RecursionError:
-        raise ConfigError(file, "", "elements are nested too deeply") from None
+        raise ConfigError(file, "", "elements or includes are nested too deeply") from None
     if reader.unused:
         names = quoted(", ".join(f"${name}" for name in options if name in reader.unused), "")
         raise ConfigError(file, names, "is set in scene.options, but the scene file does not use it")
@@ -270,13 +269,10 @@ class _Reader:
 
     values: dict[str, str]
     unused: set[str]
-    including: int = 0
     files: list[Path] = field(default_factory=list)
 
     def read(self, file: Path, folders: list[Path], include: Element | None) -> Element:
         """Return the root of `file` with includes and variables resolved. Adds folders of <path> to `folders`."""
-        if include is not None and self.including + 1 >= MAX_INCLUDE_DEPTH:
-            raise include.fail("", f"files are included more than {MAX_INCLUDE_DEPTH} levels deep")
         try:
             root = read_document(file)
         except ConfigError as error:
@@ -284,10 +280,8 @@ class _Reader:
                 raise
             raise include.fail("", f"includes {file}, which {error.message}") from None
         self.files.append(file)
-        self.including += 1
         self._put_variables(root)
         self._complete(root, root, folders)
-        self.including -= 1
         return root
 
     def _complete(self, element: Element, root: Element, folders: list[Path]) -> None:
