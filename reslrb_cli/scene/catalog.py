@@ -26,6 +26,8 @@ from reslrb_cli.scene.needs import (
     unsupported_part,
 )
 
+#: Spectra by wavelength, which RGB variants cannot evaluate: their numbers only describe the scene file.
+_SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
 #: Parameters of a mesh besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
 #: Maximum number of printed values; larger arrays show mean and range.
@@ -193,6 +195,8 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None
     if kind in ("sensor", "film"):
         return f"belongs to the {kind}; {only}"
+    if node.class_name() in _SPECTRA:
+        return "is a constant of a spectrum; give the colour as <rgb>"
     if value is None:
         return "is not in the scene file"
     if kind not in ("bsdf", "emitter", "attribute"):

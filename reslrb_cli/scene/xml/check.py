@@ -42,10 +42,6 @@ LOST_PLUGINS = {
 REFUSED_PLUGINS = {
     ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
-    **dict.fromkeys(
-        ((tag, type) for tag in ("spectrum", "texture") for type in ("regular", "irregular", "blackbody")),
-        'needs wavelengths, which RGB variants lack; write <spectrum value="400:0.1, 700:0.9"/> or <rgb>',
-    ),
     ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; use a `perspective` one",
 }
 

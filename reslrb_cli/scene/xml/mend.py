@@ -3,11 +3,17 @@
 Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives an object
 without an id a new id. The new id consists of the object's kind and its number among all objects of this kind. `mend`
 returns notes on the parts that were mended or left out.
+
+The plugins `regular`, `irregular` and `blackbody` need wavelengths, which RGB variants lack. `mend` replaces `regular`,
+`irregular` and `blackbody` plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba converts a
+`<spectrum>` element to a colour with the CIE matching functions. For emitters, the result is the colour of light.
+Otherwise, the result is the colour of a surface under D65.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -125,6 +131,14 @@ def snake_case(name: str) -> str:
     return re.sub(r"(?<=[a-z])[A-Z]+", lambda capitals: "_" + capitals[0].lower(), name)
 
 
+#: Plugins of spectra by wavelength.
+SPECTRA = ("regular", "irregular", "blackbody")
+#: Mitsuba's visible range in nm; for black bodies, the step in nm and the maximum number of steps.
+_VISIBLE, _STEP, _MOST = (360.0, 830.0), 5.0, 2**14
+#: Planck's law: 2 h c^2 (W m^2) and h c / k_B (m K), with Mitsuba's constants.
+_FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792458e8 / 1.38064852e-23
+
+
 def _floats(text: str) -> list[float]:
     """Parse a list of numbers. Returns an empty list if any word of the text is not a number."""
     try:
@@ -148,6 +162,70 @@ def linear(element: Element) -> str:
     if len(encoded) not in (1, 3):
         raise element.fail(element.name, f"must be one or three numbers or #rrggbb, not {quoted(text)}")
     return " ".join(f"{value:.9g}" for value in decode_srgb(np.array(encoded)))
+
+
+def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
+    """Return the attributes of a <spectrum> element, a parameter of `owner`. The element is equivalent to `spectrum`, a
+    plugin of `SPECTRA`.
+
+    Raises ConfigError if the plugin is not a valid spectrum, or is a black body outside of an emitter.
+    """
+    inner = spectrum.find("value")
+    if spectrum.type == "blackbody":
+        if owner.tag != "emitter":
+            raise spectrum.fail("", f"only emitters can have a blackbody; a {owner.tag} can have <rgb>")
+        wavelengths, values = _black_body(spectrum)
+    elif inner is not None and inner.tag == "spectrum":
+        return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
+    elif spectrum.type == "regular":
+        values = _numbers(spectrum, "values")
+        wavelengths = np.linspace(*_range(spectrum, ()), len(values))
+    else:
+        wavelengths, values = _numbers(spectrum, "wavelengths"), _numbers(spectrum, "values")
+        if len(wavelengths) != len(values):
+            raise spectrum.fail("", f"irregular has {len(wavelengths)} wavelengths and {len(values)} values")
+    if len(wavelengths) < 2 or (np.diff(wavelengths) <= 0).any():
+        raise spectrum.fail("", f"{spectrum.type} needs two wavelengths or more, in ascending order")
+    pairs = zip(wavelengths, values, strict=True)
+    return {"value": ", ".join(f"{wavelength:.9g}:{value:.9g}" for wavelength, value in pairs)}
+
+
+def _black_body(spectrum: Element) -> tuple[np.ndarray, np.ndarray]:
+    """Return wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
+    temperature = _numbers(spectrum, "temperature")
+    if len(temperature) > 1 or temperature[0] <= 0:
+        raise spectrum.fail("temperature", "must be a positive number of kelvin")
+    first, last = _range(spectrum, _VISIBLE)
+    nm = np.linspace(first, last, min(math.ceil((last - first) / _STEP), _MOST) + 1)
+    exponent = _SECOND / (1e-9 * nm * temperature[0])
+    # Above 700 the radiance is 0 in single precision, and expm1 overflows.
+    return nm, 1e-9 * _FIRST / ((1e-9 * nm) ** 5 * np.expm1(np.minimum(exponent, 700)))
+
+
+def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
+    """Return the range of wavelengths in nm. A missing `wavelength_min` or `wavelength_max` comes from `default`,
+    unless `default` is empty.
+    """
+    names = ("wavelength_min", "wavelength_max")
+    low, high = (
+        default[place] if default and spectrum.find(name) is None else _numbers(spectrum, name)[0]
+        for place, name in enumerate(names)
+    )
+    if not 0 < low < high:
+        raise spectrum.fail("", f"{spectrum.type}: wavelength_max must be above wavelength_min, and both above 0")
+    return low, high
+
+
+def _numbers(spectrum: Element, name: str) -> np.ndarray:
+    """Return the numbers of a parameter. Raises ConfigError if the parameter has no numbers, or if any number is
+    negative or not finite.
+    """
+    if (parameter := spectrum.find(name)) is None:
+        raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
+    numbers = np.array(_floats(parameter.value))
+    if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
+        raise spectrum.fail(name, f"must be numbers of at least 0, not {quoted(parameter.value)}")
+    return numbers
 
 
 def transform_coordinates(texture: Element) -> Element | None:
@@ -239,6 +317,7 @@ def mend(description: Description) -> list[Note]:
     if root.is_object:
         mender.mend_element(root)
     mender.mend_below(root)
+    mender.mend_spectra(root)
     # Remove references to objects that were left out.
     for element in root.walk() if mender.gone else ():
         element.children[:] = [child for child in element.children if child.tag != "ref" or child.id not in mender.gone]
@@ -376,3 +455,20 @@ class _Mender:
                 dropped.add(earlier)
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]
+
+    def mend_spectra(self, root: Element) -> None:
+        """Replace spectrum plugins by <spectrum> parameters, since RGB variants cannot evaluate these plugins."""
+        named = {id: item for id, item in root.by_id().items() if item.type in SPECTRA}
+        for owner in [element for element in root.objects() if element.type != "specfilm"]:
+            kept = []
+            for child in owner.children:
+                meant = named.get(child.id)
+                if meant is None:
+                    kept.append(child)
+                elif owner is not root:
+                    name = child.name or meant.name
+                    if not name:
+                        raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name, that of a parameter")
+                    kept.append(child.new("spectrum", name=name, **by_wavelength(meant, owner)))
+                    self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as its colour")
+            owner.children[:] = kept
