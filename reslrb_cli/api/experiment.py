@@ -295,7 +295,7 @@ def convergence(
             if count is not None and count < 1:
                 raise ConfigError(option, "", f"is {count}; at least 1 is needed")
         plan = Plan(
-            **machine_of(config, None), **compared(integrators, reference, DEFAULTS[objective]), config=config,
+            **machine_of(config), **compared(integrators, reference, DEFAULTS[objective]), config=config,
             objective=objective, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps)),
         )  # fmt: skip
         plan.check()

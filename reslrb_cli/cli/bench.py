@@ -93,7 +93,7 @@ def command(**given: Any) -> int:
     usual = depths(options.max_depth) if swept == "depth" else usual_values(swept, config)
     check_writable("--json", json_file)
     sweep = Sweep(
-        **machine_of(config, None),
+        **machine_of(config),
         config=config,
         cases=parse_cases(options.integrators or INTEGRATORS, deep=swept == "depth"),
         values=sorted(values or usual),

@@ -15,7 +15,13 @@ from typing import Any, ClassVar, get_args
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
 from reslrb_cli.config.base import code_file
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, AnyIntegrator, LightTracerOptions
+from reslrb_cli.config.integrators import (
+    AUTO_ESTIMATOR,
+    ESTIMATOR_OPTIONS,
+    UNDECIDED,
+    AnyIntegrator,
+    LightTracerOptions,
+)
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.schema import Config
@@ -27,7 +33,7 @@ from reslrb_cli.records.measurements import Method
 #: Options that a case inherits from the configuration's integrator if its own integrator has them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    *("sppc", "sppp", "sppi", *UNDECIDED),
+    *UNDECIDED,
 )
 
 #: Options that set the kinds of paths.
@@ -106,13 +112,11 @@ class Case:
         if self.type == "custom":  # unknown options are arguments of the user's class
             given["arguments"] = {name: given.pop(name) for name in [*given] if name not in own}
         values |= given
-        if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
-            raise ConfigError(blame, "estimator", "`auto` is for whole runs; use `stack`")
-        ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`",
-                "pixels": "`even` with `measured`"}  # fmt: skip
-        for option, compared in (ways | {"paths": "`light`, `camera` and `both`"}).items():
+        if self.type == "reslrb":
+            values.setdefault("estimator", PLUGIN_ESTIMATOR)
+        for option, fixed in {"estimator": AUTO_ESTIMATOR, **UNDECIDED}.items():
             if values.get(option) == "auto" and not auto:
-                raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")
+                raise ConfigError(blame, option, f"`auto` is for whole runs; use `{fixed}`, or another value")
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
         if self.type == "custom" and not config.allows_code:
             raise ConfigError(blame, "", "would run with all your rights; --allow-code permits it")
@@ -460,13 +464,13 @@ def compared(integrators: str | None, reference: str | None, usual: str) -> dict
     return {"cases": cases, "reference": stands[0], "default": integrators is None}
 
 
-def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
+def machine_of(config: Config) -> dict[str, Any]:
     """Return the fields of a `Measurement` that describe the machine: variant, device, memory, and memory limit. Raises
     ConfigError.
+
+    The memory limit limits the address space, which does not include the memory of a GPU.
     """
     variant, _ = choose(config.variant)
-    on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
-    if on_gpu and memory_limit is not None:
-        raise ConfigError("--memory-limit", "", f"limits the address space, which does not include {variant}'s memory")
-    limit = memory_limit or (None if on_gpu else memory)
+    memory = memory_bytes(variant)
+    limit = None if variant.startswith("cuda") else memory
     return {"variant": variant, "memory": memory, "memory_limit": limit, "device": device_name(variant)}
