@@ -95,7 +95,7 @@ def command(**given: Any) -> int:
     sweep = Sweep(
         **machine_of(config),
         config=config,
-        cases=parse_cases(options.integrators or INTEGRATORS, deep=swept == "depth"),
+        cases=parse_cases(options.integrators or INTEGRATORS),
         values=sorted(values or usual),
         objective=options.objective,
         budget_s=options.budget,

@@ -138,26 +138,48 @@ class Case:
         return f"{name}({','.join(other)})" if other else name
 
 
-def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Case]:
+def parse_cases(text: str, source: str = _OPTION) -> list[Case]:
     """Parse a list of cases. Raises ConfigError if a case has a wrong format or is listed twice.
 
-    `source` is the command-line option that contains the list. `deep` is True if the measurement varies the maximum
-    depth. `Case.at` checks the options of the cases.
+    `source` is the command-line option that contains the list. `Case.at` checks the options of the cases.
     """
-    return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or FILE.py:CLASS", deep)
+    cases: list[Case] = []
+    for item in _split(text):
+        if match := _OWN.fullmatch(item):
+            place = f"{Path(match['file']).expanduser().absolute()}:{match['name']}"
+            kind, options = "custom", {"file": place}
+        elif match := _ITEM.fullmatch(item):
+            kind, options = match["type"], {} if match["estimator"] is None else {"estimator": match["estimator"]}
+        else:
+            wanted = "TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or FILE.py:CLASS"
+            raise ConfigError(source, "", f"`{item}` is not an integrator; write {wanted}")
+        for pair in _split(match["options"]) if match["options"] else []:
+            name, equals, value = (part.strip() for part in pair.partition("="))
+            if not equals or not name:
+                raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
+            if name == "max_depth":
+                reason = f"all share one depth; use --set integrator.{pair}, or bench --max-depth"
+                raise ConfigError(source, item, reason)
+            options[name] = parse(value, f"{source} {item}", name_line=False)
+        case = Case(item, kind, options, source)
+        if case.label in [other.label for other in cases]:
+            raise ConfigError(source, "", f"`{item}` is given twice")
+        cases.append(case)
+    return cases
 
 
-def parse_estimators(text: str) -> list[Case]:
-    """Parse a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`. Raises like `parse_cases`."""
-    return _parse(text, "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
-
-
-def parse_own(text: str) -> list[Case]:
-    """Parse a list of a user's own integrators, FILE.py:CLASS[(OPTION=VALUE,...)]. Raises like `parse_cases`."""
-    cases = _parse(text, _OPTION, "", "integrator of your own; write FILE.py:CLASS[(OPTION=VALUE,...)]", False)
-    if others := [case.label for case in cases if case.type != "custom"]:
-        reason = f"`{others[0]}` is not your own (FILE.py:CLASS); name estimators of reslrb by `estimators`"
-        raise ConfigError(_OPTION, "", reason)
+def parse_checked(text: str) -> list[Case]:
+    """Parse the list of a gradient check: estimators of `reslrb`, and the user's own integrators. Raises
+    ConfigError.
+    """
+    cases = parse_cases(text)
+    for case in cases:
+        if case.type != "custom" and "estimator" not in case.options:
+            reason = f"`{case.label}` is neither an estimator, reslrb:ESTIMATOR, nor your own integrator, FILE.py:CLASS"
+            raise ConfigError(_OPTION, "", reason)
+        for name in ADJOINT:
+            if name in case.options and case.type != "custom":
+                raise ConfigError(_OPTION, case.label, f"all share one {name}; use --set run.{name}=VALUE")
     return cases
 
 
@@ -179,34 +201,6 @@ def all_estimators(config: Config) -> list[Case]:
             cases.append(Case(label, "reslrb", {"estimator": name} | options))
     if isinstance(own, ReslrbConfig) and own.paths == "auto":
         cases.append(Case("reslrb:stack(paths=both)", "reslrb", {"estimator": "stack", "paths": "both"}))
-    return cases
-
-
-def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list[Case]:
-    cases: list[Case] = []
-    for item in _split(text):
-        match = _ITEM.fullmatch(prefix + item)
-        kind, options = (match["type"], {"estimator": match["estimator"]}) if match else ("", {})
-        if own := None if prefix else _OWN.fullmatch(item):
-            place = f"{Path(own['file']).expanduser().absolute()}:{own['name']}"
-            match, kind, options = own, "custom", {"file": place}
-        options = {name: value for name, value in options.items() if value is not None}
-        if match is None or (prefix and "estimator" not in options):
-            raise ConfigError(source, "", f"`{item}` is not an {wanted}")
-        for pair in _split(match["options"]) if match["options"] else []:
-            name, equals, value = (part.strip() for part in pair.partition("="))
-            if not equals or not name:
-                raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
-            if name == "max_depth" and deep:
-                raise ConfigError(source, item, "max_depth is varied; --max-depth sets its end")
-            if name == "max_depth" or (name in ADJOINT and prefix):
-                section = "run" if name in ADJOINT else "integrator"
-                raise ConfigError(source, item, f"all share one {name}; use --set {section}.{pair}")
-            options[name] = parse(value, f"{source} {item}", name_line=False)
-        case = Case(prefix + item, kind, options, source)
-        if case.label in [other.label for other in cases]:
-            raise ConfigError(source, "", f"`{item}` is given twice")
-        cases.append(case)
     return cases
 
 
@@ -457,8 +451,8 @@ def compared(integrators: str | None, reference: str | None, usual: str) -> dict
     """Return a `Plan`'s cases and reference, parsed from text. `usual` is the default list of cases. Raises
     ConfigError.
     """
-    cases = parse_cases(integrators or usual, deep=False)
-    stands = parse_cases(reference or REFERENCE, "--reference", deep=False)
+    cases = parse_cases(integrators or usual)
+    stands = parse_cases(reference or REFERENCE, "--reference")
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are relative to one method; name one")
     return {"cases": cases, "reference": stands[0], "default": integrators is None}

@@ -18,7 +18,7 @@ from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
 from reslrb_cli.measure.methods import Case as Listed
-from reslrb_cli.measure.methods import all_estimators, parse_estimators, parse_own
+from reslrb_cli.measure.methods import all_estimators, parse_checked
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
@@ -102,17 +102,13 @@ class CheckSettings:
 
 
 def settings_of(
-    config: Config, estimators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float,
-    integrators: str | None = None,
-) -> CheckSettings:  # fmt: skip
-    """Return the settings of a check of `config`. `estimators` and `integrators` are lists from the command line.
-
-    Without either list, all estimators are checked. Raises ConfigError if one is invalid.
+    config: Config, integrators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float
+) -> CheckSettings:
+    """Return the settings of a check of `config`. `integrators` is a list as text, or None for all estimators. Raises
+    ConfigError if an integrator is invalid.
     """
-    listed = [] if estimators is None else parse_estimators(estimators)
-    listed += [] if integrators is None else parse_own(integrators)
-    named = estimators is not None or integrators is not None
-    checked = CheckSettings(config, listed if named else all_estimators(config), budget_s, seeds, spp, named, spent_s)
+    listed = all_estimators(config) if integrators is None else parse_checked(integrators)
+    checked = CheckSettings(config, listed, budget_s, seeds, spp, integrators is not None, spent_s)
     checked.configs()  # before anything is loaded
     return checked
 
@@ -254,7 +250,7 @@ class Participants:
             return listed
         if settings.named or not able:
             without, able_ones = others[0].options["estimator"], ", ".join(ATTACHED)
-            raise ConfigError("--estimators", "", f"{without} has no derivatives of moving light; use {able_ones}")
+            raise ConfigError("--integrators", "", f"{without} has no derivatives of moving light; use {able_ones}")
         return able
 
     def _with_paths(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
@@ -265,7 +261,7 @@ class Participants:
             ours = [case for case in settings.integrators if case.type == "reslrb"]
             told = [case for case in ours if case.options.get("paths", "light") != "light"]
             if told and settings.named:
-                raise ConfigError("--estimators", told[0].label, "only light paths have derivatives of moving light")
+                raise ConfigError("--integrators", told[0].label, "only light paths have derivatives of moving light")
             return [case for case in settings.integrators if case not in told]
         refused: dict[Way, ConfigError] = {}
         for way, config in {Way.of(config): config for config in configs.values()}.items():
