@@ -267,7 +267,7 @@ def command(**given: Any) -> int:
         if place is not None:
             from reslrb_cli.cluster.checks import samples_at
 
-            check.sample_with(stack.enter_context(samples_at(checked, check.participants, place, variant)))
+            check.sampling.engine = stack.enter_context(samples_at(checked, check.participants, place, variant))
         records, interrupted = _run(check, variant, to_keep, options)
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
@@ -295,7 +295,7 @@ def _run(
     records: list[GradcheckRecord] = []
     drawn = False
     folder, origin = options.images, origin_of(variant)
-    keeper = Keeper(options.json_file, origin, lambda: records, lambda: [], lambda: check.kept(to_keep))
+    keeper = Keeper(options.json_file, origin, lambda: records, lambda: [], lambda: check.sampling.kept(to_keep))
     with Interrupts() as interrupts:
         table = gradcheck_columns(check.expected())
         echo(table.head())
@@ -318,7 +318,7 @@ def _draw(result: CheckResult, folder: Path | None) -> None:
     from reslrb_cli.report.plots import plot_maps
 
     folder.mkdir(parents=True, exist_ok=True)
-    plot_maps(result.record, result.maps.gradient, result.maps.reference, result.maps.z, folder)
+    plot_maps(result.record, *result.maps, folder)
 
 
 def _check_folder(folder: Path | None) -> None:

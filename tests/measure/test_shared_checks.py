@@ -55,9 +55,9 @@ def sampled(settings: CheckSettings, place: Place | None, earlier: Kept | None =
             found = [str(result.record) for result in made.run(lambda: False, lambda line: None)]
         else:
             with checks.samples_at(settings, made.participants, place, "llvm_ad_rgb", threads=1) as engine:
-                made.sample_with(engine)
+                made.sampling.engine = engine
                 found = [str(result.record) for result in made.run(lambda: False, lambda line: None)]
-    kept = made.kept({})
+    kept = made.sampling.kept({})
     assert kept is not None
     return kept, found
 
