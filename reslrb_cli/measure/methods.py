@@ -40,12 +40,9 @@ SHARED = (
 PATHS_OPTIONS = ("paths", "light_share")
 
 
-def records_of(paths: str, light_share: Any) -> dict[str, Any]:
-    """Return `paths` and `light_share` for records. `light_share` is None unless `paths` is `both` and the share is a
-    number.
-    """
-    known = paths == "both" and isinstance(light_share, (int, float))
-    return {"paths": paths, "light_share": float(light_share) if known else None}
+def records_of(paths: str, light_share: float) -> dict[str, Any]:
+    """Return `paths` and `light_share` for records. `light_share` is None unless `paths` is `both`."""
+    return {"paths": paths, "light_share": float(light_share) if paths == "both" else None}
 
 
 def paths_in_records(config: Config) -> dict[str, Any]:
@@ -101,9 +98,9 @@ class Case:
         if known:
             adjoint = {"adjoint": "independent"}  # valid with any loss
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
-        values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
-        # A run chooses these by measurement, but a method has fixed values.
-        values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
+        # A run chooses options that are `auto` by measurement, but a method has fixed values.
+        left = {name for name in SHARED if name not in own or (name in UNDECIDED and shared.get(name) == "auto")}
+        values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name not in left}
         if "paths" in self.options:  # the experiment's share belongs to its own paths
             values.pop("light_share", None)
         if self.type == "custom":  # a user's integrator chooses its own paths

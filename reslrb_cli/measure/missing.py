@@ -43,8 +43,8 @@ from reslrb_cli.measure.gradients import (
     seeds,
     smooth_rows,
 )
-from reslrb_cli.measure.methods import parse_cases
-from reslrb_cli.measure.participants import MOVING_DIRECTIONS, NEVER, PATHS
+from reslrb_cli.measure.methods import NEVER, parse_cases
+from reslrb_cli.measure.participants import MOVING_DIRECTIONS, PATHS
 from reslrb_cli.measure.references import ends
 from reslrb_cli.measure.resume_store import Earlier, kept
 from reslrb_cli.optimization.assemble import assemble

@@ -17,8 +17,8 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
+from reslrb_cli.measure.methods import NEVER, all_estimators, parse_checked
 from reslrb_cli.measure.methods import Case as Listed
-from reslrb_cli.measure.methods import all_estimators, parse_checked
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
@@ -49,9 +49,6 @@ DIRECTIONS = 2
 
 #: The same for parameters that move light.
 MOVING_DIRECTIONS = 3
-
-#: A depth at which roulette never starts.
-NEVER = 1_000_000
 
 #: Settings of attached derivatives for each reference that differ from the user's. Naive AD follows everywhere;
 #: `ptracer` does not differentiate the filter's normalisation, but differences do.
