@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from reslrb_cli.config.integrators import UNDECIDED
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.comparison import (
@@ -83,15 +84,10 @@ class Gradcheck:
         compile.
         """
         parts = self.participants
-        found = [
-            Row(None, "reslrb", reference, Kind.IMAGE, way)
-            for way, (reference, _) in parts.images.items()
-            if reference is not None
-        ]
-        for listed in parts.listed:
-            reference, _ = parts.images[parts.ways[listed.label]]
-            if listed.type == "custom" and reference is not None:
-                found.append(Row(None, listed.label, reference, Kind.IMAGE, parts.ways[listed.label]))
+        shown = [("reslrb", way) for way in parts.images]
+        shown += [(listed.label, parts.ways[listed.label]) for listed in parts.listed if listed.type == "custom"]
+        images = [(label, way, parts.images[way][0]) for label, way in shown]
+        found = [Row(None, label, one, Kind.IMAGE, way) for label, way, one in images if one is not None]
         plain = [label for label, config in self.settings.configs().items() if _draws_plainly(config)]
         for key in parts.case.keys:
             for listed in parts.listed:
@@ -230,8 +226,7 @@ def _draws_plainly(config: Config) -> bool:
     `pixels: measured` make the paths differ.
     """
     options = config.integrator.options()
-    usual = {"guiding": "off", "sequence": "independent", "pixels": "even"}
-    return all(options.get(name, value) == value for name, value in usual.items())
+    return all(options.get(name, UNDECIDED[name]) == UNDECIDED[name] for name in ("guiding", "sequence", "pixels"))
 
 
 def _maps(
