@@ -29,7 +29,8 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, entry_count
 from reslrb_cli.measure.gradients import Case
-from reslrb_cli.measure.participants import ALIKE, NEVER
+from reslrb_cli.measure.methods import NEVER
+from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.processes import Begun, Ended, Process
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.records.clock import peak_mib, reset_peak

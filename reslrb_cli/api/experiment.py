@@ -207,11 +207,10 @@ def gradient(
 
 def gradcheck(
     experiment: Experiment,
-    estimators: str | None = None,
+    integrators: str | None = None,
     budget: float = 45.0,
     seeds: int | None = None,
     spp: int | None = None,
-    integrators: str | None = None,
     allow_code: bool = False,
 ) -> list[GradcheckRecord]:
     """Compare gradients with independent references, as `reslrb gradcheck` does (docs/gradcheck.md).
@@ -219,12 +218,11 @@ def gradcheck(
     Returns one record per comparison, with the fields that `--json` writes. `record.holds` is False if the comparison
     fails.
 
-    - `estimators`: a list of estimators, such as `stack,reservoir(capacity=4)` (default: all four).
+    - `integrators`: a list of estimators, such as `reslrb:stack,reslrb:reservoir(capacity=4)`, and of your own Mitsuba
+        integrators, `FILE.py:CLASS[(OPTION=VALUE,...)]` (docs/your_integrator.md). Default: all four estimators.
     - `budget`: total time in seconds.
     - `seeds`: number of seeds, at least 3, regardless of `budget`.
     - `spp`: samples per pixel of one gradient.
-    - `integrators`: your own Mitsuba integrators, `FILE.py:CLASS[(OPTION=VALUE,...)]`. They are checked instead of the
-        estimators of `reslrb` (docs/your_integrator.md).
     - `allow_code`: permit running the code of the integrators' files.
 
     For your own integrators, the log (`logging.INFO`) reports noise and cost. The log also gives hints if an integrator
@@ -242,17 +240,15 @@ def gradcheck(
                 raise ConfigError(name, "", f"is {value}; at least {least} are needed")
         keep_variant(config.variant, config.source)
         from reslrb_cli.measure.gradcheck import Gradcheck
+        from reslrb_cli.measure.own import look_into
         from reslrb_cli.measure.participants import settings_of
 
         gc.collect()  # earlier scenes and the gradients of their parameters would otherwise take part in the check
-        checked = settings_of(config, estimators, budget, seeds, spp, time.monotonic() - began, integrators)
+        checked = settings_of(config, integrators, budget, seeds, spp, time.monotonic() - began)
         check = Gradcheck(checked)
         records = [result.record for result in check.run(stop, logger.info)]
-        if integrators is not None:
-            from reslrb_cli.measure.own import look_into
-
-            for line in look_into(check, records, stop, logger.debug):
-                logger.info(line)
+        for line in look_into(check, records, stop, logger.debug):
+            logger.info(line)
         return records
 
 
@@ -295,7 +291,7 @@ def convergence(
             if count is not None and count < 1:
                 raise ConfigError(option, "", f"is {count}; at least 1 is needed")
         plan = Plan(
-            **machine_of(config, None), **compared(integrators, reference, DEFAULTS[objective]), config=config,
+            **machine_of(config), **compared(integrators, reference, DEFAULTS[objective]), config=config,
             objective=objective, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps)),
         )  # fmt: skip
         plan.check()

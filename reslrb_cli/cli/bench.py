@@ -100,9 +100,9 @@ def command(**given: Any) -> int:
     usual = depths(options.max_depth) if swept == "depth" else sample_counts(config.run.spp)
     check_writable("--json", json_file)
     sweep = Sweep(
-        **machine_of(config, None),
+        **machine_of(config),
         config=config,
-        cases=parse_cases(options.integrators or INTEGRATORS, deep=swept == "depth"),
+        cases=parse_cases(options.integrators or INTEGRATORS),
         values=sorted(values or usual),
         objective=options.objective,
         budget_s=options.budget,

@@ -83,7 +83,7 @@ def command(**given: Any) -> int:
     named = compared(options.integrators, options.reference, DEFAULTS[objective])
     check_writable("--json", json_file)
     plan = Plan(
-        **machine_of(config, None),
+        **machine_of(config),
         **named,
         config=config,
         objective=objective,

@@ -40,7 +40,7 @@ from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import PATHS_OPTIONS, Case, parse_cases
+from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_checked
 from reslrb_cli.measure.resume_store import settings
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
 
@@ -161,22 +161,12 @@ def run_suite(options: GradcheckOptions, place: Place | None) -> int:
     return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
 
 
-def _listed(text: str) -> list[Case]:
-    """Parse `--integrators`: estimators of `reslrb`, and the user's own integrators. Raises ConfigError."""
-    cases = parse_cases(text, deep=False)
-    for case in cases:
-        if case.type != "custom" and "estimator" not in case.options:
-            reason = f"`{case.label}` is neither an estimator, reslrb:ESTIMATOR, nor your own integrator, FILE.py:CLASS"
-            raise ConfigError("--integrators", "", reason)
-    return cases
-
-
 def _estimators(text: str) -> list[str]:
     """Parse the estimators for a suite. Estimators accept no option except `paths`, because the cases set their own
     options.
     """
     written = []
-    for case in _listed(text):
+    for case in parse_checked(text):
         name, label = case.options.get("estimator"), case.label.partition(":")[2]
         if not case.options.keys() <= {"estimator", *PATHS_OPTIONS}:
             raise ConfigError("--integrators", label, "a suite allows estimators of reslrb, and no option except paths")
@@ -242,8 +232,8 @@ def command(**given: Any) -> int:
     began, options = time.monotonic(), GradcheckOptions(**given)
     load_packages()  # before the imports below need them
     from reslrb_cli.measure.gradcheck import Gradcheck
-    from reslrb_cli.measure.methods import all_estimators
-    from reslrb_cli.measure.participants import CheckSettings
+    from reslrb_cli.measure.own import look_into
+    from reslrb_cli.measure.participants import settings_of
     from reslrb_cli.measure.sampling import KIND
     from reslrb_cli.measure.sampling import settings as settings_to_keep
     from reslrb_cli.report.tables import summary_lines
@@ -260,12 +250,9 @@ def command(**given: Any) -> int:
         echo(f"{device_name(variant)}, {variant}")
         return run_missing(options, config, variant)
     _check_folder(options.images)
-    listed = None if options.integrators is None else _listed(options.integrators)
-    checked = CheckSettings(
-        config, listed or all_estimators(config), options.budget, options.seeds, options.spp, listed is not None,
-        time.monotonic() - began,
-    )  # fmt: skip
-    checked.configs()  # before anything is loaded
+    checked = settings_of(
+        config, options.integrators, options.budget, options.seeds, options.spp, time.monotonic() - began
+    )
     if place is not None:
         from reslrb_cli.cluster.checks import check_shareable
 
@@ -280,14 +267,12 @@ def command(**given: Any) -> int:
         if place is not None:
             from reslrb_cli.cluster.checks import samples_at
 
-            check.sample_with(stack.enter_context(samples_at(checked, check.participants, place, variant)))
+            check.sampling.engine = stack.enter_context(samples_at(checked, check.participants, place, variant))
         records, interrupted = _run(check, variant, to_keep, options)
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
         echo(line)
-    if records and not interrupted and any(case.type == "custom" for case in checked.integrators):
-        from reslrb_cli.measure.own import look_into
-
+    if records and not interrupted:
         with Interrupts() as interrupts:
             for line in look_into(check, records, lambda: interrupts.requested, logger.info):
                 echo(line)
@@ -310,7 +295,7 @@ def _run(
     records: list[GradcheckRecord] = []
     drawn = False
     folder, origin = options.images, origin_of(variant)
-    keeper = Keeper(options.json_file, origin, lambda: records, lambda: [], lambda: check.kept(to_keep))
+    keeper = Keeper(options.json_file, origin, lambda: records, lambda: [], lambda: check.sampling.kept(to_keep))
     with Interrupts() as interrupts:
         table = gradcheck_columns(check.expected())
         echo(table.head())
@@ -333,7 +318,7 @@ def _draw(result: CheckResult, folder: Path | None) -> None:
     from reslrb_cli.report.plots import plot_maps
 
     folder.mkdir(parents=True, exist_ok=True)
-    plot_maps(result.record, result.maps.gradient, result.maps.reference, result.maps.z, folder)
+    plot_maps(result.record, *result.maps, folder)
 
 
 def _check_folder(folder: Path | None) -> None:

@@ -9,8 +9,8 @@ The module imports dask, so it is imported only for `--cluster`.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,26 +24,10 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import Case as Listed
 from reslrb_cli.measure.participants import CheckSettings, Participants
-from reslrb_cli.measure.sampling import Step, step_as, steps_of
+from reslrb_cli.measure.sampling import Steps
 from reslrb_cli.measure.scenes import small
 
 Stop = Callable[[], bool]
-
-
-@dataclass(frozen=True)
-class Steps:
-    """The step sizes of finite differences, for each parameter and each kind of paths (`sampling.steps_of`)."""
-
-    steps: Mapping[str, Sequence[Step]]
-
-    @staticmethod
-    def of(participants: Participants) -> Steps:
-        """Return the steps that this process has chosen."""
-        return Steps(steps_of(participants, participants.directions))
-
-    def take(self, participants: Participants) -> None:
-        """Set these steps."""
-        step_as(participants, self.steps)
 
 
 # --- on a worker ------------------------------------------------------------------------------------------------------

@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
+from reslrb_cli.config.integrators import UNDECIDED
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.arena import NO_TIME
@@ -29,8 +29,7 @@ from reslrb_cli.measure.comparison import (
 from reslrb_cli.measure.methods import records_of
 from reslrb_cli.measure.participants import CheckSettings, Way
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.sampling import NAIVE, Engine, Name, Sampling
-from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
 #: Relative difference of a stock integrator on the same paths: it rounds the visibility of points differently.
@@ -41,20 +40,13 @@ ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
 
 
 @dataclass(frozen=True)
-class GradientMaps:
-    """Maps of a texture: mean gradient and reference (H, W, C), and z scores (H, W) of the sums over channels."""
-
-    gradient: np.ndarray
-    reference: np.ndarray
-    z: np.ndarray
-
-
-@dataclass(frozen=True)
 class CheckResult:
-    """Record of a comparison. `maps` is present if the parameter is a texture and the reference has all its texels."""
+    """Record of a comparison. If the parameter is a texture and the reference has all its texels, `maps` has the mean
+    gradient and the reference (H, W, C), and the z scores (H, W) of the sums over channels.
+    """
 
     record: GradcheckRecord
-    maps: GradientMaps | None = None
+    maps: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
@@ -83,12 +75,8 @@ class Gradcheck:
     def __init__(
         self, settings: CheckSettings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
     ) -> None:
-        self.settings, self._sampling = settings, Sampling(settings, now, earlier)
-        self.participants = self._sampling.participants
-
-    def sample_with(self, engine: Engine) -> None:
-        """Let `engine` take the samples if the number of seeds is fixed."""
-        self._sampling.engine = engine
+        self.settings, self.sampling = settings, Sampling(settings, now, earlier)
+        self.participants = self.sampling.participants
 
     @cached_property
     def rows(self) -> list[Row]:
@@ -96,31 +84,18 @@ class Gradcheck:
         compile.
         """
         parts = self.participants
-        found = [
-            Row(None, "reslrb", reference, Kind.IMAGE, way)
-            for way, (reference, _) in parts.images.items()
-            if reference is not None
-        ]
-        for listed in parts.listed:
-            reference, _ = parts.images[parts.ways[listed.label]]
-            if listed.type == "custom" and reference is not None:
-                found.append(Row(None, listed.label, reference, Kind.IMAGE, parts.ways[listed.label]))
+        shown = [("reslrb", way) for way in parts.images]
+        shown += [(listed.label, parts.ways[listed.label]) for listed in parts.listed if listed.type == "custom"]
+        images = [(label, way, parts.images[way][0]) for label, way in shown]
+        found = [Row(None, label, one, Kind.IMAGE, way) for label, way, one in images if one is not None]
         plain = [label for label, config in self.settings.configs().items() if _draws_plainly(config)]
         for key in parts.case.keys:
             for listed in parts.listed:
-                label, way = listed.label, parts.ways[listed.label]
-                if listed.type == "custom":
-                    found += [Row(key, label, one, Kind.EXPECTATION, way) for one in parts.of_own(key, way)]
-                    continue
-                exact = ESTIMATORS[listed.options["estimator"]].exact and label in plain
-                kind = Kind.EQUAL_SEEDS if exact else Kind.EXPECTATION
-                found.append(Row(key, label, Reference.WALK_AD, kind, way))
-                stock = parts.stock[way.named(key)]
-                references = [] if stock is None else [stock]
-                references += [Reference.ANALYTIC] if key in parts.exact else []
-                references += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if parts.forward_mode else [])
-                references += [Reference.UNGUIDED] if label in parts.unguided else []
-                found += [Row(key, label, reference, Kind.EXPECTATION, way) for reference in references]
+                ours = listed.type == "reslrb" and listed.label in plain
+                exact = ours and ESTIMATORS[listed.options["estimator"]].exact
+                for reference in parts.references(key, listed):
+                    kind = Kind.EQUAL_SEEDS if exact and reference is Reference.WALK_AD else Kind.EXPECTATION
+                    found.append(Row(key, listed.label, reference, kind, parts.ways[listed.label]))
         return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 
     def conditions(self) -> str:
@@ -140,10 +115,6 @@ class Gradcheck:
             result.record for result in self._without_reference()
         ]
 
-    def kept(self, settings: dict[str, Any]) -> Kept | None:
-        """Return the state for a later session with the same `settings`, or None if there are no samples."""
-        return self._sampling.kept(settings)
-
     def run(
         self, stop: Callable[[], bool], say: Callable[[str], None], between: Callable[[], None] = lambda: None
     ) -> Iterator[CheckResult]:
@@ -151,11 +122,11 @@ class Gradcheck:
 
         If the budget is too small for a comparison, its record says so. `between` is called after each sample.
         """
-        self._sampling.between = between
-        self._sampling.expect(name for row in self.rows for name in self._needs(row))
+        self.sampling.between = between
+        self.sampling.expect(name for row in self.rows for name in self._needs(row))
         family, compared, late = self._family(), False, False
         for row in self.rows:
-            if all(self._sampling.take(name, stop, say) for name in self._needs(row)):
+            if all(self.sampling.take(name, stop, say) for name in self._needs(row)):
                 compared = True
                 yield self._result(row, family)
             elif not stop():
@@ -164,7 +135,7 @@ class Gradcheck:
         if compared or not stop():
             yield from self._without_reference()
         if late and not stop():
-            needed_s = self._sampling.needed_s()
+            needed_s = self.sampling.needed_s()
             enough = "several times as much" if needed_s is None else f"about {needed_s:.0f} s"
             say(f"the minimum number of seeds takes {enough}; allow this with --budget")
 
@@ -203,8 +174,8 @@ class Gradcheck:
 
     def _result(self, row: Row, family: Family) -> CheckResult:
         parts, (mine, *its) = self.participants, self._needs(row)
-        ours, shape, bias = self._sampling.of(mine), None, np.zeros(1)
-        reference = self._sampling.of(its[0]) if its else parts.exact[str(row.key)]
+        ours, shape, bias = self.sampling.of(mine), None, np.zeros(1)
+        reference = self.sampling.of(its[0]) if its else parts.exact[str(row.key)]
         if row.key is None:
             shape = tuple(parts.case.weights.shape)
         else:
@@ -238,15 +209,14 @@ class Gradcheck:
     def _without_reference(self) -> Iterator[CheckResult]:
         """Yield records for parameters without a stock reference."""
         parts = self.participants
-        rows = []
-        for way in parts.each_way:
-            missing = {key: parts.why[way.named(key)] for key in parts.case.keys if parts.stock[way.named(key)] is None}
-            rows += [
-                (Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION, way), why) for key, why in missing.items()
-            ]
-        for way, (reference, why) in parts.images.items():
-            if reference is None:
-                rows.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE, way), why))
+        rows = [
+            (Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION, way), parts.why[way.named(key)])
+            for way in parts.each_way for key in parts.case.keys if parts.stock[way.named(key)] is None
+        ]  # fmt: skip
+        rows += [
+            (Row(None, "reslrb", Reference.PATH, Kind.IMAGE, way), why)
+            for way, (reference, why) in parts.images.items() if reference is None
+        ]  # fmt: skip
         for row, why in rows:
             yield CheckResult(self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0))
 
@@ -256,14 +226,15 @@ def _draws_plainly(config: Config) -> bool:
     `pixels: measured` make the paths differ.
     """
     options = config.integrator.options()
-    usual = {"guiding": "off", "sequence": "independent", "pixels": "even"}
-    return all(options.get(name, value) == value for name, value in usual.items())
+    return all(options.get(name, UNDECIDED[name]) == UNDECIDED[name] for name in ("guiding", "sequence", "pixels"))
 
 
-def _maps(ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...]) -> GradientMaps | None:
+def _maps(
+    ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     if len(shape) != 3:
         return None
     grids = [side.reshape(len(side), *shape) for side in (ours, reference)]
     sums = [grid.sum(-1) for grid in grids]
     floor = ROUNDING * np.maximum(*(np.abs(side.mean(0)) for side in sums))
-    return GradientMaps(grids[0].mean(0), grids[1].mean(0), paired_z_scores(sums[0] - sums[1], floor))
+    return grids[0].mean(0), grids[1].mean(0), paired_z_scores(sums[0] - sums[1], floor)

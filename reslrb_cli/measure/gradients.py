@@ -70,7 +70,7 @@ def smooth_weights(height: int, width: int, channels: int = 3) -> np.ndarray:
     return np.asarray(value / value.mean())
 
 
-def smooth_rows(key: str, value: Any, extent: float, count: int, seed: int = 3) -> list[np.ndarray]:
+def smooth_rows(key: str, value: Any, extent: float, count: int) -> list[np.ndarray]:
     """Return directions in which a parameter moves smoothly, one direction per row. A step is a fraction of a
     direction.
 
@@ -78,7 +78,7 @@ def smooth_rows(key: str, value: Any, extent: float, count: int, seed: int = 3) 
     change by waves over the texel grid. For small parameters (a position, a rotation), all entries move. `extent` is
     the scene's size.
     """
-    random, found, name = np.random.default_rng(seed), [], key.rpartition(".")[2]
+    random, found, name = np.random.default_rng(3), [], key.rpartition(".")[2]
     shape = np.shape(value)
     for _ in range(count):
         if name == "vertex_positions":
@@ -152,7 +152,7 @@ class Direction:
         return case.difference(integrator, self.vector, seed, spp, self.step, self.sides)
 
 
-def directions(case: Case, key: str, bounds: tuple[float, float], count: int, seed: int = 3) -> list[Direction]:
+def directions(case: Case, key: str, bounds: tuple[float, float], count: int) -> list[Direction]:
     """Return up to `count` directions that change only the parameter `key` and stay within its `bounds`.
 
     If the largest step would take an entry beyond a bound, differences are one-sided, and in all directions every entry
@@ -161,7 +161,7 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int, se
     Entries are 0.5 to 1 times the width of the bounds. With infinite bounds, entries are 0.5 to 1 times the parameter's
     size.
     """
-    random, found = np.random.default_rng(seed), []
+    random, found = np.random.default_rng(3), []
     values, (low, high) = case.initial[key], bounds
     scale = high - low if np.isfinite(high - low) else float(np.sqrt(np.mean(values**2))) or 1.0
     reach = STEPS[0] * scale
@@ -253,7 +253,7 @@ class Case:
             values = Selection(params, {}, {}, Deformation(params))
         self.values, self.params = values, values.params
         self.keys = list(keys)
-        self.initial = {key: self.flat(key) for key in self.keys}
+        self.initial = {key: np.array(values.value(key), dtype=np.float64).ravel() for key in self.keys}
         self.places = places({key: len(row) for key, row in self.initial.items()})
         self.size = sum(map(len, self.initial.values()))
         film = self.scene.sensors()[sensor].film()
@@ -272,10 +272,6 @@ class Case:
         """dL/dI (H, W, C) with the channels of the film. It is 0 for alpha."""
         weights = np.array(self.weights)
         return mi.TensorXf(np.pad(weights, ((0, 0), (0, 0), (0, self.channels - weights.shape[2]))))
-
-    def flat(self, key: str) -> np.ndarray:
-        """Return the parameter's values as a flat array in storage order."""
-        return np.array(self.values.value(key), dtype=np.float64).ravel()
 
     def shaped(self, key: str, row: np.ndarray) -> Any:
         """Convert a flat array of values to the parameter's type."""
@@ -332,10 +328,6 @@ class Case:
         """Return the gradients at all seeds, (N, P)."""
         return np.stack([self.gradient(integrator, seed, spp, **step) for seed in seeds])
 
-    def value(self, integrator: Any, seed: int, spp: int) -> float:
-        """Render an image and return its objective."""
-        return self.weighted(self.image(integrator, seed, spp))
-
     def image(self, integrator: Any, seed: int, spp: int) -> np.ndarray:
         """Render an image, (H, W, C) float64, without alpha."""
         image = np.array(render_image(integrator, self.scene, self.sensor, seed, spp), np.float64)
@@ -369,11 +361,11 @@ class Case:
             self.along(direction, lambda: integrator.tangent(Job(self.scene, sensor, opaque, spp, self.params)))
         )
 
-    def directions(self, count: int, seed: int = 3) -> np.ndarray:
+    def directions(self, count: int) -> np.ndarray:
         """Return random directions (count, P) in the space of parameters. Entries have magnitudes from 0.5 to 1 and
         random signs.
         """
-        random, shape = np.random.default_rng(seed), (count, self.size)
+        random, shape = np.random.default_rng(3), (count, self.size)
         return random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape)
 
     def difference(self, integrator: Any, direction: np.ndarray, seed: int, spp: int, step: float, sides: str = "both"
@@ -388,7 +380,7 @@ class Case:
         total = 0.0
         for node, coefficient in zip(nodes, coefficients, strict=True):
             self.set({key: self.initial[key] + step * node * direction[at] for key, at in self.places.items()})
-            total += coefficient * self.value(integrator, seed, spp)
+            total += coefficient * self.weighted(self.image(integrator, seed, spp))
         self.set(self.initial)
         return total / step
 

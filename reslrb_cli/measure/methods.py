@@ -15,7 +15,13 @@ from typing import Any, ClassVar, get_args
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
 from reslrb_cli.config.base import code_file
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, AnyIntegrator, LightTracerOptions
+from reslrb_cli.config.integrators import (
+    AUTO_ESTIMATOR,
+    ESTIMATOR_OPTIONS,
+    UNDECIDED,
+    AnyIntegrator,
+    LightTracerOptions,
+)
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.schema import Config
@@ -27,19 +33,16 @@ from reslrb_cli.records.measurements import Method
 #: Options that a case inherits from the configuration's integrator if its own integrator has them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    *("sppc", "sppp", "sppi", *UNDECIDED),
+    *UNDECIDED,
 )
 
 #: Options that set the kinds of paths.
 PATHS_OPTIONS = ("paths", "light_share")
 
 
-def records_of(paths: str, light_share: Any) -> dict[str, Any]:
-    """Return `paths` and `light_share` for records. `light_share` is None unless `paths` is `both` and the share is a
-    number.
-    """
-    known = paths == "both" and isinstance(light_share, (int, float))
-    return {"paths": paths, "light_share": float(light_share) if known else None}
+def records_of(paths: str, light_share: float) -> dict[str, Any]:
+    """Return `paths` and `light_share` for records. `light_share` is None unless `paths` is `both`."""
+    return {"paths": paths, "light_share": float(light_share) if paths == "both" else None}
 
 
 def paths_in_records(config: Config) -> dict[str, Any]:
@@ -95,9 +98,9 @@ class Case:
         if known:
             adjoint = {"adjoint": "independent"}  # valid with any loss
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
-        values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
-        # A run chooses these by measurement, but a method has fixed values.
-        values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
+        # A run chooses options that are `auto` by measurement, but a method has fixed values.
+        left = {name for name in SHARED if name not in own or (name in UNDECIDED and shared.get(name) == "auto")}
+        values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name not in left}
         if "paths" in self.options:  # the experiment's share belongs to its own paths
             values.pop("light_share", None)
         if self.type == "custom":  # a user's integrator chooses its own paths
@@ -106,13 +109,11 @@ class Case:
         if self.type == "custom":  # unknown options are arguments of the user's class
             given["arguments"] = {name: given.pop(name) for name in [*given] if name not in own}
         values |= given
-        if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
-            raise ConfigError(blame, "estimator", "`auto` is for whole runs; use `stack`")
-        ways = {"guiding": "`on` with `off`", "sequence": "`independent` with `low_discrepancy`",
-                "pixels": "`even` with `measured`"}  # fmt: skip
-        for option, compared in (ways | {"paths": "`light`, `camera` and `both`"}).items():
+        if self.type == "reslrb":
+            values.setdefault("estimator", PLUGIN_ESTIMATOR)
+        for option, fixed in {"estimator": AUTO_ESTIMATOR, **UNDECIDED}.items():
             if values.get(option) == "auto" and not auto:
-                raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")
+                raise ConfigError(blame, option, f"`auto` is for whole runs; use `{fixed}`, or another value")
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
         if self.type == "custom" and not config.allows_code:
             raise ConfigError(blame, "", "would run with all your rights; --allow-code permits it")
@@ -134,26 +135,48 @@ class Case:
         return f"{name}({','.join(other)})" if other else name
 
 
-def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Case]:
+def parse_cases(text: str, source: str = _OPTION) -> list[Case]:
     """Parse a list of cases. Raises ConfigError if a case has a wrong format or is listed twice.
 
-    `source` is the command-line option that contains the list. `deep` is True if the measurement varies the maximum
-    depth. `Case.at` checks the options of the cases.
+    `source` is the command-line option that contains the list. `Case.at` checks the options of the cases.
     """
-    return _parse(text, source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or FILE.py:CLASS", deep)
+    cases: list[Case] = []
+    for item in _split(text):
+        if match := _OWN.fullmatch(item):
+            place = f"{Path(match['file']).expanduser().absolute()}:{match['name']}"
+            kind, options = "custom", {"file": place}
+        elif match := _ITEM.fullmatch(item):
+            kind, options = match["type"], {} if match["estimator"] is None else {"estimator": match["estimator"]}
+        else:
+            wanted = "TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or FILE.py:CLASS"
+            raise ConfigError(source, "", f"`{item}` is not an integrator; write {wanted}")
+        for pair in _split(match["options"]) if match["options"] else []:
+            name, equals, value = (part.strip() for part in pair.partition("="))
+            if not equals or not name:
+                raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
+            if name == "max_depth":
+                reason = f"all share one depth; use --set integrator.{pair}, or bench --max-depth"
+                raise ConfigError(source, item, reason)
+            options[name] = parse(value, f"{source} {item}", name_line=False)
+        case = Case(item, kind, options, source)
+        if case.label in [other.label for other in cases]:
+            raise ConfigError(source, "", f"`{item}` is given twice")
+        cases.append(case)
+    return cases
 
 
-def parse_estimators(text: str) -> list[Case]:
-    """Parse a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`. Raises like `parse_cases`."""
-    return _parse(text, "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
-
-
-def parse_own(text: str) -> list[Case]:
-    """Parse a list of a user's own integrators, FILE.py:CLASS[(OPTION=VALUE,...)]. Raises like `parse_cases`."""
-    cases = _parse(text, _OPTION, "", "integrator of your own; write FILE.py:CLASS[(OPTION=VALUE,...)]", False)
-    if others := [case.label for case in cases if case.type != "custom"]:
-        reason = f"`{others[0]}` is not your own (FILE.py:CLASS); name estimators of reslrb by `estimators`"
-        raise ConfigError(_OPTION, "", reason)
+def parse_checked(text: str) -> list[Case]:
+    """Parse the list of a gradient check: estimators of `reslrb`, and the user's own integrators. Raises
+    ConfigError.
+    """
+    cases = parse_cases(text)
+    for case in cases:
+        if case.type != "custom" and "estimator" not in case.options:
+            reason = f"`{case.label}` is neither an estimator, reslrb:ESTIMATOR, nor your own integrator, FILE.py:CLASS"
+            raise ConfigError(_OPTION, "", reason)
+        for name in ADJOINT:
+            if name in case.options and case.type != "custom":
+                raise ConfigError(_OPTION, case.label, f"all share one {name}; use --set run.{name}=VALUE")
     return cases
 
 
@@ -175,34 +198,6 @@ def all_estimators(config: Config) -> list[Case]:
             cases.append(Case(label, "reslrb", {"estimator": name} | options))
     if isinstance(own, ReslrbConfig) and own.paths == "auto":
         cases.append(Case("reslrb:stack(paths=both)", "reslrb", {"estimator": "stack", "paths": "both"}))
-    return cases
-
-
-def _parse(text: str, source: str, prefix: str, wanted: str, deep: bool) -> list[Case]:
-    cases: list[Case] = []
-    for item in _split(text):
-        match = _ITEM.fullmatch(prefix + item)
-        kind, options = (match["type"], {"estimator": match["estimator"]}) if match else ("", {})
-        if own := None if prefix else _OWN.fullmatch(item):
-            place = f"{Path(own['file']).expanduser().absolute()}:{own['name']}"
-            match, kind, options = own, "custom", {"file": place}
-        options = {name: value for name, value in options.items() if value is not None}
-        if match is None or (prefix and "estimator" not in options):
-            raise ConfigError(source, "", f"`{item}` is not an {wanted}")
-        for pair in _split(match["options"]) if match["options"] else []:
-            name, equals, value = (part.strip() for part in pair.partition("="))
-            if not equals or not name:
-                raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
-            if name == "max_depth" and deep:
-                raise ConfigError(source, item, "max_depth is varied; --max-depth sets its end")
-            if name == "max_depth" or (name in ADJOINT and prefix):
-                section = "run" if name in ADJOINT else "integrator"
-                raise ConfigError(source, item, f"all share one {name}; use --set {section}.{pair}")
-            options[name] = parse(value, f"{source} {item}", name_line=False)
-        case = Case(prefix + item, kind, options, source)
-        if case.label in [other.label for other in cases]:
-            raise ConfigError(source, "", f"`{item}` is given twice")
-        cases.append(case)
     return cases
 
 
@@ -445,20 +440,20 @@ def compared(integrators: str | None, reference: str | None, usual: str) -> dict
     """Return a `Plan`'s cases and reference, parsed from text. `usual` is the default list of cases. Raises
     ConfigError.
     """
-    cases = parse_cases(integrators or usual, deep=False)
-    stands = parse_cases(reference or REFERENCE, "--reference", deep=False)
+    cases = parse_cases(integrators or usual)
+    stands = parse_cases(reference or REFERENCE, "--reference")
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are relative to one method; name one")
     return {"cases": cases, "reference": stands[0], "default": integrators is None}
 
 
-def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
+def machine_of(config: Config) -> dict[str, Any]:
     """Return the fields of a `Measurement` that describe the machine: variant, device, memory, and memory limit. Raises
     ConfigError.
+
+    The memory limit limits the address space, which does not include the memory of a GPU.
     """
     variant, _ = choose(config.variant)
-    on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
-    if on_gpu and memory_limit is not None:
-        raise ConfigError("--memory-limit", "", f"limits the address space, which does not include {variant}'s memory")
-    limit = memory_limit or (None if on_gpu else memory)
+    memory = memory_bytes(variant)
+    limit = None if variant.startswith("cuda") else memory
     return {"variant": variant, "memory": memory, "memory_limit": limit, "device": device_name(variant)}

@@ -44,8 +44,8 @@ from reslrb_cli.measure.gradients import (
     seeds,
     smooth_rows,
 )
-from reslrb_cli.measure.methods import parse_estimators
-from reslrb_cli.measure.participants import MOVING_DIRECTIONS, NEVER, PATHS
+from reslrb_cli.measure.methods import NEVER, parse_cases
+from reslrb_cli.measure.participants import MOVING_DIRECTIONS, PATHS
 from reslrb_cli.measure.references import ends
 from reslrb_cli.measure.resume_store import Earlier, kept
 from reslrb_cli.optimization.assemble import assemble
@@ -164,7 +164,7 @@ IMAGE_PATHS = 2**22
 KIND = "gradcheck --missing"
 
 #: Estimator of the checked gradient: exact, and attached if anything moves.
-ESTIMATOR = "stack"
+ESTIMATOR = "reslrb:stack"
 
 
 class MissingCheck:
@@ -179,7 +179,7 @@ class MissingCheck:
     ) -> None:
         self._budget, self._count, self._start = budget_s, count, time.perf_counter()
         depth = config.integrator.max_depth
-        [listed] = parse_estimators(ESTIMATOR)
+        [listed] = parse_cases(ESTIMATOR)
         problem = assemble(listed.at(config, depth, True).with_exposures_fixed())
         self.source, sensor = str(config.source), problem.sensors[0]
         self.case = Case(problem.scene, problem.selection.keys, sensor, problem.selection)

@@ -26,7 +26,8 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.gradients import Case, seeds
-from reslrb_cli.measure.participants import NEVER, Participants
+from reslrb_cli.measure.methods import NEVER
+from reslrb_cli.measure.participants import Participants
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.graph import SceneGraph
@@ -137,12 +138,9 @@ def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
 class Looking:
     """Measurements that search for faults of the integrator `label`, which failed the check."""
 
-    def __init__(
-        self, parts: Participants, label: str, stop: Callable[[], bool], say: Callable[[str], None]
-    ) -> None:  # fmt: skip
+    def __init__(self, parts: Participants, label: str, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
         self.parts, self.label, self._stop, self._say = parts, label, stop, say
         self._seeds = SEEDS
-        self.keys = parts.case.keys
         self._options = parts.options_of(label)
         self.depth = self._options["max_depth"]
         self.deepest = DEEPEST if self.depth == -1 else min(self.depth, DEEPEST)
@@ -285,8 +283,7 @@ class Looking:
             _check(self._stop)
             yield seed
 
-    # --- messages
-    # ---------------------------------------------------------------------------------------------------------
+    # --- messages -----------------------------------------------------------------------------------------------------
 
     def sentence(self, failing: Iterable[GradcheckRecord]) -> str:
         """Return a message that names the part of the user's integrator to check."""

@@ -17,8 +17,8 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
+from reslrb_cli.measure.methods import NEVER, all_estimators, parse_checked
 from reslrb_cli.measure.methods import Case as Listed
-from reslrb_cli.measure.methods import all_estimators, parse_estimators, parse_own
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
@@ -49,9 +49,6 @@ DIRECTIONS = 2
 
 #: The same for parameters that move light.
 MOVING_DIRECTIONS = 3
-
-#: A depth at which roulette never starts.
-NEVER = 1_000_000
 
 #: Settings of attached derivatives for each reference that differ from the user's. Naive AD follows everywhere;
 #: `ptracer` does not differentiate the filter's normalisation, but differences do.
@@ -102,17 +99,13 @@ class CheckSettings:
 
 
 def settings_of(
-    config: Config, estimators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float,
-    integrators: str | None = None,
-) -> CheckSettings:  # fmt: skip
-    """Return the settings of a check of `config`. `estimators` and `integrators` are lists from the command line.
-
-    Without either list, all estimators are checked. Raises ConfigError if one is invalid.
+    config: Config, integrators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float
+) -> CheckSettings:
+    """Return the settings of a check of `config`. `integrators` is a list as text, or None for all estimators. Raises
+    ConfigError if an integrator is invalid.
     """
-    listed = [] if estimators is None else parse_estimators(estimators)
-    listed += [] if integrators is None else parse_own(integrators)
-    named = estimators is not None or integrators is not None
-    checked = CheckSettings(config, listed if named else all_estimators(config), budget_s, seeds, spp, named, spent_s)
+    listed = all_estimators(config) if integrators is None else parse_checked(integrators)
+    checked = CheckSettings(config, listed, budget_s, seeds, spp, integrators is not None, spent_s)
     checked.configs()  # before anything is loaded
     return checked
 
@@ -130,8 +123,7 @@ class Way:
     def of(cls, config: Config) -> Way:
         """Return the paths of an integrator. Integrators without the option `paths` use light paths."""
         options = config.integrator.options()
-        paths, share = options.get("paths", "light"), options.get("light_share", "auto")
-        share = 0.5 if share == "auto" else share
+        paths, share = options.get("paths", "light"), options.get("light_share", 0.5)
         if paths == "both" and share in (0, 1):
             paths = "light" if share else "camera"
         return cls(paths, share) if paths == "both" else cls(paths)
@@ -165,9 +157,9 @@ class Participants:
     def __init__(self, settings: CheckSettings) -> None:
         config, configs, self.known = settings.config, settings.configs(), settings.known
         self._configs = configs
-        # Every moving object has an estimator that follows it.
-        able = [case.label for case in settings.integrators if _attaches(case)]
-        first = (configs[able[0]] if able else next(iter(configs.values()))).with_exposures_fixed()
+        # If objects move, the experiment has an estimator with derivatives of moving light.
+        follows = [case.type == "reslrb" and case.options["estimator"] in ATTACHED for case in settings.integrators]
+        first = configs[settings.integrators[follows.index(True) if any(follows) else 0].label].with_exposures_fixed()
         built_in = config.scene.file == small.FILE
         box = small.build(config.scene.options) if built_in else None
         problem = assemble_scene(first, box, settings.initial)
@@ -177,7 +169,8 @@ class Participants:
         self.case = Case(scene, problem.selection.keys, sensor, problem.selection)
         self.sensor = scene.sensors()[sensor]
         self.film: tuple[int, int] = (self.case.weights.shape[1], self.case.weights.shape[0])
-        self.spp = settings.spp or _samples(self.film, config.run.spp, problem.samples_per_pass)
+        most = min(PATHS // (self.film[0] * self.film[1]), config.run.spp)  # not more than a step of the run
+        self.spp = settings.spp or multiple_of(max(most, 1), problem.samples_per_pass)
         options = first.integrator.options()
         depth = config.integrator.max_depth
         self._situation = Situation.of_problem(problem, sensor)
@@ -247,36 +240,27 @@ class Participants:
         """Return the estimators that can take part. Raises ConfigError if an estimator that the user named cannot take
         part, or if no estimator can take part.
         """
-        listed = self._with_paths(settings, configs, problem)
-        others = [case for case in listed if case.type == "reslrb" and not _attaches(case)]
-        able = [case for case in listed if case not in others]
-        if not self.attached or not others:
-            return listed
-        if settings.named or not able:
-            without, able_ones = others[0].options["estimator"], ", ".join(ATTACHED)
-            raise ConfigError("--estimators", "", f"{without} has no derivatives of moving light; use {able_ones}")
-        return able
-
-    def _with_paths(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
-        """Return the estimators whose paths can render the scene and, if light moves, differentiate it. Raises
-        ConfigError.
-        """
-        if self._situation.moved:
-            ours = [case for case in settings.integrators if case.type == "reslrb"]
-            told = [case for case in ours if case.options.get("paths", "light") != "light"]
-            if told and settings.named:
-                raise ConfigError("--estimators", told[0].label, "only light paths have derivatives of moving light")
-            return [case for case in settings.integrators if case not in told]
-        refused: dict[Way, ConfigError] = {}
-        for way, config in {Way.of(config): config for config in configs.values()}.items():
+        refused: dict[str, ConfigError] = {}
+        for case in settings.integrators:
             try:
-                check_integrator(config, config.integrator, problem.scene, problem.sensors)
+                self._check(case, configs[case.label], problem)
             except ConfigError as error:
-                refused[way] = error
-        listed = [case for case in settings.integrators if Way.of(configs[case.label]) not in refused]
+                refused[case.label] = error
+        listed = [case for case in settings.integrators if case.label not in refused]
         if refused and (settings.named or not listed):
             raise next(iter(refused.values()))
         return listed
+
+    def _check(self, case: Listed, config: Config, problem: Problem) -> None:
+        """Raise ConfigError if the estimator cannot render the scene or, if light moves, differentiate it."""
+        ours, estimator = case.type == "reslrb", case.options.get("estimator")
+        if not self._situation.moved:
+            check_integrator(config, config.integrator, problem.scene, problem.sensors)
+        elif ours and case.options.get("paths", "light") != "light":
+            raise ConfigError("--integrators", case.label, "only light paths have derivatives of moving light")
+        if self.attached and ours and estimator not in ATTACHED:
+            reason = f"{estimator} has no derivatives of moving light; use {', '.join(ATTACHED)}"
+            raise ConfigError("--integrators", "", reason)
 
     def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
         """Return the integrators by label. If derivatives are attached, add variants with the options that references
@@ -322,16 +306,15 @@ class Participants:
         is_bsdf = key in self.case.params.properties and parameter_kind(self.case.params, key) == "bsdf"
         return bsdfs_of(self._situation, key) if is_bsdf else []
 
-    def of_own(self, key: str, way: Way) -> list[Reference]:
-        """Return all references that the scene allows for checking a user's own integrator. `key` is the parameter of
-        the checked gradient.
-        """
-        if self._situation.moved:  # our derivatives of camera paths hold only if nothing moves
+    def references(self, key: str, listed: Listed) -> list[Reference]:
+        """Return the references that the scene allows for the gradient of a parameter by an integrator."""
+        if listed.type == "custom" and self._situation.moved:  # our camera paths have no derivatives of moving light
             return [Reference.FINITE_DIFFERENCE]
-        stock = self.stock[way.named(key)]
-        found = [] if stock is None else [stock]
+        stock = self.stock[self.ways[listed.label].named(key)]
+        found = [Reference.WALK_AD] + ([] if stock is None else [stock])
         found += [Reference.ANALYTIC] if key in self.exact else []
-        return [*found, Reference.WALK_AD, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
+        found += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if self.forward_mode else [])
+        return found + ([Reference.UNGUIDED] if listed.label in self.unguided else [])
 
     def sampled(self, label: str, reference: Reference) -> str:
         """Return the label of the integrator that replaces `label` in comparisons with `reference`. `ALIKE` has the
@@ -413,17 +396,5 @@ class Participants:
             guiding.held = True
 
 
-def _attaches(case: Listed) -> bool:
-    """True if the case is an estimator of `reslrb` with attached derivatives."""
-    return case.type == "reslrb" and case.options["estimator"] in ATTACHED
-
-
 def _alike(label: str, reference: Reference) -> str:
     return f"{label}, guided" if reference is Reference.UNGUIDED else f"{label}, as {reference.value}"
-
-
-def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:
-    """Return the samples per pixel for one gradient. The gradient has about PATHS paths, but no more samples than a
-    step of the run.
-    """
-    return multiple_of(max(min(PATHS // (film[0] * film[1]), most), 1), multiple)

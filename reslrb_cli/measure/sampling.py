@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,29 +28,27 @@ KIND = "gradcheck"
 #: Name of samples: `gradient` or `image` and an integrator's label, or `differences` or `tangents` and a parameter.
 Name = tuple[str, str]
 
-#: The step of a direction of finite differences, and its error.
-Step = tuple[float, float]
-
 #: Takes samples: calls a function with the participants and further arguments. Yields position and result of each call,
 #: in any order (`shards.serially`).
 Engine = Callable[[Participants, Callable[..., Any], Sequence[tuple[Any, ...]]], Iterable[tuple[int, Any]]]
 
 
-def take_sample(participants: Participants, kind: str, of: str, seed: int) -> np.ndarray:
-    """Return one sample (`Participants.sample`)."""
-    return participants.sample(kind, of, seed)
+@dataclass(frozen=True)
+class Steps:
+    """Steps of finite differences by way, and their errors: a pair for each direction."""
 
+    chosen: Mapping[str, Sequence[tuple[float, float]]]
 
-def steps_of(participants: Participants, keys: Iterable[str]) -> dict[str, list[Step]]:
-    """Return the finite-difference steps of parameters, by way. Each direction has one step."""
-    return {key: [(one.step, one.truncation) for one in participants.directions[key]] for key in keys}
+    @classmethod
+    def of(cls, participants: Participants) -> Steps:
+        """Return the steps of all parameters."""
+        return cls({key: [(one.step, one.truncation) for one in ds] for key, ds in participants.directions.items()})
 
-
-def step_as(participants: Participants, steps: Mapping[str, Sequence[Step]]) -> None:
-    """Set the steps of finite differences."""
-    for key, chosen in steps.items():
-        along = zip(participants.directions[key], chosen, strict=True)
-        participants.directions[key] = [replace(one, step=step, truncation=error) for one, (step, error) in along]
+    def take(self, participants: Participants) -> None:
+        """Set these steps."""
+        for key, chosen in self.chosen.items():
+            along = zip(participants.directions[key], chosen, strict=True)
+            participants.directions[key] = [replace(one, step=step, truncation=error) for one, (step, error) in along]
 
 
 def settings(checked: CheckSettings, variant: str, device: str) -> dict[str, Any]:
@@ -97,28 +95,31 @@ class Sampling:
         self._end = self._start + settings.budget_s
         self.participants = Participants(settings)
         self._samples: dict[Name, list[np.ndarray]] = {}
-        #: Parameters, by way, with chosen steps of their directions: differences keep them.
-        self._chosen: list[str] = []
         if earlier is not None:
             self._samples = {(kind, of): list(rows) for (kind, of), rows in earlier.samples.items()}
-            step_as(self.participants, earlier.head["steps"])
-            self._chosen = list(earlier.head["steps"])
+            Steps(earlier.head["steps"]).take(self.participants)
         self._before = {name: len(samples) for name, samples in self._samples.items()}
         #: Called after each sample.
         self.between: Callable[[], None] = lambda: None
         self._taken: set[Name] = set()
-        self._to_do, self._expected = list[Name](), list[Name]()
+        self._expected: list[Name] = []
         self._later_s = 0.0  # longest duration of a later sample
         self._first_s: dict[tuple[str, bool], float] = {}  # longest duration of a first sample, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
         """Announce names before sampling, so that each name gets its share of the time."""
         self._expected = list(dict.fromkeys(names))
-        self._to_do = list(self._expected)
+
+    @property
+    def _to_do(self) -> list[Name]:
+        """The expected names that are still to be sampled."""
+        return [name for name in self._expected if name not in self._taken]
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
         """Return the state for a later session with the same `settings`, or None if there are no samples."""
-        return resume_store.kept(KIND, settings, self._samples, steps=steps_of(self.participants, self._chosen))
+        taken = [of for (kind, of), rows in self._samples.items() if kind == "differences" and rows]
+        steps = Steps.of(self.participants).chosen
+        return resume_store.kept(KIND, settings, self._samples, steps={of: steps[of] for of in taken})
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
         """Take the samples of `name`, unless an earlier call has taken the samples. Returns True if there are enough
@@ -138,20 +139,17 @@ class Sampling:
 
     def _measure(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
         kind, samples = name[0], self._samples[name]
-        if name in self._to_do:
-            self._to_do.remove(name)
         limited, begin = self.settings.seeds is None, self._now()
         if limited and begin + self._expected_s(name) >= self._end:
             return
-        if kind == "differences" and name[1] not in self._chosen:
-            self.participants.choose_steps(name[1])
-            self._chosen.append(name[1])
         before = first_s = 0.0
         begun = len(samples)
         work = [(*name, seed) for seed in seeds(self._most(name))[begun:]]
         if not work or stop():
             return
-        for sample in in_order(self.engine(self.participants, take_sample, work)):
+        if kind == "differences" and not samples:
+            self.participants.choose_steps(name[1])
+        for sample in in_order(self.engine(self.participants, Participants.sample, work)):
             samples.append(sample.astype(np.float32))
             self.between()
             now = self._now()

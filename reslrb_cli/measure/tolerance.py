@@ -77,9 +77,7 @@ def picture_within(target: Array) -> tuple[slice, slice]:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def where_light_goes(
-    scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, target: Array, seed: int = 0
-) -> dict[str, float]:
+def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, target: Array) -> dict[str, float]:
     """Return three shares of the light from the front face. The light goes `inside` the picture, `beside` the picture
     on the film, or `beyond`.
 
@@ -93,7 +91,7 @@ def where_light_goes(
     front, receiver = mi.ShapePtr(shapes[plan.faces[0]]), mi.ShapePtr(shapes[plan.receiver])
     solid = [mi.ShapePtr(shape) for name, shape in shapes.items() if name in (*plan.faces, "back")]
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, RAYS)
+    sampler.seed(0, RAYS)
     ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
     light = mi.Float(mi.luminance(weight) if mi.is_rgb else weight.x)
     context = mi.BSDFContext(mi.TransportMode.Importance)

@@ -144,7 +144,7 @@ def _with_chosen(
     others = [each for each in chosen if each not in methods]
     config = loads(text, path, [*overrides, *others]).with_code(allow_code)
     for each in methods:
-        cases = parse_cases(each.value, "--vary integrator", deep=False)
+        cases = parse_cases(each.value, "--vary integrator")
         if len(cases) > 1:
             raise ConfigError(each.label, "", "names several integrators in one value; write [prb, reslrb:stack]")
         config = cases[0].at(config, config.integrator.max_depth, known=False, auto=True)

@@ -234,7 +234,7 @@ def test_the_gradient_belongs_to_the_loss(folder: Path) -> None:
         (lambda: rl.gradient("tiny.yaml", values={KEY: np.nan}), f"values: {KEY}: has a value that is not finite"),
         (lambda: rl.render("tiny.yaml", values={KEY: 1}, initial=False), "values: are those of parameters; leave out"),
         (lambda: rl.gradient("tiny.yaml", spp=0), "overrides: run.spp: must be at least 1"),
-        (lambda: rl.gradcheck("tiny.yaml", "stick"), "estimators reslrb:stick: integrator.estimator: must be one of"),
+        (lambda: rl.gradcheck("tiny.yaml", "reslrb:stick"), "integrators reslrb:stick: integrator.estimator: must be"),
         (lambda: rl.convergence("tiny.yaml", "prb,nothing"), "integrators nothing: integrator.type: must be one of"),
         (lambda: rl.convergence("tiny.yaml", reference="prb,ptracer"), "reference: errors are relative to one method"),
         (lambda: rl.convergence("tiny.yaml", objective="mean"), "objective: is 'mean'; there are fixed, loss, image"),
@@ -257,7 +257,7 @@ def lines_of(file: str) -> list[dict[str, Any]]:
 
 def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
     done("gradcheck", "tiny.yaml", "--integrators", "reslrb:stack", "--seeds", "3", "--spp", "4", "--json", "g.jsonl")
-    records = rl.gradcheck("tiny.yaml", "stack", seeds=3, spp=4)
+    records = rl.gradcheck("tiny.yaml", "reslrb:stack", seeds=3, spp=4)
     found = [json.loads(record.to_json()) for record in records]
     assert [record.parameter for record in records if record.reference.value == "walk_ad"] == [KEY, LAMP]
     told = lines_of("g.jsonl")
@@ -312,7 +312,7 @@ class Interrupting(logging.Handler):
 @pytest.mark.parametrize(
     ("call", "words", "later"),
     [
-        (lambda: rl.gradcheck("tiny.yaml", "stack", seeds=3, spp=4), "gradient reslrb:stack", "differences"),
+        (lambda: rl.gradcheck("tiny.yaml", "reslrb:stack", seeds=3, spp=4), "gradient reslrb:stack", "differences"),
         (lambda: rl.gradcheck("tiny.yaml", seeds=12, spp=4, integrators="own_replay.py:Replay(fault=kept)",
                               allow_code=True), "examining", "gradients, max_depth 1"),
     ],

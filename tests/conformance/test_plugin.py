@@ -298,7 +298,7 @@ def test_max_depth(case: Case):
     """Depths 0 and 1 give no light, because no emitter is in view, and no derivatives. Larger depths give more
     light.
     """
-    totals = [case.value(integrator("reslrb", depth), 1, 64) for depth in (0, 1, 2, 3, 6)]
+    totals = [case.weighted(case.image(integrator("reslrb", depth), 1, 64)) for depth in (0, 1, 2, 3, 6)]
     assert totals[:2] == [0, 0]
     assert all(low < high for low, high in pairwise(totals[1:]))
     for depth in (0, 1):

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from reslrb_cli.estimators.stack import Stack
 from reslrb_cli.measure.extreme import CASES
 from reslrb_cli.measure.extreme.suite import run_case
 from reslrb_cli.measure.gradcheck import Gradcheck
-from reslrb_cli.measure.methods import parse_estimators
+from reslrb_cli.measure.methods import Case, parse_checked
 from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.records.measurements import GradcheckRecord
@@ -44,9 +45,14 @@ run: {{spp: 64}}
     return loads(text, name, [*overrides])
 
 
+def estimators_of(names: str) -> list[Case]:
+    """Return the estimators of a list such as `stack,reservoir(capacity=2)`."""
+    return parse_checked(re.sub(r"(^|,)(?![^(]*\))", r"\1reslrb:", names))
+
+
 def checked(config: Config, estimators: str, seeds: int) -> list[GradcheckRecord]:
     """Return the records of `reslrb gradcheck`."""
-    made = Gradcheck(CheckSettings(config, parse_estimators(estimators), 0, seeds))
+    made = Gradcheck(CheckSettings(config, estimators_of(estimators), 0, seeds))
     return [result.record for result in made.run(lambda: False, lambda line: None)]
 
 

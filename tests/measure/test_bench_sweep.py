@@ -279,7 +279,7 @@ def test_cases_may_have_their_own_adjoint() -> None:
         ("ptracer,", "`` is not an integrator"),
         ("ptracer,ptracer", "`ptracer` is given twice"),
         ("reslrb:stack(3)", "`3` must be OPTION=VALUE"),
-        ("reslrb(max_depth=3)", "max_depth is varied"),
+        ("reslrb(max_depth=3)", "--set integrator.max_depth=3, or bench --max-depth"),
         ("path", "--integrators path: integrator.type: must be one of"),
         ("reslrb:gather(capacity=2)", "integrator.capacity: has no effect with estimator `gather`"),
         ("ptracer(capacity=2)", "integrator.capacity: not an option of ptracer but of reslrb"),
@@ -314,7 +314,7 @@ def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool
 
 
 def run_swept(values: list[int], **changes: Any) -> tuple[list[BenchResult], list[str]]:
-    cases = parse_cases(LIST, deep=False)
+    cases = parse_cases(LIST)
     settings: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"]), "variant": "llvm_ad_rgb", "cases": cases,
         "values": values, "objective": "fixed", "memory_limit": None,

@@ -147,7 +147,7 @@ def measurements(config: Config, ours: str = "reslrb:stack", reference: str = "p
         "gradcheck": sampled_as(CheckSettings(config, cases, 0), "llvm_ad_rgb", ""),
         "gradcheck --missing": measured_as(config, {}, "llvm_ad_rgb", ""),
         "bench": Sweep(**shared, values=[2]).settings(),
-        "convergence": Plan(**shared, reference=parse_cases(reference, deep=False)[0], spps=(4,)).settings(),
+        "convergence": Plan(**shared, reference=parse_cases(reference)[0], spps=(4,)).settings(),
     }
 
 

@@ -22,7 +22,7 @@ from reslrb_cli.measure import resume_store, sampling
 from reslrb_cli.measure.bench import Bench
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.gradients import Direction
-from reslrb_cli.measure.methods import parse_cases, parse_estimators
+from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import FEWEST, KIND, LEAST_SEEDS, MOST_SEEDS, Name, Sampling
@@ -182,7 +182,7 @@ CONFIG_OF_CHECK = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE)
 
 
 def check_settings(**changes: Any) -> dict[str, Any]:
-    what = CheckSettings(CONFIG_OF_CHECK, parse_estimators("stack"), 0, 4)
+    what = CheckSettings(CONFIG_OF_CHECK, parse_cases("reslrb:stack"), 0, 4)
     return sampled_as(replace(what, **changes), "llvm_ad_rgb", "")
 
 

@@ -40,8 +40,8 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def checked(config: Config, estimators: str | None, own: str | None = None) -> CheckSettings:
-    return settings_of(config, estimators, 0.0, 4, None, 0.0, own)
+def checked(config: Config, integrators: str) -> CheckSettings:
+    return settings_of(config, integrators, 0.0, 4, None, 0.0)
 
 
 def sampled(settings: CheckSettings, place: Place | None, earlier: Kept | None = None) -> tuple[Kept, list[str]]:
@@ -55,9 +55,9 @@ def sampled(settings: CheckSettings, place: Place | None, earlier: Kept | None =
             found = [str(result.record) for result in made.run(lambda: False, lambda line: None)]
         else:
             with checks.samples_at(settings, made.participants, place, "llvm_ad_rgb", threads=1) as engine:
-                made.sample_with(engine)
+                made.sampling.engine = engine
                 found = [str(result.record) for result in made.run(lambda: False, lambda line: None)]
-    kept = made.kept({})
+    kept = made.sampling.kept({})
     assert kept is not None
     return kept, found
 
@@ -78,7 +78,7 @@ def test_samples_of_workers_equal_those_of_one_process(experiment: Path) -> None
     """The test covers the steps of differences, which workers do not choose, and initial values that are sent
     separately.
     """
-    check(checked(load(experiment / "tiny.yaml", [MOTION]), "stack"), 1)
+    check(checked(load(experiment / "tiny.yaml", [MOTION]), "reslrb:stack"), 1)
 
 
 @pytest.mark.long
@@ -87,20 +87,20 @@ def test_samples_of_workers_equal_those_of_one_process(experiment: Path) -> None
 def test_any_experiment_and_any_number_of_workers(experiment: Path, case: str, workers: int) -> None:
     if case == "box":
         sets = ["scene.options.size=16", "scene.options.texture=4", "run.spp=4", "integrator.max_depth=3"]
-        settings = checked(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, sets), "stack,event")
+        settings = checked(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, sets), "reslrb:stack,reslrb:event")
     elif case == "own":
         config = load(experiment / "tiny.yaml").with_code(True)
-        settings = checked(config, None, "own_replay.py:Replay")
+        settings = checked(config, "own_replay.py:Replay")
     else:
-        settings = checked(load(experiment / "tiny.yaml"), "stack,reservoir")
+        settings = checked(load(experiment / "tiny.yaml"), "reslrb:stack,reslrb:reservoir")
     check(settings, workers)
 
 
 @pytest.mark.long
 def test_workers_continue_samples_of_one_process(experiment: Path) -> None:
     config = load(experiment / "tiny.yaml")
-    few = settings_of(config, "stack", 0.0, 3, None, 0.0)
-    more = settings_of(config, "stack", 0.0, 7, None, 0.0)
+    few = settings_of(config, "reslrb:stack", 0.0, 3, None, 0.0)
+    more = settings_of(config, "reslrb:stack", 0.0, 7, None, 0.0)
     whole, table = sampled(more, None)
     gone_on, same_table = sampled(more, Place(2), sampled(few, None)[0])
     assert {name: rows.tobytes() for name, rows in whole[1].items()} == {

@@ -326,7 +326,7 @@ def test_comparisons_and_scripts_need_an_explicit_choice(option: str) -> None:
     config = load(Path(__file__).parents[2] / "configs" / "furnace.yaml")
     [plain, asked] = parse_cases(f"reslrb:stack,reslrb:gather({option}=auto)")
     assert plain.at(config, 4, known=True).integrator.options()[option] == WORDS[option][False]
-    with pytest.raises(ConfigError, match=f"compare `{named[0]}` with `{named[1]}`"):
+    with pytest.raises(ConfigError, match=f"`auto` is for whole runs; use `{WORDS[option][False]}`"):
         asked.at(config, 4, known=True)
     with pytest.raises(ValueError, match=f"use {named[0]} or {named[1]}"):
         make_integrator("reslrb", **{option: "auto"})

@@ -23,7 +23,7 @@ from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.gradients import Case, extrapolated, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
-from reslrb_cli.measure.methods import parse_estimators, records_of
+from reslrb_cli.measure.methods import parse_cases, records_of
 from reslrb_cli.measure.references import Situation, prb_image
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.scenes.analytic import KnownScene
@@ -323,7 +323,7 @@ BOX = 0.5
 
 def split(label: str) -> tuple[str, dict[str, Any]]:
     """Split a label such as `stack(paths=both)` into estimator and options. Raises ConfigError."""
-    [listed] = parse_estimators(label)
+    [listed] = parse_cases(f"reslrb:{label}")
     options = dict(listed.options)
     return str(options.pop("estimator")), options
 
