@@ -18,9 +18,8 @@ from reslrb_cli.transport.bsdf import Scattering, evaluate, scatter, tracked_fac
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import Place, density_of_rays
 from reslrb_cli.transport.emission import sample_time
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import Product, play
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.roulette import play
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex
 from reslrb_cli.transport.weights import Rivals, cosine

@@ -25,8 +25,8 @@ import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.transport.aim import Aim
+from reslrb_cli.transport.factors import Survival
 from reslrb_cli.transport.plan import Grid, least_slots
-from reslrb_cli.transport.roulette import Survival
 
 Array = np.ndarray[Any, Any]
 CELL_BITS = 19  # cells of all emitters together, log2

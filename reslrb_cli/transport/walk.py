@@ -24,9 +24,8 @@ from reslrb_cli.transport.aim import Pending, aims_from, choose
 from reslrb_cli.transport.bsdf import Aimed, Hit, Scattering, evaluate, scatter, tracked_factor
 from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import Product, first_eta, play
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.roulette import first_eta, play
 from reslrb_cli.transport.samples import SELECTION_STREAM, Early, Numbers, Samples
 from reslrb_cli.transport.weights import Rivals, cosine, leave_emitter, weight_of_connection
 

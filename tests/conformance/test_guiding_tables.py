@@ -19,9 +19,9 @@ from reslrb_cli.guiding.tables import BLUR, FINE, Guiding, Learned, Purpose, _bl
 from reslrb_cli.integrators import freezing
 from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.transport import guide
+from reslrb_cli.transport.factors import CELLS
 from reslrb_cli.transport.guide import Guide, Table, apportion, make_grid
 from reslrb_cli.transport.plan import GUIDE_UNIFORM, Grid
-from reslrb_cli.transport.roulette import CELLS
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

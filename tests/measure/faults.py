@@ -172,7 +172,7 @@ FAULTS = [
           "return evaluate(plan, si, self, wo, connected), bs.wo",
           "return evaluate(plan, si, self, wo, connected) / dr.maximum(mi.Frame3f.cos_theta(wo), 1e-3), bs.wo",
           by("gather stack", "walk_ad", "ptracer", "finite_difference") | by("image", "ptracer")),
-    Fault("roulette_without_weight", "cornell_roulette", "transport.roulette:play",
+    Fault("roulette_without_weight", "cornell_roulette", "transport.factors:play",
           "dr.select(playing, dr.rcp(q), 1)", "dr.select(playing, mi.Float(1), 1)",
           by("image stack", "ptracer")),
     Fault("shading_normals_uncorrected", "shading_normals", "transport.bsdf:shading_correction",

@@ -87,7 +87,7 @@ def test_roulette_by_throughput_loses_light_behind_a_dark_surface(monkeypatch: p
 
 @pytest.mark.long
 def test_roulette_by_power_loses_dim_lamps(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("reslrb_cli.transport.roulette.DIMMEST", 1.0)
+    monkeypatch.setattr("reslrb_cli.transport.factors.DIMMEST", 1.0)
     assert lost("emission_1e-25_roulette", "gather")
 
 
