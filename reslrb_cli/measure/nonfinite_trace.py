@@ -34,8 +34,7 @@ from reslrb_cli.transport.connection import Connection, forward_derivatives
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import Film
-from reslrb_cli.transport.guide import Table
-from reslrb_cli.transport.samples import Samples, passes
+from reslrb_cli.transport.samples import Samples, Table, passes
 from reslrb_cli.transport.visible import primary_ray, small_points, visible_radiance, visible_tangent
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 

@@ -6,25 +6,31 @@ block and gradients.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`, even if they are not used. This package and `ptracer`
 therefore trace the same paths from one seed. Low-discrepancy numbers (`sobol.py`) replace the first random numbers of
-each path.
+each path. A `Guide` draws the numbers of emission from a learned table (`guiding/tables.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
 from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.transport.aim import Aim
 from reslrb_cli.transport.densities import EmitterDensities
+from reslrb_cli.transport.factors import Survival
 from reslrb_cli.transport.film import Film, PixelShares
-from reslrb_cli.transport.guide import Drawn, Guide, Table
 from reslrb_cli.transport.lamps import sums_of_areas
-from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.plan import Grid, Plan
 from reslrb_cli.transport.sobol import Net, Points
+
+Array = np.ndarray[Any, Any]
 
 
 def in_passes(
@@ -133,6 +139,83 @@ class Early:
 
     bsdf_2d: mi.Point2f
     bsdf_1d: mi.Float
+
+
+@dataclass
+class Table:
+    """Table for sampling.
+
+    `slots` holds the cell of each slot, `weights` holds v / p of each cell, and `edges` holds the edges of the grid.
+    `survival` and `aim` hold data for roulette and aiming.
+    """
+
+    slots: mi.UInt32
+    weights: mi.Float
+    edges: mi.Float
+    survival: Survival
+    aim: Aim | None = None
+
+    @staticmethod
+    def of(grid: Grid, counts: Array, survival: Survival | None = None, aim: Aim | None = None) -> Table:
+        """Return the table in which cell k has `counts[k]` slots. The total is `grid.slots`."""
+        weights = grid.measures() * grid.slots  # 0 without a slot
+        weights /= np.maximum(counts, 1)
+        return Table(
+            own_memory(mi.UInt32, np.repeat(np.arange(grid.cells, dtype=np.uint32), counts)),
+            own_memory(mi.Float, weights.astype(np.float32)),
+            own_memory(mi.Float, np.array(grid.edges, np.float32)),
+            survival or Survival.certain(),
+            aim,
+        )
+
+
+@dataclass
+class Drawn:
+    """Random numbers of emission that a guide has drawn. `cell` is the cell of these numbers, and `weight` is the
+    cell's v / p.
+    """
+
+    choice: mi.Float
+    position: mi.Point2f
+    direction: mi.Point2f
+    cell: mi.UInt32
+    weight: mi.Float
+
+
+@dataclass
+class Guide:
+    """Table, and the number of lanes that share the table. The number is opaque."""
+
+    table: Table
+    lanes: mi.UInt64
+
+    @staticmethod
+    def of(table: Table, width: int) -> Guide:
+        """Return a guide for a pass of `width` light paths."""
+        return Guide(table, dr.opaque(mi.UInt64, width))
+
+    def draw(
+        self, grid: Grid, width: int, stream: mi.PCG32, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f,
+    ) -> Drawn:  # fmt: skip
+        """Draw the start of each of `width` lanes. The random numbers `choice`, `position` and `direction` determine
+        the start's place within its cell.
+        """
+        lane, jitter = mi.UInt64(dr.arange(mi.UInt32, width)), mi.UInt64(stream.next_uint32())
+        slot = ((lane << 32) | jitter) // self.lanes >> (32 - (grid.slots.bit_length() - 1))
+        cell = dr.gather(mi.UInt32, self.table.slots, mi.UInt32(slot))
+        weight = dr.gather(mi.Float, self.table.weights, cell)
+        numbers, shift, below = [position.x, position.y, direction.x, direction.y], 0, dr.one_minus_epsilon(mi.Float)
+        for k, bits in enumerate(grid.bits):
+            if bits > 0:
+                index = (cell >> shift) & ((1 << bits) - 1)
+                # Rounding may reach the next cell, but must not leave the cube.
+                numbers[k] = dr.minimum((mi.Float(index) + numbers[k]) * 2.0**-bits, below)
+                shift += bits
+        if grid.emitters > 1:
+            emitter = cell >> shift
+            begin, end = (dr.gather(mi.Float, self.table.edges, emitter + k) for k in (0, 1))
+            choice = dr.minimum(dr.fma(choice, end - begin, begin), end * below)
+        return Drawn(choice, mi.Point2f(numbers[0], numbers[1]), mi.Point2f(numbers[2], numbers[3]), cell, weight)
 
 
 @dataclass
