@@ -61,7 +61,6 @@ from reslrb_cli.transport.walk import (
     Segment,
     Splat,
     Vertex,
-    find_following_vertex,
     find_vertex,
     segment,
 )
@@ -95,6 +94,28 @@ class Before:
 def is_staying(before: list[Before]) -> mi.Bool:
     """Return the lanes in which the vertex after `before` stays at its place on its surface."""
     return before[0].stays != 0 if before else mi.Bool(False)
+
+
+def find_following_vertex(
+    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Float]:
+    """Return the surface interaction of a vertex that stays at its place on its surface, and moves only with the
+    surface.
+
+    Also returns the ray that reaches the vertex, and a factor. The direction of the ray changes if either end of the
+    ray moves. The factor has the value 1, but also has a derivative. The factor converts a measure of directions at the
+    ray's origin to a measure on the surface. Apart from its normalisation to 1, the factor is |cos| / distance^2 times
+    the stretching of the surface.
+    """
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    there = si.p - ray.o
+    distance = dr.norm(there)
+    reaching = mi.Ray3f(ray)
+    reaching.d = there / distance
+    si.t = distance
+    si.wi = si.to_local(-reaching.d)
+    measure = dr.abs(dr.dot(si.n, reaching.d)) / dr.square(distance) * dr.norm(dr.cross(si.dp_du, si.dp_dv))
+    return si, reaching, dr.select(active & (measure > 0), measure / dr.detach(measure), 1)
 
 
 def reach(

@@ -210,13 +210,10 @@ def tangent_of_passage(
     """For a connection, return the target's visibility, the transmittance (C,) of the masks before the target, and the
     transmittance's derivative.
     """
-    plan, active = samples.plan, connection.active
+    plan = samples.plan
     if not plan.needs.has_null:
         return *passage(plan, samples.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
-    limit, past_lamps = plan.max_depth - vertex.depth - 1, plan.passes_lamps
-    passed = transmittance(
-        samples.scene, vertex.si, connection.target, limit, active, tangents=True, past_lamps=past_lamps
-    )
+    passed = transmittance(plan, samples.scene, vertex.si, vertex.depth, connection, tangents=True)
     return passed.reached, passed.value, passed.tangent[0]
 
 

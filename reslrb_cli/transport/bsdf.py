@@ -151,6 +151,11 @@ class Scattering:
         assert self.own_ways is not None
         return self.own_ways
 
+    def track(self, plan: Plan, hit: Hit) -> None:
+        """Give `weight` the derivatives of the scene's parameters, for naive AD."""
+        f = tracked_factor(plan, hit.si, hit.bsdf, self, self.active)
+        self.weight = dr.replace_grad(self.weight, f * (self.correction / self.pdf))
+
 
 @dataclass
 class Ways:

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.scene.graph import sensor_rays
-from reslrb_cli.transport.bsdf import Scattering, evaluate, scatter, tracked_factor
+from reslrb_cli.transport.bsdf import Scattering, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import Place, density_of_rays
 from reslrb_cli.transport.emission import sample_time
@@ -241,8 +241,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
         scattering, f = scatter(plan, vertex, bsdf_1d, bsdf_2d, scattered, wo, connected, weighed=connected)
         arrived = [own.arrive(si, path.ray) for own in path.rivals]
         if hooks.tracked:
-            tracked = tracked_factor(plan, si, bsdf, scattering, scattering.active)
-            scattering.weight = dr.replace_grad(scattering.weight, tracked * (scattering.correction / scattering.pdf))
+            scattering.track(plan, vertex)
         if event is not None:
             _weigh(samples, path, arrived, si, event, scattering)
             event.f = f
