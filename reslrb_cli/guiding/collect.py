@@ -42,11 +42,12 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.estimators.base import allocate, write
+from reslrb_cli.transport.aim import film_blocks
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.factors import BITS, CELLS, SHAPE, Product
-from reslrb_cli.transport.film import AdjointImage, film_blocks
+from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk

@@ -38,10 +38,9 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.guiding.collect import KEEP, NAMES, Onward, Said
-from reslrb_cli.transport.aim import AIM_SLOTS, Aim
+from reslrb_cli.transport.aim import AIM_SLOTS, BLOCKS, Aim, Blocks
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.factors import CELLS, Survival, box_of
-from reslrb_cli.transport.film import BLOCKS, Blocks
 from reslrb_cli.transport.plan import Grid
 from reslrb_cli.transport.samples import Samples, Table
 

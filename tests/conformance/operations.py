@@ -15,8 +15,7 @@ import mitsuba as mi
 from reslrb_cli.guiding.tables import apportion
 from reslrb_cli.integrators import reslrb as lt
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.transport.aim import Aim
-from reslrb_cli.transport.film import Blocks, film_blocks
+from reslrb_cli.transport.aim import Aim, Blocks, film_blocks
 from reslrb_cli.transport.plan import Grid, Plan
 from reslrb_cli.transport.samples import Table, passes
 
