@@ -18,18 +18,18 @@ from reslrb_cli.estimators.camera import splat_camera_paths
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
-from reslrb_cli.transport.emission import sample_emission
-from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.film import AdjointImage
-from reslrb_cli.transport.samples import Numbers, Samples
-from reslrb_cli.transport.visible import (
+from reslrb_cli.transport.emission import (
     differentiate_visible_emission,
     moving_splats,
     primary_ray,
+    sample_emission,
     small_splat,
     splat_visible_emission,
     visible_tangent,
 )
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.samples import Numbers, Samples
 from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
 
 

@@ -310,7 +310,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
     direct = path.events == 0
     if plan.hide_emitters:
         active &= ~direct
-    for lamp in plan.small_lamps:  # `visible.py` renders their direct light
+    for lamp in plan.small_lamps:  # `emission.py` renders their direct light
         active &= ~(direct & (emitter == mi.EmitterPtr(lamp.emitter)))
     for lamp in plan.needs.lamps:
         if lamp.parallel:

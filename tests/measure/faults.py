@@ -219,7 +219,7 @@ FAULTS = [
           "mi.Int32(NO_ZERO), dr.detach(transmission)", "mi.Int32(NO_ZERO), mi.Spectrum(1)",
           by("gather stack", "walk_ad")),
     Fault("visible_emission_not_differentiated", "furnace",
-          "transport.visible:differentiate_visible_emission",
+          "transport.emission:differentiate_visible_emission",
           'plan.visible_emission and plan.paths == "light" and (', "False and (", by("stack", "walk_ad", "analytic")),
     Fault("shading_normals_uncorrected_beside_zero", "black_solid", "estimators.stack:push",
           "scattering.correction / scattering.pdf", "1 / scattering.pdf", by("stack", "walk_ad")),
@@ -232,7 +232,7 @@ FAULTS = [
           "differentiate if p.plan.differentiate_null else None", "None", by("stack", "walk_ad", "finite_difference")),
     Fault("instance_forgotten", "instance", "estimators.kept:SurfacePoint.of",
           "_index(pi.instance)", "mi.UInt32(0)", by("stack", "walk_ad")),
-    Fault("mask_in_view_not_differentiated", "glow", "transport.visible:differentiate_visible_radiance",
+    Fault("mask_in_view_not_differentiated", "glow", "transport.emission:differentiate_visible_radiance",
           "adjoint * behind", "mi.Spectrum(0)", by("event stack", "walk_ad", "forward_mode")),
     # ---- Estimators: the others are right ----
     Fault("another_point_of_the_lens", "behind_lens", "estimators.selection:differentiate_event",
