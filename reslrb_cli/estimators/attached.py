@@ -213,7 +213,7 @@ class AttachedFrame:
         plan, P, B = p.plan, self.prefix, adjoint.B
         connected = self.connected != 0
         scattered = dr.any(B != 0) | dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)
-        numbers = Numbers(self.aperture[0] if self.aperture else mi.Point2f(0.5), self.sample_2, self.sample_1)
+        numbers = Numbers(self.sample_2, self.sample_1, self.aperture[0] if self.aperture else mi.Point2f(0.5))
         pi, ray = self.point.hit()
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)

@@ -134,7 +134,7 @@ class TangentSplat(Hooks):
         s, P, dP, scattered = self.samples, vertex.product.value(), state.d_product, scattering.active
         plan = s.plan
         seen, _ = passage(plan, s.scene, vertex.si, vertex.depth, connection)
-        drawn = Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
+        drawn = Numbers(scattering.sample_2, scattering.sample_1, connection.sample)
         with dr.resume_grad():
             ray = mi.Ray3f(vertex.ray)
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)

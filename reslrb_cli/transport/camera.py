@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.scene.graph import sensor_rays
-from reslrb_cli.transport.bsdf import Scattering, evaluate, scatter
+from reslrb_cli.transport.bsdf import EventNumbers, Scattering, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import Place, density_of_rays
 from reslrb_cli.transport.emission import sample_time
@@ -233,12 +233,11 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
         # ---- Sample an emitter, and scatter ----
         active = hit & (path.depth + 1 <= plan.max_depth)
         numbers = sampler.next_2d(active)
-        bsdf_1d, bsdf_2d = sampler.next_1d(active), sampler.next_2d(active)
+        bsdf_1d = sampler.next_1d(active)
+        own = EventNumbers(sampler.next_2d(active), bsdf_1d)
         event = _next_event(samples, si, bsdf, numbers, active) if plan.samples_emitters else None
         scattered = active & goes_on & (path.depth + 1 <= plan.max_depth - int(not plan.needs.has_visible_emitters))
-        wo = mi.Vector3f(0) if event is None else event.wo
-        connected = None if event is None else event.active
-        scattering, f = scatter(plan, vertex, bsdf_1d, bsdf_2d, scattered, wo, connected, weighed=connected)
+        scattering, f = scatter(plan, vertex, own, scattered, event)
         arrived = [own.arrive(si, path.ray) for own in path.rivals]
         if hooks.tracked:
             scattering.track(plan, vertex)

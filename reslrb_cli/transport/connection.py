@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.bsdf import shading_correction
 from reslrb_cli.transport.plan import Plan
 
 
@@ -99,6 +98,34 @@ def transmittance(
         mode=loop_mode,
     )
     return passage
+
+
+def shading_correction(
+    plan: Plan, si: mi.SurfaceInteraction3f, wi_world: mi.Vector3f, wo_world: mi.Vector3f, wo: mi.Vector3f
+) -> tuple[mi.Float, mi.Bool]:
+    """Return Veach's factor for shading normals (thesis, p. 155), and whether both directions are on consistent sides.
+
+    Without shading normals, the factor is 1 and the sides are always consistent. The function then computes neither the
+    factor nor the sides. With perturbed normals the factor is |n . wo| / |n . wi|. The exchanged BSDF contains the rest
+    of the correction. The geometric normal n is taken on the side of the shading normal. A transform that mirrors a
+    mesh reverses the winding of its faces. Camera paths use only the shading normal, so the winding does not affect
+    them.
+    """
+    if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
+        return mi.Float(1), mi.Bool(True)
+    n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+    wi_dot_n, wo_dot_n = dr.dot(n, wi_world), dr.dot(n, wo_world)
+    cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+    valid = (wi_dot_n * cos_i > 0) & (wo_dot_n * cos_o > 0)
+    if plan.camera:
+        return mi.Float(1), valid
+    if plan.needs.has_perturbed_normals:
+        return dr.select(valid, dr.abs(wo_dot_n / wi_dot_n), 0), valid
+    correction = dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0)
+    # On a mesh, the correction varies about 1 within each face and jumps at the edges, however fine the mesh is. A
+    # derivative with the slopes but without the jumps is wrong by several percent if faces move through the light;
+    # without both it is right. `ptracer` has the slopes.
+    return (dr.detach(correction) if plan.attached_normalization else correction), valid
 
 
 @dataclass

@@ -23,6 +23,7 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.aim import Aim
+from reslrb_cli.transport.bsdf import EventNumbers
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.factors import Survival
 from reslrb_cli.transport.film import Film, PixelShares
@@ -107,38 +108,25 @@ NET_STREAM = 0x5EC0E  # scrambles of low-discrepancy numbers
 
 
 @dataclass
-class Numbers:
-    """Random numbers of one path segment. `aperture` is a point on the sensor's aperture. `bsdf_2d` and `bsdf_1d` are
-    two numbers and one number for the BSDF.
-    """
+class Numbers(EventNumbers):
+    """Random numbers of one path segment. `aperture` is a point on the sensor's aperture."""
 
     aperture: mi.Point2f
-    bsdf_2d: mi.Point2f
-    bsdf_1d: mi.Float
 
     @staticmethod
     def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
         """Draw the numbers of the next segment. After this call, the walk draws the random number for roulette."""
-        return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
+        aperture = sampler.next_2d(active)  # drawn first, as in `ptracer`
+        return Numbers(sampler.next_2d(active), sampler.next_1d(active), aperture)
 
-    def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
+    def of_early(self, early: list[EventNumbers], depth: mi.UInt32) -> Numbers:
         """Return a copy of these numbers. At the first vertices, the `early` numbers replace the numbers for the BSDF.
         The first vertex has depth 1.
         """
-        bsdf = Early(self.bsdf_2d, self.bsdf_1d)
+        bsdf = EventNumbers(self.bsdf_2d, self.bsdf_1d)
         for bounce, own in enumerate(early):
             bsdf = dr.select(depth == bounce + 1, own, bsdf)
         return replace(self, bsdf_2d=bsdf.bsdf_2d, bsdf_1d=bsdf.bsdf_1d)
-
-
-@dataclass
-class Early:
-    """Random numbers for the BSDF at one of a path's first vertices. The random numbers are known before the path is
-    traced.
-    """
-
-    bsdf_2d: mi.Point2f
-    bsdf_1d: mi.Float
 
 
 @dataclass
@@ -308,7 +296,7 @@ class Samples:
             return choice, place, direction
         return self._points(choice, place, direction)[1]
 
-    def early_numbers(self) -> list[Early]:
+    def early_numbers(self) -> list[EventNumbers]:
         """Return the low-discrepancy numbers for the BSDFs of the first vertices. Return an empty list if there are no
         low-discrepancy numbers.
         """
@@ -317,7 +305,7 @@ class Samples:
         assert self.plan.sequence is not None
         # Their dimensions in the sequence follow those of emission.
         points, _ = self._points(mi.Float(0), mi.Point2f(0), mi.Point2f(0))
-        return [Early(points.next_2d(), points.next_1d()) for _ in range(self.plan.sequence.bounces)]
+        return [EventNumbers(points.next_2d(), points.next_1d()) for _ in range(self.plan.sequence.bounces)]
 
     def _points(
         self, choice: mi.Float, place: mi.Point2f, direction: mi.Point2f

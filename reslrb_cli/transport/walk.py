@@ -21,12 +21,12 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.aim import Pending, aims_from, choose
-from reslrb_cli.transport.bsdf import Aimed, Hit, Scattering, evaluate, scatter
+from reslrb_cli.transport.bsdf import Aimed, EventNumbers, Hit, Scattering, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product, first_eta, play
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.samples import SELECTION_STREAM, Early, Numbers, Samples
+from reslrb_cli.transport.samples import SELECTION_STREAM, Numbers, Samples
 from reslrb_cli.transport.weights import Rivals, cosine, leave_emitter, weight_of_connection
 
 
@@ -152,11 +152,7 @@ def segment(
     """
     plan, si = samples.plan, hit.si
     connection = connect(plan, samples.sensor, si, hit.ray, numbers.aperture, connected, attached)
-    wanted = connection.active if evaluates else None
-    scattering, connection.f = scatter(
-        plan, hit, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed,
-        connection.active if plan.weighs else None,
-    )  # fmt: skip
+    scattering, connection.f = scatter(plan, hit, numbers, scattered, connection, evaluates, attached, aimed)
     return Segment(si, connection, scattering)
 
 
@@ -170,7 +166,7 @@ class Path:
     pi: mi.PreliminaryIntersection3f  # the intersection of this ray
     product: Product  # E s_1 ... s_{depth-1}, roulette weights included
     eta: mi.Float  # accumulated relative index of refraction, only for roulette; starts larger if emission is dim
-    early: list[Early]  # random numbers of the first vertices, if low-discrepancy; never changed
+    early: list[EventNumbers]  # random numbers of the first vertices, if low-discrepancy; never changed
     pending: list[Pending]  # how the last event was aimed, if any are; a replay does not use it
     rivals: list[Rivals]  # if camera paths find the same light
 

@@ -110,7 +110,7 @@ def test_fresnel():
 
 
 def test_a_medium_of_index_one_has_no_effect():
-    through = point_through_surface(0.5, 2.0, 1.0, 1.0, (0.3, 1.6, -0.2), 1.0, 0.9, 60, 4)
+    through = point_through_surface(0.5, 2.0, 1.0, 1.0, (0.3, 1.6, -0.2), 1.0, plane_points(0.9, 60, 4))
     alone = 2.0 * irradiance((0.3, 1.6, -0.2), 0.9, 60, 4)
     assert through.image[..., :1] == pytest.approx(alone * 0.5 / np.pi, rel=1e-9)
 

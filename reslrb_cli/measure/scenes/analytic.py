@@ -88,7 +88,7 @@ def refraction_scene(ior: float = 1.5) -> KnownScene:
             "surface": rectangle(glass(ior, specular_transmittance=rgb(*tau)), translate=[0, 1, 0], rotate=UP, scale=2),
         }
 
-    known = point_through_surface(ALBEDO, intensity, tau, ior, light, 1.0, 0.9, 60, SIZE)
+    known = point_through_surface(ALBEDO, intensity, tau, ior, light, 1.0, plane_points(0.9, 60, SIZE))
     return KnownScene(scene, known, POOL, 3)
 
 
@@ -224,14 +224,14 @@ def furnace(albedo: ArrayLike, emission: ArrayLike, max_depth: int, size: int) -
 
 def point_through_surface(
     albedo: ArrayLike, intensity: ArrayLike, transmittance: ArrayLike, ior: float, light: ArrayLike, depth: float,
-    camera_height: float, fov: float, size: int,
+    bottom: tuple[Array, Array],
 ) -> Known:  # fmt: skip
     """A point light at `light` (3,) over a medium of index `ior` with a flat surface at y = `depth`.
 
     The light refracts once and reaches the diffuse bottom at y = 0. A camera in the medium, straight above the origin,
-    sees the bottom. Light that leaves at an angle theta_1 from the vertical meets the bottom at a distance x from the
-    point below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior sin(theta_2). Light
-    emitted into a ring of directions lands in a ring on the bottom.
+    sees the points `bottom` (`plane_points`). Light that leaves at an angle theta_1 from the vertical meets the bottom
+    at a distance x from the point below the light, with x = h tan(theta_1) + depth tan(theta_2) and sin(theta_1) = ior
+    sin(theta_2). Light emitted into a ring of directions lands in a ring on the bottom.
 
         E = I (1 - R(theta_1)) tau sin(theta_1) / (x dx/dtheta_1),   L = rho / pi * E
 
@@ -239,7 +239,7 @@ def point_through_surface(
     Principles of Optics, Sections 1.5 and 3.1. Light that the surface reflects back to the bottom is left out, as with
     max_depth 3.
     """
-    points, weights = plane_points(camera_height, fov, size)
+    points, weights = bottom
     light = np.asarray(light, np.float64)
     height = light[1] - depth
     offset = np.hypot(points[..., 0] - light[0], points[..., 2] - light[2])
