@@ -30,7 +30,7 @@ import numpy as np
 from reslrb_cli.scene.graph import Lamp, sensor_rays
 from reslrb_cli.transport.connection import connect, forward_derivatives, passage
 from reslrb_cli.transport.film import AdjointImage
-from reslrb_cli.transport.lamps import DEFENSIVE, lamp_point, lamp_ray
+from reslrb_cli.transport.lamps import environment_ray, lamp_point, lamp_ray
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import LAMP_STREAM, SMALL_LAMP_STREAM, VISIBLE_STREAM, NumberStream, Samples
 
@@ -109,7 +109,7 @@ def emission_of(
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
     if plan.environment_map:
         is_environment = index == plan.needs.environment
-        ray, weight = _environment_ray(plan, scene.environment(), time, sample_2, sample_3)
+        ray, weight = environment_ray(plan, scene.environment(), time, sample_2, sample_3)
         if len(plan.needs.emitters) > 1:
             other = _emitter_ray(samples, emitter, time, reused, sample_2, sample_3, ~is_environment)
             ray, weight = (dr.select(is_environment, a, b) for a, b in zip((ray, weight), other, strict=True))
@@ -146,52 +146,6 @@ def _emitter_ray(
         own = lamp_ray(lamp, areas, time, number, position, direction, active & here, evened)
         ray, weight = (dr.select(here, a, b) for a, b in zip(own, (ray, weight), strict=True))
     return ray, weight
-
-
-def _environment_ray(
-    plan: Plan, environment: mi.Emitter, time: mi.Float, disk: mi.Point2f, direction: mi.Point2f
-) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """Return a ray from an environment map. The ray passes through a disk that is perpendicular to the ray and covers
-    the scene's bounding sphere.
-
-    Mitsuba's `envmap.sample_ray` places the disk in the local frame of the map, which is wrong if `to_world` rotates
-    it. Directions are sampled in proportion to the map's radiance. If the map is differentiated, a part of the
-    directions is sampled uniformly. Black texels beside a sun have derivatives as large as those of any other texel.
-    """
-    assert plan.horizon is not None
-    center, radius = mi.Point3f(*plan.horizon.center), plan.horizon.radius * (1 + 1e-4)
-    reference = dr.zeros(mi.Interaction3f)
-    reference.p, reference.time = center, time
-    if plan.differentiate_emission:
-        ds, weight = _any_direction(environment, reference, direction)
-    else:
-        ds, weight = environment.sample_direction(reference, direction, True)
-    d = -dr.detach(ds.d)
-    offset = mi.warp.square_to_uniform_disk_concentric(disk)
-    perpendicular = mi.Frame3f(d).to_world(mi.Vector3f(offset.x, offset.y, 0))
-    ray = mi.Ray3f(center + (perpendicular - d) * radius, d, time, [])
-    return ray, weight * (dr.pi * radius**2)
-
-
-def _any_direction(
-    environment: mi.Emitter, reference: mi.Interaction3f, sample: mi.Point2f
-) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """Sample a direction from a mixture of the environment's own density and the uniform density.
-
-    Also returns radiance / density.
-    """
-    with dr.suspend_grad():
-        uniform = sample.x < DEFENSIVE
-        x = dr.select(uniform, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
-        sample = mi.Point2f(x, sample.y)
-        ds, _ = environment.sample_direction(reference, sample, True)
-        black = ~dr.isfinite(ds.d.y)  # the whole map is black, so there is no density to sample
-        ds.d = dr.select(uniform | black, mi.warp.square_to_uniform_sphere(sample), ds.d)
-        own = environment.pdf_direction(reference, ds, True)
-        pdf = dr.select(black, dr.inv_four_pi, (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi)
-        seen = dr.zeros(mi.SurfaceInteraction3f)
-        seen.wi = -ds.d  # `eval_direction` uses texture coordinates, which sampled directions lack
-    return ds, environment.eval(seen, True) / pdf
 
 
 # ---- Directly visible light ----

@@ -207,7 +207,7 @@ class Plan:
 
     @property
     def environment_map(self) -> bool:
-        """Whether an environment map emits. `emission.py` samples its rays."""
+        """Whether an environment map emits. `lamps.py` samples its rays."""
         return (
             self.needs.environment is not None
             and self.needs.emitters[self.needs.environment] == "EnvironmentMapEmitter"

@@ -181,7 +181,7 @@ FAULTS = [
           "TransportMode.Importance", "TransportMode.Radiance", by("stack", "analytic", "ptracer")),
     Fault("crop_offset_dropped", "crop", "transport.film:Film.put", "u + mi.Vector2f(self.offset)", "u",
           by("stack", "ptracer")),
-    Fault("density_of_sky_without_uniform_part", "sky", "transport.emission:_any_direction",
+    Fault("density_of_sky_without_uniform_part", "sky", "transport.lamps:_any_direction",
           "(1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi", "own", by("stack", "prb")),
     Fault("density_of_texels_too_high", "black_texels_of_lamp", "transport.lamps:_any_uv",
           "(1 - DEFENSIVE) * own + DEFENSIVE", "own + DEFENSIVE", by("stack", "analytic")),

@@ -102,7 +102,7 @@ def test_sampling_by_radiance_undersamples_the_sky_beside_a_sun(monkeypatch: pyt
         return ratio
 
     before = variance()
-    monkeypatch.setattr("reslrb_cli.transport.emission.DEFENSIVE", 1e-9)
+    monkeypatch.setattr("reslrb_cli.transport.lamps.DEFENSIVE", 1e-9)
     assert variance() > 100 * before
 
 
