@@ -25,9 +25,9 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.backend.probe import Probe, probe
 from reslrb_cli.backend.shared_library import missing_library
 from reslrb_cli.errors import BackendError, ExitCode
+from reslrb_cli.guiding.tables import make_grid
 from reslrb_cli.optimization.views import to_tensor
 from reslrb_cli.records.tree import like
-from reslrb_cli.transport.guide import make_grid
 
 # The choice of libLLVM: which of several libraries is used, which are refused, and what the user is told.
 

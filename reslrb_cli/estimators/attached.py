@@ -52,7 +52,6 @@ from reslrb_cli.transport.walk import (
     Segment,
     Splat,
     Vertex,
-    find_following_vertex,
     find_vertex,
     segment,
 )
@@ -86,6 +85,28 @@ class Before:
 def is_staying(before: list[Before]) -> mi.Bool:
     """Return the lanes in which the vertex after `before` stays at its place on its surface."""
     return before[0].stays != 0 if before else mi.Bool(False)
+
+
+def find_following_vertex(
+    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Float]:
+    """Return the surface interaction of a vertex that stays at its place on its surface, and moves only with the
+    surface.
+
+    Also returns the ray that reaches the vertex, and a factor. The direction of the ray changes if either end of the
+    ray moves. The factor has the value 1, but also has a derivative. The factor converts a measure of directions at the
+    ray's origin to a measure on the surface. Apart from its normalisation to 1, the factor is |cos| / distance^2 times
+    the stretching of the surface.
+    """
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    there = si.p - ray.o
+    distance = dr.norm(there)
+    reaching = mi.Ray3f(ray)
+    reaching.d = there / distance
+    si.t = distance
+    si.wi = si.to_local(-reaching.d)
+    measure = dr.abs(dr.dot(si.n, reaching.d)) / dr.square(distance) * dr.norm(dr.cross(si.dp_du, si.dp_dv))
+    return si, reaching, dr.select(active & (measure > 0), measure / dr.detach(measure), 1)
 
 
 def reach(
@@ -183,7 +204,7 @@ class AttachedFrame:
         plan, P, B = p.plan, self.prefix, adjoint.B
         connected = self.connected != 0
         scattered = dr.any(B != 0) | dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)
-        numbers = Numbers(self.aperture[0] if self.aperture else mi.Point2f(0.5), self.sample_2, self.sample_1)
+        numbers = Numbers(self.sample_2, self.sample_1, self.aperture[0] if self.aperture else mi.Point2f(0.5))
         pi, ray = self.point.hit()
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)

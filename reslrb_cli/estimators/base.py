@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -164,12 +164,8 @@ def differentiate_passage(
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     with dr.resume_grad(when=p.plan.differentiate_null):
-        limit = p.plan.max_depth - depth - 1
         on_crossing = differentiate if p.plan.differentiate_null else None
-        past_lamps = p.plan.passes_lamps
-        return transmittance(
-            p.samples.scene, si, connection.target, limit, active, on_crossing, past_lamps=past_lamps
-        ).value
+        return transmittance(p.plan, p.samples.scene, si, depth, replace(connection, active=active), on_crossing).value
 
 
 def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:

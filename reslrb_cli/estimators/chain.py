@@ -157,7 +157,7 @@ class ChainState:
 
 def numbers_of(connection: Connection, scattering: Scattering) -> Numbers:
     """Return the random numbers of a segment."""
-    return Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
+    return Numbers(scattering.sample_2, scattering.sample_1, connection.sample)
 
 
 class ChainSelection(VertexHooks):

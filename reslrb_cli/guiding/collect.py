@@ -6,7 +6,7 @@ The first PLACES vertices are stored in thread-local memory. A walk back sums ov
 `estimators/stack.py`.
 
 `Onward`: contributions of later vertices, for each cell of ray position and ray direction. Roulette uses these
-contributions. `transport/roulette.py` defines the cells. Guiding learns two means over the rays that leave a vertex in
+contributions. `transport/factors.py` defines the cells. Guiding learns two means over the rays that leave a vertex in
 a cell. m is the mean squared later contribution at throughput 1. c is the mean number of later vertices. A ray that
 leaves with throughput w survives with probability q = min(1, max(LEAST, w s)). The following value of s minimises
 variance times work.
@@ -42,13 +42,13 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.estimators.stack import allocate, write
+from reslrb_cli.transport.aim import film_blocks
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
-from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.film import AdjointImage, film_blocks
+from reslrb_cli.transport.factors import BITS, CELLS, SHAPE, Product
+from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.roulette import BITS, CELLS, SHAPE
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 

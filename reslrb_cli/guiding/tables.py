@@ -1,6 +1,18 @@
 """Tables that guide where light paths start, for each sensor. The contributions of earlier steps update the tables for
 later steps.
 
+The start of a path is a point of the four-dimensional unit cube, and a number that selects an emitter. Two coordinates
+of the point give a place or a position on a disk. The two other coordinates give a direction. The cube is divided into
+cells, separately for each emitter. A cell k with measure v_k is sampled with probability p_k. Random numbers are
+uniform within the cell k, and the path's weight is multiplied by v_k / p_k. Guiding does not change the expected
+contribution of a path under two conditions. Every cell can be sampled, and p does not depend on the random numbers with
+which p is used.
+
+Sampling takes one lookup. Cell k has m_k of the M slots, and p_k is exactly m_k / M. Lanes are stratified. The slots
+are divided into n equal parts for n lanes, and lane i samples from part i. Only the noise within cells remains, and
+similar paths are traced side by side. At least a share GUIDE_UNIFORM of all slots is distributed evenly. Therefore no
+weight is larger than 1 / GUIDE_UNIFORM.
+
 Each cell is sampled according to the contributions of the paths that started in the cell. `collect.py` defines these
 contributions. The variance of a sum over paths depends on the mean square contribution in each cell. The variance is
 smallest if each cell is sampled in proportion to the square root of its mean square contribution. Each quantity is
@@ -16,6 +28,7 @@ for the image and half for the gradient.
 from __future__ import annotations
 
 import enum
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -25,15 +38,62 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.guiding.collect import KEEP, NAMES, Onward, Said
-from reslrb_cli.transport.aim import AIM_SLOTS, Aim
+from reslrb_cli.transport.aim import AIM_SLOTS, BLOCKS, Aim, Blocks
 from reslrb_cli.transport.emission import used_numbers
-from reslrb_cli.transport.film import BLOCKS, Blocks
-from reslrb_cli.transport.guide import CELL_BITS, Table, apportion, make_grid
+from reslrb_cli.transport.factors import CELLS, Survival, box_of
 from reslrb_cli.transport.plan import Grid
-from reslrb_cli.transport.roulette import CELLS, Survival, box_of
-from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.samples import Samples, Table
 
 Array = np.ndarray[Any, Any]
+
+GUIDE_UNIFORM = 0.25  # minimum share of paths with uniform starts
+CELL_BITS = 19  # cells of all emitters together, log2
+MOST_EMITTERS = 1024  # with their own cells; among more emitters, neighbours share cells
+
+
+def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
+    """Return a grid of at most 2^cell_bits cells for emitters with these sampling weights. Only the used numbers are
+    divided.
+    """
+    if not sum(weights) > 0:
+        weights = [1.0] * max(len(weights), 1)  # no emitter emits; the grid has no use, and no effect
+    total = np.append(0.0, np.cumsum(np.asarray(weights, np.float64)))
+    groups = min(len(weights), MOST_EMITTERS)
+    edges = (total / total[-1])[np.round(np.linspace(0, len(weights), groups + 1)).astype(int)]
+    bits = [0, 0, 0, 0]
+    budget = cell_bits - (groups - 1).bit_length()
+    along = [k for k in range(4) if used[k]]
+    for k in range(budget if along else 0):
+        bits[along[k % len(along)]] += 1
+    return Grid((bits[0], bits[1], bits[2], bits[3]), tuple(float(np.float32(edge)) for edge in edges))
+
+
+@functools.lru_cache(maxsize=4)
+def least_slots(grid: Grid) -> Array:
+    """Return the minimum number of slots of each cell as float64. The minimum corresponds to GUIDE_UNIFORM times the
+    cell's measure.
+    """
+    measures = grid.measures()
+    result = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)
+    result.setflags(write=False)
+    return result
+
+
+def apportion(grid: Grid, density: Array) -> Array:
+    """Return the slots of each cell (int64). Each cell has at least the slots that correspond to GUIDE_UNIFORM times
+    its measure. The remaining slots are proportional to `density`.
+    """
+    least = least_slots(grid)
+    # Rounded along the order of the cells, so that neighbours balance.
+    ends = np.cumsum(density, dtype=np.float64)
+    ends *= (grid.slots - least.sum()) / ends[-1]
+    np.rint(ends, out=ends)
+    counts = least.copy()
+    counts[0] += ends[0]
+    counts[1:] += ends[1:]
+    counts[1:] -= ends[:-1]
+    return counts.astype(np.int64)
+
 
 #: Blur over neighbouring cells along each number. With 1/4 instead of 1/20, a cell keeps a sixteenth of its value, and
 #: second moments in rooms grow by 1.3 to 1.4; without blur, cells with few paths are trusted too much.

@@ -27,10 +27,10 @@ from reslrb_cli.scene.catalog import entry_value
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
-from reslrb_cli.transport.aim import worthwhile
+from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
-from reslrb_cli.transport.film import PixelShares, film_blocks
+from reslrb_cli.transport.film import PixelShares
 from reslrb_cli.transport.plan import Plan, make_plan
 from reslrb_cli.transport.samples import Samples, passes
 from reslrb_cli.transport.sobol import make_coordinates

@@ -15,14 +15,14 @@ from reslrb_cli.estimators.attached import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
-from reslrb_cli.transport.emission import sample_emission
-from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.samples import Numbers, Samples
-from reslrb_cli.transport.visible import (
+from reslrb_cli.transport.emission import (
     primary_ray,
+    sample_emission,
     small_splat,
     visible_tangent,
 )
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.samples import Numbers, Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 
@@ -91,7 +91,7 @@ class TangentSplat(Hooks):
         s, P, dP, scattered = self.samples, vertex.product.value(), state.d_product, scattering.active
         plan = s.plan
         seen, _ = passage(plan, s.scene, vertex.si, vertex.depth, connection)
-        drawn = Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
+        drawn = Numbers(scattering.sample_2, scattering.sample_1, connection.sample)
         with dr.resume_grad():
             ray = mi.Ray3f(vertex.ray)
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
@@ -167,13 +167,10 @@ def tangent_of_passage(
     """For a connection, return the target's visibility, the transmittance (C,) of the masks before the target, and the
     transmittance's derivative.
     """
-    plan, active = samples.plan, connection.active
+    plan = samples.plan
     if not plan.needs.has_null:
         return *passage(plan, samples.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
-    limit, past_lamps = plan.max_depth - vertex.depth - 1, plan.passes_lamps
-    passed = transmittance(
-        samples.scene, vertex.si, connection.target, limit, active, tangents=True, past_lamps=past_lamps
-    )
+    passed = transmittance(plan, samples.scene, vertex.si, vertex.depth, connection, tangents=True)
     return passed.reached, passed.value, passed.tangent[0]
 
 

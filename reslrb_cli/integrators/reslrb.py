@@ -32,10 +32,10 @@ from reslrb_cli.integrators.differentiated import Motion
 from reslrb_cli.integrators.forward import splat_tangents
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
+from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.film import AdjointImage, PixelShares
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
-from reslrb_cli.transport.visible import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.walk import Splat, walk
 
 

@@ -38,11 +38,17 @@ from reslrb_cli.seeds import seed
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, forward_derivatives
-from reslrb_cli.transport.emission import Emission, sample_emission
+from reslrb_cli.transport.emission import (
+    Emission,
+    primary_ray,
+    sample_emission,
+    small_points,
+    visible_radiance,
+    visible_tangent,
+)
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.visible import primary_ray, small_points, visible_radiance, visible_tangent
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 

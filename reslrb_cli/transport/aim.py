@@ -37,12 +37,78 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.scene.needs import SceneNeeds
 from reslrb_cli.transport.bsdf import Aimed
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.film import Blocks, film_blocks
 
 SHARE = 0.25  # share of aimed paths among the scattered ones
 AIM_UNIFORM = 0.2  # minimum share of aimed paths with a uniform target on the film
 AIM_SLOTS = 1 << 17
+BLOCKS = 1 << 14  # maximum number of blocks of pixels
 REACHED = 1 - 1e-3  # part of the distance to a point that must be free, as for shadow rays
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Blocks of `side` x `side` pixels that cover a film (crop window) of `width` x `height`. The last blocks may be
+    cut off.
+    """
+
+    width: int
+    height: int
+    side: int
+
+    @staticmethod
+    def of(size: tuple[int, int]) -> Blocks:
+        """Return the smallest blocks that cover the film with at most BLOCKS blocks."""
+        side = 1
+        while -(-size[0] // side) * -(-size[1] // side) > BLOCKS:
+            side += 1
+        return Blocks(*size, side)
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // self.side)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height // self.side)
+
+    @property
+    def count(self) -> int:
+        return self.rows * self.columns
+
+    def block(self, u: mi.Point2f) -> mi.UInt32:
+        """Return the block of a film position (pixels), or the nearest block."""
+        column, row = (mi.UInt32(dr.clip(x, 0, n - 1)) // self.side for x, n in ((u.x, self.width), (u.y, self.height)))
+        return row * self.columns + column
+
+    def areas(self) -> NDArray[np.float64]:
+        """Return the number of pixels of each block (rows * columns)."""
+        across, down = (np.minimum(self.side, n - np.arange(0, n, self.side)) for n in (self.width, self.height))
+        return np.outer(down, across).ravel().astype(np.float64)
+
+    def root_means(self, image: mi.TensorXf) -> NDArray[np.float64]:
+        """Return the root mean square of an image (height, width, C) in each block (rows * columns), times the block's
+        area.
+
+        All values are divided by the image's largest absolute value. Values that are not finite count as 0.
+        """
+        channels, values = image.shape[2], dr.abs(image.array)
+        values = dr.select(dr.isfinite(values), values, 0)
+        largest = dr.max(values)
+        values = dr.select(largest > 0, values / largest, 0)
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        square = mi.Float(0)
+        for channel in range(channels):
+            square += dr.square(dr.gather(mi.Float, values, pixel * channels + channel))
+        sums = dr.zeros(mi.Float, self.count)
+        position = mi.Point2f(pixel % self.width, pixel // self.width)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, square, self.block(position))
+        return np.sqrt(np.array(sums, np.float64) * self.areas())
+
+
+def film_blocks(sensor: mi.Sensor) -> Blocks:
+    """Return the blocks of a sensor's film."""
+    size = sensor.film().crop_size()
+    return Blocks.of((int(size[0]), int(size[1])))
 
 
 @dataclass

@@ -27,6 +27,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.connection import Connection, shading_correction
 from reslrb_cli.transport.plan import Plan
 
 DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not sample itself
@@ -92,6 +93,14 @@ def _singular_factor(
 
 
 @dataclass
+class EventNumbers:
+    """Random numbers of one scattering event."""
+
+    bsdf_2d: mi.Point2f
+    bsdf_1d: mi.Float
+
+
+@dataclass
 class Hit:
     """Surface interaction of a vertex, its BSDF, and the ray that reaches it."""
 
@@ -150,6 +159,11 @@ class Scattering:
         """Densities for the weights of combined paths, in walks that need these densities."""
         assert self.own_ways is not None
         return self.own_ways
+
+    def track(self, plan: Plan, hit: Hit) -> None:
+        """Give `weight` the derivatives of the scene's parameters, for naive AD."""
+        f = tracked_factor(plan, hit.si, hit.bsdf, self, self.active)
+        self.weight = dr.replace_grad(self.weight, f * (self.correction / self.pdf))
 
 
 @dataclass
@@ -219,47 +233,24 @@ def _ways(
     return pdf, back, ahead, ahead_back
 
 
-def shading_correction(
-    plan: Plan, si: mi.SurfaceInteraction3f, wi_world: mi.Vector3f, wo_world: mi.Vector3f, wo: mi.Vector3f
-) -> tuple[mi.Float, mi.Bool]:
-    """Return Veach's factor for shading normals (thesis, p. 155), and whether both directions are on consistent sides.
-
-    Without shading normals, the factor is 1 and the sides are always consistent. The function then computes neither the
-    factor nor the sides. With perturbed normals the factor is |n . wo| / |n . wi|. The exchanged BSDF contains the rest
-    of the correction. The geometric normal n is taken on the side of the shading normal. A transform that mirrors a
-    mesh reverses the winding of its faces. Camera paths use only the shading normal, so the winding does not affect
-    them.
-    """
-    if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
-        return mi.Float(1), mi.Bool(True)
-    n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
-    wi_dot_n, wo_dot_n = dr.dot(n, wi_world), dr.dot(n, wo_world)
-    cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-    valid = (wi_dot_n * cos_i > 0) & (wo_dot_n * cos_o > 0)
-    if plan.camera:
-        return mi.Float(1), valid
-    if plan.needs.has_perturbed_normals:
-        return dr.select(valid, dr.abs(wo_dot_n / wi_dot_n), 0), valid
-    correction = dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0)
-    # On a mesh, the correction varies about 1 within each face and jumps at the edges, however fine the mesh is. A
-    # derivative with the slopes but without the jumps is wrong by several percent if faces move through the light;
-    # without both it is right. `ptracer` has the slopes.
-    return (dr.detach(correction) if plan.attached_normalization else correction), valid
-
-
 def scatter(
-    plan: Plan, hit: Hit, sample_1: mi.Float, sample_2: mi.Point2f, active: mi.Bool, connection_wo: mi.Vector3f,
-    connected: mi.Bool | None, attached: bool = False, aimed: Aimed | None = None, weighed: mi.Bool | None = None,
+    plan: Plan, hit: Hit, numbers: EventNumbers, active: mi.Bool, connection: Connection | None, evaluates: bool = True,
+    attached: bool = False, aimed: Aimed | None = None,
 ) -> tuple[Scattering, mi.Spectrum | None]:  # fmt: skip
-    """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
+    """Sample the next direction, and evaluate f (C,) towards the `connection` of the same vertex, if there is one.
 
+    Without `evaluates`, f towards the connection is None.
     The results are detached unless `attached` is true. Sampling and evaluation share one indirect call and common work,
     for example texture lookups. `aimed` lanes use the direction to their target point. The density in `aimed` lanes is
-    the BSDF's density of the target direction. In `weighed` lanes, the function also computes the densities of `Ways`
-    for `connection_wo`.
+    the BSDF's density of the target direction. If paths are weighted, the function also computes the densities
+    of `Ways`.
     """
-    si, bsdf, context, drawn = hit.si, hit.bsdf, context_of(plan), sample_1
+    si, bsdf, context = hit.si, hit.bsdf, context_of(plan)
+    sample_1, sample_2 = numbers.bsdf_1d, numbers.bsdf_2d
     ways_asked = plan.camera or plan.weighs
+    connection_wo = mi.Vector3f(0) if connection is None else connection.wo
+    connected = connection.active if connection is not None and evaluates else None
+    weighed = connection.active if connection is not None and ways_asked else None
     later = ways_asked and (mixes(plan) or aimed is not None)  # the BSDF did not sample the direction
     densities: Sequence[mi.Float] = ()
 
@@ -320,7 +311,7 @@ def scatter(
             correction=correction,
             is_delta=is_delta,
             is_null=is_null,
-            sample_1=drawn,
+            sample_1=numbers.bsdf_1d,
             sample_2=sample_2,
             active=active & valid & (pdf > 0),
             own_ways=ways,

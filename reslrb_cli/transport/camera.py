@@ -14,13 +14,12 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.scene.graph import sensor_rays
-from reslrb_cli.transport.bsdf import Scattering, evaluate, scatter, tracked_factor
+from reslrb_cli.transport.bsdf import EventNumbers, Scattering, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import Place, density_of_rays
 from reslrb_cli.transport.emission import sample_time
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import Product, play
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.roulette import play
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex
 from reslrb_cli.transport.weights import Rivals, cosine
@@ -234,16 +233,14 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
         # ---- Sample an emitter, and scatter ----
         active = hit & (path.depth + 1 <= plan.max_depth)
         numbers = sampler.next_2d(active)
-        bsdf_1d, bsdf_2d = sampler.next_1d(active), sampler.next_2d(active)
+        bsdf_1d = sampler.next_1d(active)
+        own = EventNumbers(sampler.next_2d(active), bsdf_1d)
         event = _next_event(samples, si, bsdf, numbers, active) if plan.samples_emitters else None
         scattered = active & goes_on & (path.depth + 1 <= plan.max_depth - int(not plan.needs.has_visible_emitters))
-        wo = mi.Vector3f(0) if event is None else event.wo
-        connected = None if event is None else event.active
-        scattering, f = scatter(plan, vertex, bsdf_1d, bsdf_2d, scattered, wo, connected, weighed=connected)
+        scattering, f = scatter(plan, vertex, own, scattered, event)
         arrived = [own.arrive(si, path.ray) for own in path.rivals]
         if hooks.tracked:
-            tracked = tracked_factor(plan, si, bsdf, scattering, scattering.active)
-            scattering.weight = dr.replace_grad(scattering.weight, tracked * (scattering.correction / scattering.pdf))
+            scattering.track(plan, vertex)
         if event is not None:
             _weigh(samples, path, arrived, si, event, scattering)
             event.f = f
@@ -312,7 +309,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
     direct = path.events == 0
     if plan.hide_emitters:
         active &= ~direct
-    for lamp in plan.small_lamps:  # `visible.py` renders their direct light
+    for lamp in plan.small_lamps:  # `emission.py` renders their direct light
         active &= ~(direct & (emitter == mi.EmitterPtr(lamp.emitter)))
     for lamp in plan.needs.lamps:
         if lamp.parallel:

@@ -7,12 +7,11 @@ on the film.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.bsdf import shading_correction
 from reslrb_cli.transport.plan import Plan
 
 
@@ -45,18 +44,20 @@ class Passage:
 
 
 def transmittance(
-    scene: mi.Scene, start: mi.Interaction3f, target: mi.Point3f, limit: mi.UInt32, active: mi.Bool,
+    plan: Plan, scene: mi.Scene, start: mi.Interaction3f, depth: mi.UInt32, connection: Connection,
     on_crossing: Callable[[mi.Spectrum, mi.Bool], None] | None = None, loop_mode: str = "symbolic",
-    tangents: bool = False, past_lamps: bool = False,
+    tangents: bool = False,
 ) -> Passage:  # fmt: skip
-    """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
+    """Follow a connection from the vertex `start` at `depth` through null surfaces, as far as the depth limit allows.
 
     Each crossing counts as a vertex, as in Mitsuba's `path`. At each crossing, `on_crossing(transmission, active)` gets
     the crossing's transmission (C,). `transmission` is tracked if gradients are enabled. `on_crossing` can therefore
     differentiate the transmission. With `tangents`, the derivative along the parameters' tangents is computed (forward
-    mode). With `tangents`, gradients must be suspended, because the loop itself must not track any gradients. With
-    `past_lamps`, lamps do not block the way.
+    mode). With `tangents`, gradients must be suspended, because the loop itself must not track any gradients. If
+    `plan.passes_lamps`, lamps do not block the way.
     """
+
+    target, limit = connection.target, plan.max_depth - depth - 1
 
     def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, mi.Ray3f]:
         si = scene.ray_intersect(ray, passage.active)
@@ -72,7 +73,7 @@ def transmittance(
         if tangents:
             tangent = [dr.select(hit, tangent[0] * transmission + passage.value * d_transmission, tangent[0])]
         lamp = mi.Bool(False)
-        if past_lamps:
+        if plan.passes_lamps:
             lamp = hit & (si.emitter(scene) != dr.zeros(mi.EmitterPtr))
             transmission = dr.select(lamp, 1, transmission)
             tangent = [dr.select(lamp, passage.tangent[0], own) for own in tangent]
@@ -87,7 +88,7 @@ def transmittance(
         return state, dr.select(hit, si.spawn_ray_to(target), ray)
 
     passage = Passage(
-        mi.Bool(active), mi.Spectrum(1), mi.UInt32(0), mi.Bool(False), [mi.Spectrum(0)] if tangents else []
+        mi.Bool(connection.active), mi.Spectrum(1), mi.UInt32(0), mi.Bool(False), [mi.Spectrum(0)] if tangents else []
     )
     passage, _ = dr.while_loop(
         state=(passage, start.spawn_ray_to(target)),
@@ -97,6 +98,34 @@ def transmittance(
         mode=loop_mode,
     )
     return passage
+
+
+def shading_correction(
+    plan: Plan, si: mi.SurfaceInteraction3f, wi_world: mi.Vector3f, wo_world: mi.Vector3f, wo: mi.Vector3f
+) -> tuple[mi.Float, mi.Bool]:
+    """Return Veach's factor for shading normals (thesis, p. 155), and whether both directions are on consistent sides.
+
+    Without shading normals, the factor is 1 and the sides are always consistent. The function then computes neither the
+    factor nor the sides. With perturbed normals the factor is |n . wo| / |n . wi|. The exchanged BSDF contains the rest
+    of the correction. The geometric normal n is taken on the side of the shading normal. A transform that mirrors a
+    mesh reverses the winding of its faces. Camera paths use only the shading normal, so the winding does not affect
+    them.
+    """
+    if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
+        return mi.Float(1), mi.Bool(True)
+    n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+    wi_dot_n, wo_dot_n = dr.dot(n, wi_world), dr.dot(n, wo_world)
+    cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+    valid = (wi_dot_n * cos_i > 0) & (wo_dot_n * cos_o > 0)
+    if plan.camera:
+        return mi.Float(1), valid
+    if plan.needs.has_perturbed_normals:
+        return dr.select(valid, dr.abs(wo_dot_n / wi_dot_n), 0), valid
+    correction = dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0)
+    # On a mesh, the correction varies about 1 within each face and jumps at the edges, however fine the mesh is. A
+    # derivative with the slopes but without the jumps is wrong by several percent if faces move through the light;
+    # without both it is right. `ptracer` has the slopes.
+    return (dr.detach(correction) if plan.attached_normalization else correction), valid
 
 
 @dataclass
@@ -216,12 +245,10 @@ def passage(
     naive AD.
     """
     active, one = connection.active, mi.Spectrum(1)
-    past_lamps = plan.passes_lamps
-    if past_lamps:  # if camera rays start behind them
+    if plan.passes_lamps:  # if camera rays start behind them
         active = active & (si.emitter(scene) == dr.zeros(mi.EmitterPtr))
-    if plan.needs.has_null or past_lamps:
-        limit = plan.max_depth - depth - 1
-        through = transmittance(scene, si, connection.target, limit, active, loop_mode=loop_mode, past_lamps=past_lamps)
+    if plan.needs.has_null or plan.passes_lamps:
+        through = transmittance(plan, scene, si, depth, replace(connection, active=active), loop_mode=loop_mode)
         return through.reached, through.value
     if seen is None:
         return active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), one

@@ -1,4 +1,4 @@
-"""The film: splatting through its reconstruction filter, the exact adjoint of splatting, and blocks of pixels.
+"""The film: splatting through its reconstruction filter, and the exact adjoint of splatting.
 
 The adjoint of a splat looks up dL/dI at the film position. filter_p(u) is the weight of pixel p for film position u.
 The weights sum to 1 over the pixels.
@@ -6,8 +6,7 @@ The weights sum to 1 over the pixels.
     splat:   I_p += filter_p(u) C
     lookup:  delta = sum_p filter_p(u) dL/dI_p
 
-`Blocks` divides a film into blocks of pixels, for learning by position. `PixelShares` distributes camera paths over a
-film's pixels.
+`PixelShares` distributes camera paths over a film's pixels.
 """
 
 from __future__ import annotations
@@ -207,75 +206,6 @@ def filter_weights(
     columns = [rfilter.eval(mi.Float(first.x + i) - center.x) for i in range(taps)]
     rows = [rfilter.eval(mi.Float(first.y + i) - center.y) for i in range(taps)]
     return first, (columns, rows), sum(columns) * sum(rows)
-
-
-BLOCKS = 1 << 14  # maximum number of blocks of pixels
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """Blocks of `side` x `side` pixels that cover a film (crop window) of `width` x `height`. The last blocks may be
-    cut off.
-    """
-
-    width: int
-    height: int
-    side: int
-
-    @staticmethod
-    def of(size: tuple[int, int]) -> Blocks:
-        """Return the smallest blocks that cover the film with at most BLOCKS blocks."""
-        side = 1
-        while -(-size[0] // side) * -(-size[1] // side) > BLOCKS:
-            side += 1
-        return Blocks(*size, side)
-
-    @property
-    def columns(self) -> int:
-        return -(-self.width // self.side)
-
-    @property
-    def rows(self) -> int:
-        return -(-self.height // self.side)
-
-    @property
-    def count(self) -> int:
-        return self.rows * self.columns
-
-    def block(self, u: mi.Point2f) -> mi.UInt32:
-        """Return the block of a film position (pixels), or the nearest block."""
-        column, row = (mi.UInt32(dr.clip(x, 0, n - 1)) // self.side for x, n in ((u.x, self.width), (u.y, self.height)))
-        return row * self.columns + column
-
-    def areas(self) -> NDArray[np.float64]:
-        """Return the number of pixels of each block (rows * columns)."""
-        across, down = (np.minimum(self.side, n - np.arange(0, n, self.side)) for n in (self.width, self.height))
-        return np.outer(down, across).ravel().astype(np.float64)
-
-    def root_means(self, image: mi.TensorXf) -> NDArray[np.float64]:
-        """Return the root mean square of an image (height, width, C) in each block (rows * columns), times the block's
-        area.
-
-        All values are divided by the image's largest absolute value. Values that are not finite count as 0.
-        """
-        channels, values = image.shape[2], dr.abs(image.array)
-        values = dr.select(dr.isfinite(values), values, 0)
-        largest = dr.max(values)
-        values = dr.select(largest > 0, values / largest, 0)
-        pixel = dr.arange(mi.UInt32, self.width * self.height)
-        square = mi.Float(0)
-        for channel in range(channels):
-            square += dr.square(dr.gather(mi.Float, values, pixel * channels + channel))
-        sums = dr.zeros(mi.Float, self.count)
-        position = mi.Point2f(pixel % self.width, pixel // self.width)
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, square, self.block(position))
-        return np.sqrt(np.array(sums, np.float64) * self.areas())
-
-
-def film_blocks(sensor: mi.Sensor) -> Blocks:
-    """Return the blocks of a sensor's film."""
-    size = sensor.film().crop_size()
-    return Blocks.of((int(size[0]), int(size[1])))
 
 
 EVEN = 0.25  # minimum share of camera paths that are spread evenly over the pixels

@@ -1,4 +1,4 @@
-"""Points on lamps (shapes that emit), and the rays that leave them.
+"""Points on lamps (shapes that emit), the rays that leave them, and the rays of environment maps.
 
 `lamp_ray` samples light in five cases in which Mitsuba's own samples are wrong, or lack a derivative.
 
@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.transport.plan import Plan
 
 DEFENSIVE = 0.1  # share of uniform samples, instead of samples proportional to differentiated radiance
 
@@ -134,3 +135,52 @@ def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
     """Return the area of a face of a mesh."""
     a, b, c = (mesh.vertex_position(vertex) for vertex in mesh.face_indices(face))
     return 0.5 * dr.norm(dr.cross(b - a, c - a))
+
+
+# ---- Environment maps ----
+
+
+def environment_ray(
+    plan: Plan, environment: mi.Emitter, time: mi.Float, disk: mi.Point2f, direction: mi.Point2f
+) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """Return a ray from an environment map. The ray passes through a disk that is perpendicular to the ray and covers
+    the scene's bounding sphere.
+
+    Mitsuba's `envmap.sample_ray` places the disk in the local frame of the map, which is wrong if `to_world` rotates
+    it. Directions are sampled in proportion to the map's radiance. If the map is differentiated, a part of the
+    directions is sampled uniformly. Black texels beside a sun have derivatives as large as those of any other texel.
+    """
+    assert plan.horizon is not None
+    center, radius = mi.Point3f(*plan.horizon.center), plan.horizon.radius * (1 + 1e-4)
+    reference = dr.zeros(mi.Interaction3f)
+    reference.p, reference.time = center, time
+    if plan.differentiate_emission:
+        ds, weight = _any_direction(environment, reference, direction)
+    else:
+        ds, weight = environment.sample_direction(reference, direction, True)
+    d = -dr.detach(ds.d)
+    offset = mi.warp.square_to_uniform_disk_concentric(disk)
+    perpendicular = mi.Frame3f(d).to_world(mi.Vector3f(offset.x, offset.y, 0))
+    ray = mi.Ray3f(center + (perpendicular - d) * radius, d, time, [])
+    return ray, weight * (dr.pi * radius**2)
+
+
+def _any_direction(
+    environment: mi.Emitter, reference: mi.Interaction3f, sample: mi.Point2f
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """Sample a direction from a mixture of the environment's own density and the uniform density.
+
+    Also returns radiance / density.
+    """
+    with dr.suspend_grad():
+        uniform = sample.x < DEFENSIVE
+        x = dr.select(uniform, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
+        sample = mi.Point2f(x, sample.y)
+        ds, _ = environment.sample_direction(reference, sample, True)
+        black = ~dr.isfinite(ds.d.y)  # the whole map is black, so there is no density to sample
+        ds.d = dr.select(uniform | black, mi.warp.square_to_uniform_sphere(sample), ds.d)
+        own = environment.pdf_direction(reference, ds, True)
+        pdf = dr.select(black, dr.inv_four_pi, (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi)
+        seen = dr.zeros(mi.SurfaceInteraction3f)
+        seen.wi = -ds.d  # `eval_direction` uses texture coordinates, which sampled directions lack
+    return ds, environment.eval(seen, True) / pdf

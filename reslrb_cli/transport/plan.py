@@ -15,7 +15,6 @@ from reslrb_cli.scene.needs import SceneNeeds
 from reslrb_cli.transport.sobol import Coordinates
 
 Array = np.ndarray[Any, Any]
-GUIDE_UNIFORM = 0.25  # minimum share of paths with uniform starts
 SLOTS_PER_CELL = 4  # one of them for the uniform share
 SLOTS_OF_SEVERAL = 8  # if emitters have unequal shares, which are rounded up to whole slots
 
@@ -95,17 +94,6 @@ class Grid:
 def _measures(grid: Grid) -> Array:
     # Every new table asks for them several times.
     result = np.repeat(np.diff(grid.edges) / (1 << sum(grid.bits)), 1 << sum(grid.bits))
-    result.setflags(write=False)
-    return result
-
-
-@functools.lru_cache(maxsize=4)
-def least_slots(grid: Grid) -> Array:
-    """Return the minimum number of slots of each cell as float64. The minimum corresponds to GUIDE_UNIFORM times the
-    cell's measure.
-    """
-    measures = grid.measures()
-    result = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)
     result.setflags(write=False)
     return result
 
@@ -219,7 +207,7 @@ class Plan:
 
     @property
     def environment_map(self) -> bool:
-        """Whether an environment map emits. `emission.py` samples its rays."""
+        """Whether an environment map emits. `lamps.py` samples its rays."""
         return (
             self.needs.environment is not None
             and self.needs.emitters[self.needs.environment] == "EnvironmentMapEmitter"

@@ -6,25 +6,32 @@ block and gradients.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`, even if they are not used. This package and `ptracer`
 therefore trace the same paths from one seed. Low-discrepancy numbers (`sobol.py`) replace the first random numbers of
-each path.
+each path. A `Guide` draws the numbers of emission from a learned table (`guiding/tables.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
 from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.transport.aim import Aim
+from reslrb_cli.transport.bsdf import EventNumbers
 from reslrb_cli.transport.densities import EmitterDensities
+from reslrb_cli.transport.factors import Survival
 from reslrb_cli.transport.film import Film, PixelShares
-from reslrb_cli.transport.guide import Drawn, Guide, Table
 from reslrb_cli.transport.lamps import sums_of_areas
-from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.plan import Grid, Plan
 from reslrb_cli.transport.sobol import Net, Points
+
+Array = np.ndarray[Any, Any]
 
 
 def in_passes(
@@ -101,38 +108,102 @@ NET_STREAM = 0x5EC0E  # scrambles of low-discrepancy numbers
 
 
 @dataclass
-class Numbers:
-    """Random numbers of one path segment. `aperture` is a point on the sensor's aperture. `bsdf_2d` and `bsdf_1d` are
-    two numbers and one number for the BSDF.
-    """
+class Numbers(EventNumbers):
+    """Random numbers of one path segment. `aperture` is a point on the sensor's aperture."""
 
     aperture: mi.Point2f
-    bsdf_2d: mi.Point2f
-    bsdf_1d: mi.Float
 
     @staticmethod
     def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
         """Draw the numbers of the next segment. After this call, the walk draws the random number for roulette."""
-        return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
+        aperture = sampler.next_2d(active)  # drawn first, as in `ptracer`
+        return Numbers(sampler.next_2d(active), sampler.next_1d(active), aperture)
 
-    def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
+    def of_early(self, early: list[EventNumbers], depth: mi.UInt32) -> Numbers:
         """Return a copy of these numbers. At the first vertices, the `early` numbers replace the numbers for the BSDF.
         The first vertex has depth 1.
         """
-        bsdf = Early(self.bsdf_2d, self.bsdf_1d)
+        bsdf = EventNumbers(self.bsdf_2d, self.bsdf_1d)
         for bounce, own in enumerate(early):
             bsdf = dr.select(depth == bounce + 1, own, bsdf)
         return replace(self, bsdf_2d=bsdf.bsdf_2d, bsdf_1d=bsdf.bsdf_1d)
 
 
 @dataclass
-class Early:
-    """Random numbers for the BSDF at one of a path's first vertices. The random numbers are known before the path is
-    traced.
+class Table:
+    """Table for sampling.
+
+    `slots` holds the cell of each slot, `weights` holds v / p of each cell, and `edges` holds the edges of the grid.
+    `survival` and `aim` hold data for roulette and aiming.
     """
 
-    bsdf_2d: mi.Point2f
-    bsdf_1d: mi.Float
+    slots: mi.UInt32
+    weights: mi.Float
+    edges: mi.Float
+    survival: Survival
+    aim: Aim | None = None
+
+    @staticmethod
+    def of(grid: Grid, counts: Array, survival: Survival | None = None, aim: Aim | None = None) -> Table:
+        """Return the table in which cell k has `counts[k]` slots. The total is `grid.slots`."""
+        weights = grid.measures() * grid.slots  # 0 without a slot
+        weights /= np.maximum(counts, 1)
+        return Table(
+            own_memory(mi.UInt32, np.repeat(np.arange(grid.cells, dtype=np.uint32), counts)),
+            own_memory(mi.Float, weights.astype(np.float32)),
+            own_memory(mi.Float, np.array(grid.edges, np.float32)),
+            survival or Survival.certain(),
+            aim,
+        )
+
+
+@dataclass
+class Drawn:
+    """Random numbers of emission that a guide has drawn. `cell` is the cell of these numbers, and `weight` is the
+    cell's v / p.
+    """
+
+    choice: mi.Float
+    position: mi.Point2f
+    direction: mi.Point2f
+    cell: mi.UInt32
+    weight: mi.Float
+
+
+@dataclass
+class Guide:
+    """Table, and the number of lanes that share the table. The number is opaque."""
+
+    table: Table
+    lanes: mi.UInt64
+
+    @staticmethod
+    def of(table: Table, width: int) -> Guide:
+        """Return a guide for a pass of `width` light paths."""
+        return Guide(table, dr.opaque(mi.UInt64, width))
+
+    def draw(
+        self, grid: Grid, width: int, stream: mi.PCG32, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f,
+    ) -> Drawn:  # fmt: skip
+        """Draw the start of each of `width` lanes. The random numbers `choice`, `position` and `direction` determine
+        the start's place within its cell.
+        """
+        lane, jitter = mi.UInt64(dr.arange(mi.UInt32, width)), mi.UInt64(stream.next_uint32())
+        slot = ((lane << 32) | jitter) // self.lanes >> (32 - (grid.slots.bit_length() - 1))
+        cell = dr.gather(mi.UInt32, self.table.slots, mi.UInt32(slot))
+        weight = dr.gather(mi.Float, self.table.weights, cell)
+        numbers, shift, below = [position.x, position.y, direction.x, direction.y], 0, dr.one_minus_epsilon(mi.Float)
+        for k, bits in enumerate(grid.bits):
+            if bits > 0:
+                index = (cell >> shift) & ((1 << bits) - 1)
+                # Rounding may reach the next cell, but must not leave the cube.
+                numbers[k] = dr.minimum((mi.Float(index) + numbers[k]) * 2.0**-bits, below)
+                shift += bits
+        if grid.emitters > 1:
+            emitter = cell >> shift
+            begin, end = (dr.gather(mi.Float, self.table.edges, emitter + k) for k in (0, 1))
+            choice = dr.minimum(dr.fma(choice, end - begin, begin), end * below)
+        return Drawn(choice, mi.Point2f(numbers[0], numbers[1]), mi.Point2f(numbers[2], numbers[3]), cell, weight)
 
 
 @dataclass
@@ -225,7 +296,7 @@ class Samples:
             return choice, place, direction
         return self._points(choice, place, direction)[1]
 
-    def early_numbers(self) -> list[Early]:
+    def early_numbers(self) -> list[EventNumbers]:
         """Return the low-discrepancy numbers for the BSDFs of the first vertices. Return an empty list if there are no
         low-discrepancy numbers.
         """
@@ -234,7 +305,7 @@ class Samples:
         assert self.plan.sequence is not None
         # Their dimensions in the sequence follow those of emission.
         points, _ = self._points(mi.Float(0), mi.Point2f(0), mi.Point2f(0))
-        return [Early(points.next_2d(), points.next_1d()) for _ in range(self.plan.sequence.bounces)]
+        return [EventNumbers(points.next_2d(), points.next_1d()) for _ in range(self.plan.sequence.bounces)]
 
     def _points(
         self, choice: mi.Float, place: mi.Point2f, direction: mi.Point2f

@@ -21,13 +21,12 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.aim import Pending, aims_from, choose
-from reslrb_cli.transport.bsdf import Aimed, Hit, Scattering, evaluate, scatter, tracked_factor
+from reslrb_cli.transport.bsdf import Aimed, EventNumbers, Hit, Scattering, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import Product, first_eta, play
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.roulette import first_eta, play
-from reslrb_cli.transport.samples import SELECTION_STREAM, Early, Numbers, Samples
+from reslrb_cli.transport.samples import SELECTION_STREAM, Numbers, Samples
 from reslrb_cli.transport.weights import Rivals, cosine, leave_emitter, weight_of_connection
 
 
@@ -142,49 +141,18 @@ def find_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
     return Hit(si, si.bsdf(), ray)
 
 
-def find_following_vertex(
-    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
-) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Float]:
-    """Return the surface interaction of a vertex that stays at its place on its surface, and moves only with the
-    surface.
-
-    Also returns the ray that reaches the vertex, and a factor. The direction of the ray changes if either end of the
-    ray moves. The factor has the value 1, but also has a derivative. The factor converts a measure of directions at the
-    ray's origin to a measure on the surface. Apart from its normalisation to 1, the factor is |cos| / distance^2 times
-    the stretching of the surface.
-    """
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-    there = si.p - ray.o
-    distance = dr.norm(there)
-    reaching = mi.Ray3f(ray)
-    reaching.d = there / distance
-    si.t = distance
-    si.wi = si.to_local(-reaching.d)
-    measure = dr.abs(dr.dot(si.n, reaching.d)) / dr.square(distance) * dr.norm(dr.cross(si.dp_du, si.dp_dv))
-    return si, reaching, dr.select(active & (measure > 0), measure / dr.detach(measure), 1)
-
-
 def segment(
     samples: Samples, hit: Hit, numbers: Numbers, connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True,
-    tracked: bool = False, attached: bool = False, aimed: Aimed | None = None,
+    attached: bool = False, aimed: Aimed | None = None,
 ) -> Segment:  # fmt: skip
     """Return the segment from a vertex. `connected` lanes connect to the sensor, and `scattered` lanes scatter.
 
-    Without `evaluates`, the BSDF is not evaluated towards the sensor. With `tracked`, the scattering weight has
-    derivatives of the scene's parameters if gradients are enabled. With `tracked`, the connection is evaluated later,
-    if the connection is visible. Directions, densities and film positions have no derivatives. With `attached`,
-    everything has derivatives. `aimed` lanes scatter to their points.
+    Without `evaluates`, the BSDF is not evaluated towards the sensor. With `attached`, everything has derivatives,
+    otherwise nothing has. `aimed` lanes scatter to their points.
     """
     plan, si = samples.plan, hit.si
     connection = connect(plan, samples.sensor, si, hit.ray, numbers.aperture, connected, attached)
-    wanted = connection.active if evaluates and not tracked else None
-    scattering, connection.f = scatter(
-        plan, hit, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed,
-        connection.active if plan.weighs else None,
-    )  # fmt: skip
-    if tracked and not attached:
-        f = tracked_factor(plan, si, hit.bsdf, scattering, scattering.active)
-        scattering.weight = dr.replace_grad(scattering.weight, f * (scattering.correction / scattering.pdf))
+    scattering, connection.f = scatter(plan, hit, numbers, scattered, connection, evaluates, attached, aimed)
     return Segment(si, connection, scattering)
 
 
@@ -198,7 +166,7 @@ class Path:
     pi: mi.PreliminaryIntersection3f  # the intersection of this ray
     product: Product  # E s_1 ... s_{depth-1}, roulette weights included
     eta: mi.Float  # accumulated relative index of refraction, only for roulette; starts larger if emission is dim
-    early: list[Early]  # random numbers of the first vertices, if low-discrepancy; never changed
+    early: list[EventNumbers]  # random numbers of the first vertices, if low-discrepancy; never changed
     pending: list[Pending]  # how the last event was aimed, if any are; a replay does not use it
     rivals: list[Rivals]  # if camera paths find the same light
 
@@ -256,10 +224,11 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             able = active & aims_from(bsdf)
             aimed, bsdf_1d = choose(scene, sensor, aim, path.ray.time, numbers.bsdf_1d, numbers.bsdf_2d, slot, able)
             numbers = replace(numbers, bsdf_1d=bsdf_1d)
-        this = segment(
-            samples, vertex, numbers, connected, active, hooks.connects, hooks.tracked, hooks.attached, aimed
-        )
+        evaluates = hooks.connects and not hooks.tracked  # tracked connections are evaluated later, if visible
+        this = segment(samples, vertex, numbers, connected, active, evaluates, hooks.attached, aimed)
         connection, scattering = this.connection, this.scattering
+        if hooks.tracked and not hooks.attached:
+            scattering.track(plan, vertex)
         rivals = []
         for before_here in path.rivals:  # one or none
             arrived = before_here.arrive(si, path.ray)

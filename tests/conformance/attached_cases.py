@@ -204,7 +204,7 @@ FAULTS = [
     Fault("hit_point_detached", "slab", "transport.walk:find_vertex",
                   "pi.compute_surface_interaction(ray,", "pi.compute_surface_interaction(dr.detach(ray, False),",
                   stock=True),
-    Fault("shading_normals_detached", "slab", "transport.bsdf:shading_correction",
+    Fault("shading_normals_detached", "slab", "transport.connection:shading_correction",
                   "dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n))",
                   "dr.detach(dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)))", stock=True, quick=True),
     Fault("importance_detached", "slab", "transport.connection:connect",

@@ -18,8 +18,8 @@ from reslrb_cli.integrators import context
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.transport.guide import Table
-from reslrb_cli.transport.roulette import CELLS, Survival
+from reslrb_cli.transport.factors import CELLS, Survival
+from reslrb_cli.transport.samples import Table
 
 BY_NAME = {case.name: case for case in CASES}
 MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASES)}

@@ -14,7 +14,7 @@ from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.tables import Purpose
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.transport import guide
+from reslrb_cli.transport import samples as drawing
 
 
 def hole(patch: pytest.MonkeyPatch) -> None:
@@ -50,31 +50,31 @@ def of_the_neighbour(patch: pytest.MonkeyPatch) -> None:
 
 
 def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
-    right = guide.Table.of
+    right = drawing.Table.of
 
     def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
         table = right(grid, counts, *survival)
         weights = change(grid, counts, np.array(table.weights, np.float64))
         return replace(table, weights=mi.Float(weights.astype(np.float32)))
 
-    patch.setattr(guide.Table, "of", staticmethod(wrong))
+    patch.setattr(drawing.Table, "of", staticmethod(wrong))
 
 
 def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
     """The lanes share the slots as if there were twice as many lanes."""
-    right = guide.Guide.of
-    patch.setattr(guide.Guide, "of", staticmethod(lambda table, width: right(table, 2 * width)))
+    right = drawing.Guide.of
+    patch.setattr(drawing.Guide, "of", staticmethod(lambda table, width: right(table, 2 * width)))
 
 
 def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
     """The number that selects the emitter lies in an interval for emitters with other shares."""
-    right = guide.Table.of
+    right = drawing.Table.of
 
     def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
         table = right(grid, counts, *survival)
         return replace(table, edges=mi.Float(np.sqrt(np.array(table.edges))))
 
-    patch.setattr(guide.Table, "of", staticmethod(wrong))
+    patch.setattr(drawing.Table, "of", staticmethod(wrong))
 
 
 def in_one_corner(patch: pytest.MonkeyPatch) -> None:
@@ -90,8 +90,8 @@ def with_its_own_weight(patch: pytest.MonkeyPatch) -> None:
 
 
 def _redraw(patch: pytest.MonkeyPatch, change: Any) -> None:
-    right = guide.Guide.draw
-    patch.setattr(guide.Guide, "draw", lambda self, *given: change(right(self, *given)))
+    right = drawing.Guide.draw
+    patch.setattr(drawing.Guide, "draw", lambda self, *given: change(right(self, *given)))
 
 
 def same_numbers(patch: pytest.MonkeyPatch) -> None:

@@ -12,13 +12,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.guiding.tables import apportion
 from reslrb_cli.integrators import reslrb as lt
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.transport.aim import Aim
-from reslrb_cli.transport.film import Blocks, film_blocks
-from reslrb_cli.transport.guide import Table, apportion
+from reslrb_cli.transport.aim import Aim, Blocks, film_blocks
 from reslrb_cli.transport.plan import Grid, Plan
-from reslrb_cli.transport.samples import passes
+from reslrb_cli.transport.samples import Table, passes
 
 PATHS = 64  # paths that are traced to compile kernels
 LARGE = 100  # operations: smaller kernels only develop images or prepare textures

@@ -10,8 +10,7 @@ from conformance.drawing import aim_everywhere, guided
 from reslrb_cli.guiding.tables import NOW, Purpose
 from reslrb_cli.integrators import context
 from reslrb_cli.transport import aim
-from reslrb_cli.transport.aim import AIM_SLOTS, AIM_UNIFORM, Aim
-from reslrb_cli.transport.film import BLOCKS, Blocks
+from reslrb_cli.transport.aim import AIM_SLOTS, AIM_UNIFORM, BLOCKS, Aim, Blocks
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

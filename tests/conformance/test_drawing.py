@@ -39,9 +39,8 @@ from reslrb_cli.guiding import tables
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.transport import aim, walk
-from reslrb_cli.transport.aim import Aim, Pending
+from reslrb_cli.transport.aim import Aim, Blocks, Pending
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.film import Blocks
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

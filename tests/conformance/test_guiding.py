@@ -16,11 +16,11 @@ import reslrb_cli
 from reslrb_cli.estimators import base
 from reslrb_cli.guiding import collect
 from reslrb_cli.guiding import tables as guiding
-from reslrb_cli.guiding.tables import EVERY, Guiding
+from reslrb_cli.guiding.tables import EVERY, Guiding, make_grid
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import SIZE, diffuse, rgb, texture, transform
 from reslrb_cli.transport import plan
-from reslrb_cli.transport.guide import Guide, Table, make_grid
+from reslrb_cli.transport.samples import Guide, Table
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -256,6 +256,6 @@ def test_tables_that_stop_learning_stay_wrong(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.long
 def test_tables_without_a_uniform_share_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan, "GUIDE_UNIFORM", 0.02)
+    monkeypatch.setattr(guiding, "GUIDE_UNIFORM", 0.02)
     monkeypatch.setattr(plan, "SLOTS_PER_CELL", 64)
     assert not holds(errors(32))

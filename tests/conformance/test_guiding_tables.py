@@ -15,13 +15,26 @@ from conformance.operations import LARGE, even_table
 from conformance.test_kernels import Kernels
 
 from reslrb_cli.guiding.collect import KEEP, Onward
-from reslrb_cli.guiding.tables import BLUR, FINE, Guiding, Learned, Purpose, _blurred, grid_for, learnings, most_cells
+from reslrb_cli.guiding.tables import (
+    BLUR,
+    FINE,
+    GUIDE_UNIFORM,
+    Guiding,
+    Learned,
+    Purpose,
+    _blurred,
+    apportion,
+    grid_for,
+    learnings,
+    make_grid,
+    most_cells,
+)
 from reslrb_cli.integrators import freezing
 from reslrb_cli.measure.gradients import Case, integrator, relative
-from reslrb_cli.transport import guide
-from reslrb_cli.transport.guide import Guide, Table, apportion, make_grid
-from reslrb_cli.transport.plan import GUIDE_UNIFORM, Grid
-from reslrb_cli.transport.roulette import CELLS
+from reslrb_cli.transport import samples as drawing
+from reslrb_cli.transport.factors import CELLS
+from reslrb_cli.transport.plan import Grid
+from reslrb_cli.transport.samples import Guide, Table
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -92,13 +105,13 @@ def test_roulette_ignores_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
     """Roulette must not end paths only because they are drawn often. With weights scaled to a hundredth, the image
     changes only by this factor.
     """
-    right, factor = guide.Table.of, [1.0]
+    right, factor = drawing.Table.of, [1.0]
 
     def weighed(grid: Grid, counts: np.ndarray, *rest: Any) -> Table:
         table = right(grid, counts, *rest)
         return replace(table, weights=mi.Float(np.array(table.weights) * np.float32(factor[0])))
 
-    monkeypatch.setattr(guide.Table, "of", staticmethod(weighed))
+    monkeypatch.setattr(drawing.Table, "of", staticmethod(weighed))
     scene, images = Case(SCENES["roulette"](), []), []
     for factor[0] in (1.0, 0.01):
         images.append(scene.image(integrator("reslrb", 6, 1, guiding="on"), 5, 16) / factor[0])

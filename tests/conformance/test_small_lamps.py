@@ -187,16 +187,16 @@ def test_radiance_counts_once_if_its_lamp_moves_too(size: float):
 
 # ---- The code broken on purpose ----
 
-SPLAT = "transport.visible:small_points"
+SPLAT = "transport.emission:small_points"
 FAULTS = [
-    Fault("left_out", "third", "transport.visible:splat_visible_emission", "if samples.plan.small_lamps",
+    Fault("left_out", "third", "transport.emission:splat_visible_emission", "if samples.plan.small_lamps",
           "if False", frozenset({("stack", "ptracer")}), quick=True),
-    Fault("not_differentiated", "third", "transport.visible:differentiate_visible_emission",
+    Fault("not_differentiated", "third", "transport.emission:differentiate_visible_emission",
           "plan.small_lamps and plan", "False and plan", frozenset({("stack", "walk_ad"), ("stack", "analytic")})),
-    Fault("primary_rays_find_them_too", "third", "transport.visible:_radiance",
+    Fault("primary_rays_find_them_too", "third", "transport.emission:_radiance",
           "emitter != mi.EmitterPtr(lamp.emitter)", "mi.Bool(True)",
           frozenset({("stack", "analytic"), ("stack", "ptracer")}), quick=True),
-    Fault("cosine_forgotten", "two", "transport.visible:_points", "cos * weight", "weight",
+    Fault("cosine_forgotten", "two", "transport.emission:_points", "cos * weight", "weight",
           frozenset({("stack", "ptracer")})),
     Fault("turns_not_counted", "two", SPLAT, "(mi.Float(count) / mi.Float(lanes))", "1",
           frozenset({("stack", "ptracer")})),

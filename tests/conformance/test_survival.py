@@ -20,7 +20,7 @@ from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked, hear
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.transport.roulette import BITS, CELLS, LEAST, SHAPE, Survival
+from reslrb_cli.transport.factors import BITS, CELLS, LEAST, SHAPE, Survival
 from reslrb_cli.transport.walk import Hooks, walk
 
 pytestmark = pytest.mark.usefixtures("llvm")

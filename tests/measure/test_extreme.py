@@ -85,7 +85,7 @@ def test_roulette_by_throughput_loses_light_behind_a_dark_surface(monkeypatch: p
 
 @pytest.mark.long
 def test_roulette_by_power_loses_dim_lamps(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("reslrb_cli.transport.roulette.DIMMEST", 1.0)
+    monkeypatch.setattr("reslrb_cli.transport.factors.DIMMEST", 1.0)
     assert lost("emission_1e-25_roulette", "gather")
 
 
@@ -100,7 +100,7 @@ def test_sampling_by_radiance_undersamples_the_sky_beside_a_sun(monkeypatch: pyt
         return ratio
 
     before = variance()
-    monkeypatch.setattr("reslrb_cli.transport.emission.DEFENSIVE", 1e-9)
+    monkeypatch.setattr("reslrb_cli.transport.lamps.DEFENSIVE", 1e-9)
     assert variance() > 100 * before
 
 

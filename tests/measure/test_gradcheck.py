@@ -53,7 +53,7 @@ from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Ve
 from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior
 from reslrb_cli.transport import walk as segment
-from reslrb_cli.transport.roulette import CELLS, Survival
+from reslrb_cli.transport.factors import CELLS, Survival
 
 # Gradcheck on a small Cornell box: the current code passes, and planted faults are found and named.
 
