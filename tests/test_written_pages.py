@@ -150,8 +150,6 @@ NAMED = re.compile(
     r"(?<![\w/.{}-])((?:configs|docs|paper|scenes|scripts|tests|reslrb_cli)(?:/[\w-]+)*/[\w-]+\.\w+(?:\.\w+)*"
     r"|(?:[\w-]+/)*test_\w+\.py|(?:[a-z]\w*/)+\w+\.py|scripts/\w+)\b"
 )
-#: Names that need not exist: generated files and placeholders.
-NOT_HERE = {"docs/benchmarks/gpu.md"}
 
 
 def test_files_named_in_text_exist() -> None:
@@ -164,7 +162,7 @@ def test_files_named_in_text_exist() -> None:
         if file.endswith((".md", ".py")) and file != "CHANGELOG.md":
             for name in set(NAMED.findall((ROOT / file).read_text(encoding="utf-8"))):
                 is_told = file.endswith(".md") or Path(name).name.startswith("test_")
-                if is_told and f"/{name}" not in ends and name not in NOT_HERE:
+                if is_told and f"/{name}" not in ends:
                     gone.append(f"{file} names {name}")
     assert gone == []
     text = "`walk/x.py`, scripts/a (tests/b.py)"
