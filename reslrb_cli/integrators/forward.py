@@ -14,7 +14,7 @@ import mitsuba as mi
 from reslrb_cli.estimators.attached import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
-from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
+from reslrb_cli.transport.connection import Connection, before_lamps, forward_derivatives, passage, transmittance
 from reslrb_cli.transport.emission import (
     primary_ray,
     sample_emission,
@@ -170,7 +170,8 @@ def tangent_of_passage(
     plan = samples.plan
     if not plan.needs.has_null:
         return *passage(plan, samples.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
-    passed = transmittance(plan, samples.scene, vertex.si, vertex.depth, connection, tangents=True)
+    seen = replace(connection, active=before_lamps(plan, samples.scene, vertex.si, connection.active))
+    passed = transmittance(plan, samples.scene, vertex.si, vertex.depth, seen, tangents=True)
     return passed.reached, passed.value, passed.tangent[0]
 
 

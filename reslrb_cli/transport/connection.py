@@ -234,6 +234,11 @@ def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
     return f, connection.weight * f
 
 
+def before_lamps(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+    """Return the active lanes without vertices on lamps, if camera rays start behind lamps."""
+    return active & (si.emitter(scene) == dr.zeros(mi.EmitterPtr)) if plan.passes_lamps else active
+
+
 def passage(
     plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection,
     seen: Seen | None = None, loop_mode: str = "symbolic",
@@ -244,9 +249,7 @@ def passage(
     scenes with null surfaces, `seen` cannot be used. `loop_mode` is the mode of the loop, which must be evaluated for
     naive AD.
     """
-    active, one = connection.active, mi.Spectrum(1)
-    if plan.passes_lamps:  # if camera rays start behind them
-        active = active & (si.emitter(scene) == dr.zeros(mi.EmitterPtr))
+    active, one = before_lamps(plan, scene, si, connection.active), mi.Spectrum(1)
     if plan.needs.has_null or plan.passes_lamps:
         through = transmittance(plan, scene, si, depth, replace(connection, active=active), loop_mode=loop_mode)
         return through.reached, through.value

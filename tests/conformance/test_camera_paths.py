@@ -323,6 +323,21 @@ def test_forward_mode_equals_naive_ad(name: str, paths: str):
     assert relative(tangent, naive) < 1e-5
 
 
+def test_forward_mode_sees_no_light_from_hidden_lamps():
+    """Camera rays start behind a white lamp, in front of which a mask hangs. Light paths that end on the lamp do not
+    count. Forward mode counted them.
+    """
+    by_name = {case.name: case for case in CASES}
+    lit, masked = by_name["visible_lamp"].scene(), by_name["mask_texture_in_view"].scene()
+    white = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": rgb(0.8, 0.8, 0.8)}}
+    sign = rectangle(white, transform().translate([0.2, -0.1, 0.4]).rotate([0, 1, 0], 15).scale(0.6))
+    sign["emitter"] = {"type": "area", "radiance": rgb(1, 2, 1)}
+    scene = Case(lit | {"veil": masked["veil"], "sign": sign}, ["veil.bsdf.opacity.data"])
+    options = {"hide_emitters": True, "paths": "both"}
+    tangent = forward(scene, plugin("reslrb", estimator="stack", **options), 3, 16)
+    assert relative(tangent, forward(scene, plugin("walk_ad", **options), 3, 16)) < 1e-5
+
+
 @pytest.mark.parametrize("case", a_few([case for case in BOTH if case.reference == "prb"], ()))
 def test_gradients_equal_prb(case: GradientCase):
     scene = Case(case.scene(), case.keys)
