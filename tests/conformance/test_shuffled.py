@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from agreement import is_same
 from conformance.gradient_cases import _IN_VIEW, _mask, _pane, _textured
 from conformance.moving import camera as above
 from conformance.moving import enclosed, flat, sheet, under_glass
@@ -107,11 +108,6 @@ def visits_of(way: str, names: tuple[str, ...]) -> list[Visit]:
             key.endswith("vertex_positions") for key in SCENES[name][1][number]
         )
     ]  # fmt: skip
-
-
-def is_same(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether two results are equal to the bit. On a GPU, sums have no fixed order and may differ slightly."""
-    return np.array_equal(a, b) or (mi.variant().startswith("cuda") and np.allclose(a, b, rtol=1e-4, atol=1e-6))
 
 
 def differing(way: str, names: tuple[str, ...], orders: Iterator[np.random.Generator], length: int) -> list[str]:
