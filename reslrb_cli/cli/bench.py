@@ -47,18 +47,9 @@ class BenchOptions(ComparisonOptions):
     objective: str
 
 
-class Swept(click.Choice[str]):
-    """The quantities that can be varied. Refuses removed quantities with advice."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        if value in ("film", "texture"):
-            self.fail(f"`{value}` was removed; change sizes with --set, and call bench once for each size", param, ctx)
-        return super().convert(value, param, ctx)
-
-
 @click.command("bench")
 @optional_experiment_arguments
-@click.option("--sweep", "swept", type=Swept(["depth", "spp"]), default="depth", show_default=True,
+@click.option("--sweep", "swept", type=click.Choice(["depth", "spp"]), default="depth", show_default=True,
               help="Quantity to vary: path depth or samples per pixel. The path depth is that of CONFIG unless it is "
                    "varied.")  # fmt: skip
 @click.option("--values", type=Counts(), metavar="LIST",

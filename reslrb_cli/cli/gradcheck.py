@@ -40,8 +40,7 @@ from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_checked
-from reslrb_cli.measure.resume_store import settings
+from reslrb_cli.measure.methods import PATHS_OPTIONS, kept_settings, parse_checked
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
 
 if TYPE_CHECKING:
@@ -93,7 +92,7 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
     from reslrb_cli.measure.missing import KIND, MissingCheck
 
     json_file, seeds, spp = options.json_file, options.seeds, options.spp
-    to_keep = settings(config, {}, variant, device_name(variant), spp=spp)
+    to_keep = kept_settings(config, {}, variant, device_name(variant), spp=spp)
     check = MissingCheck(config, options.budget, seeds, spp, read_earlier(KIND, json_file, to_keep))
     echo(check.conditions())
     records: list[MissingRecord] = []
@@ -205,7 +204,7 @@ logger = logging.getLogger(__name__)
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
               help=
         "Time limit, including loading and compiling; it determines the number of seeds. Comparisons without "
-        "time are named, with the time that they need.")  # fmt: skip
+        "time are named.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
               help="Number of seeds, including those in the file of --json, for any time.")  # fmt: skip
 @allow_code_option

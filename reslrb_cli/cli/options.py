@@ -27,6 +27,7 @@ from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.records.measurement_files import (
+    Earlier,
     Kept,
     Line,
     LivePage,
@@ -42,7 +43,6 @@ from reslrb_cli.records.measurements import BenchStatus
 if TYPE_CHECKING:
     from reslrb_cli.measure.arena import Arena
     from reslrb_cli.measure.methods import Measurement
-    from reslrb_cli.measure.resume_store import Earlier
 
 
 def origin_of(variant: str) -> Origin:
@@ -129,8 +129,6 @@ def measuring(
 
 def read_earlier(kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
     """Return the saved samples (`Earlier.read`), and print that the command uses the samples."""
-    from reslrb_cli.measure.resume_store import Earlier
-
     earlier = Earlier.read(kind, json_file, now)
     if earlier is not None:
         echo(f"using the samples in {samples_file(earlier.source)}")
@@ -248,8 +246,7 @@ REMOVED = {
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
     help=
-        "Time limit, including loading and compiling. Measurements without time are named, with the time that "
-        "they need.",
+        "Time limit, including loading and compiling. Measurements without time are named.",
 )  # fmt: skip
 
 

@@ -1,8 +1,7 @@
 """Workers that take turns, from the workers' start to their end. `bench` and `convergence` share this code.
 
-Only one worker computes at a time, so drift of the machine affects all workers alike. An additional worker, the
-referee, can make the common reference. If the referee fails, nothing is measured. `Contestant` is one worker with its
-results, `Pace` divides the time, and `Arena` asks the workers in turn.
+Only one worker computes at a time, so drift of the machine affects all workers alike. `Contestant` is one worker with
+its results, `Pace` divides the time, and `Arena` asks the workers in turn.
 """
 
 from __future__ import annotations
@@ -14,11 +13,9 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from reslrb_cli.backend.installation import python_command
-from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.methods import Case, Measurement, Plan
+from reslrb_cli.measure.methods import Measurement
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
-from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.records.measurements import BenchStatus
+from reslrb_cli.records.measurement_files import Earlier
 
 #: If all processes together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
@@ -69,8 +66,9 @@ MAX_ROUNDS = 25
 #: Factor on the time for the next depth, whose kernels take longer to compile and to run.
 GROWTH = 1.3
 
-#: Message about measurements that exceed the budget.
-NO_TIME = "the budget was spent; allow more with --budget"
+#: Advice, and message, about measurements that exceed the budget.
+MORE = "allow more with --budget"
+NO_TIME = f"the budget was spent; {MORE}"
 
 
 class Pace:
@@ -90,14 +88,9 @@ class Pace:
         most: int = MAX_ROUNDS,
     ) -> None:
         self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
-        self._rounds_start = self._depth_start = now()
+        self._rounds_start = now()
         self._depth_end = self._end
         self._before = 0
-
-    @property
-    def depth_s(self) -> float:
-        """Seconds since the start of the depth."""
-        return self._now() - self._depth_start
 
     def over(self) -> bool:
         """Whether the time is up."""
@@ -109,7 +102,7 @@ class Pace:
 
     def begin_depth(self) -> None:
         """Start a depth."""
-        now = self._depth_start = self._now()
+        now = self._now()
         self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
         self._left -= 1
 
@@ -144,16 +137,12 @@ def start_process(first: dict[str, Any], does: str) -> Process:
 class Arena(Generic[Measured, Worker, Item]):
     """Running workers, `members`. The workers write files to `folder`, which the caller removes.
 
-    `facts` come from the referee. `spent_s` is the part of the budget that is already spent. Measurements of an
-    `earlier` session count, and the new session continues them. Raises ConfigError if the earlier measurements belong
-    to another measurement.
+    `spent_s` is the part of the budget that is already spent. Measurements of an `earlier` session count, and the new
+    session continues them. Raises ConfigError if the earlier measurements belong to another measurement.
     """
 
     #: Maximum number of rounds.
     MOST_ROUNDS = 256
-
-    #: Share of the budget, and seconds, that are reserved for the statistics and the plot.
-    AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
 
     def __init__(
         self,
@@ -168,15 +157,12 @@ class Arena(Generic[Measured, Worker, Item]):
     ) -> None:
         self.plan, self.folder, self.settings, self._earlier = plan, folder, plan.settings(), earlier
         self.members: list[Worker] = []
-        self.facts: dict[str, Any] = {}
-        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
-        self._referee: Contestant | None = None
+        self._stop, self._say, self._start = stop, say, start
         self._said: set[str] = set()
         if earlier is not None:
             earlier.check(self.settings)
         depths = self._set_up(earlier)
-        budget_s = max((1 - self.AFTERWARDS) * plan.budget_s - self.AFTERWARDS_S - spent_s, 0.0)
-        self._pace = Pace(budget_s, depths, plan.rounds, now, self.MOST_ROUNDS)
+        self._pace = Pace(max(plan.budget_s - spent_s, 0.0), depths, plan.rounds, now, self.MOST_ROUNDS)
 
     def _set_up(self, earlier: Earlier | None) -> int:
         """Set up the parts that are specific to one kind of session. The parts start from the data of an earlier
@@ -201,8 +187,6 @@ class Arena(Generic[Measured, Worker, Item]):
         finally:
             for member in self.members:
                 member.close()
-            if self._referee is not None:
-                self._referee.close()
 
     def _alive(self) -> list[Worker]:
         """Return the workers that can take more steps."""
@@ -263,20 +247,6 @@ class Arena(Generic[Measured, Worker, Item]):
             round += 1
             yield round
 
-    def _ask_referee(self, plan: Plan, question: dict[str, Any] | None = None) -> dict[str, Any] | None:
-        """Return the referee's answer to `question`. Without a question, return the referee's first message. Returns
-        None if the budget is spent. Raises Refused if the referee ended.
-        """
-        assert self._referee is not None, "it is started first"
-        if question is not None:
-            self._referee.process.ask(question)
-        answer, end = self._open(self._referee), self._referee.end
-        if end is not None:
-            memory = end.status is BenchStatus.OUT_OF_MEMORY
-            code = ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
-            raise Refused(f"--reference {plan.reference.label}: {end.reason}", code)
-        return answer
-
     def _open(self, member: Contestant) -> dict[str, Any] | None:
         """Return the first message of a worker that has loaded its scene, and print its new warnings. Returns None if
         the worker ended, or if the time was up.
@@ -294,12 +264,3 @@ class Arena(Generic[Measured, Worker, Item]):
             self._say(f"left out: {label}: {member.refusal}")
         elif member.end is not None:
             self._say(f"{label}: {member.end.status.value}: {member.end.reason}")
-
-    def _without(self, case: Case) -> str | None:
-        """Return why a method of the default list is left out, or None if it takes part."""
-        if not self.plan.default:
-            return None
-        if self.facts.get("paths") == "light" and case.options.get("paths", "light") != "light":
-            return "this scene has only light paths"
-        reason: str | None = self.facts["without"].get(case.type)
-        return reason

@@ -8,8 +8,8 @@ round.
 
 A case that runs out of memory is tried again at greater depths, so every record is an observation. A case of the
 default list that does not support the scene is left out, with the reason. The budget includes loading and compiling.
-Once the budget is spent, cases that still compile are left out. The output says how much time these cases would have
-taken. Each case that has compiled takes part in at least one round.
+Once the budget is spent, cases that still compile are left out, and the output names these cases. Each case that has
+compiled takes part in at least one round.
 """
 
 from __future__ import annotations
@@ -19,12 +19,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from reslrb_cli.config.schema import Config
-from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.arena import GROWTH, MAX_ROUNDS, NO_TIME, Arena, Contestant
+from reslrb_cli.measure.arena import MAX_ROUNDS, NO_TIME, Arena, Contestant
 from reslrb_cli.measure.methods import Case, Sweep, paths_in_records
 from reslrb_cli.measure.processes import Ended, Stopped
-from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
 
 #: Sizes that all cases have in common; None until a case has loaded its scene.
@@ -125,7 +123,7 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
     `size` has the `width` and `height` of the film in pixels, and the `texels` of all textures that are parameters.
     """
 
-    AFTERWARDS, AFTERWARDS_S, MOST_ROUNDS = 0.0, 0.0, MAX_ROUNDS
+    MOST_ROUNDS = MAX_ROUNDS
 
     def _set_up(self, earlier: Earlier | None) -> int:
         self.runs, self.done, self.left_out = dict[int, list[BenchRun]](), set[int](), list[Case]()
@@ -173,7 +171,7 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
         if not any(entries for _, entries in values):
             return None
         content = {"values": values, "left_out": [case.label for case in self.left_out], "size": self.size}
-        return resume_store.kept(self.plan.KIND, self.settings, None, **content)
+        return kept(self.plan.KIND, self.settings, None, **content)
 
     def _course(self) -> Iterator[list[BenchResult]]:
         """Measure. Yields an empty list after each round, and a value's results when the value is finished. Prints
@@ -193,7 +191,6 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
             except Stopped:
                 stopped = True
             late = [run for run in self.members if run.late and not run.steps]
-            needed = self._needed(len(values) - number)
             for run in self.members:
                 run.close()
                 if run.refusal is not None:
@@ -201,7 +198,7 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
                     self.left_out.append(run.case)
             if late:
                 names = ", ".join(run.case.label for run in late)
-                self._say(f"not measured: {plan.name(value)}, {names}: {NO_TIME}{needed}")
+                self._say(f"not measured: {plan.name(value)}, {names}: {NO_TIME}")
             self.done.add(value)
             yield self._results(value)
             if stopped:
@@ -234,12 +231,3 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
         # Rounds continue after those of an earlier session, whose numbers set the seeds, until all have enough.
         first = 1 + max((round for run in self.members for round in run.steps), default=-1)
         return self._take_rounds(first, min((len(run.steps) for run in self._alive()), default=0))
-
-    def _needed(self, left: int) -> str:
-        """Describe the budget for all remaining values. The budget includes the time since the command was called."""
-        late, warm = sum(run.late for run in self.members), len(self._alive())
-        if warm == 0:
-            return "; nothing had compiled by then, so allow several times as much"
-        # Kernels that are not compiled yet are assumed to take as long as the compiled ones; deeper paths take longer.
-        further = late / warm + sum(GROWTH**k for k in range(1, left))
-        return f"; everything takes about {self._now() - self._began + self._pace.depth_s * further:.0f} s"

@@ -28,8 +28,8 @@ from reslrb_cli.measure.comparison import (
 )
 from reslrb_cli.measure.methods import records_of
 from reslrb_cli.measure.participants import CheckSettings, Way
-from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
+from reslrb_cli.records.measurement_files import Earlier
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
 #: Relative difference of a stock integrator on the same paths: it rounds the visibility of points differently.
@@ -124,20 +124,15 @@ class Gradcheck:
         """
         self.sampling.between = between
         self.sampling.expect(name for row in self.rows for name in self._needs(row))
-        family, compared, late = self._family(), False, False
+        family, compared = self._family(), False
         for row in self.rows:
             if all(self.sampling.take(name, stop, say) for name in self._needs(row)):
                 compared = True
                 yield self._result(row, family)
             elif not stop():
-                late = True
                 yield CheckResult(self._record(row, Comparison(Verdict.NOT_MEASURED, message=NO_TIME), 0))
         if compared or not stop():
             yield from self._without_reference()
-        if late and not stop():
-            needed_s = self.sampling.needed_s()
-            enough = "several times as much" if needed_s is None else f"about {needed_s:.0f} s"
-            say(f"the minimum number of seeds takes {enough}; allow this with --budget")
 
     def _needs(self, row: Row) -> list[Name]:
         """Return the sample names that a comparison needs. The samples are those of the estimator and, unless the

@@ -7,7 +7,7 @@ is the plan of the command `convergence`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, get_args
@@ -27,7 +27,7 @@ from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure import resume_store
+from reslrb_cli.records.measurement_files import FILES, program
 from reslrb_cli.records.measurements import Method
 
 #: Options that a case inherits from the configuration's integrator if its own integrator has them.
@@ -238,6 +238,26 @@ def code_files(cases: Iterable[Case]) -> dict[str, Path]:
     return {case.label: code_file(case.options["file"]) for case in cases if case.type == "custom"}
 
 
+def kept_settings(
+    config: Config, codes: Mapping[str, Path], variant: str, device: str, **options: Any
+) -> dict[str, Any]:
+    """Return the settings that must be the same in all sessions of a measurement, as JSON.
+
+    `codes` are the files of integrators that the command names. `options` are the command's options. Files are compared
+    by their contents. The variant and the device are included, because times of all sessions are compared.
+    """
+    from reslrb_cli.scene.files import file_digests, files_of  # which loads Mitsuba
+
+    return {
+        "config": parse(dump(config), str(config.source)),
+        **options,
+        "variant": variant,
+        "device": device,
+        "versions": program(),
+        FILES: file_digests({**files_of(config), **codes}),
+    }
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
     """The settings common to all measurements that use processes.
@@ -269,11 +289,11 @@ class Measurement:
                 "memory_limit": self.memory_limit, "allow_code": config.allows_code}  # fmt: skip
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings that must be the same in all sessions, as JSON (`resume_store.settings`)."""
+        """Return the settings that must be the same in all sessions, as JSON (`kept_settings`)."""
         labels = [case.label for case in self.cases]
         options = {"integrators": labels, **self._options(), "memory limit": self.memory_limit}
         codes = code_files([*self.cases, *(each for each in vars(self).values() if isinstance(each, Case))])
-        return resume_store.settings(self.config, codes, self.variant, self.device, **options)
+        return kept_settings(self.config, codes, self.variant, self.device, **options)
 
     def _options(self) -> dict[str, Any]:
         """Return the command's options that belong to the settings."""

@@ -47,12 +47,11 @@ from reslrb_cli.measure.gradients import (
 from reslrb_cli.measure.methods import NEVER, parse_cases
 from reslrb_cli.measure.participants import MOVING_DIRECTIONS, PATHS
 from reslrb_cli.measure.references import ends
-from reslrb_cli.measure.resume_store import Earlier, kept
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
 from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES
-from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.needs import camera_finds_all

@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.gradients import seeds
-from reslrb_cli.measure.methods import code_files
+from reslrb_cli.measure.methods import code_files, kept_settings
 from reslrb_cli.measure.participants import CheckSettings, Participants
-from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.optimization.shards import in_order, serially
-from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 
 #: Kind of measurement in the file of samples.
 KIND = "gradcheck"
@@ -54,7 +52,7 @@ class Steps:
 def settings(checked: CheckSettings, variant: str, device: str) -> dict[str, Any]:
     """Return the settings that must be the same in all sessions."""
     labels, codes = [case.label for case in checked.integrators], code_files(checked.integrators)
-    return resume_store.settings(checked.config, codes, variant, device, estimators=labels, spp=checked.spp)
+    return kept_settings(checked.config, codes, variant, device, estimators=labels, spp=checked.spp)
 
 
 #: Default seeds: the same number of everything, and more of cheap samples as the budget allows.
@@ -91,8 +89,7 @@ class Sampling:
         self, settings: CheckSettings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
     ) -> None:
         self._now, self.settings = now, settings
-        self._start = now() - settings.spent_s
-        self._end = self._start + settings.budget_s
+        self._end = now() - settings.spent_s + settings.budget_s
         self.participants = Participants(settings)
         self._samples: dict[Name, list[np.ndarray]] = {}
         if earlier is not None:
@@ -103,7 +100,6 @@ class Sampling:
         self.between: Callable[[], None] = lambda: None
         self._taken: set[Name] = set()
         self._expected: list[Name] = []
-        self._later_s = 0.0  # longest duration of a later sample
         self._first_s: dict[tuple[str, bool], float] = {}  # longest duration of a first sample, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
@@ -119,7 +115,7 @@ class Sampling:
         """Return the state for a later session with the same `settings`, or None if there are no samples."""
         taken = [of for (kind, of), rows in self._samples.items() if kind == "differences" and rows]
         steps = Steps.of(self.participants).chosen
-        return resume_store.kept(KIND, settings, self._samples, steps={of: steps[of] for of in taken})
+        return kept(KIND, settings, self._samples, steps={of: steps[of] for of in taken})
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
         """Take the samples of `name`, unless an earlier call has taken the samples. Returns True if there are enough
@@ -154,7 +150,6 @@ class Sampling:
             self.between()
             now = self._now()
             next_s = now - before
-            self._later_s = max(self._later_s, next_s if len(samples) > begun + 1 else 0.0)
             before = now
             if len(samples) == begun + 1:
                 first_s, next_s = now - begin, 0.0  # it does not predict the next one
@@ -166,18 +161,6 @@ class Sampling:
                 break
         if len(samples) > begun:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")
-
-    def needed_s(self) -> float | None:
-        """Return the estimated total time until every name has the minimum number of samples. The total includes
-        finished samples. Return None if there are no samples yet.
-        """
-        if not self._first_s:
-            return None
-        lacking = [name for name in self._expected if len(self._samples.get(name, ())) < FEWEST]
-        later_s = (FEWEST - 1) * self._later_s
-        # The steps of differences are chosen first, which also compiles kernels.
-        firsts_s = sum((1 + (name[0] == "differences")) * self._expected_s(name) for name in lacking)
-        return self._now() - self._start + firsts_s + len(lacking) * later_s
 
     def _expected_s(self, name: Name) -> float:
         """Return the estimated time of a first sample, from earlier samples."""

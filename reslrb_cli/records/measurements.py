@@ -87,6 +87,11 @@ class BenchRecord(Line):
 TARGETS = (0.1, 0.03, 0.01)
 
 
+def _column(title: str, width: int) -> dict[str, Any]:
+    """Return the metadata of a field that the table of `convergence` shows."""
+    return {"title": title, "width": width}
+
+
 @dataclass(frozen=True)
 class Range:
     """Estimate with its 95 % interval."""
@@ -138,8 +143,10 @@ class PointRecord(Line):
 
 @dataclass(frozen=True)
 class MethodRecord(Line):
-    """Summary of the points of one method and parameter. `repeats` is the number of steps.
+    """Summary of the points of one method and parameter. The table of `convergence` shows the fields with a column, in
+    this order, and `seconds_to`.
 
+    - `repeats` is the number of steps.
     - `relative_rmse` is the error of one step, computed from the variance of the steps. `step_s` is the number of
         seconds per step.
     - `cold_s` are the seconds of the first step in a new process, including compilation.
@@ -163,14 +170,14 @@ class MethodRecord(Line):
     method: Method
     parameter: str
     status: BenchStatus
-    repeats: int = 0
-    step_s: float | None = None
+    step_s: float | None = field(default=None, metadata=_column("step s", 8))
+    repeats: int = field(default=0, metadata=_column("steps", 5))
     cold_s: float | None = None
-    relative_rmse: float | None = None
+    relative_rmse: float | None = field(default=None, metadata=_column("error", 8))
     reference_rmse: float | None = None
-    slope: Range | None = None
-    efficiency: Range | None = None
-    bias_z: float | None = None
+    slope: Range | None = field(default=None, metadata=_column("slope", 20))
+    efficiency: Range | None = field(default=None, metadata=_column("efficiency", 24))
+    bias_z: float | None = field(default=None, metadata=_column("max |z| (limit)", 16))
     bias_z_limit: float | None = None
     bias: float | None = None
     bias_reference: str | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import fields
 
 from reslrb_cli.measure.bench import BenchResult
 from reslrb_cli.measure.convergence.judgement import ConvergenceResults
@@ -173,14 +174,16 @@ def _limited(value: float | None, limit: float | None, spec: str) -> str:
 #: Maximum width of a parameter key.
 KEY_WIDTH = 28
 
+#: Figures of a method with a column of their own.
+FIGURES = [figure for figure in fields(MethodRecord) if "title" in figure.metadata]
+
 
 def method_columns(labels: Sequence[str], parameters: Sequence[str]) -> Columns:
     """Return the columns of the table. The first two columns fit `labels` and `parameters`."""
-    figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)")
-    titles = ("", "parameter", *figures, *(f"s to {target:.0%}" for target in TARGETS))
+    titles = ("", "parameter", *(figure.metadata["title"] for figure in FIGURES), *(f"s to {t:.0%}" for t in TARGETS))
     names = max(len(shorten(key, KEY_WIDTH)) for key in ("parameter", *parameters))
-    widths = (max(map(len, labels), default=0), names, 8, 5, 8, 20, 24, 16) + (9,) * len(TARGETS)
-    return Columns(titles, widths, "<<>")
+    figures = (figure.metadata["width"] for figure in FIGURES)
+    return Columns(titles, (max(map(len, labels), default=0), names, *figures, *(9 for _ in TARGETS)), "<<>")
 
 
 def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[str, ...]:
@@ -188,14 +191,17 @@ def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[st
     named = (record.method.label, shorten(parameter or record.parameter, KEY_WIDTH))
     if record.relative_rmse is None:
         return *named, record.message if record.status is BenchStatus.OK else record.status.value
-    return (
-        *named, number(record.step_s, 3), str(record.repeats), number(record.relative_rmse, 3), _range(record.slope),
-        _range(record.efficiency), _deviation(record), *(_seconds(record, f"{target:g}") for target in TARGETS),
-    )  # fmt: skip
+    figures = (_figure(record, figure.name) for figure in FIGURES)
+    return *named, *figures, *(_seconds(record, f"{target:g}") for target in TARGETS)
 
 
-def _range(value: Range | None) -> str:
-    return "" if value is None else interval(value.value, value.low, value.high, 3)
+def _figure(record: MethodRecord, name: str) -> str:
+    value = getattr(record, name)
+    if name == "bias_z":
+        return _deviation(record)
+    if isinstance(value, Range):
+        return interval(value.value, value.low, value.high, 3)
+    return number(value, 3) if value is None or isinstance(value, float) else str(value)
 
 
 def _deviation(record: MethodRecord) -> str:

@@ -132,10 +132,7 @@ def test_a_failing_case_gives_its_reason(tmp_path: Path, capsys: pytest.CaptureF
         ),
         (["--memory-limit", "2GiB"], "--memory-limit was removed; the shell's `ulimit -v KIB` limits every process"),
         (["--max-depth", "1"], "--max-depth"),
-        (
-            ["--sweep", "film"],
-            "`film` was removed; change sizes with --set, and call bench once for each size",
-        ),
+        (["--sweep", "film"], "'film' is not one of 'depth', 'spp'"),
         (["--integrators", "pt"], "--integrators pt: integrator.type"),
         (["--json", "no/such/folder.json"], "--json: cannot write"),
         (["--plot", "a.png"], "--plot was removed; `reslrb report FILE -o page.html` plots results of --json FILE"),

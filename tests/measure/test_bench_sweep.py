@@ -12,11 +12,11 @@ from measure.pretended_steps import Pretended
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.arena import MAX_ROUNDS, MIN_ROUNDS, Pace
+from reslrb_cli.measure.arena import MAX_ROUNDS, MIN_ROUNDS, NO_TIME, Pace
 from reslrb_cli.measure.bench import Bench, BenchResult
 from reslrb_cli.measure.methods import Sweep, depths, parse_cases, sample_counts
 from reslrb_cli.measure.processes import Refused, Stopped
-from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.records.measurement_files import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
 from reslrb_cli.report.tables import bench_cells, bench_columns
 
@@ -185,36 +185,15 @@ def test_pace_divides_the_budget() -> None:
 def test_the_budget_covers_compilation(budget_s: float, measured: dict[int, list[str]], left: list[str]) -> None:
     """The first step of a method takes 30 s, and each later step takes 0.1 s. The step in progress ends when the budget
     is spent.
-
-    As soon as a method has compiled, the message names a budget for all measurements, and that budget is enough.
     """
     found, said, seconds = spent(budget_s)
     assert found == measured
-    assert [line.partition("; allow more")[0] for line in said] == [
-        f"not measured: {what}: the budget was spent" for what in left
-    ]
+    assert said == [f"not measured: {what}: {NO_TIME}" for what in left]
     assert seconds < budget_s + 0.5
-    if found and left:
-        enough = float(said[0].partition("everything takes about ")[2].removesuffix(" s"))
-        assert budget_s < enough < 260
-        assert spent(enough)[0] == {2: LIST.split(","), 4: LIST.split(",")}
-    elif left:
-        assert said[0].endswith("; nothing had compiled by then, so allow several times as much")
 
 
-def test_the_named_budget_includes_the_time_before_the_session() -> None:
-    """A command imports packages and checks its arguments before the session starts."""
-    (found, [line], _), (_, [without], _) = spent(170.0, before_s=40.0), spent(130.0)
-    enough, less = (float(said.partition("about ")[2].removesuffix(" s")) for said in (line, without))
-    assert enough == less + 40.0
-    assert found == {2: LIST.split(","), 4: ["ptracer"]}
-    assert spent(enough, before_s=40.0)[0] == {2: LIST.split(","), 4: LIST.split(",")}
-
-
-def spent(budget_s: float, before_s: float = 0.0) -> tuple[dict[int, list[str]], list[str], float]:
-    """Return the measured methods for each depth, the messages, and the time of a session with this budget. The command
-    takes `before_s` before the session.
-    """
+def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
+    """Return the measured methods for each depth, the messages, and the time of a session with this budget."""
     now = [0.0]
 
     class Slow(Pretended):
@@ -225,7 +204,7 @@ def spent(budget_s: float, before_s: float = 0.0) -> tuple[dict[int, list[str]],
                     raise Stopped
             return super().answer(stop)
 
-    rows, said = play(sweep(rounds=None, budget_s=budget_s), Slow, now=lambda: now[0], spent_s=before_s)
+    rows, said = play(sweep(rounds=None, budget_s=budget_s), Slow, now=lambda: now[0])
     found: dict[int, list[str]] = {}
     for row in rows:
         found.setdefault(row.record.max_depth, []).append(row.case.label)

@@ -22,13 +22,13 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import Plan, Sweep, parse_cases
+from reslrb_cli.measure.methods import kept_settings as measured_as
 from reslrb_cli.measure.participants import CheckSettings
-from reslrb_cli.measure.resume_store import first_difference
-from reslrb_cli.measure.resume_store import settings as measured_as
 from reslrb_cli.measure.sampling import settings as sampled_as
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune.sampling import situation
 from reslrb_cli.records.decisions import DecisionCache, key_of
+from reslrb_cli.records.measurement_files import first_difference
 from reslrb_cli.runs.sweep import make_plan, resumed, started
 from reslrb_cli.scene.files import files_of
 

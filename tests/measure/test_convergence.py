@@ -15,6 +15,7 @@ from scipy import stats
 from turns import a_few
 
 from reslrb_cli.config.loader import load
+from reslrb_cli.measure.convergence import setup
 from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement, MethodSamples, ReferenceMean
 from reslrb_cli.measure.convergence.session import Role
 from reslrb_cli.measure.convergence.setup import Sampler, survey
@@ -351,8 +352,13 @@ def problem(folder: Path, *changes: tuple[str, str], overrides: tuple[str, ...] 
     return assemble_scene(load(folder / "tiny.yaml", list(overrides)))
 
 
+@pytest.fixture(autouse=True)
+def _few_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(setup, "PATHS", dict.fromkeys(setup.PATHS, 2**16))
+
+
 def asked(what: Any, objective: str = "fixed", camera: bool = False, named: bool = True) -> Any:
-    return survey(what, objective, camera=camera, named=named, budget_s=0.1)
+    return survey(what, objective, camera=camera, named=named)
 
 
 def test_facts(tmp_path: Path) -> None:

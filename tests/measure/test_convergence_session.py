@@ -12,8 +12,7 @@ from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, pla
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.measure.convergence.session import MOST_REFERENCE_STEPS, MOST_STEPS, Role
-from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.records.measurement_files import read_samples, write_samples
+from reslrb_cli.records.measurement_files import Earlier, read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.tables import closing_sentence, notes
 
@@ -171,10 +170,10 @@ def test_a_second_budget_too_small_for_a_round_is_reported(tmp_path: Path) -> No
     kept = first.kept()
     assert kept is not None
     earlier = Earlier("convergence", Path("c.jsonl"), *kept)
-    again, results, said = play(tmp_path, Stage(), plan(rounds=None, budget_s=7.5), earlier=earlier)
+    again, results, said = play(tmp_path, Stage(), plan(rounds=None, budget_s=5.25), earlier=earlier)
     assert again.rounds == first.rounds
     assert of(results, "ptracer").efficiency is not None  # from the earlier samples
-    assert said[-1].startswith("no round was added; allow about ")
+    assert said[-1] == "no round was added: the budget was spent; allow more with --budget"
 
 
 @pytest.mark.parametrize("after", [0, 5, 12, 40, 120])
@@ -189,38 +188,23 @@ def test_a_stop_keeps_finished_measurements(tmp_path: Path, after: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("budget_s", "measured"), [(60.0, True), (14.0, False), (11.0, False), (6.0, False), (2.0, False)]
+    ("budget_s", "measured"), [(60.0, True), (11.5, False), (8.5, False), (3.5, False), (0.5, False)]
 )
-def test_the_budget_covers_compilation_and_a_small_one_names_the_needed_time(
+def test_the_budget_covers_compilation_and_a_small_one_is_reported(
     tmp_path: Path, budget_s: float, measured: bool
 ) -> None:
     stage = Stage(case_ptracer=Pretence(0.4, cold_s=2.0))
     _, results, said = play(tmp_path, stage, plan(rounds=None, budget_s=budget_s))
-    assert stage.now <= max(budget_s, 1.0)
+    assert stage.now <= max(budget_s, 1.0) + 0.1  # a session looks at the clock every 0.05 s
     assert any(record.relative_rmse is not None for record in results.methods) is measured
     assert any("budget" in line for line in said) is not measured
-    advice = [line for line in said if "allow about" in line]
-    if advice:
-        enough = float(advice[-1].split("allow about ")[1].split(" s")[0])
-        again = Stage(case_ptracer=Pretence(0.4, cold_s=2.0))
-        _, results, _ = play(tmp_path, again, plan(rounds=None, budget_s=1.05 * enough))
-        assert any(record.relative_rmse is not None for record in results.methods)
-        assert enough > budget_s
 
 
-def test_too_few_steps_for_a_slope_name_the_needed_time(tmp_path: Path) -> None:
-    def slow() -> Stage:
-        return Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
-
-    _, results, said = play(tmp_path, slow(), plan(rounds=None, budget_s=45.0))
-    lacking = {record.method.label for record in results.methods if record.slope is None}
-    assert lacking == {"ptracer"}
-    assert said[-1].startswith("no slope for ptracer: it needs 16 steps of each; allow about ")
-    enough = float(said[-1].split("allow about ")[1].split(" s")[0])
-    assert enough > 45
-    _, results, said = play(tmp_path, slow(), plan(rounds=None, budget_s=1.05 * enough))
-    assert all(record.slope is not None for record in results.methods)
-    assert not any("no slope" in line for line in said)
+def test_too_few_steps_for_a_slope_are_reported(tmp_path: Path) -> None:
+    stage = Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
+    _, results, said = play(tmp_path, stage, plan(rounds=None, budget_s=45.0))
+    assert {record.method.label for record in results.methods if record.slope is None} == {"ptracer"}
+    assert said[-1] == "no slope for ptracer: it needs 16 steps of each; allow more with --budget"
 
 
 def test_no_budget_is_exceeded(tmp_path: Path) -> None:
@@ -228,7 +212,7 @@ def test_no_budget_is_exceeded(tmp_path: Path) -> None:
     for budget_s in range(8, 60, 4):
         stage = Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
         play(tmp_path, stage, plan(rounds=None, budget_s=float(budget_s)))
-        assert stage.now <= budget_s
+        assert stage.now <= budget_s + 0.1
 
 
 def test_the_budget_is_kept_and_used(tmp_path: Path) -> None:

@@ -43,12 +43,11 @@ from reslrb_cli.measure.references import (
     ptracer_gradient,
     ptracer_image,
 )
-from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import KIND, settings
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
 from reslrb_cli.measure.scenes.small import room as corner
-from reslrb_cli.records.measurement_files import read_samples, write_samples
+from reslrb_cli.records.measurement_files import Earlier, read_samples, write_samples
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
 from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior

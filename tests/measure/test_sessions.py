@@ -18,17 +18,16 @@ from measure.test_bench_sweep import CONFIG, sweep
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure import resume_store, sampling
+from reslrb_cli.measure import sampling
 from reslrb_cli.measure.bench import Bench
 from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.gradients import Direction
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.participants import CheckSettings
-from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import FEWEST, KIND, LEAST_SEEDS, MOST_SEEDS, Name, Sampling
 from reslrb_cli.measure.sampling import settings as sampled_as
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurement_files import Earlier, Kept, program
 from reslrb_cli.records.measurements import Reference
 
 # Gradcheck: participants whose samples cost seconds of the tests' own clock.
@@ -141,18 +140,6 @@ def test_a_second_budget_adds_new_seeds_and_is_kept() -> None:
     assert ("differences", "a") not in before or ("choose", "a") not in participants.known
 
 
-@pytest.mark.parametrize("budget_s", [12.0, 30.0])
-def test_a_too_small_budget_names_the_time_of_the_fewest_seeds(budget_s: float) -> None:
-    made = spend(budget_s).made
-    assert any(len(made._samples.get(name, ())) < FEWEST for name in NAMES)
-    needed_s = made.needed_s()
-    assert needed_s is not None
-    assert needed_s > budget_s
-    enough = spend(1.3 * needed_s)
-    assert {name: len(enough.made._samples[name]) >= FEWEST for name in NAMES} == dict.fromkeys(NAMES, True)
-    assert enough.seconds <= 1.3 * needed_s
-
-
 # All kinds of sessions: what an earlier session has taken is not taken again, and only the same measurement continues.
 
 
@@ -244,6 +231,6 @@ def test_samples_of_other_code_are_not_continued(monkeypatch: pytest.MonkeyPatch
     earlier = Earlier(KIND, Path("g.jsonl"), *gradcheck(tmp_path).kept)
     read_bytes = Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda path: read_bytes(path) + b" " * (path.name == "stack.py"))
-    changed = {"versions": resume_store.program.__wrapped__()}
+    changed = {"versions": program.__wrapped__()}
     with pytest.raises(ConfigError, match=r"versions\.code is \w+ there, \w+ here; remove the file"):
         earlier.check(check_settings() | changed)

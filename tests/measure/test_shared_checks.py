@@ -17,10 +17,9 @@ from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.participants import CheckSettings, settings_of
-from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import KIND
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurement_files import Earlier, Kept
 
 checks = pytest.importorskip("reslrb_cli.cluster.checks", reason="pip install reslrb[cluster]", exc_type=ImportError)
 

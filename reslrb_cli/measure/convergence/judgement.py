@@ -416,7 +416,9 @@ class Judgement:
         if not self._has_figures(member, key):
             reason = member.message or ("" if member.end is None else member.end.reason)
             reason = reason or ("the budget was spent" if member.late or not self._measured(member) else _UNSEEN)
-            return MethodRecord(member.method, key, status, len(member.rows), cold_s=member.cold_s, message=reason)
+            return MethodRecord(
+                member.method, key, status, repeats=len(member.rows), cold_s=member.cold_s, message=reason
+            )
         samples, biased = self._samples(member, key), bias.biased is True
         magnitude = samples
         if biased and references is not None and references[key].biased and key != ALL:

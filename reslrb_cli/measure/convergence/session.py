@@ -6,6 +6,7 @@ from the steps of an earlier one, with the same dL/dI.
 
 from __future__ import annotations
 
+import contextlib
 import enum
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,14 +17,13 @@ import numpy as np
 
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
-from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.arena import Arena, Contestant
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.arena import MORE, NO_TIME, Arena, Contestant
 from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Ended
-from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.records.measurement_files import Kept
-from reslrb_cli.records.measurements import Method
+from reslrb_cli.measure.processes import Ended, Refused
+from reslrb_cli.records.measurement_files import Earlier, Kept, kept
+from reslrb_cli.records.measurements import BenchStatus, Method
 
 #: The module of the functions that processes run.
 SETUP = "reslrb_cli.measure.convergence.setup"
@@ -166,12 +166,14 @@ def _fitting(turn_s: float, step_s: float, least: int, most: int) -> int:
 class Session(Arena[Plan, Member, int]):
     """Running processes and their samples (see `Arena`).
 
-    `judges` maps names of independent stock integrators to their members.
+    `judges` maps names of independent stock integrators to their members. `facts` are those of `survey`, which an
+    additional process, the referee, finds before the members start. If the referee fails, nothing is measured.
     """
 
     def _set_up(self, earlier: Earlier | None) -> int:
         self.rounds = self._before = 0 if earlier is None else earlier.head["rounds"]
         self.judges: dict[str, Member] = {}
+        self.facts: dict[str, Any] = {}
         return 1
 
     def slices(self) -> dict[str, slice]:
@@ -188,7 +190,7 @@ class Session(Arena[Plan, Member, int]):
             self._begin()
             self._warm_up_all()
             yield from self._take_turns()
-        self._say_what_it_takes()
+        self._say_what_lacks()
 
     def kept(self) -> Kept | None:
         """Return the data for a later session, or None if nothing has been sampled.
@@ -198,14 +200,14 @@ class Session(Arena[Plan, Member, int]):
         """
         if not self.rounds or not any(member.rows for member in self.members):
             return None
-        entries, samples = [], dict[resume_store.Name, Any]()
+        entries, samples = [], dict[tuple[str, ...], Any]()
         for member in self.members:
             entry, samples[("rows", member.name)] = member.kept(self.rounds)
             entries.append(entry)
         with np.load(self._arrays) as survey:
             samples |= {("survey", name): survey[name] for name in survey.files}
         content = {"facts": self.facts, "rounds": self.rounds, "members": entries}
-        return resume_store.kept(self.plan.KIND, self.settings, samples, **content)
+        return kept(self.plan.KIND, self.settings, samples, **content)
 
     def _restore(self, earlier: Earlier) -> None:
         """Give the members their earlier steps. Raises ConfigError if they differ."""
@@ -234,25 +236,36 @@ class Session(Arena[Plan, Member, int]):
             self.facts = self._earlier.head["facts"]
             return True
         first = plan.first(plan.reference_config) | {"arrays": str(self._arrays), "objective": plan.objective}
-        self._referee, answer = Contestant(process=self._start(first, f"{SETUP}:begin_survey"), may_refuse=False), None
-        if self._ask_referee(plan) is not None:
-            ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
-            answer = self._ask_referee(plan, {"out": first["arrays"], "ask": ask})
-        self._referee.close()
+        answer, referee = None, Contestant(process=self._start(first, f"{SETUP}:begin_survey"), may_refuse=False)
+        with contextlib.closing(referee):
+            if self._open(referee) is not None:
+                referee.process.ask({"out": first["arrays"], "ask": plan.camera})
+                answer = self._answer(referee, self._pace.over)
+        if referee.end is not None:
+            memory = referee.end.status is BenchStatus.OUT_OF_MEMORY
+            code = ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
+            raise Refused(f"--reference {plan.reference.label}: {referee.end.reason}", code)
         self.facts = answer or {}
         if answer is None:
-            self._say(
-                f"the budget of {plan.budget_s:g} s was spent before dL/dI was known; allow several times as much"
-            )
+            self._say(f"dL/dI was not computed: {NO_TIME}")
         return answer is not None
+
+    def _why_not(self, case: Case) -> str | None:
+        """Return why a method of the default list is left out, or None if it takes part."""
+        if not self.plan.default:
+            return None
+        if self.facts["paths"] == "light" and case.options.get("paths", "light") != "light":
+            return "this scene has only light paths"
+        reason: str | None = self.facts["without"].get(case.type)
+        return reason
 
     def _begin(self) -> None:
         plan, facts = self.plan, self.facts
-        for case in plan.cases:
-            if (reason := self._without(case)) is not None:
-                self._say(f"left out: {case.label}: {reason}")
+        left_out = {case.label: reason for case in plan.cases if (reason := self._why_not(case)) is not None}
+        for label, reason in left_out.items():
+            self._say(f"left out: {label}: {reason}")
         for case, spp in plan.entries:
-            if self._without(case) is None:
+            if case.label not in left_out:
                 self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
         reference = plan.settled_reference(facts["paths"])
         known = reference.at(plan.config, plan.config.integrator.max_depth, True)
@@ -318,7 +331,8 @@ class Session(Arena[Plan, Member, int]):
         alive = self._alive()
         if not {Role.CASE, Role.REFERENCE} <= {member.role for member in alive}:
             return
-        if not self._pace.fits(self._fewest * self._round_s):
+        round_s = sum(member.count * member.step_s for member in alive)
+        if not self._pace.fits(max(FEWEST - self._before, 1) * round_s):
             return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
@@ -327,48 +341,14 @@ class Session(Arena[Plan, Member, int]):
             self.rounds = now
             yield now
 
-    @property
-    def _fewest(self) -> int:
-        """Minimum number of rounds of this session."""
-        return max(FEWEST - self._before, 1)
-
-    @property
-    def _round_s(self) -> float:
-        """Seconds of a round with warm members."""
-        return sum(member.count * member.step_s for member in self._alive())
-
-    def _say_what_it_takes(self) -> None:
-        """Print a sufficient budget if the actual budget did not suffice for figures or for slopes."""
-        late = [member for member in self.members if member.late]
-        taken = self.rounds - self._before
-        if taken >= self._fewest and not late:
-            self._say_what_slopes_take()
-            return
+    def _say_what_lacks(self) -> None:
+        """Print which results need more time than the budget allowed."""
+        late = [member.label for member in self.members if member.late]
+        few = [m.label for m in self.of(Role.CASE) if m.alive and 0 < len(m.rows) < FEWEST_FOR_SLOPE]
         if late:
-            names = ", ".join(member.label for member in late)
-            self._say(f"not measured: {names}: the budget of {self.plan.budget_s:g} s was spent")
-        warm = self._alive()
-        if late and not warm:
-            advice = "allow several times as much with --budget, or name fewer --integrators"
-            self._say(f"nothing had compiled by then: {advice}")
-        if not warm or self.plan.rounds is not None:
-            return
-        # Kernels that are not compiled yet are assumed to take as long as the compiled ones.
-        needed = self._budget_of(self._fewest, share=1 + len(late) / len(warm))
-        advice = f"allow about {needed:.0f} s with --budget, name fewer --integrators, or use a smaller film"
-        fact = f"results need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
-        self._say(f"{fact}; {advice}")
-
-    def _say_what_slopes_take(self) -> None:
-        few = [m for m in self.of(Role.CASE) if m.alive and 0 < len(m.rows) < FEWEST_FOR_SLOPE]
-        if not few or self.plan.rounds is not None:
-            return
-        rounds = max(-(-FEWEST_FOR_SLOPE // m.count) for m in few) - self._before
-        names, needed = ", ".join(member.label for member in few), self._budget_of(rounds)
-        advice = f"allow about {needed:.0f} s with --budget, or use fewer samples per step with --spp"
-        self._say(f"no slope for {names}: it needs {FEWEST_FOR_SLOPE} steps of each; {advice}")
-
-    def _budget_of(self, rounds: int, share: float = 1.0) -> float:
-        """Return the budget in seconds for `rounds` rounds of this session. `share` scales the measured work."""
-        before = self._now() - self._began - (self.rounds - self._before) * self._round_s
-        return (share * (before + rounds * self._round_s) + self.AFTERWARDS_S) / (1 - self.AFTERWARDS)
+            self._say(f"not measured: {', '.join(late)}: {NO_TIME}")
+        elif self.plan.rounds is None and self.rounds - self._before < max(FEWEST - self._before, 1):
+            lacking = f"results need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
+            self._say(f"{lacking}: {NO_TIME}")
+        elif self.plan.rounds is None and few:
+            self._say(f"no slope for {', '.join(few)}: it needs {FEWEST_FOR_SLOPE} steps of each; {MORE}")

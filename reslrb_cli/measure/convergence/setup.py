@@ -4,7 +4,6 @@ member (`Sampler`).
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -31,17 +30,8 @@ from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
 from reslrb_cli.seeds import seed
 
-#: Light paths of the target, and of all images with a fixed dL/dI together, without a time limit.
+#: Light paths of the target, and of all images with a fixed dL/dI together.
 PATHS = {"fixed": 2**21, "loss": 2**23}
-
-#: Their maximum with a time limit.
-MOST_PATHS = 2**24
-
-#: Share of the time for the target and the images.
-SHARE = {"fixed": 0.1, "loss": 0.25}
-
-#: Light paths for measuring their speed.
-TRIAL = 2**16
 
 #: Purpose of the samples of these images.
 _PURPOSE = "convergence, dL/dI"
@@ -62,7 +52,7 @@ def begin_survey(first: dict[str, Any]) -> Begun:
 
 
 def survey(
-    problem: Problem, objective: str, camera: bool, named: bool, budget_s: float | None, light: bool = True
+    problem: Problem, objective: str, camera: bool, named: bool, light: bool = True
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the facts of a problem that has no targets, and the arrays that the problem's samples need.
 
@@ -80,7 +70,7 @@ def survey(
     The arrays are `mask` (H, W, 1), the first view's `target_arrays`, and `adjoints` (B, H, W, C). If the image is the
     objective, `mask` is the only array. `camera` is true if some method may have camera paths. These methods take part
     if `named`, or if `prb` is valid for some key. Images with camera paths have no dark film border. `light` is true if
-    methods with a dark film border take part. `budget_s` is the time of the whole measurement, if it is limited.
+    methods with a dark film border take part.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
@@ -95,7 +85,7 @@ def survey(
     facts |= {"masked": not inside.all(), "pictures": "", "pixels": pixels}
     if objective == "image":
         return facts | {"shapes": {"image": [height, width, int(film.base_channels_count())]}}, {"mask": mask}
-    paths = PATHS[objective] if budget_s is None else affordable_paths(problem, pixels, SHARE[objective] * budget_s / 2)
+    paths = PATHS[objective]
     problem, shortened = shorten_target(problem, paths // pixels)
     problem = make_targets(problem, lambda line: None)
     count = IMAGES if objective == "loss" else 1
@@ -155,19 +145,6 @@ def _unlike(config: Config) -> str | None:
     if all(options.get(name, value) == value for name, value in alike.items()):
         return None
     return "its attached derivatives are those of " + ", ".join(f"{name}: {value}" for name, value in alike.items())
-
-
-def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
-    """Return the number of light paths that can be traced in `seconds` seconds. The number of paths is a power of 2, so
-    similar machines have the same images.
-    """
-    spp = multiple_of(TRIAL // pixels, problem.samples_per_pass)
-    for _ in range(2):  # the first one compiles kernels
-        began = time.perf_counter()
-        problem.render(problem.sensors[0], spp, 0, "convergence, trial")
-        taken = time.perf_counter() - began
-    paths = pixels * spp * seconds / max(taken, 1e-6)
-    return 2 ** int(np.log2(np.clip(paths, TRIAL, MOST_PATHS)))
 
 
 def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:

@@ -19,16 +19,15 @@ from reslrb_cli.estimators.gather import Gathering, Taking
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import gradient_step
-from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.gradients import Case, extrapolated, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
 from reslrb_cli.measure.methods import parse_cases, records_of
 from reslrb_cli.measure.references import Situation, prb_image
-from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.scenes.analytic import KnownScene
 from reslrb_cli.measure.scenes.moving import Move, moving_case
-from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurement_files import Earlier, Kept, program
+from reslrb_cli.records.measurement_files import kept as kept_content
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
 Scene = Callable[[], dict]
@@ -262,7 +261,7 @@ def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, 
         "--seeds": "as the cases have it" if seeds is None else seeds,
         "variant": variant,
         "device": device,
-        "versions": resume_store.program(),
+        "versions": program(),
     }
 
 
@@ -281,7 +280,7 @@ def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckReco
     if not cases:
         return None
     rows = {case: [asdict(record) for record in records] for case, records in cases.items()}
-    return resume_store.kept(KIND, settings, None, cases=rows)
+    return kept_content(KIND, settings, None, cases=rows)
 
 
 #: Number of comparisons for the correction of all z scores of the suite; slightly more than it has.
