@@ -280,21 +280,17 @@ def convergence(
     with called() as stop:
         config = load(experiment)
         config = config.with_code(allow_code or config.allows_code)
-        from reslrb_cli.measure.convergence.judgement import Judgement
-        from reslrb_cli.measure.convergence.session import Session
-        from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of
+        from reslrb_cli.measure.convergence import Session
+        from reslrb_cli.measure.judgement import Judgement
+        from reslrb_cli.measure.methods import Plan
         from reslrb_cli.report.tables import result_lines
 
-        if objective not in DEFAULTS:
-            raise ConfigError("objective", "", f"is {objective!r}; there are {', '.join(DEFAULTS)}")
         for option, count in [("rounds", rounds), *(("spps", each) for each in spps)]:
             if count is not None and count < 1:
                 raise ConfigError(option, "", f"is {count}; at least 1 is needed")
-        plan = Plan(
-            **machine_of(config), **compared(integrators, reference, DEFAULTS[objective]), config=config,
-            objective=objective, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps)),
-        )  # fmt: skip
-        plan.check()
+        plan = Plan.of(
+            config, objective, integrators, reference, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps))
+        )
         with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
             spent_s = time.monotonic() - began
             session = Session(plan, Path(name), stop, logger.info, spent_s=spent_s)

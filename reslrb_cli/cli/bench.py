@@ -120,19 +120,19 @@ def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[Bench
             if row.reason:
                 notes.append(f"{sweep.name(row.value)}, {row.case.label}: {row.reason}")
 
-    def lines(done: bool | None = None) -> list[BenchRecord]:
-        return [row.record for row in session.results(done)]
+    def lines() -> list[BenchRecord]:
+        return [row.record for row in session.results()]
 
     say = logging.getLogger(__name__).info
-    with measuring(Bench, sweep, json_file, began, "round", say) as (session, interrupts):
-        keeper = Keeper(json_file, origin_of(sweep.variant), lambda: lines(True), lambda: lines(False), session.kept)
+    with measuring(Bench, sweep, json_file, began, say) as (session, interrupts):
+        keeper = Keeper(json_file, origin_of(sweep.variant), lines, session.kept)
         echo(_conditions(sweep.config, sweep))
         echo(table.head())
-        show(session.results(True))
+        show([row for row in session.results() if row.value in session.done])
         for rows in session.run():
             show(rows)
             keeper.refresh()
-        keeper.finish(lines())
+        keeper.finish()
         for note in notes:
             echo(note)
         return session.results(), interrupts.requested

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,10 +25,9 @@ from reslrb_cli.config.optimizers import loss_words
 from reslrb_cli.report.format import WITHOUT_BORDER, Columns
 
 if TYPE_CHECKING:
-    from reslrb_cli.measure.convergence.judgement import ConvergenceResults
-    from reslrb_cli.measure.convergence.session import Session
+    from reslrb_cli.measure.convergence import Session
+    from reslrb_cli.measure.judgement import ConvergenceResults
     from reslrb_cli.measure.methods import Plan
-    from reslrb_cli.records.measurements import MethodRecord
 
 
 @dataclass(frozen=True)
@@ -75,23 +73,16 @@ def command(**given: Any) -> int:
     from reslrb_cli.config.loader import check_code
 
     load_packages()  # before the imports below need them
-    from reslrb_cli.measure.methods import DEFAULTS, Plan, compared, machine_of
+    from reslrb_cli.measure.methods import Plan
 
     config, objective, json_file = options.config(), options.objective, options.json_file
     if objective == "loss":
         check_code(config)
-    named = compared(options.integrators, options.reference, DEFAULTS[objective])
     check_writable("--json", json_file)
-    plan = Plan(
-        **machine_of(config),
-        **named,
-        config=config,
-        objective=objective,
-        budget_s=options.budget,
-        rounds=options.rounds,
+    plan = Plan.of(
+        config, objective, options.integrators, options.reference, budget_s=options.budget, rounds=options.rounds,
         spps=options.spps or (),
-    )
-    plan.check()
+    )  # fmt: skip
     results, interrupted = _run(plan, json_file, began)
     done = any(record.relative_rmse is not None for record in results.methods)
     return exit_code(interrupted, done, {record.status for record in results.methods})
@@ -99,8 +90,8 @@ def command(**given: Any) -> int:
 
 def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write. Return the results, and True if the user interrupted."""
-    from reslrb_cli.measure.convergence.judgement import Judgement
-    from reslrb_cli.measure.convergence.session import Role, Session
+    from reslrb_cli.measure.convergence import Role, Session
+    from reslrb_cli.measure.judgement import Judgement
     from reslrb_cli.report.tables import (
         closing_sentence,
         method_cells,
@@ -109,9 +100,9 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
         result_lines,
     )
 
-    with measuring(Session, plan, json_file, began, "round") as (session, interrupts):
+    with measuring(Session, plan, json_file, began) as (session, interrupts):
         origin = origin_of(plan.variant)
-        keeper = Keeper(json_file, origin, lambda: [], lambda: result_lines(Judgement(session).results()), session.kept)
+        keeper = Keeper(json_file, origin, lambda: result_lines(Judgement(session).results()), session.kept)
         table: Columns | None = None
         for rounds in session.run():
             keeper.refresh()
@@ -125,36 +116,25 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
             for member in session.of(Role.CASE):
                 if judgement.ready and member.refusal is None:
                     echo(table.line(method_cells(judgement.overall(member), f"{rounds} rounds")))
+        keeper.finish()
         results = Judgement(session).results()
-        keeper.finish(result_lines(results))
         table = _table(session)
         echo(table.head())
-        shown = _shown(results.methods)
         for record in results.methods:
-            if record.parameter in shown:
-                echo(table.line(method_cells(record)))
-        for stood in results.references:
-            if stood.parameter in shown:
-                echo(reference_line(stood))
-        for note in notes([record for record in results.methods if record.parameter in shown]):
-            echo(note)
+            echo(table.line(method_cells(record)))
+        for line in [*map(reference_line, results.references), *notes(results.methods)]:
+            echo(line)
         echo(closing_sentence(results.methods))
         return results, interrupts.requested
 
 
 def _table(session: Session) -> Columns:
     """Return a table with columns that fit the finished and the expected results of the session."""
-    from reslrb_cli.measure.convergence.session import Role
+    from reslrb_cli.measure.convergence import Role
     from reslrb_cli.report.tables import method_columns
 
     labels = [member.label for member in session.of(Role.CASE)]
     return method_columns(labels, [*session.facts.get("shapes", ()), "999 rounds"])
-
-
-def _shown(records: Sequence[MethodRecord]) -> list[str]:
-    """Return the parameters to show; `all` is left out if there is only one parameter."""
-    keys = list(dict.fromkeys(record.parameter for record in records))
-    return [key for key in keys if key != "all"] if len(keys) == 2 else keys
 
 
 def _conditions(plan: Plan, session: Session) -> str:

@@ -41,7 +41,7 @@ from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.measure.methods import PATHS_OPTIONS, kept_settings, parse_checked
-from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
+from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.gradcheck import CheckResult, Gradcheck
@@ -95,16 +95,11 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
     to_keep = kept_settings(config, {}, variant, device_name(variant), spp=spp)
     check = MissingCheck(config, options.budget, seeds, spp, read_earlier(KIND, json_file, to_keep))
     echo(check.conditions())
-    records: list[MissingRecord] = []
-    keeper = Keeper(
-        json_file, origin_of(variant), lambda: records, lambda: check.known()[len(records) :],
-        lambda: check.kept(to_keep),
-    )  # fmt: skip
+    keeper = Keeper(json_file, origin_of(variant), check.known, lambda: check.kept(to_keep))
     with Interrupts() as interrupts:
         for record in check.run(lambda: interrupts.requested, keeper.refresh):
-            records.append(record)
             echo(record.line())
-        keeper.finish(check.known())
+        keeper.finish()
         return ExitCode.INTERRUPTED if interrupts.requested else ExitCode.DONE
 
 
@@ -137,7 +132,7 @@ def run_suite(options: GradcheckOptions, place: Place | None) -> int:
     def lines() -> list[GradcheckRecord]:
         return [record for rows in done.values() for record in rows]
 
-    keeper = Keeper(json_file, origin_of(variant), lines, lambda: [], lambda: suite.kept(to_keep, done))
+    keeper = Keeper(json_file, origin_of(variant), lines, lambda: suite.kept(to_keep, done))
     work = [(name, chosen, seeds) for name in to_do]
     with contextlib.ExitStack() as stack:
         run: Callable[..., Any] = serially
@@ -154,7 +149,7 @@ def run_suite(options: GradcheckOptions, place: Place | None) -> int:
             keeper.refresh()
             echo(_case_line(name, rows))
         interrupted = interrupts.requested
-        keeper.finish(lines())
+        keeper.finish()
     for line in summary_lines(lines()):
         echo(line)
     return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
@@ -294,7 +289,7 @@ def _run(
     records: list[GradcheckRecord] = []
     drawn = False
     folder, origin = options.images, origin_of(variant)
-    keeper = Keeper(options.json_file, origin, lambda: records, lambda: [], lambda: check.sampling.kept(to_keep))
+    keeper = Keeper(options.json_file, origin, lambda: records, lambda: check.sampling.kept(to_keep))
     with Interrupts() as interrupts:
         table = gradcheck_columns(check.expected())
         echo(table.head())
@@ -305,7 +300,7 @@ def _run(
                 echo(table.line(cells(result.record)))
             _draw(result, folder)
             drawn = drawn or result.maps is not None
-        keeper.finish(records)
+        keeper.finish()
     if folder is not None and drawn:
         echo(f"look at {os.path.relpath(folder)}")
     return records, interrupts.requested

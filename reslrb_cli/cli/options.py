@@ -53,23 +53,21 @@ def origin_of(variant: str) -> Origin:
 class Keeper:
     """Writer of a JSON file and of a file of samples. If the process is killed, only seconds of work are lost.
 
-    `origin` is the first line. `final` returns the lines that will not change. `provisional` returns the current state
-    of all other lines. `kept` returns the data for a later session, or None if there is none yet. Without a file, the
-    writer does nothing.
+    `origin` is the first line. `lines` returns the current state of all other lines. `kept` returns the data for a
+    later session, or None if there is none yet. Without a file, the writer does nothing.
     """
 
     def __init__(
         self,
         json_file: Path | None,
         origin: Line,
-        final: Callable[[], Sequence[Line]],
-        provisional: Callable[[], Sequence[Line]],
+        lines: Callable[[], Sequence[Line]],
         kept: Callable[[], Kept | None],
     ) -> None:
         self._file = json_file
         self._samples = None if json_file is None or is_stream(json_file) else samples_file(json_file)
-        self._origin, self._final, self._provisional, self._kept = origin, final, provisional, kept
-        self._live = LivePage(lambda: self._write(self._final(), self._provisional()), "the file of --json")
+        self._origin, self._lines, self._kept = origin, lines, kept
+        self._live = LivePage(self._write, "the file of --json")
 
     def refresh(self) -> None:
         """Write the files every few seconds. Writing takes only a small share of the time. Call this method between
@@ -78,12 +76,12 @@ class Keeper:
         if self._samples is not None:  # a stream gets only the final lines
             self._live.refresh()
 
-    def finish(self, lines: Sequence[Line]) -> None:
-        """Write all `lines` in their final state. Raises OSError."""
-        if self._file is not None and not self._write(lines):
+    def finish(self) -> None:
+        """Write all lines in their final state. Raises OSError."""
+        if self._file is not None and not self._write():
             echo("the samples are too large to save: the same command will measure everything again")
 
-    def _write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
+    def _write(self) -> bool:
         """Write both files. Return True if the samples were small enough to save."""
         assert self._file is not None
         kept = None if self._samples is None else self._kept()
@@ -93,7 +91,7 @@ class Keeper:
                 write_samples(self._samples, *kept)
             else:  # an existing file belongs to other lines
                 self._samples.unlink(missing_ok=True)
-        write_lines(self._file, [self._origin, *final, *provisional])
+        write_lines(self._file, [self._origin, *self._lines()])
         return fits
 
 
@@ -102,14 +100,14 @@ A = TypeVar("A", bound="Arena[Any, Any, Any]")
 
 @contextmanager
 def measuring(
-    kind: type[A], plan: Measurement, json_file: Path | None, began: float, of: str,
+    kind: type[A], plan: Measurement, json_file: Path | None, began: float,
     say: Callable[[str], None] = echo,
 ) -> Iterator[tuple[A, Interrupts]]:  # fmt: skip
     """Yield a session that measures `plan`, and the session's `Interrupts`. Removes the session's folder and workers at
     the end.
 
     The session continues from the samples of `json_file`, if any. `began` is the `monotonic` time at which the command
-    was called. `of` names the unit of `plan.rounds` in the message. Raises ConfigError.
+    was called. Raises ConfigError.
     """
     from reslrb_cli.measure.processes import abandon_all
 
@@ -123,7 +121,7 @@ def measuring(
         with Interrupts(last_act=tidy) as interrupts:
             spent_s = time.monotonic() - began
             session = kind(plan, Path(name), lambda: interrupts.requested, say, spent_s=spent_s, earlier=earlier)
-            echo(f"{plan.device}, {plan.variant}; {allowance(plan.budget_s, plan.rounds, of)}")
+            echo(f"{plan.device}, {plan.variant}; {allowance(plan.budget_s, plan.rounds, 'round')}")
             yield session, interrupts
 
 

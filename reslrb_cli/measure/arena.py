@@ -66,9 +66,8 @@ MAX_ROUNDS = 25
 #: Factor on the time for the next depth, whose kernels take longer to compile and to run.
 GROWTH = 1.3
 
-#: Advice, and message, about measurements that exceed the budget.
-MORE = "allow more with --budget"
-NO_TIME = f"the budget was spent; {MORE}"
+#: Message about measurements that exceed the budget.
+NO_TIME = "the budget was spent; allow more with --budget"
 
 
 class Pace:
@@ -252,7 +251,7 @@ class Arena(Generic[Measured, Worker, Item]):
         the worker ended, or if the time was up.
         """
         opening = self._answer(member, self._pace.over)
-        for line in (opening or {}).get("warnings", ()):
+        for line in (opening or {}).pop("warnings", ()):
             if line not in self._said:  # every process loads the same scene
                 self._said.add(line)
                 self._say(line)

@@ -86,7 +86,7 @@ def _result(run: BenchRun, value: int, baseline: BenchRun, size: Mapping[str, in
         figures |= {name: Spread.of([step[name] for step in run.steps.values()]) for name in TIMES}
         figures["repeats"] = len(run.steps)
         if run.cold:
-            figures |= {"cold_ms": run.cold["step_ms"], "cold_codegen_ms": run.cold["codegen_ms"]}
+            figures |= {"cold_ms": run.cold["step_ms"]}
             figures |= {name: run.cold[name] for name in ("peak_mib", "scratch_bytes")}
     record = BenchRecord(
         integrator=run.case.type,
@@ -113,7 +113,7 @@ def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
 
 
 #: The function that a process runs.
-STEPS = "reslrb_cli.measure.stepper:begin_steps"
+STEPS = "reslrb_cli.measure.steps:begin_steps"
 
 
 class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
@@ -149,16 +149,9 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
         may_refuse = self.plan.may_refuse(case)
         return BenchRun(process=None, may_refuse=may_refuse, case=case, config=self.plan.at(case, value))
 
-    def results(self, done: bool | None = None) -> list[BenchResult]:
-        """Return the results in the order of the sweep. `done` selects finished values (true), unfinished values
-        (false), or all values (None).
-        """
-        return [
-            result
-            for value in self.plan.values
-            if value in self.runs and done in (None, value in self.done)
-            for result in self._results(value)
-        ]
+    def results(self) -> list[BenchResult]:
+        """Return the results so far, in the order of the sweep."""
+        return [result for value in self.plan.values if value in self.runs for result in self._results(value)]
 
     def _results(self, value: int) -> list[BenchResult]:
         runs = self.runs[value]

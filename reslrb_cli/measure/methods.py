@@ -375,6 +375,22 @@ class Plan(Measurement):
 
     KIND = "convergence"
 
+    @classmethod
+    def of(cls, config: Config, objective: str, integrators: str | None, reference: str | None, **others: Any) -> Plan:
+        """Return a plan from lists as text. None stands for the default list. `others` are further fields. Raises
+        ConfigError.
+        """
+        if objective not in DEFAULTS:
+            raise ConfigError("objective", "", f"is {objective!r}; there are {', '.join(DEFAULTS)}")
+        cases = parse_cases(integrators or DEFAULTS[objective])
+        stands = parse_cases(reference or REFERENCE, "--reference")
+        if len(stands) != 1:
+            raise ConfigError("--reference", "", "errors are relative to one method; name one")
+        own = {"cases": cases, "reference": stands[0], "default": integrators is None, "objective": objective}
+        plan = cls(**machine_of(config), **own, config=config, **others)
+        plan.check()
+        return plan
+
     def _options(self) -> dict[str, Any]:
         return {"objective": self.objective, "reference": self.reference.label, "spp": list(self.spps)}
 
@@ -384,7 +400,7 @@ class Plan(Measurement):
         return self.objective != "loss"
 
     @property
-    def camera(self) -> dict[str, bool]:
+    def sides(self) -> dict[str, bool]:
         """Arguments of `survey`, which describe the kinds of paths in the measurement.
 
         - `camera`: some method may have camera paths.
@@ -454,17 +470,6 @@ class Plan(Measurement):
         label = f"{case.label}, {spp} spp" if self.spps and not reference else case.label
         capacity = options.get("capacity")
         return Method(label, case.type, estimator, capacity, adjoint, spp, **paths_in_records(config))
-
-
-def compared(integrators: str | None, reference: str | None, usual: str) -> dict[str, Any]:
-    """Return a `Plan`'s cases and reference, parsed from text. `usual` is the default list of cases. Raises
-    ConfigError.
-    """
-    cases = parse_cases(integrators or usual)
-    stands = parse_cases(reference or REFERENCE, "--reference")
-    if len(stands) != 1:
-        raise ConfigError("--reference", "", "errors are relative to one method; name one")
-    return {"cases": cases, "reference": stands[0], "default": integrators is None}
 
 
 def machine_of(config: Config) -> dict[str, Any]:

@@ -51,6 +51,7 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
 from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES
+from reslrb_cli.optimization.views import View
 from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
 from reslrb_cli.scene.deformation import where_moved
@@ -184,7 +185,9 @@ class MissingCheck:
         self.case = Case(problem.scene, problem.selection.keys, sensor, problem.selection)
         height, width, _ = self.case.weights.shape
         self.spp = spp or max(PATHS // (height * width), 1)
-        self._weigh(problem, sensor, max(IMAGE_PATHS // (height * width), 1))
+        if not _weigh(problem, problem.views[:1], [self.case], max(IMAGE_PATHS // (height * width), 1)):
+            reason = "has no derivative at the initial values, which equal those of the target"
+            raise ConfigError(self.source, "loss", reason)
         options = problem.config.integrator.options()
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")}
         self._tracer = make_integrator("reslrb", **options, freeze=True)
@@ -247,16 +250,18 @@ class MissingCheck:
         share, error = found.share() or (None, None)
         return MissingRecord(self.source, key, share, error, len(found.directions), found.count)
 
-    def _weigh(self, problem: Problem, sensor: int, spp: int) -> None:
-        view = problem.views[0]
-        gradient = problem.image_gradient(view, problem.render(sensor, spp, 0, "missing"))
-        weights = gradient.astype(np.float64)[:, :, : self.case.weights.shape[2]]
-        if not np.any(weights):
-            raise ConfigError(
-                self.source, "loss", "has no derivative at the initial values, which equal those of the target"
-            )
-        # The size of dL/dI does not affect a share, and tiny numbers would vanish in the rounding of a sum.
-        self.case.weigh(weights / np.abs(weights).mean())
+
+def _weigh(problem: Problem, views: Sequence[View], cases: Sequence[Case], spp: int) -> bool:
+    """Set the weights of each view's case to dL/dI of the loss at the problem's values. Return whether any is not 0."""
+    weights = []
+    for case, view in zip(cases, views, strict=True):
+        gradient = problem.image_gradient(view, problem.render(view.sensor, spp, 0, "missing"))
+        weights.append(np.nan_to_num(gradient.astype(np.float64)[:, :, : case.weights.shape[2]]) * view.share)
+    # The size of dL/dI does not affect a share, and tiny numbers would vanish in the rounding of a sum.
+    size = max(float(np.abs(each).mean()) for each in weights)
+    for case, each in zip(cases, weights, strict=True):
+        case.weigh(each / (size or 1.0))
+    return size > 0
 
 
 # --- before a run's first iteration -----------------------------------------------------------------------------------
@@ -351,7 +356,9 @@ class _Short:
         If the remaining samples are too few, or if dL/dI is zero, all records have no share.
         """
         image_spp, fewest = 2 * self.problem.config.run.spp, seeds(FEWEST)
-        if image_spp + FEWEST * self._spp_of_seed(*self.keys) > self._left or not self._weigh(image_spp):
+        if image_spp + FEWEST * self._spp_of_seed(*self.keys) > self._left:
+            return [self._record(key, None) for key in self.keys]
+        if not _weigh(self.problem, self._views, self._cases, image_spp):
             return [self._record(key, None) for key in self.keys]
         self._left -= image_spp
         short = {key: [self._difference(key, SHORT, seed) for seed in fewest] for key in self.keys}
@@ -407,17 +414,6 @@ class _Short:
         self._left -= 2 * len(rows) * self._spp
         return np.sum([[case.difference(self._integrator, row, seed, self._spp, step) for row in rows]
                        for case in self._cases], axis=0)  # fmt: skip
-
-    def _weigh(self, spp: int) -> bool:
-        """Set the weights of each view's case to dL/dI of the run's loss. Returns whether any weight is not zero."""
-        problem, weights = self.problem, []
-        for case, view in zip(self._cases, self._views, strict=True):
-            gradient = problem.image_gradient(view, problem.render(view.sensor, spp, 0, "missing"))
-            weights.append(np.nan_to_num(gradient.astype(np.float64)[:, :, : case.weights.shape[2]]) * view.share)
-        size = max(float(np.abs(each).mean()) for each in weights)
-        for case, each in zip(self._cases, weights, strict=True):
-            case.weigh(each / (size or 1.0))
-        return size > 0
 
 
 def _size(box: Any) -> float:

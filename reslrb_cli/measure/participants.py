@@ -33,7 +33,6 @@ from reslrb_cli.measure.references import (
     ptracer_image,
 )
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.measure.stepper import multiple_of, shrink
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import check_integrator
 from reslrb_cli.optimization.problem import Problem
@@ -66,6 +65,34 @@ LESSONS = 8
 
 #: Seeds for choosing the step of finite differences.
 PILOT_SEEDS = 2
+
+
+def multiple_of(spp: int, unit: int | None) -> int:
+    """Return the greatest multiple of `unit` that is at most `spp`, but at least `unit`."""
+    unit = unit or 1
+    return max(spp // unit, 1) * unit
+
+
+def shrink(scene: Any, sensor: int, pixels: int) -> None:
+    """Reduce the film of the sensor with the index `sensor` to about `pixels` pixels. The view stays the same.
+
+    A crop window shrinks with it.
+    """
+    params = mi.traverse(scene.sensors()[sensor])
+    width, height = (int(n) for n in params["film.size"])
+    factor = (pixels / (width * height)) ** 0.5
+    if factor >= 1:
+        return
+
+    def scaled(name: str, least: int) -> list[int]:
+        return [max(round(n * factor), least) for n in params[name]]
+
+    size, offset = scaled("film.size", 1), scaled("film.crop_offset", 0)
+    offset = [min(o, n - 1) for o, n in zip(offset, size, strict=True)]
+    window = [min(w, n - o) for w, n, o in zip(scaled("film.crop_size", 1), size, offset, strict=True)]
+    for name, value in (("film.size", size), ("film.crop_size", window), ("film.crop_offset", offset)):
+        params[name] = type(params[name])(*value)
+    params.update()
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,7 @@ class BenchRecord(Line):
     - `step_ms` is the wall time of warm steps. `kernel_ms` is the part for executing kernels. `codegen_ms` is the part
         for generating kernels, including the lookup in the kernel cache. `tracing_ms` is the remaining part, mostly
         Python.
-    - `cold_ms` is the wall time of the first step in a new process with an empty kernel cache. `cold_codegen_ms` is the
-        part for generating and compiling kernels.
+    - `cold_ms` is the wall time of the first step in a new process with an empty kernel cache.
     - `peak_mib` is the peak memory of the allocator in the first step, including the scene.
     - `scratch_bytes` is the thread-local memory of a path.
     - `texels` is the texel count of all textures that are parameters.
@@ -74,7 +73,6 @@ class BenchRecord(Line):
     codegen_ms: Spread | None = None
     tracing_ms: Spread | None = None
     cold_ms: float | None = None
-    cold_codegen_ms: float | None = None
     peak_mib: float | None = None
     scratch_bytes: int | None = None
     repeats: int = 0
@@ -124,10 +122,10 @@ class Method:
 class PointRecord(Line):
     """Error of the average of `steps` steps, which take `elapsed_s` seconds.
 
-    `parameter` is a parameter key, `all` (all parameters together) or `image`. Errors are in L2 over all entries,
-    relative to the norm of the estimated quantity. `relative_rmse` is the root mean square error of `repeats` averages.
-    The error of the reference, `reference_rmse`, is subtracted. If `reference_rmse` exceeds the measured error,
-    `relative_rmse` is None.
+    `parameter` is a parameter key, `all` (all parameters together, if there are several) or `image`. Errors are in L2
+    over all entries, relative to the norm of the estimated quantity. `relative_rmse` is the root mean square error of
+    `repeats` averages. The error of the reference, `reference_rmse`, is subtracted. If `reference_rmse` exceeds the
+    measured error, `relative_rmse` is None.
     """
 
     KIND: ClassVar[str] = "point"
@@ -175,7 +173,7 @@ class MethodRecord(Line):
     cold_s: float | None = None
     relative_rmse: float | None = field(default=None, metadata=_column("error", 8))
     reference_rmse: float | None = None
-    slope: Range | None = field(default=None, metadata=_column("slope", 20))
+    slope: float | None = field(default=None, metadata=_column("slope", 7))
     efficiency: Range | None = field(default=None, metadata=_column("efficiency", 24))
     bias_z: float | None = field(default=None, metadata=_column("max |z| (limit)", 16))
     bias_z_limit: float | None = None

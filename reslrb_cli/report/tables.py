@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields
 
 from reslrb_cli.measure.bench import BenchResult
-from reslrb_cli.measure.convergence.judgement import ConvergenceResults
+from reslrb_cli.measure.judgement import ConvergenceResults
 from reslrb_cli.optimization.sensitivity import QUANTITIES, Conditioning
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
@@ -250,12 +250,12 @@ def result_lines(results: ConvergenceResults) -> list[Line]:
 
 
 def closing_sentence(records: Sequence[MethodRecord]) -> str:
-    """Return a sentence that names the best method for this scene, for all parameters together. The sentence also gives
-    the method's lead.
+    """Return a sentence that names the best method for this scene, and its lead. The last record is that of all
+    parameters together, the only parameter, or the image.
 
     A biased method is always called biased. A lead counts only if the interval of the efficiency ratio lies above 1.
     """
-    together = [record for record in records if record.parameter in ("all", "image") and record.efficiency is not None]
+    together = [r for r in records if r.parameter == records[-1].parameter and r.efficiency is not None]
     if not together:
         return "Nothing can be said of which method is the best: there are too few steps."
     sound = sorted((r for r in together if r.biased is not True), key=_efficiency, reverse=True)

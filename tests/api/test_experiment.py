@@ -26,8 +26,8 @@ from runs.going_on import LAMP, work_alone, write_experiment
 
 import reslrb_cli as rl
 from reslrb_cli.config.loader import changed, dump, load, with_integrator
-from reslrb_cli.measure.convergence import session
-from reslrb_cli.measure.convergence.session import Session
+from reslrb_cli.measure import convergence as session
+from reslrb_cli.measure.convergence import Session
 from reslrb_cli.measure.methods import Plan
 
 #: Settings that make a run cheap and exactly repeatable.

@@ -195,8 +195,8 @@ class Measurement:
     """Measurement whose lines and samples a test can change while the measurement goes on."""
 
     def __init__(self, file: Path) -> None:
-        self.final, self.now, self.rows = lines(), lines(), np.zeros(0)
-        self.keeper = Keeper(file, *lines("here"), lambda: self.final, lambda: self.now, self.kept)
+        self.lines, self.rows = lines(), np.zeros(0)
+        self.keeper = Keeper(file, *lines("here"), lambda: self.lines, self.kept)
 
     def kept(self) -> measurement_files.Kept | None:
         return ({"rows": len(self.rows)}, {"rows": self.rows}) if len(self.rows) else None
@@ -212,17 +212,18 @@ def test_both_files_are_current_and_old_ones_are_removed(tmp_path: Path, monkeyp
     measured = Measurement(file)
     # The old files stay until there is a new result.
     assert (file.read_text(), measurement_files.read_samples(samples)[0]) == ("old\n", {"rows": 9})
-    measured.now = lines("a")
+    measured.lines = lines("a")
     measured.keeper.refresh()
     assert read(file) == ["a"]
     with pytest.raises(ConfigError, match=r"c\.samples\.npz: no such file"):
         measurement_files.read_samples(samples)
-    measured.final, measured.now, measured.rows = lines("a"), lines("b"), np.ones(3)
+    measured.lines, measured.rows = lines("a", "b"), np.ones(3)
     measured.keeper.refresh()
     assert read(file) == ["a", "b"]
     head, arrays = measurement_files.read_samples(samples)
     assert (head, list(arrays["rows"])) == ({"rows": 3}, [1.0] * 3)
-    measured.keeper.finish(lines("a", "c"))
+    measured.lines = lines("a", "c")
+    measured.keeper.finish()
     assert read(file) == ["a", "c"]
     assert {path.name for path in tmp_path.iterdir()} == {"c.jsonl", "c.samples.npz"}
 
@@ -238,7 +239,7 @@ def test_a_failed_intermediate_write_is_reported_at_the_end(tmp_path: Path, monk
     monkeypatch.setattr("reslrb_cli.records.measurement_files.write_atomically", full)
     measured.keeper.refresh()
     with pytest.raises(OSError, match="No space left"):
-        measured.keeper.finish(lines("a"))
+        measured.keeper.finish()
 
 
 def test_too_large_samples_are_not_saved_and_reported(
@@ -247,7 +248,7 @@ def test_too_large_samples_are_not_saved_and_reported(
     monkeypatch.setattr(measurement_files, "MOST_SAMPLES_BYTES", 100)
     measured = Measurement(tmp_path / "c.jsonl")
     measured.rows = np.ones(13)
-    measured.keeper.finish(lines("a"))
+    measured.keeper.finish()
     assert "the same command will measure everything again" in capsys.readouterr().out
     assert not measurement_files.samples_file(tmp_path / "c.jsonl").exists()
 
@@ -256,8 +257,9 @@ def test_a_pipe_gets_all_lines_at_the_end(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
     measured = Measurement(tmp_path / "pipe")
+    measured.lines = lines("a")
     measured.keeper.refresh()
-    measured.keeper.finish(lines("a"))
+    measured.keeper.finish()
     assert os.read(reader, 1000).splitlines()[1:] == [b'{"kind": "summary", "line": "a"}']
     os.close(reader)
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]

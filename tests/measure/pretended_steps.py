@@ -12,8 +12,8 @@ import numpy as np
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.measure.bench import STEPS
-from reslrb_cli.measure.convergence.judgement import ConvergenceResults, Judgement
-from reslrb_cli.measure.convergence.session import Session
+from reslrb_cli.measure.convergence import Session
+from reslrb_cli.measure.judgement import ConvergenceResults, Judgement
 from reslrb_cli.measure.methods import Plan, parse_cases
 from reslrb_cli.measure.processes import Ended, Refused, Stopped
 from reslrb_cli.records.measurements import BenchStatus, MethodRecord
@@ -152,11 +152,9 @@ class Player:
         if stop():
             raise Stopped
         if self.played is None:
-            if self.question is None:
-                return {"warnings": ["old"]}
             self._wait(self.stage.survey_s, stop)
-            np.savez(self.question["out"], mask=np.ones((2, 2, 1), np.float32))
-            return self.stage.facts
+            np.savez(self.first["arrays"], mask=np.ones((2, 2, 1), np.float32))
+            return self.stage.facts | {"warnings": ["old"]}
         if self.question is None:
             if self.played.refuses:
                 raise Refused("cannot be done here", 2)

@@ -11,7 +11,7 @@ import pytest
 from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.measure.convergence.session import MOST_REFERENCE_STEPS, MOST_STEPS, Role
+from reslrb_cli.measure.convergence import MOST_REFERENCE_STEPS, MOST_STEPS, Role
 from reslrb_cli.records.measurement_files import Earlier, read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.tables import closing_sentence, notes
@@ -138,7 +138,7 @@ def test_continuing(tmp_path: Path) -> None:
         assert len({row.tobytes() for row in member.rows}) == len(member.rows)
 
 
-@pytest.mark.parametrize("after", [188, 212, 236])
+@pytest.mark.parametrize("after", [186, 210, 230])
 def test_an_interrupted_round_is_restarted(tmp_path: Path, after: int) -> None:
     """The restarted round uses new seeds and no earlier step of that round, so that figures cover whole rounds only."""
     answers = iter(range(10**6))
@@ -198,13 +198,6 @@ def test_the_budget_covers_compilation_and_a_small_one_is_reported(
     assert stage.now <= max(budget_s, 1.0) + 0.1  # a session looks at the clock every 0.05 s
     assert any(record.relative_rmse is not None for record in results.methods) is measured
     assert any("budget" in line for line in said) is not measured
-
-
-def test_too_few_steps_for_a_slope_are_reported(tmp_path: Path) -> None:
-    stage = Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
-    _, results, said = play(tmp_path, stage, plan(rounds=None, budget_s=45.0))
-    assert {record.method.label for record in results.methods if record.slope is None} == {"ptracer"}
-    assert said[-1] == "no slope for ptracer: it needs 16 steps of each; allow more with --budget"
 
 
 def test_no_budget_is_exceeded(tmp_path: Path) -> None:

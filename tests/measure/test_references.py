@@ -10,7 +10,7 @@ import pytest
 from cli.test_optimize import KEY
 from measure import pretended_steps
 
-from reslrb_cli.measure.convergence.session import Role
+from reslrb_cli.measure.convergence import Role
 from reslrb_cli.measure.methods import REFERENCE, parse_cases
 from reslrb_cli.optimization.autotune import race
 

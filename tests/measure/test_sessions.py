@@ -20,7 +20,7 @@ from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import sampling
 from reslrb_cli.measure.bench import Bench
-from reslrb_cli.measure.convergence.session import Session
+from reslrb_cli.measure.convergence import Session
 from reslrb_cli.measure.gradients import Direction
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.participants import CheckSettings

@@ -164,10 +164,8 @@ def test_a_convergence(tmp_path):
 
 
 def test_a_convergence_over_samples_and_of_a_single_parameter(tmp_path):
-    """Each sample count is a separate method. For a single parameter, the page leaves out the results of all parameters
-    together.
-    """
-    lines = [line for what in ("all", LAMP) for line in convergence_lines(what)]
+    """Each sample count is a separate method."""
+    lines = convergence_lines(LAMP)
     lines += [line | {"spp": 16} for line in lines if line["kind"] == "point"]
     (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     markup = render(read_sources([tmp_path / "c.jsonl"]))

@@ -90,8 +90,6 @@ def convergence(objects: Sequence[Entry]) -> Markup:
     labels = list(dict.fromkeys(map(name, [*methods, *points])))
     quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
     quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
-    if len(quantities) == 2 and quantities[0] == "all":  # with one parameter, `all` is the same
-        del quantities[0]
     drawn = [_error_diagram([entry for entry in points if quantity(entry) == what], labels, what, name)
              for what in quantities[:MOST_DRAWN]]  # fmt: skip
     rows = [

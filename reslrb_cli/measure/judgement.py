@@ -18,7 +18,6 @@ The two variances are added.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,7 +25,7 @@ import numpy as np
 from scipy import stats
 
 from reslrb_cli.measure.comparison import ROUNDING, TAIL, Family, compare_expectations, entry_count, tail_weight
-from reslrb_cli.measure.convergence.session import FEWEST, FEWEST_FOR_SLOPE, Member, Role, Session
+from reslrb_cli.measure.convergence import FEWEST, Member, Role, Session
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
     TARGETS,
@@ -52,10 +51,9 @@ _UNSEEN = "nothing exceeds the reference's noise"
 #: Confidence level of all intervals.
 CONFIDENCE = 0.95
 
-#: Minimum number of steps, and number of groups for the interval of a slope; the longest average is as long as a group.
-#: The logarithms of errors of shorter averages, for example of a single colour, are so skewed that intervals are too
-#: narrow.
-GROUPS = {32: 8, FEWEST_FOR_SLOPE: 4}
+#: Minimum number of steps for a slope, and of averages for an error that counts. The logarithms of the errors of fewer
+#: averages are skewed.
+FEWEST_FOR_SLOPE, FEWEST_AVERAGES = 16, 4
 
 
 @dataclass(frozen=True)
@@ -133,49 +131,37 @@ class MethodSamples:
         mean, variance = self.deviations.mean(0), self.variance * self.reference.signal
         return max(0.0, float(mean @ mean - variance / self.count - self.reference.noise)) / self.reference.signal
 
-    def points(self, method: Method, parameter: str) -> list[PointRecord]:
-        """Return the errors of averages of 1, 2, 4, ... steps, up to the number of steps. An error is None if the
-        reference's own error is larger.
+    def _levels(self) -> list[tuple[int, int, float]]:
+        """Return the length, the number and the mean squared error of averages of 1, 2, 4, ... steps, up to the number
+        of steps. The squared error of the reference is subtracted.
         """
         found, averages, steps = [], self.deviations, 1
         while len(averages):
-            squared = float(np.square(averages).sum(1).mean()) - self.reference.noise
-            error = float(np.sqrt(squared / self.reference.signal)) if squared > 0 else None
-            seconds, repeats = steps * self.step_s, len(averages)
-            found.append(PointRecord(method, parameter, steps, seconds, error, self.reference.floor, repeats))
-            averages, steps = _halved(averages), 2 * steps
+            found.append((steps, len(averages), float(np.square(averages).sum(1).mean()) - self.reference.noise))
+            pairs = len(averages) // 2
+            averages, steps = 0.5 * (averages[0 : 2 * pairs : 2] + averages[1 : 2 * pairs : 2]), 2 * steps
         return found
 
-    def slope(self) -> JackknifeEstimate | None:
-        """Return d log RMSE / d log time, or None if there are too few steps. The slope is -1/2 for independent,
+    def points(self, method: Method, parameter: str) -> list[PointRecord]:
+        """Return the errors of averages. An error is None if the reference's own error is larger."""
+        signal, floor = self.reference.signal, self.reference.floor
+        return [
+            PointRecord(method, parameter, steps, steps * self.step_s,
+                        float(np.sqrt(squared / signal)) if squared > 0 else None, floor, repeats)
+            for steps, repeats, squared in self._levels()
+        ]  # fmt: skip
+
+    def slope(self) -> float | None:
+        """Return d log RMSE / d log time, or None if there are too few steps. The slope is about -1/2 for independent,
         unbiased steps.
 
-        Averages are over steps of one group. The fit weights the error for each average length by the number of
-        averages of that length.
+        The fit weights the error for each average length by the number of averages of that length.
         """
-        groups = next((groups for steps, groups in GROUPS.items() if self.count >= steps), None)
-        if groups is None:
+        known = [level for level in self._levels() if level[1] >= FEWEST_AVERAGES and level[2] > 0]
+        if self.count < FEWEST_FOR_SLOPE or len(known) < 2:
             return None
-        size = self.count // groups
-        averages, levels, errors = self.deviations[: groups * size].reshape(groups, size, -1), [], []
-        while averages.shape[1]:
-            levels.append(size // averages.shape[1])
-            errors.append(np.square(averages).sum(2).mean(1))
-            averages = _halved(averages.swapaxes(0, 1)).swapaxes(0, 1)
-        lengths = 2.0 ** np.arange(len(levels))
-        raw, noise = np.array(errors), self.reference.noise  # (levels, groups)
-        all_but_one = (raw.sum(1, keepdims=True) - raw) / (groups - 1) - noise
-        moved, noises, _ = self.reference.without
-        shift = np.square(moved).sum(1) - 2 * moved @ self.deviations.mean(0) - noises
-        shifted = raw.mean(1)[:, None] + shift
-        whole = raw.mean(1) - noise
-        usable = (whole > 0) & (all_but_one > 0).all(1) & (shifted > 0).all(1)
-        if usable.sum() < 2:
-            return None
-        fit = _fit(lengths[usable])
-        value, left, right = fit(whole[usable]), fit(all_but_one[usable]), fit(shifted[usable])
-        corrected = groups * value - (groups - 1) * left.mean()  # the logarithm of few averages is biased
-        return _joined(float(corrected), left, right)
+        steps, repeats, squared = np.transpose(known)
+        return float(0.5 * np.polyfit(np.log(steps), np.log(squared), 1, w=np.sqrt(repeats))[0])
 
     def efficiency(self, biased: bool = False) -> JackknifeEstimate | None:
         """Return the logarithm of 1 / (relative variance * seconds of a step). Without noise or with too few turns,
@@ -224,22 +210,6 @@ class MethodSamples:
         steps = max(self.variance / room, 1.0)
         floor = self.reference.floor
         return steps * self.step_s, bool(steps > self.count or floor is None or error < floor)
-
-
-def _halved(averages: np.ndarray) -> np.ndarray:
-    """Return the average of each pair of neighbours along the first axis of (N, ...). An odd last one is left out."""
-    pairs = len(averages) // 2
-    return 0.5 * (averages[0 : 2 * pairs : 2] + averages[1 : 2 * pairs : 2])
-
-
-def _fit(lengths: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that fits the slope of log(squared errors) / 2 over log(lengths), for squared errors (levels,
-    ...).
-    """
-    weights = 1 / lengths
-    at = np.log(lengths) - np.average(np.log(lengths), weights=weights)
-    coefficients = weights * at / (weights * at**2).sum()
-    return lambda squared: 0.5 * np.tensordot(coefficients, np.log(squared), 1)
 
 
 def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, noise: float, biased: bool) -> np.ndarray:
@@ -296,8 +266,8 @@ class Judgement:
         self._slices = session.slices() if session.facts else {}
         #: References of the errors, by parameter and for all; empty if there are too few steps of the reference.
         self._whole: dict[str, ReferenceMean] = {}
-        #: Each parameter's slice, and the slice of all parameters together. Images have only the latter.
-        self._places = self._slices if "image" in self._slices else self._slices | {ALL: slice(None)}
+        #: Each parameter's slice, and the slice of all parameters together if there are several.
+        self._places = self._slices if len(self._slices) == 1 else self._slices | {ALL: slice(None)}
         for found in session.of(Role.REFERENCE):
             if len(set(found.turns)) >= FEWEST and not found.message:
                 self._whole = {key: ReferenceMean(self._rows(found, place)) for key, place in self._places.items()}
@@ -333,10 +303,6 @@ class Judgement:
             if member.refusal is not None:
                 continue
             for key in self._places:
-                if key == ALL and len(self._slices) == 1:  # there are no others
-                    methods.append(replace(methods[-1], parameter=ALL))
-                    points += [replace(point, parameter=ALL) for point in points if point.method == member.method]
-                    continue
                 methods.append(self._method(member, key, judged.get(member.label, {}).get(key, _Bias()), own))
                 if self._has_figures(member, key):
                     points += self._samples(member, key).points(member.method, key)
@@ -365,9 +331,9 @@ class Judgement:
         return None if member is reference else reference
 
     def _biases(self, member: Member) -> dict[str, _Bias]:
-        """Return the bias for each parameter, and the worst bias of all parameters together."""
+        """Return the bias for each parameter, and the worst bias if there are several parameters."""
         found = {key: self._bias(member, key) for key in self._slices}
-        if "image" in found:
+        if len(found) == 1:
             return found
         biases = list(found.values())
         worst = max(biases, key=lambda bias: -1.0 if bias.bias_z is None else bias.bias_z)
@@ -430,7 +396,7 @@ class Judgement:
         if not message and tail_weight(samples.deviations) > TAIL:
             message = HEAVY
         times = {f"{target:g}": magnitude.seconds_to(target, biased) for target in TARGETS}
-        slope, efficiency = samples.slope(), magnitude.efficiency(biased)
+        efficiency = magnitude.efficiency(biased)
         return MethodRecord(
             method=member.method,
             parameter=key,
@@ -440,7 +406,7 @@ class Judgement:
             cold_s=member.cold_s,
             relative_rmse=float(np.sqrt(samples.variance)),
             reference_rmse=samples.reference.floor,
-            slope=None if slope is None else slope.interval(),
+            slope=samples.slope(),
             efficiency=None if efficiency is None else efficiency.exponential(),
             bias=float(np.sqrt(magnitude.squared_bias)) if biased else None,
             seconds_to={name: seconds for name, (seconds, _) in times.items()},

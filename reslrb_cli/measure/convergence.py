@@ -18,7 +18,7 @@ import numpy as np
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.arena import MORE, NO_TIME, Arena, Contestant
+from reslrb_cli.measure.arena import NO_TIME, Arena, Contestant
 from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
 from reslrb_cli.measure.processes import Ended, Refused
@@ -26,7 +26,7 @@ from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import BenchStatus, Method
 
 #: The module of the functions that processes run.
-SETUP = "reslrb_cli.measure.convergence.setup"
+STEPS = "reslrb_cli.measure.steps"
 
 #: Maximum memory for the samples of all methods, in bytes.
 MEMORY = 2**30
@@ -36,9 +36,6 @@ INDEPENDENT_PATHS = 2**18
 
 #: Fewer turns, or rows of a reference, give no useful standard error.
 FEWEST = 3
-
-#: Fewer steps give no slope.
-FEWEST_FOR_SLOPE = 16
 
 #: A turn lasts as long as a step of the slowest method, but at most this many seconds.
 TURN_S = 2.0
@@ -235,20 +232,19 @@ class Session(Arena[Plan, Member, int]):
             np.savez(self._arrays, **found)  # type: ignore[arg-type]
             self.facts = self._earlier.head["facts"]
             return True
-        first = plan.first(plan.reference_config) | {"arrays": str(self._arrays), "objective": plan.objective}
-        answer, referee = None, Contestant(process=self._start(first, f"{SETUP}:begin_survey"), may_refuse=False)
+        own = {"arrays": str(self._arrays), "objective": plan.objective, "sides": plan.sides}
+        first = plan.first(plan.reference_config) | own
+        referee = Contestant(process=self._start(first, f"{STEPS}:begin_survey"), may_refuse=False)
         with contextlib.closing(referee):
-            if self._open(referee) is not None:
-                referee.process.ask({"out": first["arrays"], "ask": plan.camera})
-                answer = self._answer(referee, self._pace.over)
+            facts = self._open(referee)
         if referee.end is not None:
             memory = referee.end.status is BenchStatus.OUT_OF_MEMORY
             code = ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
             raise Refused(f"--reference {plan.reference.label}: {referee.end.reason}", code)
-        self.facts = answer or {}
-        if answer is None:
+        self.facts = facts or {}
+        if facts is None:
             self._say(f"dL/dI was not computed: {NO_TIME}")
-        return answer is not None
+        return facts is not None
 
     def _why_not(self, case: Case) -> str | None:
         """Return why a method of the default list is left out, or None if it takes part."""
@@ -298,7 +294,7 @@ class Session(Arena[Plan, Member, int]):
         }
         has_all = plan.rounds is not None and self._before >= plan.rounds
         member = Member(
-            process=None if has_all else self._start(first, f"{SETUP}:begin_sampling"),
+            process=None if has_all else self._start(first, f"{STEPS}:begin_sampling"),
             may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
             role=role,
             method=method,
@@ -344,11 +340,8 @@ class Session(Arena[Plan, Member, int]):
     def _say_what_lacks(self) -> None:
         """Print which results need more time than the budget allowed."""
         late = [member.label for member in self.members if member.late]
-        few = [m.label for m in self.of(Role.CASE) if m.alive and 0 < len(m.rows) < FEWEST_FOR_SLOPE]
         if late:
             self._say(f"not measured: {', '.join(late)}: {NO_TIME}")
         elif self.plan.rounds is None and self.rounds - self._before < max(FEWEST - self._before, 1):
             lacking = f"results need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
             self._say(f"{lacking}: {NO_TIME}")
-        elif self.plan.rounds is None and few:
-            self._say(f"no slope for {', '.join(few)}: it needs {FEWEST_FOR_SLOPE} steps of each; {MORE}")
