@@ -232,8 +232,7 @@ class Session(Arena[Plan, Member, int]):
             np.savez(self._arrays, **found)  # type: ignore[arg-type]
             self.facts = self._earlier.head["facts"]
             return True
-        own = {"arrays": str(self._arrays), "objective": plan.objective, "sides": plan.sides}
-        first = plan.first(plan.reference_config) | own
+        first = plan.first(plan.reference_config) | {"arrays": str(self._arrays), "objective": plan.objective}
         referee = Contestant(process=self._start(first, f"{STEPS}:begin_survey"), may_refuse=False)
         with contextlib.closing(referee):
             facts = self._open(referee)

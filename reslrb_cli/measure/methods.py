@@ -54,9 +54,6 @@ def paths_in_records(config: Config) -> dict[str, Any]:
     return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
 
 
-#: Default share of light paths if there are both kinds.
-BOTH_SHARE = float(UNDECIDED["light_share"])
-
 #: The estimator of a case that names none, as in the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
 
@@ -348,9 +345,13 @@ DEFAULTS = {
     "image": "ptracer,prb,reslrb:stack,reslrb:stack(paths=camera),reslrb:stack(paths=both)",
 }
 
-#: Default reference for errors. It uses both kinds of paths with a fixed share if the scene allows it, and otherwise
-#: the kind that can render the scene.
+#: Default reference for errors, and what it becomes for the kinds of paths that the scene allows.
 REFERENCE = "reslrb:stack(paths=auto)"
+REFERENCES = {
+    "light": "reslrb:stack",
+    "camera": "reslrb:stack(paths=camera)",
+    "both": f"reslrb:stack(paths=both,light_share={UNDECIDED['light_share']})",
+}
 
 #: An `rr_depth` at which Russian roulette never starts.
 NEVER = 1_000_000
@@ -386,8 +387,8 @@ class Plan(Measurement):
         stands = parse_cases(reference or REFERENCE, "--reference")
         if len(stands) != 1:
             raise ConfigError("--reference", "", "errors are relative to one method; name one")
-        own = {"cases": cases, "reference": stands[0], "default": integrators is None, "objective": objective}
-        plan = cls(**machine_of(config), **own, config=config, **others)
+        own: dict[str, Any] = {"cases": cases, "reference": stands[0], "default": integrators is None}
+        plan = cls(**machine_of(config), **own, config=config, objective=objective, **others)
         plan.check()
         return plan
 
@@ -398,24 +399,6 @@ class Plan(Measurement):
     def known(self) -> bool:
         """True if dL/dI is known before the image, or is not needed."""
         return self.objective != "loss"
-
-    @property
-    def sides(self) -> dict[str, bool]:
-        """Arguments of `survey`, which describe the kinds of paths in the measurement.
-
-        - `camera`: some method may have camera paths.
-        - `named`: some method has camera paths, regardless of what the scene supports.
-        - `light`: some method has only light paths.
-        """
-        spp = self.config.run.spp
-        sides = [self._has_camera_paths(self.config_of(case, spp)) for case in self.cases]
-        named = self._has_camera_paths(self.reference_config)  # the reference is one of them
-        return {"camera": named or any(sides), "named": named or not self.default,
-                "light": not (named and all(sides))}  # fmt: skip
-
-    def _has_camera_paths(self, config: Config) -> bool:
-        """True if an integrator's options give images that are complete at the film's border."""
-        return str(paths_in_records(config)["paths"]) != "light"
 
     @property
     def entries(self) -> list[tuple[Case, int]]:
@@ -429,20 +412,12 @@ class Plan(Measurement):
     @property
     def reference_config(self) -> Config:
         """The experiment with the reference integrator and known dL/dI. Raises ConfigError."""
-        return self.reference.at(self.config, self.config.integrator.max_depth, True, auto=True)
+        auto = self.reference.label == REFERENCE
+        return self.reference.at(self.config, self.config.integrator.max_depth, True, auto)
 
     def settled_reference(self, paths: str) -> Case:
-        """Return the reference case. If the reference's option `paths` is `auto`, the argument `paths` replaces
-        `auto`.
-        """
-        if self.reference.options.get("paths") != "auto":
-            return self.reference
-        own: dict[str, Any] = {} if paths == "light" else {"paths": paths}
-        own |= {"light_share": BOTH_SHARE} if paths == "both" else {}
-        options = {name: value for name, value in self.reference.options.items() if name not in PATHS_OPTIONS} | own
-        text = ",".join(f"{name}={value}" for name, value in options.items() if name != "estimator")
-        kind = f"{self.reference.type}:{options['estimator']}"
-        return replace(self.reference, label=f"{kind}({text})" if text else kind, options=options)
+        """Return the reference case for the scene's kinds of `paths`."""
+        return self.reference if self.reference.label != REFERENCE else parse_cases(REFERENCES[paths], "--reference")[0]
 
     def independent_config(self, name: str) -> Config:
         """Return the experiment with a stock integrator. `ptracer` runs without Russian roulette, because naive AD with
@@ -455,8 +430,6 @@ class Plan(Measurement):
 
     def check(self) -> None:
         """Raise ConfigError if an integrator of the list, or the reference, is invalid."""
-        if self.reference.options.get("estimator") == "auto":
-            raise ConfigError("--reference", "", "`auto` measures which estimator to use; name one")
         for case, spp in self.entries:
             self.config_of(case, spp)
         _ = self.reference_config

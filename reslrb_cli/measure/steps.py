@@ -22,7 +22,7 @@ from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE, multiple_of
 from reslrb_cli.measure.processes import Begun
-from reslrb_cli.measure.references import CAMERA_PATHS, Situation, choose, of_gradient, of_image
+from reslrb_cli.measure.references import Situation, choose, of_gradient, of_image
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import load_configured
@@ -182,14 +182,12 @@ def begin_survey(first: dict[str, Any]) -> Begun:
     """Start the process. The process first reports the facts of `survey`, and writes the arrays to the file `arrays`.
     It answers no questions.
     """
-    facts, arrays = survey(assemble_scene(told(first).with_exposures_fixed()), first["objective"], **first["sides"])
+    facts, arrays = survey(assemble_scene(told(first).with_exposures_fixed()), first["objective"])
     np.savez(first["arrays"], **arrays)  # type: ignore[arg-type]
     return facts, dict
 
 
-def survey(
-    problem: Problem, objective: str, camera: bool, named: bool, light: bool = True
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def survey(problem: Problem, objective: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the facts of a problem that has no targets, and the arrays that the problem's samples need.
 
     The facts have these keys.
@@ -199,28 +197,20 @@ def survey(
         integrators for each key.
     - `without`: stock integrators that are valid for no key, with the reason.
     - `paths`: the kinds of paths in the reference, which determine the reference's light.
-    - `masked`: true if pixels along the film's border are left out, because some of the compared images are dark there
-        and others are not. `pixels`: the number of pixels.
+    - `masked`: true if pixels along the film's border are left out, because light paths lose light there and camera
+        paths do not. `pixels`: the number of pixels.
     - `pictures`: a description of the rendered images.
 
     The arrays are `mask` (H, W, 1), the first view's `target_arrays`, and `adjoints` (B, H, W, C). If the image is the
-    objective, `mask` is the only array. `camera` is true if some method may have camera paths. These methods take part
-    if `named`, or if `prb` is valid for some key. Images with camera paths have no dark film border. `light` is true if
-    methods with a dark film border take part.
+    objective, `mask` is the only array.
     """
-    film = problem.scene.sensors()[problem.sensors[0]].film()
-    width, height = (int(n) for n in film.crop_size())
-    facts = find_references(problem, objective)
-    inside = np.ones((height, width), bool)
-    pixels = width * height
-    sides = {name in CAMERA_PATHS for name in facts["independent"].values() if name is not None}
-    sides |= {True} if camera and (named or "prb" not in facts["without"]) else set()
-    if len(sides | ({False} if light else set())) > 1:
-        inside = interior((height, width), problem.scene.sensors()[problem.sensors[0]])
+    sensor = problem.scene.sensors()[problem.sensors[0]]
+    width, height = (int(n) for n in sensor.film().crop_size())
+    pixels, inside = width * height, interior((height, width), sensor)
     mask = inside[:, :, None].astype(np.float32)
-    facts |= {"masked": not inside.all(), "pictures": "", "pixels": pixels}
+    facts = find_references(problem, objective) | {"masked": not inside.all(), "pictures": "", "pixels": pixels}
     if objective == "image":
-        return facts | {"shapes": {"image": [height, width, int(film.base_channels_count())]}}, {"mask": mask}
+        return facts | {"shapes": {"image": [height, width, int(sensor.film().base_channels_count())]}}, {"mask": mask}
     paths = PATHS[objective]
     problem, shortened = shorten_target(problem, paths // pixels)
     problem = make_targets(problem, lambda line: None)

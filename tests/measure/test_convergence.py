@@ -21,8 +21,8 @@ from reslrb_cli.measure.judgement import HEAVY, Judgement, MethodSamples, Refere
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.steps import Sampler, survey
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.records.measurements import BenchStatus, Method
-from reslrb_cli.report.tables import closing_sentence, notes
+from reslrb_cli.records.measurements import BenchStatus, Method, MethodRecord, Range
+from reslrb_cli.report.tables import closing_sentence, method_cells, method_columns, notes
 
 # What `convergence` reports about methods of known cost, noise and bias. The processes only pretend to measure.
 
@@ -325,6 +325,13 @@ def test_times_prevented_by_a_bias() -> None:
     assert seconds == pytest.approx(samples.variance / (3 * size**2) * samples.step_s)
 
 
+def test_figures_of_the_table_are_fields_of_the_record() -> None:
+    figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)", "s to 10%", "s to 3%", "s to 1%")
+    assert method_columns([], []).titles == ("", "parameter", *figures)
+    record = MethodRecord(METHOD, "a", BenchStatus.OK, 0.5, 12000, None, 0.1, None, -0.5, Range(2, 1, 3), 1.5, 4.5)
+    assert method_cells(record)[2:8] == ("0.5", "12000", "0.1", "-0.5", "2 [1, 3]", "1.5 (4.5) open")
+
+
 def test_too_few_steps_have_no_intervals() -> None:
     assert make(7, steps=4, per_turn=2).efficiency() is None
     assert make(7, steps=6, per_turn=2).efficiency() is not None
@@ -355,12 +362,8 @@ def _few_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(steps, "PATHS", dict.fromkeys(steps.PATHS, 2**16))
 
 
-def asked(what: Any, objective: str = "fixed", camera: bool = False, named: bool = True) -> Any:
-    return survey(what, objective, camera=camera, named=named)
-
-
 def test_facts(tmp_path: Path) -> None:
-    facts, arrays = asked(problem(tmp_path))
+    facts, arrays = survey(problem(tmp_path), "fixed")
     assert facts["shapes"] == {KEY: [4, 4, 3]}
     assert (facts["independent"], facts["why"], facts["without"]) == ({KEY: "ptracer"}, {KEY: ""}, {})
     assert (facts["pixels"], facts["masked"]) == (64, False)
@@ -369,23 +372,16 @@ def test_facts(tmp_path: Path) -> None:
 
 
 def test_the_loss_has_several_images(tmp_path: Path) -> None:
-    _, arrays = asked(problem(tmp_path), "loss")
+    _, arrays = survey(problem(tmp_path), "loss")
     assert arrays["adjoints"].shape == (IMAGES, 8, 8, 3)
     assert len({adjoint.tobytes() for adjoint in arrays["adjoints"]}) == IMAGES
 
 
 @pytest.mark.parametrize(
-    ("camera", "change", "masked"),
-    [
-        (True, GAUSSIAN, True),
-        (False, GAUSSIAN, False),
-        pytest.param(True, ("box", "box"), False, marks=pytest.mark.long),
-    ],
+    ("change", "masked"), [(GAUSSIAN, True), pytest.param(("box", "box"), False, marks=pytest.mark.long)]
 )
-def test_the_border_is_left_out_with_camera_paths(
-    tmp_path: Path, camera: bool, change: tuple[str, str], masked: bool
-) -> None:
-    facts, arrays = asked(problem(tmp_path, change), camera=camera)
+def test_the_border_is_left_out(tmp_path: Path, change: tuple[str, str], masked: bool) -> None:
+    facts, arrays = survey(problem(tmp_path, change), "fixed")
     assert facts["masked"] is masked
     inside = arrays["mask"][:, :, 0] == 1
     assert inside.all() is not masked
@@ -393,22 +389,21 @@ def test_the_border_is_left_out_with_camera_paths(
     adjoint = np.abs(arrays["adjoints"][0]).sum(2)
     assert (adjoint[~inside] == 0).all()
     assert adjoint[4, 4] > 0
-    facts, arrays = asked(problem(tmp_path, change), "image", camera=camera)
+    facts, arrays = survey(problem(tmp_path, change), "image")
     assert (facts["shapes"], set(arrays)) == ({"image": [8, 8, 3]}, {"mask"})
 
 
 def test_a_method_that_is_never_right_is_reported(tmp_path: Path) -> None:
-    facts, arrays = asked(problem(tmp_path, ("area", "directionalarea"), GAUSSIAN), camera=True, named=False)
+    facts, _ = survey(problem(tmp_path, ("area", "directionalarea"), GAUSSIAN), "fixed")
     assert list(facts["without"]) == ["prb"]
     assert "directionalarea" in facts["without"]["prb"]
     assert facts["independent"] == {KEY: "ptracer"}
-    assert arrays["mask"].all()  # prb takes no part
 
 
 @pytest.mark.parametrize("mode", a_few(["fixed", "loss", "image"], ["fixed", "image"]))
 def test_steps_are_repeatable_and_the_border_does_not_count(tmp_path: Path, mode: str) -> None:
     what = problem(tmp_path, GAUSSIAN, overrides=("run.adjoint=independent",))
-    _, arrays = asked(what, "image" if mode == "image" else "loss", camera=True)
+    _, arrays = survey(what, "image" if mode == "image" else "loss")
     sampler = Sampler(what.config, mode, arrays)
     row, times = sampler.step(3, 4, 0)
     assert row.shape == ((192,) if mode == "image" else (48,))

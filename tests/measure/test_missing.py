@@ -168,6 +168,17 @@ def test_a_part_lost_in_noise_has_no_share():
     assert line == "lamp.position: 16 seeds cannot distinguish the derivative from 0"
 
 
+def test_truncation_errors_of_differences_are_not_missing():
+    """The complete derivative would lack 1.1 % if the share came from the differences of one step."""
+    random, found = np.random.default_rng(2), Missing([Direction(np.ones(3), "both")] * 3)
+    exact = np.array([1.0, 2.0, 0.5])
+    for _ in range(12):
+        found.ours.append(exact + random.normal(scale=1e-4, size=3))
+        found.differences.append(np.stack([found.ours[-1] + 0.011 * steps**2 * exact for steps in (1, 2, 4)]))
+    share, error = found.share() or (1.0, 1.0)
+    assert share < 3 * error < 1e-3
+
+
 def test_errors_are_correct():
     """Over many simulated measurements, the deviation from the known share is about as large as the stated error."""
     random, z = np.random.default_rng(1), []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,27 +53,6 @@ def test_gradients_without_light_are_undecided():
     assert race.compare(none, [1.0] * 8, none, [1.0] * 8) == (None, None, None)
 
 
-CAMERA_CASES = [
-    ("ptracer,reslrb:stack", "reslrb:stack", (False, True, True)),
-    ("prb,reslrb:stack", "reslrb:stack", (True, True, True)),
-    ("reslrb:stack", "prb", (True, True, True)),  # the reference of errors counts as a side too
-    ("reslrb:stack(paths=both),reslrb:event", "reslrb:stack", (True, True, True)),
-    ("reslrb:stack", "reslrb:stack(paths=auto)", (True, True, True)),
-    ("prb,reslrb:stack(paths=camera)", "reslrb:stack(paths=both)", (True, True, False)),  # all use the camera
-]
-
-
-@pytest.mark.parametrize(("cases", "reference", "expected"), CAMERA_CASES)
-def test_camera_paths_are_checked_wherever_they_are_used(
-    tmp_path: Path, cases: str, reference: str, expected: tuple[bool, bool, bool]
-) -> None:
-    changes: dict[str, Any] = {"reference": parse_cases(reference)[0]}
-    stage = pretended_steps.Stage()
-    pretended_steps.play(tmp_path, stage, pretended_steps.plan(cases, rounds=3, **changes))
-    [ask] = [question["ask"] for question in stage.asked if "ask" in question]
-    assert (ask["camera"], ask["named"], ask["light"]) == expected
-
-
 @pytest.mark.parametrize(
     ("paths", "label", "share"),
     [("light", "reslrb:stack", None), ("camera", "reslrb:stack(paths=camera)", None),
@@ -92,10 +70,3 @@ def test_errors_refer_to_all_light_of_the_scene(tmp_path: Path, paths: str, labe
     assert session.of(Role.REFERENCE)[0].config.integrator.options()["paths"] == paths
     left_out = "left out: reslrb:stack(paths=both): this scene has only light paths"
     assert (left_out in said) == (paths == "light")
-
-
-def test_camera_paths_of_the_default_list_may_be_left_out(tmp_path: Path) -> None:
-    stage = pretended_steps.Stage()
-    pretended_steps.play(tmp_path, stage, pretended_steps.plan("prb,reslrb:stack", rounds=3, default=True))
-    [ask] = [question["ask"] for question in stage.asked if "ask" in question]
-    assert (ask["camera"], ask["named"]) == (True, False)
