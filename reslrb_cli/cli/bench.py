@@ -44,7 +44,6 @@ class BenchOptions(ComparisonOptions):
     swept: str
     values: tuple[int, ...] | None
     max_depth: int
-    objective: str
 
 
 @click.command("bench")
@@ -61,12 +60,9 @@ class BenchOptions(ComparisonOptions):
 @click.option("--integrators", metavar="LIST",
               help="Integrators to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or your own "
                    "FILE.py:CLASS, separated by "
-                   "commas; OPTION is one of the integrator's, or adjoint. Default: those of "
+                   "commas; OPTION is one of the integrator's. Default: those of "
                    f"{INTEGRATORS} that support CONFIG. Times are divided by those of ptracer, or else of the "
                    "first.")  # fmt: skip
-@click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,
-              help="fixed: dL/dI is known before the image; l2: it comes from the image, as "
-                   "run.adjoint says.")  # fmt: skip
 @comparison_options
 def command(**given: Any) -> int:
     """Measure time and peak memory of gradient steps against path depth or sample count (--sweep).
@@ -95,7 +91,6 @@ def command(**given: Any) -> int:
         config=config,
         cases=parse_cases(options.integrators or INTEGRATORS),
         values=sorted(values or usual),
-        objective=options.objective,
         budget_s=options.budget,
         rounds=options.rounds,
         default=options.integrators is None,
@@ -146,6 +141,5 @@ def _conditions(config: Config, sweep: Sweep) -> str:
     parts = [str(config.source)]
     parts += [] if sweep.swept == "depth" else [f"depth {own}"]
     parts += [] if sweep.swept == "spp" else [f"{config.run.spp} spp"]
-    delta = "dL/dI known in advance" if sweep.objective == "fixed" else f"l2, adjoint {config.adjoint}"
     limit = "" if sweep.memory_limit is None else f", {sweep.memory_limit / 2**30:.2f} GiB each"
-    return ", ".join([*parts, roulette, delta, f"ratios to {sweep.baseline.label}{limit}"])
+    return ", ".join([*parts, roulette, "dL/dI known in advance", f"ratios to {sweep.baseline.label}{limit}"])

@@ -216,6 +216,7 @@ REMOVED = {
         ("bench gradcheck convergence", "--plot", "`reslrb report FILE -o page.html` plots results of --json FILE"),
         ("bench gradcheck convergence", "--resume", "--json FILE continues from the results in FILE"),
         ("bench convergence", "--memory-limit", "the shell's `ulimit -v KIB` limits every process of the command"),
+        ("bench", "--objective", "`reslrb convergence CONFIG --objective loss` measures steps of the loss"),
         ("optimize", "--verbose", "`reslrb --debug optimize` prints details of the measurements"),
         ("optimize", "-v", "`reslrb --debug optimize` prints details of the measurements"),
         ("sweep", "--verbose", "the folder of each run has its warnings"),

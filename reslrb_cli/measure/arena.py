@@ -17,10 +17,6 @@ from reslrb_cli.measure.methods import Measurement
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
 from reslrb_cli.records.measurement_files import Earlier
 
-#: If all processes together hold more than this share of the memory, each releases its own after a step.
-MEMORY_SHARE = 0.7
-MIB = 2**20
-
 #: Maximum number of steps after the cold one until no new kernel is compiled.
 MAX_WARM_UPS = 4
 
@@ -191,11 +187,6 @@ class Arena(Generic[Measured, Worker, Item]):
         """Return the workers that can take more steps."""
         return [member for member in self.members if member.alive]
 
-    def _tight(self) -> bool:
-        """True if workers together use so much memory that each worker must release memory after each step."""
-        mib = sum(member.cold["peak_mib"] for member in self._alive() if member.cold is not None)
-        return bool(mib * MIB > MEMORY_SHARE * self.plan.memory)
-
     def _answer(self, member: Contestant, over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
         """Wait for a worker's next answer. Returns None if the worker ended, or if the time was up (`over`)."""
         try:
@@ -220,7 +211,7 @@ class Arena(Generic[Measured, Worker, Item]):
         """
         for number in range(1 + MAX_WARM_UPS):
             cold = number == 0
-            member.process.ask(member.question(None) | {"cold": cold, "release": not cold and self._tight()})
+            member.process.ask(member.question(None) | {"cold": cold})
             answer = self._answer(member, self._pace.over)
             if answer is None:
                 return None
@@ -234,12 +225,12 @@ class Arena(Generic[Measured, Worker, Item]):
         """Yield the number of completed rounds after each round. Rounds start at number `first`. Earlier sessions
         completed `before` rounds.
         """
-        tight, round = self._tight(), first
+        round = first
         self._pace.begin_rounds(before)
         while (workers := self._alive()) and self._pace.another(round - first):
             start = round % len(workers)  # the first worker changes from round to round
             for worker in [*workers[start:], *workers[:start]]:
-                worker.process.ask(worker.question(round) | {"cold": False, "release": tight})
+                worker.process.ask(worker.question(round) | {"cold": False})
                 answer = self._answer(worker)
                 if answer is not None:
                     worker.keep(round, answer)

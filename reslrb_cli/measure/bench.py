@@ -179,7 +179,7 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
             stopped = False
             try:
                 self._begin(value)
-                for _ in self._measure(plan.name(value)):
+                for _ in self._measure():
                     yield []
             except Stopped:
                 stopped = True
@@ -208,19 +208,15 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
                 run = before.get(case.label) or self._run(case, value)
                 self.members.append(run)
                 if run.end is None:
-                    run.process = self._start(plan.first(run.config) | {"objective": plan.objective}, STEPS)
+                    run.process = self._start(plan.first(run.config), STEPS)
 
-    def _measure(self, name: str) -> Iterator[int]:
+    def _measure(self) -> Iterator[int]:
         for run in self._alive():
             answer = self._open(run)
             if answer is not None:
                 self.size = {name: answer[name] for name in SIZES}
         for run in self._alive():
             self._warm_up(run)
-        if self._tight():
-            self._say(
-                f"{name}: together the cases need more than the available memory; each releases its memory after a step"
-            )
         # Rounds continue after those of an earlier session, whose numbers set the seeds, until all have enough.
         first = 1 + max((round for run in self.members for round in run.steps), default=-1)
         return self._take_rounds(first, min((len(run.steps) for run in self._alive()), default=0))

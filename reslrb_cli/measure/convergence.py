@@ -37,24 +37,6 @@ INDEPENDENT_PATHS = 2**18
 #: Fewer turns, or rows of a reference, give no useful standard error.
 FEWEST = 3
 
-#: A turn lasts as long as a step of the slowest method, but at most this many seconds.
-TURN_S = 2.0
-
-#: A turn has at least two steps that are shorter than this many seconds: the first one refills the caches.
-SHORT_S = 1.0
-
-#: Maximum number of steps of one turn.
-MOST_STEPS = 8
-
-#: Turns of references, per turn of the compared methods.
-SHARES = {"reference": 0.5, "independent": 0.35}
-
-#: Steps of a turn if their number must not depend on time.
-FIXED = {"case": 2, "reference": 8, "independent": 4}
-
-#: Maximum number of steps of a reference's turn.
-MOST_REFERENCE_STEPS = 64
-
 
 class Role(str, enum.Enum):
     """Role of a member."""
@@ -64,12 +46,16 @@ class Role(str, enum.Enum):
     INDEPENDENT = "independent"
 
 
+#: Steps of a turn. The first one refills the caches.
+TURN = {Role.CASE: 2, Role.REFERENCE: 8, Role.INDEPENDENT: 4}
+
+
 @dataclass(kw_only=True)
 class Member(Contestant):
-    """Process of one member, with its steps so far and its number of steps per turn.
+    """Process of one member, with its steps so far.
 
-    `rows` are samples (P,), `turns` are their rounds, and `seconds` has the time of one step in each turn. `count` is
-    the number of steps in a turn. `taken` is the number of all requested steps, which determines the seeds.
+    `rows` are samples (P,), `turns` are their rounds, and `seconds` has the time of one step in each turn. `taken` is
+    the number of all requested steps, which determines the seeds.
     """
 
     role: Role
@@ -77,13 +63,17 @@ class Member(Contestant):
     config: Config
     spp: int
     out: Path
-    count: int = 1
     taken: int = 0
     step_s: float = 0.0
     rows: list[np.ndarray] = field(default_factory=list)
     turns: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     message: str = ""
+
+    @property
+    def count(self) -> int:
+        """The number of steps in a turn."""
+        return TURN[self.role]
 
     @property
     def label(self) -> str:
@@ -134,30 +124,6 @@ class Member(Contestant):
         self.rows, self.end = list(rows), entry["end"] and Ended(**entry["end"])
         if self.end is not None:
             self.close()
-
-
-def share_turns(members: list[Member], fixed: bool) -> None:
-    """Set the number of steps per turn of each member so that turns take about equal times.
-
-    With `fixed`, each member takes the `FIXED` number of steps for its role.
-    """
-    if fixed:
-        for member in members:
-            member.count = FIXED[member.role.value]
-        return
-    cases = [member for member in members if member.role is Role.CASE]
-    turn_s = min(max((member.step_s for member in cases), default=0.0), TURN_S)
-    for member in cases:
-        least = 2 if member.step_s < SHORT_S else 1
-        member.count = _fitting(turn_s, member.step_s, least, MOST_STEPS)
-    together = sum(member.count * member.step_s for member in cases)
-    for member in members:
-        if member.role is not Role.CASE:
-            member.count = _fitting(SHARES[member.role.value] * together, member.step_s, 1, MOST_REFERENCE_STEPS)
-
-
-def _fitting(turn_s: float, step_s: float, least: int, most: int) -> int:
-    return min(max(round(turn_s / max(step_s, 1e-4)), least), most)
 
 
 class Session(Arena[Plan, Member, int]):
@@ -318,7 +284,6 @@ class Session(Arena[Plan, Member, int]):
                     f"first step {member.cold_s:.1f} s, then {member.step_s:.3g} s, {member.cold['peak_mib']:.0f} MiB"
                 )
                 self._say(f"{member.label}{what}: {took}")
-        share_turns(self._alive(), self.plan.rounds is not None)
 
     # --- the rounds ---------------------------------------------------------------------------------------------------
 

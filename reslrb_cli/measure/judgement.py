@@ -254,7 +254,6 @@ class _Bias:
     bias_z: float | None = None
     bias_z_limit: float | None = None
     bias_reference: str | None = None
-    independent: bool = False
     message: str = ""
 
 
@@ -339,15 +338,14 @@ class Judgement:
         worst = max(biases, key=lambda bias: -1.0 if bias.bias_z is None else bias.bias_z)
         biased = True if any(b.biased for b in biases) else None if any(b.biased is None for b in biases) else False
         judges = ", ".join(dict.fromkeys(b.bias_reference for b in biases if b.bias_reference is not None)) or None
-        message, independent = next((b.message for b in biases if b.message), ""), all(b.independent for b in biases)
-        found[ALL] = replace(worst, biased=biased, bias_reference=judges, independent=independent, message=message)
+        message = next((b.message for b in biases if b.message), "")
+        found[ALL] = replace(worst, biased=biased, bias_reference=judges, message=message)
         return found
 
     def _bias(self, member: Member, key: str) -> _Bias:
         judge, place = self._judge(member, key), self._slices[key]
         if judge is None:
             return _Bias(message="there is no independent reference")
-        independent = _kin(judge) != _kin(member)
         ours, theirs = np.stack(member.rows)[:, place].astype(np.float64), self._rows(judge, place)
         if member.role is not Role.CASE:
             ours = self._rows(member, place)
@@ -357,11 +355,11 @@ class Judgement:
             self._family(),
             shape=tuple(self._session.facts["shapes"][key]),
             paired=False,
-            rounding=STOCK_ROUNDING if independent else ROUNDING,
+            rounding=ROUNDING if _kin(judge) == _kin(member) else STOCK_ROUNDING,
         )
         biased = {Verdict.HOLDS: False, Verdict.FAILS: True}.get(figures.verdict)
         message = figures.message or ("gradient and reference differ" if biased else "")
-        return _Bias(biased, figures.z_max, figures.z_max_limit, judge.label, independent, message)
+        return _Bias(biased, figures.z_max, figures.z_max_limit, judge.label, message)
 
     def _family(self) -> Family:
         """Return all comparisons of the session, which have a common correction."""
@@ -415,11 +413,9 @@ class Judgement:
         )
 
     def _stood(self, member: Member, key: str, bias: _Bias) -> ReferenceRecord:
-        floor, known = self._whole[key].floor, vars(bias).copy()
-        del known["independent"]
-        if floor is None:
-            known["message"] = _UNSEEN
-        return ReferenceRecord(member.method, key, len(member.rows), floor, **known)
+        floor = self._whole[key].floor
+        bias = bias if floor is not None else replace(bias, message=_UNSEEN)
+        return ReferenceRecord(member.method, key, len(member.rows), floor, **vars(bias))
 
 
 def _kin(member: Member) -> str:

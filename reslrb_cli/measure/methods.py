@@ -91,7 +91,9 @@ class Case:
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
         if known and adjoint:
-            raise ConfigError(blame, next(iter(adjoint)), "has no effect if dL/dI is known; change --objective")
+            raise ConfigError(
+                blame, next(iter(adjoint)), "has no effect if dL/dI is known; use convergence --objective loss"
+            )
         if known:
             adjoint = {"adjoint": "independent"}  # valid with any loss
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
@@ -260,7 +262,6 @@ class Measurement:
     """The settings common to all measurements that use processes.
 
     - `memory_limit` is the limit of each process in bytes, or None.
-    - `memory` is the machine's memory in bytes.
     - `device` is the name of the device.
     - `rounds` is the number of rounds, or None if `budget_s` decides.
     - `default` tells whether `cases` is the default list. Cases that do not support the scene are then left out.
@@ -269,9 +270,7 @@ class Measurement:
     config: Config
     variant: str
     cases: Sequence[Case]
-    objective: str
     memory_limit: int | None
-    memory: int
     budget_s: float
     rounds: int | None = None
     default: bool = False
@@ -314,7 +313,7 @@ class Sweep(Measurement):
         return next((case for case in self.cases if case.type == "ptracer"), self.cases[0])
 
     def _options(self) -> dict[str, Any]:
-        return {"values": list(self.values), "objective": self.objective, "sweep": self.swept}
+        return {"values": list(self.values), "sweep": self.swept}
 
     def may_refuse(self, case: Case) -> bool:
         """True if the measurement skips `case` when the case's integrator does not support the scene."""
@@ -324,7 +323,7 @@ class Sweep(Measurement):
         """Return the experiment of one case at one value. Raises ConfigError."""
         config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
         depth = value if self.swept == "depth" else config.integrator.max_depth
-        return case.at(config, depth, known=self.objective == "fixed")
+        return case.at(config, depth, known=True)
 
     def name(self, *values: int) -> str:
         """Format values of the swept quantity, for example `depth 2, 4`."""
@@ -366,11 +365,12 @@ ALL = "all"
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Measurement):
-    """The plan of `convergence`. Errors are relative to the `reference`.
+    """The plan of `convergence`. Errors are relative to the `reference`. `objective` is a key of `DEFAULTS`.
 
     `spps` are the samples per pixel of a step. If it is empty, those of `run` are used.
     """
 
+    objective: str
     reference: Case
     spps: Sequence[int] = ()
 
@@ -446,12 +446,11 @@ class Plan(Measurement):
 
 
 def machine_of(config: Config) -> dict[str, Any]:
-    """Return the fields of a `Measurement` that describe the machine: variant, device, memory, and memory limit. Raises
+    """Return the fields of a `Measurement` that describe the machine: variant, device, and memory limit. Raises
     ConfigError.
 
     The memory limit limits the address space, which does not include the memory of a GPU.
     """
     variant, _ = choose(config.variant)
-    memory = memory_bytes(variant)
-    limit = None if variant.startswith("cuda") else memory
-    return {"variant": variant, "memory": memory, "memory_limit": limit, "device": device_name(variant)}
+    limit = None if variant.startswith("cuda") else memory_bytes(variant)
+    return {"variant": variant, "memory_limit": limit, "device": device_name(variant)}

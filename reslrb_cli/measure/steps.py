@@ -64,15 +64,14 @@ class TimedSteps:
             dr.eval(result.image, result.loss, gradients)
         return gradients, times
 
-    def told(self, answer: dict[str, Any], cold: bool, release: bool) -> dict[str, Any]:
-        """Return the answer for a step. For a `cold` step, the answer includes the peak memory of Dr.Jit's arrays.
-        `release` frees the allocator's cache.
+    def told(self, answer: dict[str, Any], cold: bool) -> dict[str, Any]:
+        """Return the answer for a step, and free the allocator's cache for other processes. For a `cold` step, the
+        answer includes the peak memory of Dr.Jit's arrays.
         """
         if cold:
             answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
         self.clock.history = []
-        if release:
-            dr.flush_malloc_cache()
+        dr.flush_malloc_cache()
         return answer
 
 
@@ -107,13 +106,11 @@ def _of_kernel(ir: str) -> int:
 
 
 class Stepper(TimedSteps):
-    """The steps of `bench`.
-
-    `objective` is `fixed` or `l2`. `fixed` is sum(G * I) with an image G that is known before the image I. `l2` is the
-    mean of (I - G)^2 with `run.adjoint`. G is noise, because its content does not affect the time.
+    """The steps of `bench`. The objective is sum(G * I) with an image G that is known before the image I. G is noise,
+    because its content does not affect the time.
     """
 
-    def __init__(self, config: Config, objective: str) -> None:
+    def __init__(self, config: Config) -> None:
         built_in = config.scene.file == small.FILE
         super().__init__(config, small.build(config.scene.options) if built_in else load_configured(config))
         film = self.problem.scene.sensors()[self.sensor].film()
@@ -121,14 +118,11 @@ class Stepper(TimedSteps):
         self.size = (int(width), int(height))
         shapes = [self.problem.selection.array(key).shape for key in self.problem.selection.keys]
         self.texels = sum(shape[0] * shape[1] for shape in shapes if len(shape) == 3)
-        image = _noise(*self.size, int(film.base_channels_count()))
-        self._given = image if objective == "fixed" else lambda seen: dr.mean(dr.square(seen - image).array)
+        self._given = _noise(*self.size, int(film.base_channels_count()))
 
-    def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
+    def step(self, round: int, cold: bool) -> dict[str, Any]:
         """Take one step and measure it. For a `cold` step, memory is measured as well. Every step that is not `cold`
         runs twice, and only the second run is timed.
-
-        `release` frees the allocator's cache afterwards.
         """
         run, new_kernels = self.problem.config.run, 0
         at = seed(run.seed, round, self.sensor, "image")
@@ -147,16 +141,16 @@ class Stepper(TimedSteps):
         }
         if cold:
             answer["scratch_bytes"] = scratch_bytes(self.clock.history)
-        return self.told(answer, cold, release)
+        return self.told(answer, cold)
 
 
 def begin_steps(first: dict[str, Any]) -> Begun:
     """Start the process. The process first reports the size of film and textures. Each question then asks for a
     step.
     """
-    stepper = Stepper(told(first), first["objective"])
+    stepper = Stepper(told(first))
     size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
-    return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
+    return size, lambda question: stepper.step(question["round"], question["cold"])
 
 
 def _noise(width: int, height: int, channels: int) -> Any:
@@ -342,6 +336,6 @@ def begin_sampling(first: dict[str, Any]) -> Begun:
             taken.append(times)
         np.save(question["out"], np.stack(rows))
         reply = {"step_ms": [times.wall_ms for times in taken], "new_kernels": sum(t.new_kernels for t in taken)}
-        return sampler.told(reply, question["cold"], question["release"])
+        return sampler.told(reply, question["cold"])
 
     return {}, answer

@@ -155,7 +155,6 @@ class MethodRecord(Line):
         `bias_z`. By chance, any value in the table exceeds its limit with probability 1e-4.
     - `bias` is the relative bias, if there is one. `biased` is None if the bias is undecided. `message` then gives the
         reason.
-    - `independent` tells whether the reference shares no code with the method.
     - `seconds_to` has the time until averages reach each error (`0.1`, `0.03`, `0.01`). The time is None if a bias
         keeps averages above the error.
     - `extrapolated` lists the errors that need more steps than were measured, or that are below the reference's error.
@@ -179,7 +178,6 @@ class MethodRecord(Line):
     bias_z_limit: float | None = None
     bias: float | None = None
     bias_reference: str | None = None
-    independent: bool = False
     biased: bool | None = None
     seconds_to: dict[str, float | None] = field(default_factory=lambda: {f"{target:g}": None for target in TARGETS})
     extrapolated: list[str] = field(default_factory=list)

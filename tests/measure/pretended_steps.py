@@ -202,7 +202,7 @@ SIGNAL = float(TRUTH @ TRUTH)
 def plan(cases: str = LIST, **changes: Any) -> Plan:
     values: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": parse_cases(cases),
-        "reference": parse_cases("reslrb:stack")[0], "objective": "fixed", "memory_limit": None, "memory": 2**40,
+        "reference": parse_cases("reslrb:stack")[0], "objective": "fixed", "memory_limit": None,
         "budget_s": 0.0, "rounds": 32,
     }  # fmt: skip
     return Plan(**(values | changes))

@@ -41,8 +41,8 @@ def sweep(list_of: str = LIST, **changes: Any) -> Sweep:
     cases = parse_cases(list_of)
     values: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": cases,
-        "values": [2, 4], "objective": "fixed", "memory_limit": None,
-        "memory": 2**40, "budget_s": 0.0, "rounds": MIN_ROUNDS,
+        "values": [2, 4], "memory_limit": None,
+        "budget_s": 0.0, "rounds": MIN_ROUNDS,
     }  # fmt: skip
     return Sweep(**(values | changes))
 
@@ -127,19 +127,6 @@ def test_a_stop_keeps_finished_measurements(after: int, kept: list[int]) -> None
     rows = run(sweep(), stop=lambda: next(answers) > after)
     assert [row.record.repeats for row in rows] == kept
     assert all(row.record.status is BenchStatus.OK for row in rows)
-
-
-def test_cases_that_need_shared_memory_release_it() -> None:
-    asked: list[bool] = []
-
-    class Noting(Pretended):
-        def ask(self, question: dict[str, Any]) -> None:
-            asked.append(question["release"])
-            super().ask(question)
-
-    _, said = play(sweep(values=[2], memory=5 * 2**20), Noting)
-    assert asked[-1]
-    assert "memory" in said[0]
 
 
 def test_pace_divides_the_budget() -> None:
@@ -295,8 +282,8 @@ def run_swept(values: list[int], **changes: Any) -> tuple[list[BenchResult], lis
     cases = parse_cases(LIST)
     settings: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"]), "variant": "llvm_ad_rgb", "cases": cases,
-        "values": values, "objective": "fixed", "memory_limit": None,
-        "memory": 2**40, "budget_s": 0.0, "rounds": 3, "swept": "spp",
+        "values": values, "memory_limit": None,
+        "budget_s": 0.0, "rounds": 3, "swept": "spp",
     }  # fmt: skip
     what = Sweep(**(settings | changes))
     what.check()

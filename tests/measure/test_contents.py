@@ -141,13 +141,13 @@ CASES = [("photo.yaml", OF_PHOTO), ("cameras.yaml", OF_CAMERAS)]
 def measurements(config: Config, ours: str = "reslrb:stack", reference: str = "path") -> dict[str, Any]:
     """Return, for each command, the settings that must be equal for its measurement to continue."""
     cases = parse_cases(ours)
-    shared: dict[str, Any] = {"config": config, "variant": "llvm_ad_rgb", "cases": cases, "objective": "fixed",
-                              "memory_limit": None, "memory": 2**40, "budget_s": 0.0}  # fmt: skip
+    shared: dict[str, Any] = {"config": config, "variant": "llvm_ad_rgb", "cases": cases,
+                              "memory_limit": None, "budget_s": 0.0}  # fmt: skip
     return {
         "gradcheck": sampled_as(CheckSettings(config, cases, 0), "llvm_ad_rgb", ""),
         "gradcheck --missing": measured_as(config, {}, "llvm_ad_rgb", ""),
         "bench": Sweep(**shared, values=[2]).settings(),
-        "convergence": Plan(**shared, reference=parse_cases(reference)[0], spps=(4,)).settings(),
+        "convergence": Plan(**shared, objective="fixed", reference=parse_cases(reference)[0], spps=(4,)).settings(),
     }
 
 

@@ -11,7 +11,7 @@ import pytest
 from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.measure.convergence import MOST_REFERENCE_STEPS, MOST_STEPS, Role
+from reslrb_cli.measure.convergence import Role
 from reslrb_cli.records.measurement_files import Earlier, read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.tables import closing_sentence, notes
@@ -31,15 +31,12 @@ def test_steps_continue_after_compilation_with_distinct_seeds(tmp_path: Path) ->
     assert stage.purposes == [f"convergence, {name}" for name in names]
 
 
-def test_turns_are_interleaved_with_similar_lengths(tmp_path: Path) -> None:
+def test_turns_are_interleaved(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4), case_reslrb_stack=Pretence(0.1), case_reslrb_event=Pretence(0.01))
     session, _, _ = play(tmp_path, stage, plan(rounds=None, budget_s=20.0))
     names = ["case ptracer", "case reslrb:stack", "case reslrb:event", "reference reslrb:stack"]
     turns = [names[(r + k) % 4] for r in range(session.rounds) for k in range(4)]
     assert stage.turns == names + turns
-    assert [m.count for m in session.of(Role.CASE)] == [2, 4, MOST_STEPS]
-    together = 2 * 0.4 + 4 * 0.1 + MOST_STEPS * 0.01
-    assert session.of(Role.REFERENCE)[0].count == min(round(together / 2 / 0.1), MOST_REFERENCE_STEPS)
 
 
 def test_cache_effects_of_others_are_not_timed(tmp_path: Path) -> None:
@@ -106,7 +103,6 @@ def test_an_ended_independent_reference_is_replaced(tmp_path: Path) -> None:
     stage = Stage(independent_ptracer=Pretence(ends=1))
     _, results, _ = play(tmp_path, stage, plan("reslrb:event"))
     assert of(results, "reslrb:event").bias_reference == "reslrb:stack"
-    assert of(results, "reslrb:event").independent is False
 
 
 @pytest.mark.parametrize("default", [True, False])
