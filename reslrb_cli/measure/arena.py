@@ -59,19 +59,15 @@ class Contestant:
 MIN_ROUNDS = 3
 MAX_ROUNDS = 25
 
-#: Factor on the time for the next depth, whose kernels take longer to compile and to run.
-GROWTH = 1.3
-
 #: Message about measurements that exceed the budget.
 NO_TIME = "the budget was spent; allow more with --budget"
 
 
 class Pace:
-    """Divides the time among depths. Each depth gets GROWTH times as much time as the previous depth.
+    """Divides the time among depths. Each depth gets an equal share of the remaining time.
 
-    Time that one depth leaves unused goes to the remaining depths. While there is time, each depth gets at least
-    MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time does not count. Rounds of earlier sessions
-    count.
+    While there is time, each depth gets at least MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time
+    does not count. Rounds of earlier sessions count.
     """
 
     def __init__(
@@ -98,7 +94,7 @@ class Pace:
     def begin_depth(self) -> None:
         """Start a depth."""
         now = self._now()
-        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
+        self._depth_end = now + (self._end - now) / self._left
         self._left -= 1
 
     def begin_rounds(self, before: int = 0) -> None:

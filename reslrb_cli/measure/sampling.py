@@ -61,9 +61,6 @@ LEAST_SEEDS, MOST_SEEDS = 8, 64
 #: Fewer seeds give no useful standard error and are not judged.
 FEWEST = 3
 
-#: Shares of the budget: samples with more than LEAST_SEEDS get the larger one.
-LARGE_SHARE, SMALL_SHARE = 3, 1
-
 #: References by naive AD, which compile much longer than any other.
 NAIVE = ("walk_ad", "ptracer")
 
@@ -174,12 +171,8 @@ class Sampling:
         leave time for the first samples of all remaining names. Samples beyond LEAST_SEEDS get a share of the rest.
         """
         kept = self._end - sum(self._expected_s(other) for other in self._to_do)
-        own = self._share(name)
-        share = now + max(kept - now, 0.0) * own / (own + sum(self._share(other) for other in self._to_do))
+        share = now + max(kept - now, 0.0) / (1 + len(self._to_do))
         return [(FEWEST, self._end), (LEAST_SEEDS, kept), (math.inf, share)]
-
-    def _share(self, name: Name) -> int:
-        return LARGE_SHARE if self._is_cheap(name) else SMALL_SHARE
 
     def _is_cheap(self, name: Name) -> bool:
         """Whether more than LEAST_SEEDS are taken. Estimators and stock references get more than LEAST_SEEDS, because

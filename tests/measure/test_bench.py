@@ -206,8 +206,8 @@ def peak(name: str, depth: int) -> float:
     dr.flush_malloc_cache()
     reset_peak()
     before = peak_mib(dr.backend_v(mi.Float))
-    cold = stepper.step(0, True, False)
-    warm = stepper.step(1, False, False)
+    cold = stepper.step(0, True)
+    warm = stepper.step(1, False)
     assert warm["kernel_ms"] > 0
     return float(cold["peak_mib"]) - before
 

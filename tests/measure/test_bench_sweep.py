@@ -143,11 +143,11 @@ def test_pace_divides_the_budget() -> None:
             done += 1
         return done
 
-    # The shares of 100 s are 1, 1.3 and 1.69, so the first depth gets 25.1 s. The second depth gets 33.5 s of the
-    # remaining 77 s. The third depth gets the rest.
-    assert rounds(2.0, 3.0) == 7
+    # The first depth gets 33.3 s of 100 s. The second depth gets 34 s of the remaining 68 s. The third depth gets the
+    # rest.
+    assert rounds(2.0, 3.0) == 10
     assert rounds(3.0, 4.0) == 7
-    assert rounds(1.0, 5.0) == 9
+    assert rounds(1.0, 5.0) == 7
     assert 95.0 < now[0] <= 100.0
     assert rounds(1.0, 30.0, spent) == MIN_ROUNDS
     assert rounds(1.0, 50.0, Pace(100.0, 1, now=lambda: now[0])) == 1  # a second round would exceed the whole budget
