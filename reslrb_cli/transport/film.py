@@ -64,21 +64,21 @@ class Film:
             color = [showing(c) for c in color]  # they are added one by one, not as a packet
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
-    def taps(self, u: mi.Point2f, normalization: bool) -> list[tuple[mi.Point2u, mi.Float]]:
-        """Return the pixels that a splat at film position `u` touches, with their weights. Some pixels may be off the
-        film.
+    def taps(self, u: mi.Point2f, normalization: bool) -> tuple[list[tuple[mi.Point2u, mi.Float]], mi.Float]:
+        """Return the pixels that a splat at film position `u` touches, with their weights before normalisation, and the
+        factor that normalises them. Some pixels may be off the film.
         """
         first, (weights_x, weights_y), total = filter_weights(self.film.rfilter(), u)
         if self.whole:
             total = mi.Float(1)
         if not normalization:
             total = dr.detach(total)
-        scale = dr.select(total != 0, dr.rcp(total), 0)
-        return [
-            (mi.Point2u(mi.Point2i(first.x + x, first.y + y)), weights_x[x] * weights_y[y] * scale)
+        taps = [
+            (mi.Point2u(mi.Point2i(first.x + x, first.y + y)), weights_x[x] * weights_y[y])
             for y in range(len(weights_y))
             for x in range(len(weights_x))
         ]
+        return taps, dr.select(total != 0, dr.rcp(total), 0)
 
     def add(self, block: mi.ImageBlock, pixel: mi.Point2u, value: mi.Spectrum, active: mi.Bool) -> None:
         """Add `value` (C,) to one pixel if it is on the film."""
@@ -139,7 +139,6 @@ class AdjointImage:
 
     def __init__(self, film: Film, image: mi.Float, channels: int) -> None:
         self.image, self.channels, self.film = image, channels, film
-        self.filter = film.film.rfilter()
 
     def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> mi.Spectrum:
         """Return delta (C,) at film position `u` (pixels, relative to the crop window). If gradients are enabled, delta
@@ -147,11 +146,16 @@ class AdjointImage:
 
         Without `normalization`, the sum that divides the filter's weights has no derivative, as in Mitsuba.
         """
-        if self.filter.is_box_filter():  # 1 within a pixel, with or without normalisation
+        if self.film.film.rfilter().is_box_filter():  # 1 within a pixel, with or without normalisation
             pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
             inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
             return self._pixel(pixel, inside)
-        return self._filtered(u, active, normalization)
+        delta = mi.Spectrum(0)
+        taps, scale = self.film.taps(u, normalization)
+        for pixel, weight in taps:
+            inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
+            delta += self._pixel(pixel, inside) * weight
+        return delta * scale
 
     def _pixel(self, pixel: mi.Point2u, active: mi.Bool) -> mi.Spectrum:
         index = dr.fma(pixel.y, mi.UInt32(self.film.size.x), pixel.x)
@@ -161,20 +165,6 @@ class AdjointImage:
             color = [dr.gather(mi.Float, self.image, index * self.channels + c, active) for c in range(N_COLOR)]
         color = [color[c] for c in range(N_COLOR)]
         return mi.Spectrum(*color) if len(mi.Spectrum(0)) == N_COLOR else mi.Spectrum(sum(color))
-
-    def _filtered(self, u: mi.Point2f, active: mi.Bool, normalization: bool) -> mi.Spectrum:
-        first, (weights_x, weights_y), total = filter_weights(self.filter, u)
-        if self.film.whole:
-            total = mi.Float(1)
-        if not normalization:
-            total = dr.detach(total)
-        delta = mi.Spectrum(0)
-        for y in range(len(weights_y)):
-            for x in range(len(weights_x)):
-                pixel = mi.Point2u(mi.Point2i(first.x + x, first.y + y))
-                inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
-                delta += self._pixel(pixel, inside) * (weights_x[x] * weights_y[y])
-        return delta * dr.select(total != 0, dr.rcp(total), 0)
 
 
 STEPS = 256  # for a filter's integral, in each pixel
@@ -252,11 +242,6 @@ class PixelShares:
         )  # fmt: skip
         dr.make_opaque(made.even, made.rounds)
         return made
-
-    @staticmethod
-    def bytes(pixels: int) -> int:
-        """Return the distribution's size in bytes for a film with `pixels` pixels and one number of paths."""
-        return (MOST_SLOTS + 2) * 4 * pixels
 
     def count(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:
         """Return the number of paths of a pixel."""

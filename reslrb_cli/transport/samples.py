@@ -278,7 +278,7 @@ class Samples:
         return [self] if self.camera is None else [self, self.camera]
 
     def stream(self, name: int) -> mi.PCG32:
-        """Return a stream of random numbers independent of the sampler.
+        """Return a stream of random numbers independent of the sampler, so that light paths remain those of `ptracer`.
 
         The stream is hashed for each lane, as in Mitsuba's samplers. Without the hash, the first numbers of the lanes
         would be evenly distributed, with the same offset for all seeds.
@@ -286,6 +286,13 @@ class Samples:
         seed = mi.sample_tea_32(self.seed, mi.UInt32(name))[0]
         state, sequence = mi.sample_tea_32(seed, dr.arange(mi.UInt32, self.width))
         return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
+
+    def time(self, next_1d: Callable[[], mi.Float]) -> mi.Float:
+        """Return a time within the shutter interval. A random number is drawn only if the interval is longer than 0."""
+        time = mi.Float(self.sensor.shutter_open())
+        if self.plan.needs.moving_shutter:
+            time += next_1d() * self.sensor.shutter_open_time()
+        return time
 
     def emission_numbers(self, sampler: mi.Sampler) -> tuple[mi.Float, mi.Point2f, mi.Point2f]:
         """Return the random numbers of emission in the order of `ptracer`. The order is the choice of an emitter, the
@@ -337,23 +344,6 @@ class Samples:
         assert self.plan.grid is not None
         stream = self.stream(GUIDE_STREAM)
         return self.guide.draw(self.plan.grid, self.width, stream, choice, position, direction)
-
-    def numbers(self, name: int) -> NumberStream:
-        """Return a stream of numbers independent of the sampler, so that the light paths remain those of `ptracer`."""
-        return NumberStream(self.stream(name))
-
-
-class NumberStream:
-    """A plain generator with the two sampler methods that emission needs."""
-
-    def __init__(self, generator: mi.PCG32) -> None:
-        self.generator = generator
-
-    def next_1d(self) -> mi.Float:
-        return self.generator.next_float32()
-
-    def next_2d(self) -> mi.Point2f:
-        return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
 
 
 def passes(

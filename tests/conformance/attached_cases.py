@@ -186,7 +186,7 @@ FAULTS = [
                   "p.adjoint.lookup(there.u,", "p.adjoint.lookup(dr.detach(there.u),"),
     Fault("connection_without_geometry", "slab", BACK,
                   "there.f * there.weight", "there.f * dr.detach(there.weight)"),
-    Fault("rows_of_the_filter_detached", "slab", "transport.film:AdjointImage._filtered",
+    Fault("rows_of_the_filter_detached", "slab", "transport.film:Film.taps",
                   "weights_x[x] * weights_y[y]", "weights_x[x] * dr.detach(weights_y[y])"),
     Fault("blocks_begin_anew", "stack_of_2", "estimators.stack:walk_back",
                   "again(left), left, bottom, adjoint)", "again(left), left, bottom, adjoint.zero())"),

@@ -390,7 +390,7 @@ FAULTS = [
           "distance=arrived.distance", "distance=mi.Float(0)", by_ways("HNL")),
     Fault("sides_forgotten", "smooth", "transport.camera:_behind", "dr.select(ways.valid, m, 0)", "m",
           by_ways("HN"), quick=True),
-    Fault("aperture_forgotten", "small", "transport.camera:camera_walk", "mi.Float(first.near)", "mi.Float(0)",
+    Fault("aperture_forgotten", "small", "transport.camera:camera_walk", "mi.Float(near)", "mi.Float(0)",
           by_ways("HN")),
     Fault("twice_as_many_on_both_sides", "small", "transport.samples:_of_both",
           "width / (n_camera / crop)", "2 * width / (n_camera / crop)", by_ways("HNL")),
