@@ -17,7 +17,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.graph import sensor_rays
 from reslrb_cli.transport.connection import forward_derivatives
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.lamp_light import moving_splats, small_splat
@@ -149,8 +148,8 @@ def primary_ray(samples: Samples) -> tuple[mi.Ray3f, mi.Point2f, mi.Spectrum]:
     time = samples.time(next_1d)
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + mi.Point2f(next_1d(), next_1d())
     aperture = mi.Point2f(next_1d(), next_1d()) if plan.needs.thin_lens else mi.Point2f(0.5)
-    ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture)
-    return ray, u, weight * dr.rcp(per_pixel)
+    ray, weight = sensor.sample_ray_differential(time, 0.5, u / mi.Vector2f(size), aperture, True)
+    return mi.Ray3f(ray), u, weight * dr.rcp(per_pixel)
 
 
 @dataclass

@@ -374,19 +374,35 @@ def passes(
     if table is None:  # a plan has a grid only if paths are guided
         plan = replace(plan, grid=None, aims=False)
     film, pixels = Film(sensor, plan.whole), int(dr.prod(sensor.film().size()))  # as in `ptracer`
+    crop = int(dr.prod(film.size))
     # Opaque: literals would compile kernels for every sample count.
-    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))
+    scale = dr.opaque(mi.Float, float(crop) / (float(pixels) * spp))
 
     def part(size: int) -> Samples:
-        width, fraction = size * pixels, dr.opaque(mi.Float, size / spp)
-        if plan.paths == "camera":
-            return _camera_samples(plan, scene, sensor, film, size, size * int(dr.prod(film.size)), fraction, shares)
-        if plan.paths == "both":
-            return _of_both(plan, scene, sensor, film, size, fraction, light_share, table, emitters, shares)
-        if width > PASS_PATHS:
-            raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {size}")
+        """Return one pass. If the plan has both kinds of paths, the pass has at least one path of each kind."""
+        fraction, own_scale, ratio, camera = dr.opaque(mi.Float, size / spp), scale, None, None
+        n_camera = size * crop
+        width = n_camera if plan.paths == "camera" else size * pixels
+        if plan.weighs:
+            width = max(round(light_share * size * pixels), 1)
+            n_camera = max(round((1 - light_share) * size * crop), 1)
+            ratio = dr.opaque(mi.Float, width / (n_camera / crop))
+            own_scale = dr.opaque(mi.Float, crop / width) * fraction
+        most = max(width, n_camera)
+        if most > PASS_PATHS:
+            raise ValueError(f"{most} paths in one pass are more than 2^32 - 1: set samples_per_pass below {size}")
+        given = scene, sensor, plan, film, seeds[0], size
+        if plan.paths != "light":
+            camera_scale = dr.opaque(mi.Float, crop / n_camera) * fraction
+            dr.make_opaque(own_scale, camera_scale)
+            own = None if shares is None else shares(n_camera)
+            camera = Samples(*given, n_camera, camera_scale, fraction, None, None, ratio, emitters, own)
+            camera.plan = replace(plan, camera=True)
+            if plan.paths == "camera":
+                return camera
         guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
-        return Samples(scene, sensor, plan, film, seeds[0], size, width, scale, fraction, guide, net)
+        shared = None if camera is None else camera.shares
+        return Samples(*given, width, own_scale, fraction, guide, net, ratio, emitters, shared, camera)
 
     made = {size: part(size) for size in set(sizes)}
     return [_seeded(made[size], s) for size, s in zip(sizes, seeds, strict=True)]
@@ -400,38 +416,6 @@ def _seeded(samples: Samples, seed: mi.UInt32) -> Samples:
         dr.make_opaque(apart)
         camera = replace(camera, seed=apart)
     return replace(samples, seed=seed, camera=camera)
-
-
-def _camera_samples(
-    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, width: int, fraction: mi.Float,
-    shares: Callable[[int], PixelShares | None] | None,
-) -> Samples:  # fmt: skip
-    """Return `width` camera paths. `fraction` is the share of these paths in the image's samples."""
-    if width > PASS_PATHS:
-        raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
-    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / width) * fraction
-    dr.make_opaque(scale)
-    plan = replace(plan, camera=True)
-    own = None if shares is None else shares(width)
-    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, scale, fraction, shares=own)
-
-
-def _of_both(
-    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, fraction: mi.Float, light_share: float,
-    table: Table | None, emitters: EmitterDensities | None, shares: Callable[[int], PixelShares | None] | None,
-) -> Samples:  # fmt: skip
-    """Return light paths and camera paths, together `spp` samples per pixel. There is at least one of each kind."""
-    pixels, crop = int(dr.prod(sensor.film().size())), int(dr.prod(film.size))
-    width = max(round(light_share * spp * pixels), 1)
-    n_camera = max(round((1 - light_share) * spp * crop), 1)
-    camera = _camera_samples(plan, scene, sensor, film, spp, n_camera, fraction, shares)
-    ratio = dr.opaque(mi.Float, width / (n_camera / crop))
-    scale = dr.opaque(mi.Float, crop / width) * fraction
-    dr.make_opaque(scale)
-    guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
-    camera = replace(camera, ratio=ratio, emitters=emitters)
-    own = scale, fraction, guide, net, ratio, emitters, camera.shares, camera
-    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, *own)
 
 
 def _parts(spp: int) -> list[int]:
