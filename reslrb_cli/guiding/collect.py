@@ -360,15 +360,6 @@ class Said:
     whole: mi.Float
     places: list[mi.Float]
 
-    def by_start(self, cells: int) -> Array:
-        """Return sums of squares (voices, cells), float32."""
-        return np.array(self.starts).reshape(-1, cells)
-
-    def by_block(self) -> Array | None:
-        """Return sums of squares (voices, blocks of the film), float32, or None if no path is aimed."""
-        rows = len(self.whole) // BINS - 2
-        return np.array(self.places[0]).reshape(rows, -1) if self.places else None
-
 
 def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
     """Return the contributions of guided samples. `gradient` (H, W, C) is dL/dI. Values that are not finite are left

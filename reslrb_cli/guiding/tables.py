@@ -426,8 +426,9 @@ class Guiding:
             before = Learned.nothing(self.grid)
             before.calls = 1
         onward = self._onward(number).with_more(said, paths)
-        heard, draws = said.by_start(self.grid.cells), paths * (counts / self.grid.slots)
-        learned = before.with_more(self.grid, heard, draws, onward, said.by_block())
+        heard, draws = np.array(said.starts).reshape(-1, self.grid.cells), paths * (counts / self.grid.slots)
+        film = np.array(said.places[0]).reshape(len(heard), -1) if said.places else None
+        learned = before.with_more(self.grid, heard, draws, onward, film)
         if learned.worse > WRONG and learned.calls % EVERY == 0:
             learned.calls = 0  # the scene has changed, so it learns as often as at the start
         self.learned[number] = learned

@@ -97,8 +97,8 @@ class TangentSplat(Hooks):
             dr.set_grad(ray.d, d_direction)
             this, reached = segment_again(s, state.before, ray, vertex.pi, drawn, seen, scattered)
             following = this.next_ray(attached=True)
-            taps, scale = s.film.taps(this.connection.u, plan.attached_normalization)
-            taps = [(pixel, k * scale) for pixel, k in taps]
+            taps, total = s.film.taps(this.connection.u, plan.attached_normalization)
+            taps = [(pixel, k * dr.select(total != 0, dr.rcp(total), 0)) for pixel, k in taps]
             # `select` makes new variables: no other output depends on them, so clearing them on the way is harmless.
             there, sampled = this.connection, this.scattering
             c, weight = reached * there.f * there.weight, reached * sampled.weight

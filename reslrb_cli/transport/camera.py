@@ -20,7 +20,7 @@ from reslrb_cli.transport.densities import density_of_rays
 from reslrb_cli.transport.factors import Product, play
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.walk import Vertex, intersect
 from reslrb_cli.transport.weights import Rivals, cosine
 
 
@@ -185,19 +185,10 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
     state = hooks.start(first)
     active = mi.Bool(active) & (plan.max_depth > 0)
 
-    def intersect(ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.PreliminaryIntersection3f, mi.Bool]:
-        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        if not surrounded:
-            active = active & pi.is_valid()
-            pi.valid = mi.Bool(True)  # true in active lanes
-        if not plan.needs.has_instances:
-            pi.instance = dr.zeros(mi.ShapePtr)
-        return pi, active
-
     begun = first.ray.o
     if plan.hide_emitters:
         first.ray = _behind_lamps(scene, first.ray, active)
-    pi, active = intersect(first.ray, active)
+    pi, active = intersect(plan, scene, first.ray, active, surrounded)
     M, rivals = [mi.Float(0)], []
     if plan.weighs:
         axis = dr.normalize(dr.detach(sensor.world_transform() @ mi.Vector3f(0, 0, 1)))  # the sensor looks along it
@@ -262,7 +253,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
 
         path = _behind(plan, path, arrived, si, scattering)
         ray = dr.detach(si.spawn_ray(scattering.d))
-        pi, active = intersect(ray, active)
+        pi, active = intersect(plan, scene, ray, active, surrounded)
         path = replace(
             path, active=active, depth=path.depth + 1, ray=ray, pi=pi, product=product, eta=eta
         )  # fmt: skip

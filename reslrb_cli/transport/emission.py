@@ -105,7 +105,7 @@ def _emitter_ray(
 ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
     """Return a ray that leaves each lane's emitter. `lamp_ray` or Mitsuba samples the ray."""
     placed = samples.plan.placed_lamps
-    lamps = {lamp.emitter: (lamp, samples.areas(lamp), lamp in samples.plan.evened_lamps) for lamp in placed}
+    lamps = {lamp.emitter: (lamp, samples.areas.get(lamp), lamp in samples.plan.evened_lamps) for lamp in placed}
     if samples.plan.moving_emission:
         # An indirect call, even for a single emitter: without it, the derivative by each number of a transformation is
         # a sum over all paths, which would trace them again.

@@ -82,7 +82,7 @@ def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, stream: i
     time = samples.time(next_1d)
     position, aperture = mi.Point2f(next_1d(), next_1d()), mi.Point2f(next_1d(), next_1d())
     emitter = dr.gather(mi.EmitterPtr, samples.scene.emitters_dr(), index)
-    found = {lamp.emitter: (lamp, samples.areas(lamp), lamp in plan.evened_lamps) for lamp in lamps}
+    found = {lamp.emitter: (lamp, samples.areas.get(lamp), lamp in plan.evened_lamps) for lamp in lamps}
 
     def point(
         self: mi.Emitter, time: mi.Float, position: mi.Point2f, active: mi.Bool

@@ -235,17 +235,13 @@ class Samples:
     shares: PixelShares | None = None
     #: The camera paths of the same pass, next to light paths.
     camera: Samples | None = None
-    _areas: list[mi.Float] = field(init=False)  # of the reshaped lamps: `sums_of_areas`
+    #: Cumulative areas of the faces of lamps with moving faces.
+    areas: dict[Lamp, mi.Float] = field(init=False)
 
     def __post_init__(self) -> None:
         # Evaluated now: during tracing, they would split a kernel.
         lamps = self.plan.reshaped_lamps
-        self._areas = sums_of_areas(lamps) if lamps else []
-
-    def areas(self, lamp: Lamp) -> mi.Float | None:
-        """Return the cumulative areas of a lamp's faces if the faces move, otherwise None."""
-        reshaped = self.plan.reshaped_lamps
-        return self._areas[reshaped.index(lamp)] if lamp in reshaped else None
+        self.areas = dict(zip(lamps, sums_of_areas(lamps), strict=True)) if lamps else {}
 
     def ratio_at(self, u: mi.Point2f) -> mi.Float:
         """Return the number of all light paths divided by one pixel's number of camera paths. The film position `u`

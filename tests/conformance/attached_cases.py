@@ -187,7 +187,7 @@ FAULTS = [
     Fault("connection_without_geometry", "slab", BACK,
                   "there.f * there.weight", "there.f * dr.detach(there.weight)"),
     Fault("rows_of_the_filter_detached", "slab", "transport.film:Film.taps",
-                  "weights_x[x] * weights_y[y]", "weights_x[x] * dr.detach(weights_y[y])"),
+                  "columns[x] * rows[y]", "columns[x] * dr.detach(rows[y])"),
     Fault("blocks_begin_anew", "stack_of_2", "estimators.stack:walk_back",
                   "again(left), left, bottom, adjoint)", "again(left), left, bottom, adjoint.zero())"),
     Fault("blocks_without_their_last_vertex", "stack_of_2", "estimators.stack:walk_back",

@@ -193,8 +193,8 @@ def test_the_derivative_of_film_positions_is_the_same_in_both_modes(whole: bool)
     image = AdjointImage(film, weights, shape[2])
 
     def taps(u: mi.Point2f) -> Any:
-        weighed, scale = film.taps(u, True)
-        return sum(k * scale * dr.sum(image._pixel(pixel, (pixel.x < shape[1]) & (pixel.y < shape[0])))
+        weighed, total = film.taps(u, True)
+        return sum(k / total * dr.sum(image._pixel(pixel, (pixel.x < shape[1]) & (pixel.y < shape[0])))
                    for pixel, k in weighed)  # fmt: skip
 
     found = []
