@@ -383,16 +383,11 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
         value = square / dr.square(drawn.weight)
         counts = dr.isfinite(value) & (value > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, counts)
+    rows = [*squares, heard.light, mi.Float(heard.trail.count)]
+    whole, lane = dr.zeros(mi.Float, len(rows) * BINS), dr.arange(mi.UInt32, samples.width) % BINS
+    for number, value in enumerate(rows):
+        dr.scatter_reduce(dr.ReduceOp.Add, whole, value, lane + number * BINS, dr.isfinite(value))
     # One kernel: a later evaluation would trace everything again.
-    whole = _sums([*squares, heard.light, mi.Float(heard.trail.count)], samples.width)
     said = Said(sums, *walk_back(heard.trail), whole, hooks.places)
     dr.eval(said)
     return said
-
-
-def _sums(values: list[mi.Float], width: int) -> mi.Float:
-    """Return sums over paths. The result has len(values) * BINS entries. Values that are not finite are left out."""
-    result, lane = dr.zeros(mi.Float, len(values) * BINS), dr.arange(mi.UInt32, width) % BINS
-    for number, value in enumerate(values):
-        dr.scatter_reduce(dr.ReduceOp.Add, result, value, lane + number * BINS, dr.isfinite(value))
-    return result

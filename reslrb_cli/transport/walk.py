@@ -193,7 +193,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     pi, active = intersect(plan, scene, emission.ray, active)
     path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta, samples.early_numbers(), [], [])
     if aim is not None and not hooks.replaying:
-        path.pending = [Pending.nothing()]
+        path.pending = [Pending(mi.Float(0), mi.Float(1), mi.Float(-1))]  # no vertex, so nothing is aimed
     if plan.weighs:
         assert samples.emitters is not None
         path.rivals = [leave_emitter(plan, samples.emitters, scene, emission)]
