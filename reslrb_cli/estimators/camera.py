@@ -50,7 +50,7 @@ class Radiance(CameraHooks):
 def splat_camera_paths(samples: Samples, block: mi.ImageBlock, tracked: bool = False) -> None:
     """Add the image of camera paths to the block."""
     first, L = camera_walk(samples, Radiance(tracked))
-    samples.film.put(block, first.u, L * first.weight, first.active)
+    samples.film.put(block, first.u, L * first.weight, mi.Bool(True))
 
 
 @dataclass
@@ -72,7 +72,7 @@ class CameraSweep(CameraHooks):
         self.delta = mi.Spectrum(0)  # assigned at the start
 
     def start(self, first: FilmRay) -> CameraState:
-        self.delta = self.p.delta(first.u, first.active) * first.weight
+        self.delta = self.p.delta(first.u, mi.Bool(True)) * first.weight
         stack = Frame.empty_stack(self.p.plan, self.ring)
         return CameraState(stack, [] if self.p.block is None else [mi.Spectrum(0)])
 
@@ -127,7 +127,7 @@ def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
     ring, again = Ring.of(p.plan, stack_size), Pass(p.samples, None, p.adjoint)
     first, state = camera_walk(p.samples, CameraSweep(p, ring))
     if p.block is not None:
-        p.samples.film.put(p.block, first.u, state.L[0] * first.weight, first.active)
+        p.samples.film.put(p.block, first.u, state.L[0] * first.weight, mi.Bool(True))
 
     def before(end: mi.UInt32) -> StackState:
         return camera_walk(p.samples, CameraSweep(again, ring, end), end > 0)[1].stack

@@ -45,7 +45,6 @@ from reslrb_cli.estimators.stack import allocate, write
 from reslrb_cli.transport.aim import film_blocks
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.factors import BITS, CELLS, SHAPE, Product
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.plan import Plan
@@ -145,24 +144,6 @@ RAY = 0.2  # cost of a ray that hits nothing, in vertices
 
 
 @dataclass
-class Walked:
-    """Result of one walk, as float64.
-
-    For each cell there are three sums over the paths: squared later contributions at throughput 1 (voices, CELLS),
-    number of later vertices, and number of rays. There are also three means over the paths. `said` is the mean squared
-    contribution for each quantity (voices). `light` is the mean weight at the emitter. `length` is the mean number of
-    vertices plus one.
-    """
-
-    squares: Array
-    followed: Array
-    left: Array
-    said: Array
-    light: float
-    length: float
-
-
-@dataclass
 class Onward:
     """Sums (4, CELLS) as float32: squared contributions to gradient and image, later vertices, and rays.
 
@@ -180,20 +161,23 @@ class Onward:
         """Return the state before the first walk."""
         return Onward(np.asarray(box, np.float32), np.zeros((4, CELLS), np.float32))
 
-    def with_more(self, walked: Walked) -> Onward:
-        """Return the state after one more walk. All quantities of the gradient have equal weights, and the image is
-        last.
+    def with_more(self, said: Said, paths: int) -> Onward:
+        """Return the state after one more walk of `paths` paths. All quantities of the gradient have equal weights, and
+        the image is last.
 
         A walk without contributions to gradient or image adds nothing.
         """
-        heard = np.isfinite(walked.said) & (walked.said > 0)
-        if not (heard[:-1].any() and heard[-1] and np.isfinite(walked.light) and walked.light > 0):
+        *means, light, count = np.array(said.whole, np.float64).reshape(-1, BINS).sum(1) / paths
+        contributions, light, length = np.array(means), float(light), 1 + float(count)
+        heard = np.isfinite(contributions) & (contributions > 0)
+        if not (heard[:-1].any() and heard[-1] and np.isfinite(light) and light > 0):
             return self
-        unit = np.divide(walked.light**2, walked.said, out=np.zeros(len(heard)), where=heard)
-        gradient = unit[:-1] @ walked.squares[:-1] / heard[:-1].sum()
-        newest = np.stack([gradient, unit[-1] * walked.squares[-1], walked.followed, walked.left])
+        squares = np.array(said.squares).reshape(-1, CELLS)
+        unit = np.divide(light**2, contributions, out=np.zeros(len(heard)), where=heard)
+        gradient = unit[:-1] @ squares[:-1] / heard[:-1].sum()
+        newest = np.stack([gradient, unit[-1] * squares[-1], np.array(said.followed), np.array(said.left)])
         old = KEEP if self.light > 0 else 0.0
-        light, length = (old * a + (1 - old) * b for a, b in ((self.light, walked.light), (self.length, walked.length)))
+        light, length = (old * a + (1 - old) * b for a, b in ((self.light, light), (self.length, length)))
         return Onward(self.box, (KEEP * self.sums + newest).astype(np.float32), light, length)
 
     def arrays(self) -> dict[str, Array]:
@@ -376,22 +360,6 @@ class Said:
     whole: mi.Float
     places: list[mi.Float]
 
-    def by_start(self, cells: int) -> Array:
-        """Return sums of squares (voices, cells), float32."""
-        return np.array(self.starts).reshape(-1, cells)
-
-    def by_block(self) -> Array | None:
-        """Return sums of squares (voices, blocks of the film), float32, or None if no path is aimed."""
-        rows = len(self.whole) // BINS - 2
-        return np.array(self.places[0]).reshape(rows, -1) if self.places else None
-
-    def walked(self, paths: int) -> Walked:
-        """Return the result for `Onward`, given the number of paths."""
-        *said, light, count = np.array(self.whole, np.float64).reshape(-1, BINS).sum(1) / paths
-        squares, followed, left = (np.array(sums) for sums in (self.squares, self.followed, self.left))
-        squares = squares.reshape(len(said), CELLS)
-        return Walked(squares, followed, left, np.array(said), float(light), 1 + float(count))
-
 
 def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
     """Return the contributions of guided samples. `gradient` (H, W, C) is dL/dI. Values that are not finite are left
@@ -405,7 +373,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
     hooks = Hearing(samples, adjoint, loudness)
     heard: Heard = walk(samples, hooks)
     sampler = samples.sampler()
-    sample_time(plan, samples.sensor, sampler)
+    samples.time(sampler.next_1d)
     drawn = samples.drawn(*samples.emission_numbers(sampler))  # the numbers that the walk used
     assert drawn is not None
     squares = [dr.squared_norm(total) for total in heard.sums] + [heard.image]
@@ -415,16 +383,11 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
         value = square / dr.square(drawn.weight)
         counts = dr.isfinite(value) & (value > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, counts)
+    rows = [*squares, heard.light, mi.Float(heard.trail.count)]
+    whole, lane = dr.zeros(mi.Float, len(rows) * BINS), dr.arange(mi.UInt32, samples.width) % BINS
+    for number, value in enumerate(rows):
+        dr.scatter_reduce(dr.ReduceOp.Add, whole, value, lane + number * BINS, dr.isfinite(value))
     # One kernel: a later evaluation would trace everything again.
-    whole = _sums([*squares, heard.light, mi.Float(heard.trail.count)], samples.width)
     said = Said(sums, *walk_back(heard.trail), whole, hooks.places)
     dr.eval(said)
     return said
-
-
-def _sums(values: list[mi.Float], width: int) -> mi.Float:
-    """Return sums over paths. The result has len(values) * BINS entries. Values that are not finite are left out."""
-    result, lane = dr.zeros(mi.Float, len(values) * BINS), dr.arange(mi.UInt32, width) % BINS
-    for number, value in enumerate(values):
-        dr.scatter_reduce(dr.ReduceOp.Add, result, value, lane + number * BINS, dr.isfinite(value))
-    return result

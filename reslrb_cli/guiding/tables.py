@@ -28,7 +28,6 @@ for the image and half for the gradient.
 from __future__ import annotations
 
 import enum
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -68,31 +67,20 @@ def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = C
     return Grid((bits[0], bits[1], bits[2], bits[3]), tuple(float(np.float32(edge)) for edge in edges))
 
 
-@functools.lru_cache(maxsize=4)
-def least_slots(grid: Grid) -> Array:
-    """Return the minimum number of slots of each cell as float64. The minimum corresponds to GUIDE_UNIFORM times the
-    cell's measure.
-    """
-    measures = grid.measures()
-    result = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)
-    result.setflags(write=False)
-    return result
-
-
 def apportion(grid: Grid, density: Array) -> Array:
     """Return the slots of each cell (int64). Each cell has at least the slots that correspond to GUIDE_UNIFORM times
     its measure. The remaining slots are proportional to `density`.
     """
-    least = least_slots(grid)
+    measures = grid.measures()
+    least = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)
     # Rounded along the order of the cells, so that neighbours balance.
     ends = np.cumsum(density, dtype=np.float64)
     ends *= (grid.slots - least.sum()) / ends[-1]
     np.rint(ends, out=ends)
-    counts = least.copy()
-    counts[0] += ends[0]
-    counts[1:] += ends[1:]
-    counts[1:] -= ends[:-1]
-    return counts.astype(np.int64)
+    least[0] += ends[0]
+    least[1:] += ends[1:]
+    least[1:] -= ends[:-1]
+    return least.astype(np.int64)
 
 
 #: Blur over neighbouring cells along each number. With 1/4 instead of 1/20, a cell keeps a sixteenth of its value, and
@@ -385,11 +373,6 @@ class Guiding:
         assert self.grid is not None
         return max(MOST_BYTES // sensor_bytes(self.grid), 1)
 
-    def bytes(self, sensors: int) -> int:
-        """Return the bytes of the tables for `sensors` sensors."""
-        assert self.grid is not None
-        return min(sensors, self._apart) * sensor_bytes(self.grid)
-
     def state(self) -> tuple[dict[str, int], dict[str, Array]]:
         """Return the learned state: the gradient count of each sensor, and a mapping from `<sensor>/<what>` to
         arrays.
@@ -442,9 +425,10 @@ class Guiding:
         if before is None:
             before = Learned.nothing(self.grid)
             before.calls = 1
-        onward = self._onward(number).with_more(said.walked(paths))
-        heard, draws = said.by_start(self.grid.cells), paths * (counts / self.grid.slots)
-        learned = before.with_more(self.grid, heard, draws, onward, said.by_block())
+        onward = self._onward(number).with_more(said, paths)
+        heard, draws = np.array(said.starts).reshape(-1, self.grid.cells), paths * (counts / self.grid.slots)
+        film = np.array(said.places[0]).reshape(len(heard), -1) if said.places else None
+        learned = before.with_more(self.grid, heard, draws, onward, film)
         if learned.worse > WRONG and learned.calls % EVERY == 0:
             learned.calls = 0  # the scene has changed, so it learns as often as at the start
         self.learned[number] = learned

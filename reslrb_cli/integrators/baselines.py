@@ -23,9 +23,10 @@ from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.emission import differentiate_visible_emission, moving_splats, splat_visible_emission
+from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.lamp_light import moving_splats
 from reslrb_cli.transport.samples import Samples, in_passes
 from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
 

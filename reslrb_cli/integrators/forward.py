@@ -15,13 +15,9 @@ from reslrb_cli.estimators.attached import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, before_lamps, forward_derivatives, passage, transmittance
-from reslrb_cli.transport.emission import (
-    primary_ray,
-    sample_emission,
-    small_splat,
-    visible_tangent,
-)
+from reslrb_cli.transport.emission import primary_ray, sample_emission, visible_tangent
 from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.lamp_light import small_splat
 from reslrb_cli.transport.samples import Numbers, Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
@@ -100,7 +96,9 @@ class TangentSplat(Hooks):
             dr.set_grad(ray.o, mi.Point3f(d_origin))
             dr.set_grad(ray.d, d_direction)
             this, reached = segment_again(s, state.before, ray, vertex.pi, drawn, seen, scattered)
-            following, taps = this.next_ray(attached=True), s.film.taps(this.connection.u, plan.attached_normalization)
+            following = this.next_ray(attached=True)
+            taps, total = s.film.taps(this.connection.u, plan.attached_normalization)
+            taps = [(pixel, k * dr.select(total != 0, dr.rcp(total), 0)) for pixel, k in taps]
             # `select` makes new variables: no other output depends on them, so clearing them on the way is harmless.
             there, sampled = this.connection, this.scattering
             c, weight = reached * there.f * there.weight, reached * sampled.weight
@@ -190,9 +188,9 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             E = sample_emission(samples, samples.sampler()).weight
             [dE] = forward_derivatives(E)
         if plan.visible_emission and plan.paths == "light" and (plan.differentiate_emission or plan.differentiate_null):
-            primary = primary_ray(samples)
-            tangent = visible_tangent(plan, samples.scene, primary)
-            samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
+            ray, u, weight = primary_ray(samples)
+            tangent = visible_tangent(plan, samples.scene, ray)
+            samples.film.put(block, u, tangent * weight * samples.fraction, mi.Bool(True))
         if plan.small_lamps and plan.differentiate_emission:
             u, C, active = small_splat(samples)
             [tangent] = forward_derivatives(C)
@@ -200,6 +198,6 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
     for side in samples.sides():
         if side.plan.camera:
             first, state = camera_walk(side, CameraTangents(side))
-            side.film.put(block, first.u, state.d_radiance * first.weight, first.active)
+            side.film.put(block, first.u, state.d_radiance * first.weight, mi.Bool(True))
         else:
             walk(side, TangentSplat(side, block, dE))

@@ -42,12 +42,12 @@ from reslrb_cli.transport.emission import (
     Emission,
     primary_ray,
     sample_emission,
-    small_points,
     visible_radiance,
     visible_tangent,
 )
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import Film
+from reslrb_cli.transport.lamp_light import small_points
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
@@ -327,13 +327,13 @@ def _seen_emission(samples: Samples) -> Iterator[tuple[Suspect, mi.Spectrum, mi.
     Each item has radiance (C,) with its tangent, film positions, and active lanes.
     """
     plan, tangent = samples.plan, mi.Spectrum(0)
-    primary = primary_ray(samples)
-    radiance = visible_radiance(plan, samples.scene, primary)
+    ray, u, _ = primary_ray(samples)
+    radiance = visible_radiance(plan, samples.scene, ray)
     if plan.differentiate_emission or plan.differentiate_null:
-        tangent = visible_tangent(plan, samples.scene, primary)
-    si = samples.scene.ray_intersect(primary.ray, primary.active)
-    p, shape = dr.select(si.is_valid(), si.p, primary.ray.o), dr.reinterpret_array(mi.UInt32, si.shape)
-    yield Suspect(mi.UInt32(0), mi.UInt32(0), p, shape, radiance), tangent, primary.u, primary.active
+        tangent = visible_tangent(plan, samples.scene, ray)
+    si = samples.scene.ray_intersect(ray)
+    p, shape = dr.select(si.is_valid(), si.p, ray.o), dr.reinterpret_array(mi.UInt32, si.shape)
+    yield Suspect(mi.UInt32(0), mi.UInt32(0), p, shape, radiance), tangent, u, mi.Bool(True)
     if not plan.small_lamps:
         return
     tangent, point = mi.Spectrum(0), small_points(samples)

@@ -155,11 +155,6 @@ class Pending:
     distance: mi.Float
 
     @staticmethod
-    def nothing() -> Pending:
-        """Return the state of a path that leaves an emitter."""
-        return Pending(mi.Float(0), mi.Float(1), mi.Float(-1))
-
-    @staticmethod
     def of(aimed: Aimed, si: mi.SurfaceInteraction3f, pdf: mi.Float, discrete: mi.Bool) -> Pending:
         """Return the state after an event at `si`. `pdf` is the density of the event's direction. `discrete` marks the
         lanes in which the direction is discrete.

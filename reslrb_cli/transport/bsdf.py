@@ -152,13 +152,7 @@ class Scattering:
     sample_1: mi.Float
     sample_2: mi.Point2f
     active: mi.Bool
-    own_ways: Ways | None = None
-
-    @property
-    def ways(self) -> Ways:
-        """Densities for the weights of combined paths, in walks that need these densities."""
-        assert self.own_ways is not None
-        return self.own_ways
+    ways: Any = None  # `Ways`, in walks that need these densities
 
     def track(self, plan: Plan, hit: Hit) -> None:
         """Give `weight` the derivatives of the scene's parameters, for naive AD."""
@@ -314,7 +308,7 @@ def scatter(
             sample_1=numbers.bsdf_1d,
             sample_2=sample_2,
             active=active & valid & (pdf > 0),
-            own_ways=ways,
+            ways=ways,
         )
         return scattering, f_connection
 

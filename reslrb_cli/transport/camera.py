@@ -16,12 +16,11 @@ import mitsuba as mi
 from reslrb_cli.scene.graph import sensor_rays
 from reslrb_cli.transport.bsdf import EventNumbers, Scattering, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, film_density, passage
-from reslrb_cli.transport.densities import Place, density_of_rays
-from reslrb_cli.transport.emission import sample_time
+from reslrb_cli.transport.densities import density_of_rays
 from reslrb_cli.transport.factors import Product, play
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.walk import Vertex, intersect
 from reslrb_cli.transport.weights import Rivals, cosine
 
 
@@ -29,15 +28,12 @@ from reslrb_cli.transport.weights import Rivals, cosine
 class FilmRay:
     """Ray through film position `u` (pixels, relative to the crop window).
 
-    `weight` (C,) is the sensor's importance, normalised so that a sum over lanes gives an image. `near` is the distance
-    from the sensor's aperture to the origin of the ray.
+    `weight` (C,) is the sensor's importance, normalised so that a sum over lanes gives an image.
     """
 
     ray: mi.Ray3f
     u: mi.Point2f
     weight: mi.Spectrum
-    near: mi.Float
-    active: mi.Bool
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
@@ -45,11 +41,11 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
 
     If there are fewer rays than pixels, each ray goes to a random pixel of its own group of pixels.
     """
-    plan, sensor, size = samples.plan, samples.sensor, samples.film.size
+    sensor, size = samples.sensor, samples.film.size
     n_pixels = int(dr.prod(size))
     lane = dr.arange(mi.UInt32, samples.width)
     count = dr.opaque(mi.UInt32, samples.width)  # a literal would compile a kernel for every sample count
-    time = sample_time(plan, sensor, sampler)
+    time = samples.time(sampler.next_1d)
     if samples.width < n_pixels:
         per_pixel = mi.Float(count) / n_pixels
         pixel = dr.minimum(mi.UInt32((mi.Float(lane) + sampler.next_1d()) / per_pixel), n_pixels - 1)
@@ -63,11 +59,8 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + _within_pixel(samples, number, pixel, per_pixel)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture)
-    near = mi.Float(0)
-    if plan.weighs:
-        near = mi.Float(mi.traverse(sensor)["near_clip"]) / dr.dot(ray.d, axis_of(sensor))
     weight = weight * (samples.fraction * dr.rcp(per_pixel))
-    return FilmRay(dr.detach(ray), u, dr.detach(weight), near, mi.Bool(True))
+    return FilmRay(dr.detach(ray), u, dr.detach(weight))
 
 
 def _within_pixel(samples: Samples, number: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
@@ -80,11 +73,6 @@ def _within_pixel(samples: Samples, number: mi.UInt32, pixel: mi.UInt32, per_pix
     inverse = mi.Float(dr.brev(number)) * 2**-32
     place = mi.Point2f(x + mi.Float(number) / dr.maximum(per_pixel, 1), y + inverse)
     return dr.minimum(place - dr.floor(place), dr.one_minus_epsilon(mi.Float))
-
-
-def axis_of(sensor: mi.Sensor) -> mi.Vector3f:
-    """Return the direction in which a sensor looks."""
-    return dr.normalize(dr.detach(sensor.world_transform() @ mi.Vector3f(0, 0, 1)))
 
 
 @dataclass
@@ -190,31 +178,25 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
     """Trace one camera path per lane of `samples`, in `active` lanes. Returns the rays and the final state of
     `hooks`.
     """
-    plan, scene = samples.plan, samples.scene
+    plan, scene, sensor = samples.plan, samples.scene, samples.sensor
     sampler = samples.sampler()
     surrounded = plan.needs.environment is not None
     first = film_ray(samples, sampler)
     state = hooks.start(first)
-    active = first.active & mi.Bool(active) & (plan.max_depth > 0)
+    active = mi.Bool(active) & (plan.max_depth > 0)
 
-    def intersect(ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.PreliminaryIntersection3f, mi.Bool]:
-        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        if not surrounded:
-            active = active & pi.is_valid()
-            pi.valid = mi.Bool(True)  # true in active lanes
-        if not plan.needs.has_instances:
-            pi.instance = dr.zeros(mi.ShapePtr)
-        return pi, active
-
+    begun = first.ray.o
     if plan.hide_emitters:
-        begun = first.ray.o
         first.ray = _behind_lamps(scene, first.ray, active)
-        first.near = first.near + dr.norm(first.ray.o - begun)
-    pi, active = intersect(first.ray, active)
+    pi, active = intersect(plan, scene, first.ray, active, surrounded)
     M, rivals = [mi.Float(0)], []
     if plan.weighs:
-        p_cam = film_density(samples.sensor, dr.dot(first.ray.d, axis_of(samples.sensor)))
-        M, rivals = [], [Rivals(samples.ratio_at(first.u) / p_cam, mi.Float(0), mi.Float(first.near))]
+        axis = dr.normalize(dr.detach(sensor.world_transform() @ mi.Vector3f(0, 0, 1)))  # the sensor looks along it
+        cos = dr.dot(first.ray.d, axis)
+        near = mi.Float(mi.traverse(sensor)["near_clip"]) / cos  # from the aperture to the ray's origin
+        if plan.hide_emitters:
+            near = near + dr.norm(first.ray.o - begun)
+        M, rivals = [], [Rivals(samples.ratio_at(first.u) / film_density(sensor, cos), mi.Float(0), mi.Float(near))]
     path = CameraPath(
         active, mi.UInt32(1), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
         mi.Point3f(first.ray.o), mi.UInt32(0), M, rivals,
@@ -271,7 +253,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
 
         path = _behind(plan, path, arrived, si, scattering)
         ray = dr.detach(si.spawn_ray(scattering.d))
-        pi, active = intersect(ray, active)
+        pi, active = intersect(plan, scene, ray, active, surrounded)
         path = replace(
             path, active=active, depth=path.depth + 1, ray=ray, pi=pi, product=product, eta=eta
         )  # fmt: skip
@@ -339,7 +321,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
             if plan.needs.lamps:
                 cos = dr.abs(dr.dot(ds.n, ds.d))
                 place = dr.select(emitter.is_environment(), place, place * cos / dr.square(ds.dist))
-            e = density_of_rays(plan, table, Place(emitter, place, si.uv, -path.ray.d), indirect)
+            e = density_of_rays(plan, table, emitter, place, si.uv, -path.ray.d, indirect)
             rivals = sampled * own.M + dr.select(dr.isfinite(e), e, 0) * own.V
         weight = dr.select(active, dr.select(direct, 1, dr.rcp(1 + rivals)), 0)
     return MetLight(dr.select(active, Le, 0), weight, active, emitter, si)
@@ -409,7 +391,7 @@ def _weigh(
             if "DirectionalEmitter" in plan.needs.emitters:
                 distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
             g = dr.select(ds.delta & ~distant, dr.square(ds.dist), 1)
-        e = density_of_rays(plan, table, Place(ds.emitter, place, ds.uv, -ds.d), event.active)
+        e = density_of_rays(plan, table, ds.emitter, place, ds.uv, -ds.d, event.active)
         m = dr.select(path.events == 0, own.M, own.V * ways.ahead_back)
         m = dr.select(ways.ahead_valid, m, 0)
         joined = m * e * cosine(si, ds.d) / (ds.pdf * g)

@@ -99,65 +99,52 @@ def _projected_area(projector: mi.Emitter) -> float:
     return 1e-6 / max(abs(float(across[0] * down[1] - across[1] * down[0])), 1e-12)
 
 
-@dataclass
-class Place:
-    """Place where light leaves an emitter, as input for `density_of_rays`.
+def density_of_rays(
+    plan: Plan, table: EmitterDensities, emitter: mi.EmitterPtr, own: mi.Float, uv: mi.Point2f, d: mi.Vector3f,
+    active: mi.Bool,
+) -> mi.Float:  # fmt: skip
+    """Return e, the density of the rays that leave an emitter along `d`. If the emitter has a surface, e is divided by
+    the cosine at the surface.
 
-    `own` is the density of the place or direction in next event estimation. For a lamp, `own` is the density of the
-    place per area. For environments, `own` is the density of the direction. `own` does not include the probability of
-    choosing the emitter. `uv` are texture coordinates, and `d` is the direction of the light.
+    `own` is a density of next event estimation, without the choice of the emitter: of the place per area on a lamp, of
+    the direction for an environment. `uv` are the texture coordinates of the place.
     """
-
-    emitter: mi.EmitterPtr
-    own: mi.Float
-    uv: mi.Point2f
-    d: mi.Vector3f
-
-
-def density_of_rays(plan: Plan, table: EmitterDensities, at: Place, active: mi.Bool) -> mi.Float:
-    """Return e, the density of the rays that leave these places. If the emitter has a surface, e is divided by the
-    cosine at the surface.
-    """
-    number = dr.reinterpret_array(mi.UInt32, at.emitter)
+    number = dr.reinterpret_array(mi.UInt32, emitter)
     e = dr.gather(mi.Float, table.emitted, number, active)
     textured = any(lamp.texture is not None for lamp in plan.needs.lamps)
-    mapped = plan.needs.environment is not None and not _constant_environment(plan)
+    surrounds = None if plan.needs.environment is None else plan.needs.emitters[plan.needs.environment]
+    mapped = surrounds not in (None, "ConstantBackgroundEmitter")
     if not (textured or mapped or "Projector" in plan.needs.emitters):
         return e
     kind = dr.gather(mi.UInt32, table.kind, number, active)
     factor = mi.Float(1)
     if textured:
-        own = mi.Float(at.own)
+        by_texture = mi.Float(own)
         for lamp in plan.evened_lamps:
-            own = dr.select(at.emitter == mi.EmitterPtr(lamp.emitter), _evened(lamp, at, active), own)
-        factor = dr.select(kind == TEXTURED, own, factor)
+            here = emitter == mi.EmitterPtr(lamp.emitter)
+            by_texture = dr.select(here, _evened(lamp, own, uv, active & here), by_texture)
+        factor = dr.select(kind == TEXTURED, by_texture, factor)
     if mapped:
-        own = at.own
+        by_map = own
         if plan.environment_map and plan.differentiate_emission:
-            own = dr.select(dr.isfinite(own), (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi, dr.inv_four_pi)
-        factor = dr.select(kind == ENVIRONMENT, own, factor)
+            by_map = dr.select(dr.isfinite(own), (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi, dr.inv_four_pi)
+        factor = dr.select(kind == ENVIRONMENT, by_map, factor)
     if "Projector" in plan.needs.emitters:
-        factor = dr.select(kind == PROJECTOR, _projected(at, active & (kind == PROJECTOR)), factor)
+        factor = dr.select(kind == PROJECTOR, _projected(emitter, uv, d, active & (kind == PROJECTOR)), factor)
     return e * factor
 
 
-def _constant_environment(plan: Plan) -> bool:
-    assert plan.needs.environment is not None
-    return plan.needs.emitters[plan.needs.environment] == "ConstantBackgroundEmitter"
-
-
-def _evened(lamp: Lamp, at: Place, active: mi.Bool) -> mi.Float:
+def _evened(lamp: Lamp, own: mi.Float, uv: mi.Point2f, active: mi.Bool) -> mi.Float:
     """Return the density per area of a lamp whose points are sampled partly from its texture and partly uniformly."""
-    here = active & (at.emitter == mi.EmitterPtr(lamp.emitter))
-    there = lamp.shape.eval_parameterization(at.uv, mi.RayFlags.All, here)
+    there = lamp.shape.eval_parameterization(uv, mi.RayFlags.All, active)
     stretch = dr.norm(dr.cross(there.dp_du, there.dp_dv))
-    drawn = at.own * stretch
+    drawn = own * stretch
     return dr.select(dr.isfinite(drawn), (1 - DEFENSIVE) * drawn + DEFENSIVE, 1) / stretch
 
 
-def _projected(at: Place, active: mi.Bool) -> mi.Float:
+def _projected(emitter: mi.EmitterPtr, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """Return the density of a projector's directions, without the factor 1 / A. A is the picture's area at a distance
-    of 1. `at.uv` are coordinates of the picture.
+    of 1. `uv` are coordinates of the picture.
     """
 
     def density(self: mi.Emitter, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
@@ -167,4 +154,4 @@ def _projected(at: Place, active: mi.Bool) -> mi.Float:
         axis = dr.normalize(dr.detach(mi.traverse(self)["to_world"] @ mi.Vector3f(0, 0, 1)))
         return picture.pdf_position(uv, active) / dr.dot(axis, d) ** 3
 
-    return dr.dispatch(at.emitter, density, at.uv, at.d, active)
+    return dr.dispatch(emitter, density, uv, d, active)

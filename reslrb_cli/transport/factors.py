@@ -111,12 +111,6 @@ class Product:
         """Return the contribution: zero in every channel with a zero factor. Tracked under naive AD."""
         return self.tracked[0] if self.tracked else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
 
-    def differentiable(self) -> mi.Spectrum:
-        """Return the product of the nonzero factors. Return zero in channels with two or more zero factors, because
-        value and derivative vanish there.
-        """
-        return self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero])
-
     def weight(self) -> mi.Spectrum:
         """Return the weight (C,) of this product for roulette and selection. The weight estimates the value and the
         derivative of the contribution.
@@ -124,8 +118,8 @@ class Product:
         return self._where(self.raised[0] if self.raised else self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
     def alive(self) -> mi.Bool:
-        """Whether the value or derivative of any channel can be nonzero."""
-        return dr.any(self.differentiable() != 0)
+        """Whether the value or derivative of any channel can be nonzero. Both vanish with two or more zero factors."""
+        return dr.any(self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero]) != 0)
 
     @staticmethod
     def _where(values: mi.Spectrum, keep: list[mi.Bool]) -> mi.Spectrum:

@@ -57,28 +57,31 @@ class Film:
         `whole`, the filter weights are not divided by their sum.
         """
         if normalization and not self.whole:
-            total = filter_weights(self.film.rfilter(), u)[2]
+            _, total = self.taps(u, normalization)
             value = value * dr.select(total != 0, dr.detach(total) / total, 1)
         color = [value[c % len(value)] for c in range(N_COLOR)]  # a mono variant fills all three
         if block.channel_count() != len("RGBW"):
             color = [showing(c) for c in color]  # they are added one by one, not as a packet
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
-    def taps(self, u: mi.Point2f, normalization: bool) -> list[tuple[mi.Point2u, mi.Float]]:
-        """Return the pixels that a splat at film position `u` touches, with their weights. Some pixels may be off the
-        film.
+    def taps(self, u: mi.Point2f, normalization: bool) -> tuple[list[tuple[mi.Point2u, mi.Float]], mi.Float]:
+        """Return the pixels that a splat at film position `u` touches, with the filter weights of `ImageBlock.put`, and
+        the total that divides the weights. The total includes pixels off the film, and is 1 if the film is `whole`.
+
+        Without `normalization`, the total has no derivative.
         """
-        first, (weights_x, weights_y), total = filter_weights(self.film.rfilter(), u)
-        if self.whole:
-            total = mi.Float(1)
+        rfilter = self.film.rfilter()
+        radius, center = rfilter.radius(), u - 0.5
+        n = int(dr.ceil(2 * radius))
+        first = mi.Point2i(dr.ceil(center - radius))
+        columns = [rfilter.eval(mi.Float(first.x + i) - center.x) for i in range(n)]
+        rows = [rfilter.eval(mi.Float(first.y + i) - center.y) for i in range(n)]
+        total = mi.Float(1) if self.whole else sum(columns) * sum(rows)
         if not normalization:
             total = dr.detach(total)
-        scale = dr.select(total != 0, dr.rcp(total), 0)
         return [
-            (mi.Point2u(mi.Point2i(first.x + x, first.y + y)), weights_x[x] * weights_y[y] * scale)
-            for y in range(len(weights_y))
-            for x in range(len(weights_x))
-        ]
+            (mi.Point2u(mi.Point2i(first.x + x, first.y + y)), columns[x] * rows[y]) for y in range(n) for x in range(n)
+        ], total
 
     def add(self, block: mi.ImageBlock, pixel: mi.Point2u, value: mi.Spectrum, active: mi.Bool) -> None:
         """Add `value` (C,) to one pixel if it is on the film."""
@@ -139,7 +142,6 @@ class AdjointImage:
 
     def __init__(self, film: Film, image: mi.Float, channels: int) -> None:
         self.image, self.channels, self.film = image, channels, film
-        self.filter = film.film.rfilter()
 
     def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> mi.Spectrum:
         """Return delta (C,) at film position `u` (pixels, relative to the crop window). If gradients are enabled, delta
@@ -147,11 +149,16 @@ class AdjointImage:
 
         Without `normalization`, the sum that divides the filter's weights has no derivative, as in Mitsuba.
         """
-        if self.filter.is_box_filter():  # 1 within a pixel, with or without normalisation
+        if self.film.film.rfilter().is_box_filter():  # 1 within a pixel, with or without normalisation
             pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
             inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
             return self._pixel(pixel, inside)
-        return self._filtered(u, active, normalization)
+        delta = mi.Spectrum(0)
+        taps, total = self.film.taps(u, normalization)
+        for pixel, weight in taps:
+            inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
+            delta += self._pixel(pixel, inside) * weight
+        return delta * dr.select(total != 0, dr.rcp(total), 0)
 
     def _pixel(self, pixel: mi.Point2u, active: mi.Bool) -> mi.Spectrum:
         index = dr.fma(pixel.y, mi.UInt32(self.film.size.x), pixel.x)
@@ -161,20 +168,6 @@ class AdjointImage:
             color = [dr.gather(mi.Float, self.image, index * self.channels + c, active) for c in range(N_COLOR)]
         color = [color[c] for c in range(N_COLOR)]
         return mi.Spectrum(*color) if len(mi.Spectrum(0)) == N_COLOR else mi.Spectrum(sum(color))
-
-    def _filtered(self, u: mi.Point2f, active: mi.Bool, normalization: bool) -> mi.Spectrum:
-        first, (weights_x, weights_y), total = filter_weights(self.filter, u)
-        if self.film.whole:
-            total = mi.Float(1)
-        if not normalization:
-            total = dr.detach(total)
-        delta = mi.Spectrum(0)
-        for y in range(len(weights_y)):
-            for x in range(len(weights_x)):
-                pixel = mi.Point2u(mi.Point2i(first.x + x, first.y + y))
-                inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
-                delta += self._pixel(pixel, inside) * (weights_x[x] * weights_y[y])
-        return delta * dr.select(total != 0, dr.rcp(total), 0)
 
 
 STEPS = 256  # for a filter's integral, in each pixel
@@ -189,23 +182,6 @@ def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
     x = (np.arange((2 * taps + 1) * STEPS) + 0.5) / STEPS - taps - 0.5
     values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
     return list(zip(range(-taps, taps + 1), values.reshape(-1, STEPS).mean(1).tolist(), strict=True))
-
-
-def filter_weights(
-    rfilter: mi.ReconstructionFilter, u: mi.Point2f
-) -> tuple[mi.Point2i, tuple[list[mi.Float], list[mi.Float]], mi.Float]:
-    """Return the filter weights that `ImageBlock.put` uses at film position `u`.
-
-    The result contains the first touched pixel, the column weights, the row weights, and the sum over all pixels. The
-    sum includes pixels off the film.
-    """
-    radius = rfilter.radius()
-    taps = int(dr.ceil(2 * radius))
-    center = u - 0.5
-    first = mi.Point2i(dr.ceil(center - radius))
-    columns = [rfilter.eval(mi.Float(first.x + i) - center.x) for i in range(taps)]
-    rows = [rfilter.eval(mi.Float(first.y + i) - center.y) for i in range(taps)]
-    return first, (columns, rows), sum(columns) * sum(rows)
 
 
 EVEN = 0.25  # minimum share of camera paths that are spread evenly over the pixels
@@ -252,11 +228,6 @@ class PixelShares:
         )  # fmt: skip
         dr.make_opaque(made.even, made.rounds)
         return made
-
-    @staticmethod
-    def bytes(pixels: int) -> int:
-        """Return the distribution's size in bytes for a film with `pixels` pixels and one number of paths."""
-        return (MOST_SLOTS + 2) * 4 * pixels
 
     def count(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:
         """Return the number of paths of a pixel."""

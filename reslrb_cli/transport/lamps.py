@@ -53,7 +53,10 @@ def lamp_point(
     if lamp.texture is not None and lamp.has_faces:
         return _textured_point(lamp.shape, lamp.texture, sample, active, evened)
     if lamp.texture is not None and evened:
-        ps, weight = _any_point(lamp.shape, lamp.texture, time, sample, active)
+        uv, density = _any_uv(lamp.texture, sample, active)
+        there = lamp.shape.eval_parameterization(uv, mi.RayFlags.All, active)
+        there.time = time
+        ps, weight = mi.PositionSample3f(there), _weight(there, density, active)
     else:
         ps, weight = lamp.emitter.sample_position(time, sample, active)
     if lamp.is_sphere:
@@ -82,16 +85,6 @@ def _textured_point(
     si = mi.SurfaceInteraction3f(mi.PositionSample3f(there), mi.Color0f())
     si.n = there.n
     return si, _weight(there, density, active)
-
-
-def _any_point(
-    shape: mi.Shape, texture: mi.Texture, time: mi.Float, sample: mi.Point2f, active: mi.Bool
-) -> tuple[mi.PositionSample3f, mi.Float]:
-    """Return a point on a textured lamp. The point is sampled partly as in Mitsuba's emitter, and partly uniformly."""
-    uv, density = _any_uv(texture, sample, active)
-    there = shape.eval_parameterization(uv, mi.RayFlags.All, active)
-    there.time = time
-    return mi.PositionSample3f(there), _weight(there, density, active)
 
 
 def _weight(there: mi.SurfaceInteraction3f, density: mi.Float, active: mi.Bool) -> mi.Float:

@@ -235,17 +235,13 @@ class Samples:
     shares: PixelShares | None = None
     #: The camera paths of the same pass, next to light paths.
     camera: Samples | None = None
-    _areas: list[mi.Float] = field(init=False)  # of the reshaped lamps: `sums_of_areas`
+    #: Cumulative areas of the faces of lamps with moving faces.
+    areas: dict[Lamp, mi.Float] = field(init=False)
 
     def __post_init__(self) -> None:
         # Evaluated now: during tracing, they would split a kernel.
         lamps = self.plan.reshaped_lamps
-        self._areas = sums_of_areas(lamps) if lamps else []
-
-    def areas(self, lamp: Lamp) -> mi.Float | None:
-        """Return the cumulative areas of a lamp's faces if the faces move, otherwise None."""
-        reshaped = self.plan.reshaped_lamps
-        return self._areas[reshaped.index(lamp)] if lamp in reshaped else None
+        self.areas = dict(zip(lamps, sums_of_areas(lamps), strict=True)) if lamps else {}
 
     def ratio_at(self, u: mi.Point2f) -> mi.Float:
         """Return the number of all light paths divided by one pixel's number of camera paths. The film position `u`
@@ -278,7 +274,7 @@ class Samples:
         return [self] if self.camera is None else [self, self.camera]
 
     def stream(self, name: int) -> mi.PCG32:
-        """Return a stream of random numbers independent of the sampler.
+        """Return a stream of random numbers independent of the sampler, so that light paths remain those of `ptracer`.
 
         The stream is hashed for each lane, as in Mitsuba's samplers. Without the hash, the first numbers of the lanes
         would be evenly distributed, with the same offset for all seeds.
@@ -286,6 +282,13 @@ class Samples:
         seed = mi.sample_tea_32(self.seed, mi.UInt32(name))[0]
         state, sequence = mi.sample_tea_32(seed, dr.arange(mi.UInt32, self.width))
         return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
+
+    def time(self, next_1d: Callable[[], mi.Float]) -> mi.Float:
+        """Return a time within the shutter interval. A random number is drawn only if the interval is longer than 0."""
+        time = mi.Float(self.sensor.shutter_open())
+        if self.plan.needs.moving_shutter:
+            time += next_1d() * self.sensor.shutter_open_time()
+        return time
 
     def emission_numbers(self, sampler: mi.Sampler) -> tuple[mi.Float, mi.Point2f, mi.Point2f]:
         """Return the random numbers of emission in the order of `ptracer`. The order is the choice of an emitter, the
@@ -338,23 +341,6 @@ class Samples:
         stream = self.stream(GUIDE_STREAM)
         return self.guide.draw(self.plan.grid, self.width, stream, choice, position, direction)
 
-    def numbers(self, name: int) -> NumberStream:
-        """Return a stream of numbers independent of the sampler, so that the light paths remain those of `ptracer`."""
-        return NumberStream(self.stream(name))
-
-
-class NumberStream:
-    """A plain generator with the two sampler methods that emission needs."""
-
-    def __init__(self, generator: mi.PCG32) -> None:
-        self.generator = generator
-
-    def next_1d(self) -> mi.Float:
-        return self.generator.next_float32()
-
-    def next_2d(self) -> mi.Point2f:
-        return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
-
 
 def passes(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None,
@@ -384,19 +370,35 @@ def passes(
     if table is None:  # a plan has a grid only if paths are guided
         plan = replace(plan, grid=None, aims=False)
     film, pixels = Film(sensor, plan.whole), int(dr.prod(sensor.film().size()))  # as in `ptracer`
+    crop = int(dr.prod(film.size))
     # Opaque: literals would compile kernels for every sample count.
-    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))
+    scale = dr.opaque(mi.Float, float(crop) / (float(pixels) * spp))
 
     def part(size: int) -> Samples:
-        width, fraction = size * pixels, dr.opaque(mi.Float, size / spp)
-        if plan.paths == "camera":
-            return _camera_samples(plan, scene, sensor, film, size, size * int(dr.prod(film.size)), fraction, shares)
-        if plan.paths == "both":
-            return _of_both(plan, scene, sensor, film, size, fraction, light_share, table, emitters, shares)
-        if width > PASS_PATHS:
-            raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {size}")
+        """Return one pass. If the plan has both kinds of paths, the pass has at least one path of each kind."""
+        fraction, own_scale, ratio, camera = dr.opaque(mi.Float, size / spp), scale, None, None
+        n_camera = size * crop
+        width = n_camera if plan.paths == "camera" else size * pixels
+        if plan.weighs:
+            width = max(round(light_share * size * pixels), 1)
+            n_camera = max(round((1 - light_share) * size * crop), 1)
+            ratio = dr.opaque(mi.Float, width / (n_camera / crop))
+            own_scale = dr.opaque(mi.Float, crop / width) * fraction
+        most = max(width, n_camera)
+        if most > PASS_PATHS:
+            raise ValueError(f"{most} paths in one pass are more than 2^32 - 1: set samples_per_pass below {size}")
+        given = scene, sensor, plan, film, seeds[0], size
+        if plan.paths != "light":
+            camera_scale = dr.opaque(mi.Float, crop / n_camera) * fraction
+            dr.make_opaque(own_scale, camera_scale)
+            own = None if shares is None else shares(n_camera)
+            camera = Samples(*given, n_camera, camera_scale, fraction, None, None, ratio, emitters, own)
+            camera.plan = replace(plan, camera=True)
+            if plan.paths == "camera":
+                return camera
         guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
-        return Samples(scene, sensor, plan, film, seeds[0], size, width, scale, fraction, guide, net)
+        shared = None if camera is None else camera.shares
+        return Samples(*given, width, own_scale, fraction, guide, net, ratio, emitters, shared, camera)
 
     made = {size: part(size) for size in set(sizes)}
     return [_seeded(made[size], s) for size, s in zip(sizes, seeds, strict=True)]
@@ -410,38 +412,6 @@ def _seeded(samples: Samples, seed: mi.UInt32) -> Samples:
         dr.make_opaque(apart)
         camera = replace(camera, seed=apart)
     return replace(samples, seed=seed, camera=camera)
-
-
-def _camera_samples(
-    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, width: int, fraction: mi.Float,
-    shares: Callable[[int], PixelShares | None] | None,
-) -> Samples:  # fmt: skip
-    """Return `width` camera paths. `fraction` is the share of these paths in the image's samples."""
-    if width > PASS_PATHS:
-        raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
-    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / width) * fraction
-    dr.make_opaque(scale)
-    plan = replace(plan, camera=True)
-    own = None if shares is None else shares(width)
-    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, scale, fraction, shares=own)
-
-
-def _of_both(
-    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, fraction: mi.Float, light_share: float,
-    table: Table | None, emitters: EmitterDensities | None, shares: Callable[[int], PixelShares | None] | None,
-) -> Samples:  # fmt: skip
-    """Return light paths and camera paths, together `spp` samples per pixel. There is at least one of each kind."""
-    pixels, crop = int(dr.prod(sensor.film().size())), int(dr.prod(film.size))
-    width = max(round(light_share * spp * pixels), 1)
-    n_camera = max(round((1 - light_share) * spp * crop), 1)
-    camera = _camera_samples(plan, scene, sensor, film, spp, n_camera, fraction, shares)
-    ratio = dr.opaque(mi.Float, width / (n_camera / crop))
-    scale = dr.opaque(mi.Float, crop / width) * fraction
-    dr.make_opaque(scale)
-    guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
-    camera = replace(camera, ratio=ratio, emitters=emitters)
-    own = scale, fraction, guide, net, ratio, emitters, camera.shares, camera
-    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, *own)
 
 
 def _parts(spp: int) -> list[int]:

@@ -4,8 +4,8 @@ The hooks process the connections. `Hooks` is the interface between a walk and a
 repeats the loop.
 
 One segment of a light path starts with the ray that reaches a vertex. A segment consists of the vertex's connection,
-the scattering event, and the next ray. A segment depends only on its ray, its intersection, its random numbers, and the
-scene. A segment can therefore be evaluated again from its ray, its intersection, its random numbers and the scene.
+the scattering event, and the next ray. A segment can be evaluated again from its ray, its intersection, its random
+numbers, and the scene.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`. This walk and `ptracer` therefore trace the same paths
 from the same seed. Numbers for selections by hooks come from a separate stream. A replay that selects nothing therefore
@@ -193,7 +193,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     pi, active = intersect(plan, scene, emission.ray, active)
     path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta, samples.early_numbers(), [], [])
     if aim is not None and not hooks.replaying:
-        path.pending = [Pending.nothing()]
+        path.pending = [Pending(mi.Float(0), mi.Float(1), mi.Float(-1))]  # no vertex, so nothing is aimed
     if plan.weighs:
         assert samples.emitters is not None
         path.rivals = [leave_emitter(plan, samples.emitters, scene, emission)]
@@ -297,12 +297,15 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
 
 
 def intersect(
-    plan: Plan, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+    plan: Plan, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, surrounded: bool = False
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Bool]:
-    """Return the intersection of the ray, and the active lanes with a hit."""
+    """Return the intersection of the ray, and the active lanes with a hit. If `surrounded`, rays may reach an
+    environment, and lanes without a hit stay active.
+    """
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    active = active & pi.is_valid()
-    pi.valid = mi.Bool(True)  # in active lanes
+    if not surrounded:
+        active = active & pi.is_valid()
+        pi.valid = mi.Bool(True)  # in active lanes
     if not plan.needs.has_instances:
         pi.instance = dr.zeros(mi.ShapePtr)
     return pi, active

@@ -41,7 +41,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.bsdf import Scattering
-from reslrb_cli.transport.densities import EmitterDensities, Place, density_of_rays
+from reslrb_cli.transport.densities import EmitterDensities, density_of_rays
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.lamps import lamp_point
 from reslrb_cli.transport.plan import Plan
@@ -136,7 +136,7 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
         own, cos, uv, surface, distance = dr.dispatch(
             emitter, leave, ray.time, emission.position, ray.o, ray.d, mi.Bool(True)
         )
-        e = density_of_rays(plan, table, Place(emitter, own, uv, dr.normalize(ray.d)), mi.Bool(True))
+        e = density_of_rays(plan, table, emitter, own, uv, dr.normalize(ray.d), mi.Bool(True))
         unseen = mi.Bool(False)
         sphere = []
         M = choice * own / (e * dr.maximum(cos, 1e-12))

@@ -193,8 +193,9 @@ def test_the_derivative_of_film_positions_is_the_same_in_both_modes(whole: bool)
     image = AdjointImage(film, weights, shape[2])
 
     def taps(u: mi.Point2f) -> Any:
-        return sum(k * dr.sum(image._pixel(pixel, (pixel.x < shape[1]) & (pixel.y < shape[0])))
-                   for pixel, k in film.taps(u, True))  # fmt: skip
+        weighed, total = film.taps(u, True)
+        return sum(k / total * dr.sum(image._pixel(pixel, (pixel.x < shape[1]) & (pixel.y < shape[0])))
+                   for pixel, k in weighed)  # fmt: skip
 
     found = []
     for objective in (splat, taps, lambda u: dr.sum(image.lookup(u, mi.Bool(True)))):

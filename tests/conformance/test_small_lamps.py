@@ -187,7 +187,7 @@ def test_radiance_counts_once_if_its_lamp_moves_too(size: float):
 
 # ---- The code broken on purpose ----
 
-SPLAT = "transport.emission:small_points"
+SPLAT = "transport.lamp_light:small_points"
 FAULTS = [
     Fault("left_out", "third", "transport.emission:splat_visible_emission", "if samples.plan.small_lamps",
           "if False", frozenset({("stack", "ptracer")}), quick=True),
@@ -196,7 +196,7 @@ FAULTS = [
     Fault("primary_rays_find_them_too", "third", "transport.emission:_radiance",
           "emitter != mi.EmitterPtr(lamp.emitter)", "mi.Bool(True)",
           frozenset({("stack", "analytic"), ("stack", "ptracer")}), quick=True),
-    Fault("cosine_forgotten", "two", "transport.emission:_points", "cos * weight", "weight",
+    Fault("cosine_forgotten", "two", "transport.lamp_light:_points", "cos * weight", "weight",
           frozenset({("stack", "ptracer")})),
     Fault("turns_not_counted", "two", SPLAT, "(mi.Float(count) / mi.Float(lanes))", "1",
           frozenset({("stack", "ptracer")})),

@@ -16,7 +16,7 @@ from conformance.drawing import SPP, by_harsh_table, guided, harsh
 
 from reslrb_cli.estimators.attached import AttachedSweep
 from reslrb_cli.guiding import collect
-from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked, hear
+from reslrb_cli.guiding.collect import BINS, FLOOR, LEAN, SURE, Onward, Said, hear
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import Case, integrator, seeds
@@ -119,9 +119,11 @@ def test_the_probability_is_bounded_on_both_sides() -> None:
         assert (raised <= np.maximum(np.array(throughput)[:5], 1 / chance if chance else np.inf)).all()
 
 
-def walked(**changes: Any) -> Walked:
-    zeros = np.zeros(CELLS)
-    return replace(Walked(np.zeros((2, CELLS)), zeros, zeros, np.array([4.0, 9.0]), 2.0, 3.0), **changes)
+def walked(said: tuple[float, float] = (4.0, 9.0), light: float = 2.0, **changes: Any) -> Said:
+    """Return the result of a walk of one path with two later vertices, which contributed `said`."""
+    whole, zeros = np.zeros((4, BINS)), np.zeros(CELLS)
+    whole[:, 0] = [*said, light, 2.0]
+    return replace(Said(None, np.zeros((2, CELLS)), zeros, zeros, whole, []), **changes)
 
 
 def cell_of(x: int, y: int, z: int) -> int:
@@ -137,7 +139,7 @@ def test_cells_share_with_their_neighbours_and_none_is_zero() -> None:
     left[[loud, quiet]] = 1e6
     squares = np.zeros((2, CELLS))
     squares[0, loud], squares[1, loud] = 1e6 * 0.25 * 4, 1e6 * 0.5 * 9
-    onward = Onward.nothing(BOX).with_more(walked(squares=squares, followed=2.0 * left, left=left))
+    onward = Onward.nothing(BOX).with_more(walked(squares=squares, followed=2.0 * left, left=left), 1)
     for share, square in ((1.0, 0.25), (0.0, 0.5), (0.5, 0.375)):
         s = onward.chances(share)
         # (squared contributions relative to whole paths, times light squared) / (later vertices plus the cost of a ray)
@@ -152,13 +154,13 @@ def test_cells_share_with_their_neighbours_and_none_is_zero() -> None:
 def test_walks_without_contributions_change_nothing() -> None:
     onward = Onward.nothing(BOX)
     assert np.isinf(onward.chances(1.0)).all()
-    for said, light in (([0.0, 1.0], 1.0), ([1.0, 0.0], 1.0), ([np.nan, 1.0], 1.0), ([1.0, 1.0], 0.0)):
-        assert onward.with_more(walked(said=np.array(said), light=light)) is onward
+    for said, light in (((0.0, 1.0), 1.0), ((1.0, 0.0), 1.0), ((np.nan, 1.0), 1.0), ((1.0, 1.0), 0.0)):
+        assert onward.with_more(walked(said, light), 1) is onward
 
 
 def test_without_data_all_paths_survive() -> None:
     """No table ends paths in a scene whose paths do not continue beyond the first surface."""
-    known = Onward.nothing(BOX).with_more(walked())
+    known = Onward.nothing(BOX).with_more(walked(), 1)
     assert known.light > 0
     for share in (0.0, 0.5, 1.0):
         assert np.isposinf(known.chances(share)).all()
@@ -168,21 +170,22 @@ def test_learned_state_does_not_depend_on_the_unit_of_light() -> None:
     """Throughputs are proportional to the light. The learned s is therefore inversely proportional to the light."""
     random = np.random.default_rng(3)
     squares, left = random.gamma(0.2, size=(2, CELLS)), random.integers(0, 300, CELLS).astype(float)
-    known = walked(squares=squares, followed=2 * left, left=left)
-    s = Onward.nothing(BOX).with_more(known).chances(0.5)
+    sums = {"squares": squares, "followed": 2 * left, "left": left}
+    s = Onward.nothing(BOX).with_more(walked(**sums), 1).chances(0.5)
     for unit in (1e-12, 1e12):
-        brighter = replace(known, said=known.said * unit**2, light=known.light * unit)
-        np.testing.assert_allclose(Onward.nothing(BOX).with_more(brighter).chances(0.5) * unit, s, rtol=1e-5)
+        brighter = walked((4.0 * unit**2, 9.0 * unit**2), 2.0 * unit, **sums)
+        np.testing.assert_allclose(Onward.nothing(BOX).with_more(brighter, 1).chances(0.5) * unit, s, rtol=1e-5)
 
 
-def walk_of(scene: Case, ours: Any, seed: int) -> Walked:
-    """Return the data of one walk, from which a table would learn."""
+def walk_of(scene: Case, ours: Any, seed: int) -> Said:
+    """Return the data of one walk, from which a table would learn, with sums by cell as NumPy arrays."""
     leaves = scene.leaves()
     job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(seed), SPP, scene.params)
     samples = ours.passes(job, Purpose.BOTH)[0]
-    found = hear(samples, scene.adjoint).walked(samples.width)
+    found = hear(samples, scene.adjoint)
     scene.release(leaves)
-    return found
+    squares = np.array(found.squares).reshape(-1, CELLS)
+    return replace(found, squares=squares, followed=np.array(found.followed), left=np.array(found.left))
 
 
 def heard(name: str, change: Callable[[Case, Any], None], count: int, block: int) -> np.ndarray:
@@ -282,6 +285,6 @@ def test_trained_tables_end_paths_with_small_contributions() -> None:
     for table in ("learned", "certain"):
         if table == "certain":
             certain(scene, ours)
-        lengths.append(walk_of(scene, ours, 7).length)
+        lengths.append(np.array(walk_of(scene, ours, 7).whole).reshape(-1, BINS)[-1].sum())
     print(lengths)
     assert lengths[0] < lengths[1]

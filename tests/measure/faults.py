@@ -198,7 +198,7 @@ FAULTS = [
           "dr.select(even | black, sample, uv)", "dr.select(even, sample, uv)", by("stack", "analytic")),
     # ---- Adjoints and derivatives: paths are right, and naive AD of them is a reference ----
     Fault("adjoint_without_filter", "wide_filter", "transport.film:AdjointImage.lookup",
-          "self.filter.is_box_filter()", "True", by("gather stack", "walk_ad", "ptracer")),
+          "self.film.film.rfilter().is_box_filter()", "True", by("gather stack", "walk_ad", "ptracer")),
     Fault("channels_of_adjoint_swapped", "cornell", "transport.film:AdjointImage._pixel",
           "mi.Spectrum(*color)", "mi.Spectrum(*color[::-1])", by("gather stack", "walk_ad", "ptracer")),
     Fault("emission_not_differentiated", "lamp", "estimators.base:differentiate_emission",
