@@ -246,7 +246,7 @@ def gradcheck(
         gc.collect()  # earlier scenes and the gradients of their parameters would otherwise take part in the check
         checked = settings_of(config, integrators, budget, seeds, spp, time.monotonic() - began)
         check = Gradcheck(checked)
-        records = [result.record for result in check.run(stop, logger.info)]
+        records = list(check.run(stop, logger.info))
         for line in look_into(check, records, stop, logger.debug):
             logger.info(line)
         return records
