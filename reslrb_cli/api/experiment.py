@@ -225,8 +225,7 @@ def gradcheck(
     - `spp`: samples per pixel of one gradient.
     - `allow_code`: permit running the code of the integrators' files.
 
-    For your own integrators, the log (`logging.INFO`) reports noise and cost. The log also gives hints if an integrator
-    is wrong.
+    If your own integrator is wrong, the log (`logging.INFO`) gives hints.
 
     An interrupt stops the check after the current gradient and raises KeyboardInterrupt. Sets the experiment's Mitsuba
     variant if none is set. Raises ConfigError and UnsupportedScene.

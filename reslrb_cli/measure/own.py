@@ -14,8 +14,7 @@ message reports measurements, and is no proof.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -35,9 +34,6 @@ Array = np.ndarray
 #: Seeds of each measurement; the reference has twice as many, and its first half is the direction. If these are
 #: inconclusive, there are `MORE` times as many.
 SEEDS, MORE = 16, 4
-
-#: Minimum number of seeds for the noise and time of a gradient, and seconds during which more are taken.
-LEAST_SEEDS, COST_SECONDS = 4, 10.0
 
 #: Maximum path length that is examined.
 DEEPEST = 5
@@ -75,62 +71,24 @@ class Ratio:
 def look_into(
     check: Gradcheck, records: Sequence[GradcheckRecord], stop: Callable[[], bool], say: Callable[[str], None]
 ) -> Iterator[str]:
-    """Yield messages about the noise, time and likely faults of each of the user's own integrators. `records` are the
+    """Yield a message about the likely fault of each of the user's own integrators that fails. `records` are the
     results of `gradcheck`.
 
-    Raises KeyboardInterrupt after `stop()`. `say` receives the name of the current measurement.
+    Raises KeyboardInterrupt after `stop()`. `say` receives the name of the examined integrator.
     """
     for listed in check.participants.listed:
-        if listed.type != "custom":
-            continue
         mine = [record for record in records if record.integrator == listed.label]
-        yield _cost(check, listed.label, stop)
         failing = [record for record in mine if record.verdict is Verdict.FAILS]
-        if failing:
-            yield f"{listed.label}: {Looking(check.participants, listed.label, stop, say).sentence(failing)}"
-
-
-def _cost(check: Gradcheck, label: str, stop: Callable[[], bool]) -> str:
-    """Compare a gradient's noise and time with `reslrb`, for the same kinds of paths."""
-    parts = check.participants
-    ours = _ours(parts, label)
-    figures, measured = [], SEEDS
-    for integrator in (parts.integrators[label], ours):
-        rows, times = [], []
-        for seed in seeds(measured, 5):
-            _check(stop)
-            begin = time.perf_counter()
-            rows.append(parts.gradient(integrator, seed))
-            times.append(time.perf_counter() - begin)
-            if len(times) >= LEAST_SEEDS and sum(times) > COST_SECONDS:
-                break
-        measured = len(rows)
-        figures.append((np.var(rows, axis=0, ddof=1).sum(), float(np.median(times[1:]))))
-    (noise, seconds), (our_noise, our_seconds) = figures
-    way = parts.ways[label].paths
-    times_noise = f"{noise / our_noise:.3g} times the variance" if our_noise > 0 else "variance unknown"
-    return (
-        f"{label}: {times_noise} and {seconds / our_seconds:.3g} times the time ({1e3 * seconds:.3g} ms) of a "
-        f"gradient by reslrb:stack(paths={way}), medians of {measured - 1}"
-    )
-
-
-def _check(stop: Callable[[], bool]) -> None:
-    if stop():
-        raise KeyboardInterrupt
-
-
-def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
-    """Return the reference: `reslrb` with the same kind of paths. `other` may change the depths."""
-    options = parts.options_of(label) | other
-    return make_integrator("reslrb", estimator="stack", **parts.ways[label].options, **options)
+        if listed.type == "custom" and failing:
+            say(f"now examining {listed.label}")
+            yield f"{listed.label}: {Looking(check.participants, listed.label, stop).sentence(failing)}"
 
 
 class Looking:
     """Measurements that search for faults of the integrator `label`, which failed the check."""
 
-    def __init__(self, parts: Participants, label: str, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
-        self.parts, self.label, self._stop, self._say = parts, label, stop, say
+    def __init__(self, parts: Participants, label: str, stop: Callable[[], bool]) -> None:
+        self.parts, self.label, self._stop = parts, label, stop
         self._seeds = SEEDS
         self._options = parts.options_of(label)
         self.depth = self._options["max_depth"]
@@ -139,12 +97,12 @@ class Looking:
     # --- measuring ----------------------------------------------------------------------------------------------------
 
     def _pair(self, **other: int) -> tuple[StepIntegrator, StepIntegrator]:
-        """Return the integrator and the reference. `other` may change the depths of both."""
-        return self.parts.own_with(self.label, **other), _ours(self.parts, self.label, **other)
+        """Return the integrator, and `reslrb` with the same kind of paths. `other` may change the depths of both."""
+        ours = self._options | other | self.parts.ways[self.label].options
+        return self.parts.own_with(self.label, **other), make_integrator("reslrb", estimator="stack", **ours)
 
     def images(self, **other: int) -> Ratio:
         """Return the ratio of the images, with equal weights in all pixels."""
-        self._measure("images", other)
         mine, ours = (
             np.array([self.parts.case.image(one, seed, self.parts.spp).sum() for seed in self._each(SEEDS, block)])
             for block, one in zip((5, 6), self._pair(**other), strict=True)
@@ -153,7 +111,6 @@ class Looking:
 
     def gradients(self, **other: int) -> dict[str, Ratio]:
         """Return the ratio for each parameter whose reference gradient differs significantly from zero."""
-        self._measure("gradients", other)
         own, ours = self._pair(**other)
         reference = np.stack([self.parts.gradient(ours, seed) for seed in self._each(2 * self._seeds, 6)])
         mine = np.stack([self.parts.gradient(own, seed) for seed in self._each(self._seeds, 5)])
@@ -185,7 +142,6 @@ class Looking:
         own, image = (self.parts.own_with(self.label, max_depth=n) for n in (depth, depth if seen is None else seen))
         case = Case(scene, keys, self.parts.case.sensor)
         case.weigh(np.array(self.parts.case.weights))
-        self._measure("derivatives by emission", {"max_depth": depth})
         emitted = np.concatenate([case.initial[key] for key in keys])
         found = np.array([
             case.gradient(own, seed, self.parts.spp, step=case.known_step) @ emitted
@@ -194,16 +150,11 @@ class Looking:
         ])  # fmt: skip
         return Ratio(float(found.mean()), _error(found)), float(found.std(ddof=1))
 
-    def _measure(self, what: str, options: Mapping[str, int]) -> None:
-        """Report the current measurement."""
-        where = ", ".join(f"{name} {value}" for name, value in options.items() if value != NEVER)
-        without = "without roulette" if NEVER in options.values() else ""
-        self._say(f"now examining {self.label}: {', '.join(filter(None, [what, where, without]))}")
-
     def _each(self, count: int, block: int) -> Iterator[int]:
         """Yield seeds until the user stops."""
         for seed in seeds(count, block):
-            _check(self._stop)
+            if self._stop():
+                raise KeyboardInterrupt
             yield seed
 
     # --- messages -----------------------------------------------------------------------------------------------------

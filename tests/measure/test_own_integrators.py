@@ -81,11 +81,8 @@ def checked(capsys: pytest.CaptureFixture[str], options: str, *more: str) -> tup
     return code, [line for line in lines if line.startswith(f"{name}:")]
 
 
-def test_a_correct_integrator_holds_and_its_cost_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    code, lines = checked(capsys, "", *FEW)
-    assert code == 0
-    assert len(lines) == 1
-    assert "times the variance and" in lines[0]
+def test_a_correct_integrator_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert checked(capsys, "", *FEW) == (0, [])
 
 
 #: Faults, and the phrases that the message about each fault must contain.
@@ -118,9 +115,9 @@ def test_a_fault_is_found_and_explained(capsys: pytest.CaptureFixture[str], faul
         Path("scene.xml").write_text(room(MIXED))
     code, lines = checked(capsys, fault, *more)
     assert code == ExitCode.CHECK_FAILED
-    assert len(lines) == 2, lines
+    [line] = lines
     for words in FOUND[fault]:
-        assert words in lines[1], lines[1]
+        assert words in line
 
 
 #: Integrators of Mitsuba, imported as in users' files, and the configuration that checks them.
