@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 #: Options of comparisons; `--missing` makes none.
-COMPARING = {"suite": "--suite", "integrators": "--integrators", "cluster": "--cluster"}
+COMPARING = {"suite": "--suite", "integrators": "--integrators"}
 
 #: Options of a configuration; a suite has none.
 CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp"}
@@ -73,6 +73,8 @@ class GradcheckOptions(ExperimentOptions):
             raise ConfigError(option, "", "has no effect with --missing, which compares nothing; remove one of them")
         if self.missing and self.config_file is None:
             raise ConfigError("--missing", "", "needs a CONFIG with parameters and a loss")
+        if self.missing and self.cluster is not None:
+            raise ConfigError("--cluster", "", "has no effect with --missing, which distributes nothing; remove one")
         if self.suite is not None and (option := _given(CONFIGURED)):
             raise ConfigError("--suite", "", f"{option} has no effect on a suite; remove it")
         if self.suite is not None and self.suite.partition(":")[0] != "extreme":

@@ -224,7 +224,7 @@ LIGHTS_CASES = [
                 Stock("ptracer"), open_ended=dict.fromkeys((WALL, LAMP), "no path reaches it")),
     exact("furnace", "a closed furnace, 16 bounces", lambda: grey(16), FURNACE, 16),
     exact("furnace_roulette", "a closed furnace without a depth limit: only Russian roulette ends the paths",
-          lambda: grey(-1), FURNACE, -1, rr_depth=5, seeds=12),
+          lambda: grey(-1), FURNACE, -1, options={"max_depth": -1, "rr_depth": 5}, seeds=12),
     exact("furnace_1024", "a furnace of albedo 1, 1024 bounces",
           lambda: furnace_scene((1, 1, 1), (0.5, 1, 2), 1024, 4), FURNACE, 1024, spp=256, image="", naive=False),
     ExtremeCase("white_box_100", "a white box with an obstacle, and more bounces than bits for visibility",

@@ -66,7 +66,7 @@ class Stock:
         other.weights = setup.weights
         tracer = integrator(self.name, **without_roulette(case))
         values = other.gradients(tracer, seeds_of(case.seeds, 1), case.spp)
-        scale = [np.full(len(values), self.factors.get(key, 1.0)) for key, values in other.initial.items()]
+        scale = [np.full(len(row), self.factors.get(key, 1.0)) for key, row in other.initial.items()]
         return ReferenceGradients(values * np.concatenate(scale))
 
 
@@ -181,14 +181,12 @@ class ExtremeCase:
 
 
 def exact(
-    name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int,
-    rr_depth: int | None = None, **more: Any,
-) -> ExtremeCase:  # fmt: skip
+    name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int, **more: Any
+) -> ExtremeCase:
     """Return a case whose image is known in closed form. `keys` are the case's parameters. `more` sets other fields of
     the case.
     """
-    options = {"max_depth": max_depth} | ({} if rr_depth is None else {"rr_depth": rr_depth})
-    shared: dict[str, Any] = {"options": options, **more}
+    shared: dict[str, Any] = {"options": {"max_depth": max_depth}, **more}
     return ExtremeCase(name, about, lambda: known().scene(), tuple(keys.values()), Exact(known), **shared)
 
 
