@@ -225,8 +225,7 @@ def gradcheck(
     - `spp`: samples per pixel of one gradient.
     - `allow_code`: permit running the code of the integrators' files.
 
-    For your own integrators, the log (`logging.INFO`) reports noise and cost. The log also gives hints if an integrator
-    is wrong.
+    If your own integrator is wrong, the log (`logging.INFO`) gives hints.
 
     An interrupt stops the check after the current gradient and raises KeyboardInterrupt. Sets the experiment's Mitsuba
     variant if none is set. Raises ConfigError and UnsupportedScene.
@@ -246,7 +245,7 @@ def gradcheck(
         gc.collect()  # earlier scenes and the gradients of their parameters would otherwise take part in the check
         checked = settings_of(config, integrators, budget, seeds, spp, time.monotonic() - began)
         check = Gradcheck(checked)
-        records = [result.record for result in check.run(stop, logger.info)]
+        records = list(check.run(stop, logger.info))
         for line in look_into(check, records, stop, logger.debug):
             logger.info(line)
         return records

@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 import logging
-import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -44,14 +43,14 @@ from reslrb_cli.measure.methods import PATHS_OPTIONS, kept_settings, parse_check
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
 if TYPE_CHECKING:
-    from reslrb_cli.measure.gradcheck import CheckResult, Gradcheck
+    from reslrb_cli.measure.gradcheck import Gradcheck
 
 
 #: Options of comparisons; `--missing` makes none.
-COMPARING = {"suite": "--suite", "integrators": "--integrators", "images": "--images"}
+COMPARING = {"suite": "--suite", "integrators": "--integrators"}
 
 #: Options of a configuration; a suite has none.
-CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "images": "--images"}
+CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp"}
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,6 @@ class GradcheckOptions(ExperimentOptions):
     json_file: Path | None
     spp: int | None
     missing: bool
-    images: Path | None
 
     def check(self) -> None:
         """Raise ConfigError if an option has no effect beside another."""
@@ -211,10 +209,6 @@ logger = logging.getLogger(__name__)
               help=
         "Instead, measure the share of each parameter's derivative that silhouettes, shadow edges and light "
         "that leaves the film make up, which no gradient here includes.")  # fmt: skip
-@click.option("--images", type=click.Path(path_type=Path, file_okay=False),
-              help=
-        "Write maps of the gradients of textures, their references and z to this folder, as PNG and as layers "
-        "of EXR files.")  # fmt: skip
 def command(**given: Any) -> int:
     """Compare the gradients of every parameter of CONFIG with references. The parameters have their initial values.
 
@@ -243,7 +237,6 @@ def command(**given: Any) -> int:
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
         return run_missing(options, config, variant)
-    _check_folder(options.images)
     checked = settings_of(
         config, options.integrators, options.budget, options.seeds, options.spp, time.monotonic() - began
     )
@@ -287,38 +280,15 @@ def _run(
     from reslrb_cli.report.tables import cells, gradcheck_columns
 
     records: list[GradcheckRecord] = []
-    drawn = False
-    folder, origin = options.images, origin_of(variant)
+    origin = origin_of(variant)
     keeper = Keeper(options.json_file, origin, lambda: records, lambda: check.sampling.kept(to_keep))
     with Interrupts() as interrupts:
         table = gradcheck_columns(check.expected())
         echo(table.head())
-        for result in check.run(lambda: interrupts.requested, logger.info, keeper.refresh):
-            records.append(result.record)
+        for record in check.run(lambda: interrupts.requested, logger.info, keeper.refresh):
+            records.append(record)
             keeper.refresh()
-            if result.record.verdict is not Verdict.NOT_MEASURED:  # the last lines say how many there are
-                echo(table.line(cells(result.record)))
-            _draw(result, folder)
-            drawn = drawn or result.maps is not None
+            if record.verdict is not Verdict.NOT_MEASURED:  # the last lines say how many there are
+                echo(table.line(cells(record)))
         keeper.finish()
-    if folder is not None and drawn:
-        echo(f"look at {os.path.relpath(folder)}")
     return records, interrupts.requested
-
-
-def _draw(result: CheckResult, folder: Path | None) -> None:
-    if folder is None or result.maps is None:
-        return
-    from reslrb_cli.report.plots import plot_maps
-
-    folder.mkdir(parents=True, exist_ok=True)
-    plot_maps(result.record, *result.maps, folder)
-
-
-def _check_folder(folder: Path | None) -> None:
-    """Raise ConfigError if maps cannot be written."""
-    if folder is None:
-        return
-    above = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-    if not above.is_dir() or not os.access(above, os.W_OK):
-        raise ConfigError("--images", "", f"cannot write into {above}")

@@ -227,6 +227,7 @@ REMOVED = {
         ("sweep", "--quiet", "redirect the output, as in > sweep.log"),
         ("gradcheck", "--estimators", "name them by --integrators, such as reslrb:stack,reslrb:gather"),
         ("gradcheck", "--case", "name the case after the suite, as in --suite extreme:furnace"),
+        ("gradcheck", "--images", "--json FILE keeps the gradients of each seed in FILE.samples.npz"),
         ("gradcheck", "--directions", "each parameter has three directions"),
         ("render", "--run", "name the folder of the run in place of CONFIG, as in `reslrb render RUN -o IMAGE`"),
         ("render", "--spp", "use --set run.spp=N"),

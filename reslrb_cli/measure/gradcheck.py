@@ -24,7 +24,6 @@ from reslrb_cli.measure.comparison import (
     compare_equal_seeds,
     compare_expectations,
     entry_count,
-    paired_z_scores,
 )
 from reslrb_cli.measure.methods import records_of
 from reslrb_cli.measure.participants import CheckSettings, Way
@@ -37,16 +36,6 @@ STOCK_ROUNDING = 1e-3
 
 #: References that know the gradient only along a few directions.
 ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
-
-
-@dataclass(frozen=True)
-class CheckResult:
-    """Record of a comparison. If the parameter is a texture and the reference has all its texels, `maps` has the mean
-    gradient and the reference (H, W, C), and the z scores (H, W) of the sums over channels.
-    """
-
-    record: GradcheckRecord
-    maps: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
@@ -111,13 +100,13 @@ class Gradcheck:
 
     def expected(self) -> list[GradcheckRecord]:
         """Return a record without results for every line of the table."""
-        return [self._record(row, Comparison(Verdict.NOT_MEASURED), 0) for row in self.rows] + [
-            result.record for result in self._without_reference()
-        ]
+        return [self._record(row, Comparison(Verdict.NOT_MEASURED), 0) for row in self.rows] + list(
+            self._without_reference()
+        )
 
     def run(
         self, stop: Callable[[], bool], say: Callable[[str], None], between: Callable[[], None] = lambda: None
-    ) -> Iterator[CheckResult]:
+    ) -> Iterator[GradcheckRecord]:
         """Measure and compare, row by row. After `stop()`, compare only finished samples.
 
         If the budget is too small for a comparison, its record says so. `between` is called after each sample.
@@ -130,7 +119,7 @@ class Gradcheck:
                 compared = True
                 yield self._result(row, family)
             elif not stop():
-                yield CheckResult(self._record(row, Comparison(Verdict.NOT_MEASURED, message=NO_TIME), 0))
+                yield self._record(row, Comparison(Verdict.NOT_MEASURED, message=NO_TIME), 0)
         if compared or not stop():
             yield from self._without_reference()
 
@@ -167,7 +156,7 @@ class Gradcheck:
             return len(parts.exact[row.key])
         return entry_count(parts.shape(row.key))
 
-    def _result(self, row: Row, family: Family) -> CheckResult:
+    def _result(self, row: Row, family: Family) -> GradcheckRecord:
         parts, (mine, *its) = self.participants, self._needs(row)
         ours, shape, bias = self.sampling.of(mine), None, np.zeros(1)
         reference = self.sampling.of(its[0]) if its else parts.exact[str(row.key)]
@@ -191,8 +180,7 @@ class Gradcheck:
             ours_too = row.reference in (Reference.WALK_AD, Reference.UNGUIDED)
             rounding = ROUNDING if shape is None or ours_too else STOCK_ROUNDING
             figures = compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=rounding)
-        maps = _maps(ours, reference, shape) if row.key is not None and shape is not None else None
-        return CheckResult(self._record(row, figures, len(ours)), maps)
+        return self._record(row, figures, len(ours))
 
     def _record(self, row: Row, figures: Comparison, seeds: int) -> GradcheckRecord:
         kind, _, estimator = row.label.partition(":") if row.label.startswith("reslrb") else (row.label, "", "")
@@ -201,7 +189,7 @@ class Gradcheck:
             **vars(figures), **records_of(row.way.paths, row.way.light_share),
         )  # fmt: skip
 
-    def _without_reference(self) -> Iterator[CheckResult]:
+    def _without_reference(self) -> Iterator[GradcheckRecord]:
         """Yield records for parameters without a stock reference."""
         parts = self.participants
         rows = [
@@ -213,7 +201,7 @@ class Gradcheck:
             for way, (reference, why) in parts.images.items() if reference is None
         ]  # fmt: skip
         for row, why in rows:
-            yield CheckResult(self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0))
+            yield self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0)
 
 
 def _draws_plainly(config: Config) -> bool:
@@ -222,14 +210,3 @@ def _draws_plainly(config: Config) -> bool:
     """
     options = config.integrator.options()
     return all(options.get(name, UNDECIDED[name]) == UNDECIDED[name] for name in ("guiding", "sequence", "pixels"))
-
-
-def _maps(
-    ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    if len(shape) != 3:
-        return None
-    grids = [side.reshape(len(side), *shape) for side in (ours, reference)]
-    sums = [grid.sum(-1) for grid in grids]
-    floor = ROUNDING * np.maximum(*(np.abs(side.mean(0)) for side in sums))
-    return grids[0].mean(0), grids[1].mean(0), paired_z_scores(sums[0] - sums[1], floor)

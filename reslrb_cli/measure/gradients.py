@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -103,28 +103,6 @@ def _waves(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
     wave = random.normal(size=points.shape[1])
     wave *= random.uniform(0.5, 1) * WAVES * 2 * np.pi / np.linalg.norm(wave)
     return np.asarray(np.cos(points @ wave + random.uniform(0, 2 * np.pi)))
-
-
-class Values(Protocol):
-    """Interface to a scene's parameters, or to values on which the parameters depend. `scene.Selection`
-    implements it.
-    """
-
-    @property
-    def params(self) -> mi.SceneParameters:
-        """The scene's `mi.traverse`."""
-
-    def value(self, key: str) -> Any:
-        """Return the current value of `key` as a Dr.Jit array."""
-
-    def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Set `values` and their derivatives in the scene, and evaluate everything that depends on the values."""
-
-    def collect(self) -> None:
-        """Propagate gradients from the scene to the values that `hand_over` has set."""
-
-    def push(self) -> None:
-        """Propagate tangents from the values that `hand_over` has set to the scene."""
 
 
 #: Candidate steps, as fractions of the direction.
@@ -242,10 +220,11 @@ def embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
 class Case:
     """A scene (or a dictionary to load) with one sensor, parameters, and a linear objective.
 
-    `keys` are keys of `values`, or of the scene if `values` is not given.
+    `keys` are keys of `values`, or of the scene if `values` is not given. `values` is a `Selection`, or has its
+    `params`, `value`, `hand_over`, `collect` and `push`.
     """
 
-    def __init__(self, scene: Any, keys: Iterable[str], sensor: int = 0, values: Values | None = None) -> None:
+    def __init__(self, scene: Any, keys: Iterable[str], sensor: int = 0, values: Any = None) -> None:
         self.scene = load(scene) if isinstance(scene, dict) else scene
         self.sensor = sensor
         if values is None:

@@ -14,9 +14,7 @@ message reports measurements, and is no proof.
 
 from __future__ import annotations
 
-import functools
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -30,16 +28,12 @@ from reslrb_cli.measure.methods import NEVER
 from reslrb_cli.measure.participants import Participants
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 from reslrb_cli.scene.catalog import parameter_kind
-from reslrb_cli.scene.graph import SceneGraph
 
 Array = np.ndarray
 
 #: Seeds of each measurement; the reference has twice as many, and its first half is the direction. If these are
 #: inconclusive, there are `MORE` times as many.
 SEEDS, MORE = 16, 4
-
-#: Minimum number of seeds for the noise and time of a gradient, and seconds during which more are taken.
-LEAST_SEEDS, COST_SECONDS = 4, 10.0
 
 #: Maximum path length that is examined.
 DEEPEST = 5
@@ -52,13 +46,6 @@ LINEAR = (".value", "scale")
 
 #: Relative scatter of sums of the same paths in another order.
 SAME_PATHS = 1e-3
-
-#: BSDFs whose values are linear in their reflectances, and the factor by which reflectances or lamps are darkened.
-SCALING, DARKER = {"SmoothDiffuse", "TwoSidedBRDF", "BlendBSDF"}, 16.0
-
-#: Frequent wrong constants, and their notation.
-CONSTANTS = {"2": 2.0, "1/2": 0.5, "pi": np.pi, "1/pi": 1 / np.pi, "2 pi": 2 * np.pi, "1/(2 pi)": 0.5 / np.pi,
-             "4 pi": 4 * np.pi, "1/(4 pi)": 0.25 / np.pi, "-1": -1.0}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,62 +71,24 @@ class Ratio:
 def look_into(
     check: Gradcheck, records: Sequence[GradcheckRecord], stop: Callable[[], bool], say: Callable[[str], None]
 ) -> Iterator[str]:
-    """Yield messages about the noise, time and likely faults of each of the user's own integrators. `records` are the
+    """Yield a message about the likely fault of each of the user's own integrators that fails. `records` are the
     results of `gradcheck`.
 
-    Raises KeyboardInterrupt after `stop()`. `say` receives the name of the current measurement.
+    Raises KeyboardInterrupt after `stop()`. `say` receives the name of the examined integrator.
     """
     for listed in check.participants.listed:
-        if listed.type != "custom":
-            continue
         mine = [record for record in records if record.integrator == listed.label]
-        yield _cost(check, listed.label, stop)
         failing = [record for record in mine if record.verdict is Verdict.FAILS]
-        if failing:
-            yield f"{listed.label}: {Looking(check.participants, listed.label, stop, say).sentence(failing)}"
-
-
-def _cost(check: Gradcheck, label: str, stop: Callable[[], bool]) -> str:
-    """Compare a gradient's noise and time with `reslrb`, for the same kinds of paths."""
-    parts = check.participants
-    ours = _ours(parts, label)
-    figures, measured = [], SEEDS
-    for integrator in (parts.integrators[label], ours):
-        rows, times = [], []
-        for seed in seeds(measured, 5):
-            _check(stop)
-            begin = time.perf_counter()
-            rows.append(parts.gradient(integrator, seed))
-            times.append(time.perf_counter() - begin)
-            if len(times) >= LEAST_SEEDS and sum(times) > COST_SECONDS:
-                break
-        measured = len(rows)
-        figures.append((np.var(rows, axis=0, ddof=1).sum(), float(np.median(times[1:]))))
-    (noise, seconds), (our_noise, our_seconds) = figures
-    way = parts.ways[label].paths
-    times_noise = f"{noise / our_noise:.3g} times the variance" if our_noise > 0 else "variance unknown"
-    return (
-        f"{label}: {times_noise} and {seconds / our_seconds:.3g} times the time ({1e3 * seconds:.3g} ms) of a "
-        f"gradient by reslrb:stack(paths={way}), medians of {measured - 1}"
-    )
-
-
-def _check(stop: Callable[[], bool]) -> None:
-    if stop():
-        raise KeyboardInterrupt
-
-
-def _ours(parts: Participants, label: str, **other: int) -> StepIntegrator:
-    """Return the reference: `reslrb` with the same kind of paths. `other` may change the depths."""
-    options = parts.options_of(label) | other
-    return make_integrator("reslrb", estimator="stack", **parts.ways[label].options, **options)
+        if listed.type == "custom" and failing:
+            say(f"now examining {listed.label}")
+            yield f"{listed.label}: {Looking(check.participants, listed.label, stop).sentence(failing)}"
 
 
 class Looking:
     """Measurements that search for faults of the integrator `label`, which failed the check."""
 
-    def __init__(self, parts: Participants, label: str, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
-        self.parts, self.label, self._stop, self._say = parts, label, stop, say
+    def __init__(self, parts: Participants, label: str, stop: Callable[[], bool]) -> None:
+        self.parts, self.label, self._stop = parts, label, stop
         self._seeds = SEEDS
         self._options = parts.options_of(label)
         self.depth = self._options["max_depth"]
@@ -148,24 +97,20 @@ class Looking:
     # --- measuring ----------------------------------------------------------------------------------------------------
 
     def _pair(self, **other: int) -> tuple[StepIntegrator, StepIntegrator]:
-        """Return the integrator and the reference. `other` may change the depths of both."""
-        return self.parts.own_with(self.label, **other), _ours(self.parts, self.label, **other)
+        """Return the integrator, and `reslrb` with the same kind of paths. `other` may change the depths of both."""
+        ours = self._options | other | self.parts.ways[self.label].options
+        return self.parts.own_with(self.label, **other), make_integrator("reslrb", estimator="stack", **ours)
 
     def images(self, **other: int) -> Ratio:
         """Return the ratio of the images, with equal weights in all pixels."""
-        return _over(*self._sums(**other))
-
-    def _sums(self, **other: int) -> tuple[Array, Array]:
-        self._measure("images", other)
         mine, ours = (
             np.array([self.parts.case.image(one, seed, self.parts.spp).sum() for seed in self._each(SEEDS, block)])
             for block, one in zip((5, 6), self._pair(**other), strict=True)
         )
-        return mine, ours
+        return _over(mine, ours)
 
     def gradients(self, **other: int) -> dict[str, Ratio]:
         """Return the ratio for each parameter whose reference gradient differs significantly from zero."""
-        self._measure("gradients", other)
         own, ours = self._pair(**other)
         reference = np.stack([self.parts.gradient(ours, seed) for seed in self._each(2 * self._seeds, 6)])
         mine = np.stack([self.parts.gradient(own, seed) for seed in self._each(self._seeds, 5)])
@@ -180,107 +125,36 @@ class Looking:
                 found[key] = _over(*sides)
         return found
 
-    def emission(
-        self, depth: int | None = None, seen: int | None = None, even: bool = False
-    ) -> tuple[Ratio, float] | None:
+    def emission(self, depth: int | None = None, seen: int | None = None) -> tuple[Ratio, float] | None:
         """Return the ratio of sum(dL/dE E) to sum(dL/dI I), where I is the image. The ratio must be 1, because images
         are linear in emission.
 
         Also returns how much the ratio varies between seeds. At each seed, the image and the derivative sum use the
         same paths. Returns None if the emission of some emitter is not given by a number (`.value`, `scale`). `depth`
-        is the gradient's maximum depth. `seen` is the image's maximum depth. `even` sets dL/dI to 1 in all pixels and
-        channels.
+        is the gradient's maximum depth. `seen` is the image's maximum depth.
         """
         depth = self.depth if depth is None else depth
-        keys = self._lamps()
-        if not keys:
-            return None
-        derivatives, images = self._by_emission(keys, depth, seen, even)
-        found = derivatives / images
-        return Ratio(float(found.mean()), _error(found)), float(found.std(ddof=1))
-
-    def _by_emission(
-        self, keys: list[str], max_depth: int, seen: int | None = None, even: bool = False, **other: int
-    ) -> tuple[Array, Array]:
-        """Return sum(dL/dE E) and sum(dL/dI I) for each seed, where I is the image. Both sums must be equal."""
-        depths = max_depth, max_depth if seen is None else seen
-        own, image = (self.parts.own_with(self.label, max_depth=n, **other) for n in depths)
-        case = Case(self.parts.case.scene, keys, self.parts.case.sensor)
-        weights = np.array(self.parts.case.weights)
-        case.weigh(np.ones_like(weights) if even else weights)
-        self._measure("derivatives by emission", {"max_depth": max_depth} | other)
-        emitted = np.concatenate([case.initial[key] for key in keys])
-        rows = [
-            (case.gradient(own, seed, self.parts.spp, step=case.known_step) @ emitted,
-             case.weighted(case.image(image, seed, self.parts.spp)))
-            for seed in self._each(SEEDS, 7)
-        ]  # fmt: skip
-        derivatives, images = np.transpose(rows)
-        return derivatives, images
-
-    def _lamps(self) -> list[str]:
-        """Return the keys in which all light is linear. The list is empty if some light is not given by a number
-        (`.value`, `scale`).
-        """
-        params = mi.traverse(self.parts.case.scene)
+        scene = self.parts.case.scene
+        params = mi.traverse(scene)
         keys = [key for key, _ in params if parameter_kind(params, key) == "emitter" and key.endswith(LINEAR)]
-        return keys if len(keys) == len(self.parts.case.scene.emitters()) else []
-
-    def _surfaces(self) -> list[str]:
-        """Return the keys in which all light with a single scattering event is linear. The list is empty if some BSDF
-        is not linear.
-        """
-        params = mi.traverse(self.parts.case.scene)
-        graph = SceneGraph.of(self.parts.case.scene)
-        bsdfs = dict.fromkeys(each for bsdf in graph.surface_bsdfs() for each in graph.nested_bsdfs(bsdf))
-        kinds = [bsdf.class_name() for bsdf in bsdfs]
-        keys = [key for key, _ in params if key.endswith((".reflectance.value", ".reflectance.data"))]
-        return keys if set(kinds) <= SCALING and len(keys) == kinds.count("SmoothDiffuse") else []
-
-    def _of_length(self, at: int, sums: Callable[..., tuple[Array, Array]]) -> Ratio:
-        """Return the ratio of estimate to correct value for paths of exactly `at` segments. For a maximum depth, `sums`
-        returns samples of the ratio's numerator and denominator.
-        """
-        own, reference = sums(max_depth=at, rr_depth=NEVER)
-        if at > 1:
-            shorter = sums(max_depth=at - 1, rr_depth=NEVER)
-            own, reference = own - shorter[0], reference - shorter[1]
-        return _over(own, reference)
-
-    def _limited(self, at: int, sums: Callable[..., tuple[Array, Array]], before: Ratio) -> str:
-        """Describe an upper limit on values. If darker lamps or surfaces bring the ratio for paths of `at` segments
-        closer to 1 than `before`, an upper limit probably exists.
-        """
-        if not np.isfinite(before.value):
-            return ""
-        scene, sensor = self.parts.case.scene, self.parts.case.sensor
-        for what, keys, meant in (("lamps", self._lamps(), "of light, as opposed to fireflies"),
-                                  ("surfaces", self._surfaces(), "of the throughput")):  # fmt: skip
-            if not keys:
-                continue
-            case = Case(scene, keys, sensor)
-            try:
-                case.set({key: value / DARKER for key, value in case.initial.items()})
-                darker = self._of_length(at, sums)
-            finally:
-                case.set(case.initial)
-            if not darker.same(before) and abs(darker.value - 1) < abs(before.value - 1) / 2:
-                return (
-                    f"with all {what} {DARKER:g} times darker, the light of these paths is {darker} its correct value, "
-                    f"and {before} without this change: look for an upper limit {meant} (dr.minimum, a clamp)"
-                )
-        return ""
-
-    def _measure(self, what: str, options: Mapping[str, int]) -> None:
-        """Report the current measurement."""
-        where = ", ".join(f"{name} {value}" for name, value in options.items() if value != NEVER)
-        without = "without roulette" if NEVER in options.values() else ""
-        self._say(f"now examining {self.label}: {', '.join(filter(None, [what, where, without]))}")
+        if not keys or len(keys) != len(scene.emitters()):
+            return None
+        own, image = (self.parts.own_with(self.label, max_depth=n) for n in (depth, depth if seen is None else seen))
+        case = Case(scene, keys, self.parts.case.sensor)
+        case.weigh(np.array(self.parts.case.weights))
+        emitted = np.concatenate([case.initial[key] for key in keys])
+        found = np.array([
+            case.gradient(own, seed, self.parts.spp, step=case.known_step) @ emitted
+            / case.weighted(case.image(image, seed, self.parts.spp))
+            for seed in self._each(SEEDS, 7)
+        ])  # fmt: skip
+        return Ratio(float(found.mean()), _error(found)), float(found.std(ddof=1))
 
     def _each(self, count: int, block: int) -> Iterator[int]:
         """Yield seeds until the user stops."""
         for seed in seeds(count, block):
-            _check(self._stop)
+            if self._stop():
+                raise KeyboardInterrupt
             yield seed
 
     # --- messages -----------------------------------------------------------------------------------------------------
@@ -316,9 +190,7 @@ class Looking:
             parts.append(_segments(where, self._options["hide_emitters"]))
         if self._roulette() and not self.images(rr_depth=NEVER).wrong:
             parts.append("without roulette it is right: check the weight 1/p of surviving paths")
-        elif where is not None:
-            parts.append(self._limited(where, self._sums, self._of_length(where, self._sums)))
-        return "; ".join(filter(None, parts))
+        return "; ".join(parts)
 
     def _of_gradient(self, found: dict[str, Ratio], wrong: dict[str, Ratio]) -> str:
         zero = [key for key, ratio in wrong.items() if ratio.value == 0 and ratio.error == 0]
@@ -329,13 +201,7 @@ class Looking:
             )
         first, *others = wrong.values()
         if len(wrong) == len(found) and all(first.same(other) for other in others):
-            known = [
-                name
-                for name, value in CONSTANTS.items()
-                if abs(first.value - value) <= ERRORS * first.error + 0.01 * abs(value)
-            ]
-            named = f", which is {known[0]}" if known else ""
-            return f"its image holds; its gradient is {first} the reference's{named}"
+            return f"its image holds; its gradient is {first} the reference's"
         right = [key for key in found if key not in wrong]
         beside = f", while {_names(right)} {'holds' if len(right) == 1 else 'hold'}" if right else ""
         return f"its image holds; it has {_list(wrong)} of the reference's gradient{beside}"
@@ -355,13 +221,7 @@ class Looking:
                         "weight is missing in one of the two passes"]  # fmt: skip
         said = []
         at, before = self._from_depth(lambda depth: self.gradients(max_depth=depth).get(worst))
-        if at is not None and (alone := self._of_length(at, self._sums)).wrong:
-            said.append(
-                f"{_segments(at, self._options['hide_emitters'], before)}; in its image, the light of these paths "
-                f"alone is {alone} its correct value, but there is little of it"
-            )
-            said.append(self._limited(at, self._sums, alone))
-        elif at is not None:
+        if at is not None:
             said.append(
                 f"{_from(at, before)}, though its derivative by emission, its paths and the terms of their vertices "
                 "are right: check the terms that are differentiated there (the BSDF's value over its detached self), "
@@ -369,7 +229,7 @@ class Looking:
             )
         if lobes := self._lobes(worst):
             said.append(lobes)
-        return [each for each in said if each]
+        return said
 
     def _of_passes(self, wrong: dict[str, Ratio]) -> str | None:
         """Describe a difference between the differentiated pass and the image pass, in terms or in paths. Return None
@@ -380,34 +240,19 @@ class Looking:
             return None
         ratio, scatter = measured
         if not ratio.wrong:
-            if scatter > SAME_PATHS and self._right_if_even():
-                return _MIXED
             return None if scatter <= SAME_PATHS else (
                 f"at equal seeds its derivative by all emission varies by {100 * scatter:.2g} % about its image, which "
                 "it must equal: the differentiated pass traces other paths than the first one (random numbers out of "
-                "step)"
+                "step), or it reads dL/dI at another pixel"
             )  # fmt: skip
         begin = f"its derivative by all emission is {ratio} its image, which it must equal: "
-        if self._right_if_even():
-            return _MIXED
         if scatter <= 0.01 * abs(ratio.value - 1) and all(ratio.same(other) for other in wrong.values()):
             return f"{begin}the factor is the same at every seed, so dL/dI is passed on wrongly (its sign, its scale)"
         if self._too_short():
             return f"{begin}the differentiated pass ends paths a segment too soon"
         at, before = self._from_depth(lambda depth: (self.emission(depth) or (None,))[0])
-        said = [f"{begin}the terms of a vertex differ between the differentiated pass and the first one"]
-        if at is not None:
-            sums = functools.partial(self._by_emission, self._lamps())
-            said.append(_segments(at, self._options["hide_emitters"], before))
-            said.append(self._limited(at, sums, self._of_length(at, sums)))
-        return "; ".join(filter(None, said))
-
-    def _right_if_even(self) -> bool:
-        """True if the differentiated pass is wrong only in its use of dL/dI. If only the use of dL/dI is wrong, a
-        constant dL/dI gives right results.
-        """
-        found = self.emission(even=True)
-        return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
+        said = f"{begin}the terms of a vertex, or its dL/dI, differ between the differentiated pass and the first one"
+        return said if at is None else f"{said}; {_segments(at, self._options['hide_emitters'], before)}"
 
     def _too_short(self) -> bool:
         """Whether the differentiated pass has only paths of two segments when it should have paths of three."""
@@ -439,12 +284,6 @@ class Looking:
                     "the value of `bsdf.eval` over a detached density"
                 )
         return ""
-
-
-_MIXED = (
-    "its derivative by all emission equals the image, as it must, if dL/dI is 1 everywhere, but not if dL/dI differs "
-    "between pixels and channels: check where dL/dI is read (another pixel, another channel)"
-)
 
 
 def _from(depth: int, before: bool) -> str:

@@ -1,20 +1,12 @@
-"""Curves in the diagrams of pages, and maps of gradients."""
+"""Curves in the diagrams of pages."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from reslrb_cli.errors import one_line
-from reslrb_cli.records.images import bounded, file_stem, write_layers
-from reslrb_cli.records.measurements import GradcheckRecord
-from reslrb_cli.report.tables import integrator_name, reference_name
-from reslrb_cli.report.tonemap import color_map
 
 Array = np.ndarray[Any, Any]
 
@@ -106,45 +98,3 @@ def _thinned(points: Array, together: int) -> tuple[Any, Any]:
     counts = np.diff([*starts, len(points)])
     xs, ys = (sums / counts[:, None]).T
     return xs, ys
-
-
-#: z at the ends of the scale.
-_MOST_Z = 5.0
-
-
-def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarray, z: np.ndarray, folder: Path
-              ) -> Path:  # fmt: skip
-    """Write a PNG of `gradient` and `reference` (H, W, C), summed over channels, and of `z` (H, W). Return its path.
-
-    Both gradients share one scale, which 1 % of the texels exceed. An EXR of the same name holds the unchanged values
-    as the layers `gradient`, `reference`, `difference` and `z`.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    colors = color_map(signed=True)
-    sums = gradient.sum(-1), reference.sum(-1)
-    end = float(np.quantile(np.abs(np.stack(sums)), 0.99)) or 1.0
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)  # without pyplot, which would choose a backend for the whole process
-    axes = figure.subplots(1, 3)
-    titles = (integrator_name(record), reference_name(record), "difference in standard errors, z")
-    for axis, image, limit, title in zip(axes, (*sums, z), (end, end, _MOST_Z), titles, strict=True):
-        shown: Any = axis.imshow(image, cmap=colors, vmin=-limit, vmax=limit, interpolation="nearest")
-        axis.set_title(title, fontsize=9)
-        axis.tick_params(labelsize=7)
-        figure.colorbar(shown, ax=axis, extend="both").ax.tick_params(labelsize=7)
-    title = f"{record.parameter}, sum over channels, {record.seeds} seeds: {record.verdict.value}"
-    figure.suptitle(one_line(title, 150), fontsize=10, parse_math=False)  # keys may contain $
-    path = folder / f"{map_name(record)}.png"
-    figure.savefig(path, dpi=110)
-    layers = {"gradient": gradient, "reference": reference, "difference": gradient - reference, "z": z}
-    write_layers(folder / f"{map_name(record)}.exr", layers)
-    return path
-
-
-def map_name(record: GradcheckRecord) -> str:
-    """Return the file name for a record, without the suffix."""
-    what = (record.integrator, record.estimator, record.reference.value)
-    parts = [file_stem(record.parameter)] if record.parameter else []
-    return bounded("-".join(parts + [re.sub(r"[^\w.=]+", "_", part).strip("_") for part in what if part]))

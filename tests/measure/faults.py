@@ -53,7 +53,7 @@ def estimators_of(names: str) -> list[Case]:
 def checked(config: Config, estimators: str, seeds: int) -> list[GradcheckRecord]:
     """Return the records of `reslrb gradcheck`."""
     made = Gradcheck(CheckSettings(config, estimators_of(estimators), 0, seeds))
-    return [result.record for result in made.run(lambda: False, lambda line: None)]
+    return list(made.run(lambda: False, lambda line: None))
 
 
 def cornell(*overrides: str, estimators: str, seeds: int = 8) -> Check:

@@ -61,8 +61,6 @@ class Replay(RBIntegrator):
                 if dr.hint(self.primal_fault == "nan", mode="scalar"):
                     arriving *= dr.nan
                 direct = dr.select(reach, β * f * arriving, 0)
-                if dr.hint("bright" in (wrong, self.primal_fault), mode="scalar"):
-                    direct = dr.minimum(direct, 0.5)
 
             bs, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), onward)
             ray = si.spawn_ray(si.to_world(bs.wo))
@@ -73,8 +71,6 @@ class Replay(RBIntegrator):
             before = mi.Spectrum(β)
             η *= bs.eta
             β *= weight
-            if dr.hint("clamp" in (wrong, self.primal_fault), mode="scalar"):
-                β = dr.minimum(β, 0.4)
             fit = dr.minimum(dr.max(β) * dr.square(η), 0.95)
             plays = depth >= self.rr_depth
             if dr.hint(not primal, mode="scalar"):

@@ -81,11 +81,8 @@ def checked(capsys: pytest.CaptureFixture[str], options: str, *more: str) -> tup
     return code, [line for line in lines if line.startswith(f"{name}:")]
 
 
-def test_a_correct_integrator_holds_and_its_cost_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    code, lines = checked(capsys, "", *FEW)
-    assert code == 0
-    assert len(lines) == 1
-    assert "times the variance and" in lines[0]
+def test_a_correct_integrator_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert checked(capsys, "", *FEW) == (0, [])
 
 
 #: Faults, and the phrases that the message about each fault must contain.
@@ -118,31 +115,9 @@ def test_a_fault_is_found_and_explained(capsys: pytest.CaptureFixture[str], faul
         Path("scene.xml").write_text(room(MIXED))
     code, lines = checked(capsys, fault, *more)
     assert code == ExitCode.CHECK_FAILED
-    assert len(lines) == 2, lines
+    [line] = lines
     for words in FOUND[fault]:
-        assert words in lines[1], lines[1]
-    assert "upper limit" not in lines[1], lines[1]
-
-
-#: Settings of a small Cornell box with only diffuse surfaces.
-DIFFUSE = ["--set", "scene.options.size=16", "--set", "integrator.max_depth=5", "--set",
-           "integrator.hide_emitters=false"]  # fmt: skip
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("options", ["primal_fault=clamp", "fault=clamp", "primal_fault=bright", "fault=bright"])
-def test_clamped_values_are_detected_in_darker_scenes(capsys: pytest.CaptureFixture[str], options: str) -> None:
-    """Clamped throughput and clamped light are detected, in both passes or only in the differentiating pass."""
-    Path("scene.xml").write_text(room(MIXED))
-    words = DIFFUSE if options.endswith("clamp") else ["room.yaml"]
-    name = f"own_replay.py:Replay({options})"
-    words = ["gradcheck", *words, "--integrators", name, "--allow-code", "--seeds", "24", "--spp", "64"]
-    assert call(words) == ExitCode.CHECK_FAILED
-    said = capsys.readouterr().out.splitlines()[-1]
-    darker, meant = ("surfaces", "the throughput") if options.endswith("clamp") else ("lamps", "light")
-    assert f"with all {darker} 16 times darker, the light of these paths is" in said, said
-    assert f"look for an upper limit of {meant}" in said, said
-    assert f"wrong from paths of {3 if options.endswith('clamp') else 2} segments on" in said, said
+        assert words in line
 
 
 #: Integrators of Mitsuba, imported as in users' files, and the configuration that checks them.

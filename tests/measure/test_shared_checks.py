@@ -51,11 +51,11 @@ def sampled(settings: CheckSettings, place: Place | None, earlier: Kept | None =
     made = Gradcheck(settings, earlier=before)
     with one_thread():
         if place is None:
-            found = [str(result.record) for result in made.run(lambda: False, lambda line: None)]
+            found = [str(record) for record in made.run(lambda: False, lambda line: None)]
         else:
             with checks.samples_at(settings, made.participants, place, "llvm_ad_rgb", threads=1) as engine:
                 made.sampling.engine = engine
-                found = [str(result.record) for result in made.run(lambda: False, lambda line: None)]
+                found = [str(record) for record in made.run(lambda: False, lambda line: None)]
     kept = made.sampling.kept({})
     assert kept is not None
     return kept, found

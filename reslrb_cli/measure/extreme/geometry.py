@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.measure.extreme.suite import Differences, Extrapolated, ExtremeCase, Stock, Twin, exact
+from reslrb_cli.measure.extreme.suite import Differences, Extrapolated, ExtremeCase, Stock, exact
 from reslrb_cli.measure.scenes.analytic import DOWN, POOL, SLAB, UP, refraction_scene, slab_scene
 from reslrb_cli.measure.scenes.moving import (
     FILTER,
@@ -285,12 +285,12 @@ def vertical_light() -> dict:
 
 PLACES_CASES = [
     ExtremeCase("scaled_1e-2", "the room at a hundredth of its size", lambda: placed(1e-2), (FLOOR, WALL, LAMP),
-                Twin(room)),
+                Stock("ptracer", room)),
     ExtremeCase("scaled_1e+4", "the room at ten thousand times its size", lambda: placed(1e4), (FLOOR, WALL, LAMP),
-                Twin(room)),
+                Stock("ptracer", room)),
     ExtremeCase("moved_100", "the room 100 units from the origin, which is fifty times its own size",
                 lambda: placed(1, AWAY),
-                (FLOOR, WALL, LAMP), Twin(room)),
+                (FLOOR, WALL, LAMP), Stock("ptracer", room)),
     ExtremeCase("grazing_sensor", "a camera that looks along the floor",
                 lambda: room(camera=pinhole([0.9, -0.95, 0.9], [-0.9, -0.96, -0.2], [0, 1, 0], 25)),
                 (FLOOR, WALL, LAMP), Stock("ptracer"), spp=512),
@@ -356,27 +356,20 @@ def plate(kind: str, roughness: str) -> dict:
 
 ROUGHNESS = ("1", "0.1", "1e-2", "1e-4")
 
-#: Roughnesses with a decided derivative on followed paths. `principled` chooses a lobe and has no such derivative.
+#: Roughnesses whose derivative is checked on followed paths. `principled` chooses a lobe and has no such derivative.
 FOLLOWED = [(kind, roughness) for kind in ("roughconductor", "roughdielectric") for roughness in ("0.1", "1e-2")]
 NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal seeds decide"
 
 
-def followed(kind: str, roughness: str) -> str:
-    """Return the name of the case in which the roughness parameter moves light."""
-    return f"{kind}_{roughness}_followed"
-
-
 def _case(kind: str, roughness: str) -> ExtremeCase:
     _, _, colour, own, is_parameter = KINDS[kind]
-    key = f"plate.bsdf.{own}.value"
-    is_followed = is_parameter and (kind, roughness) in FOLLOWED
-    is_noisy = is_parameter and not is_followed and float(roughness) <= 0.1
+    key, differentiated = f"plate.bsdf.{own}.value", is_parameter and (kind, roughness) not in FOLLOWED
+    is_noisy = differentiated and float(roughness) <= 0.1
     return ExtremeCase(
         f"{kind}_{roughness}", f"light that a {kind} of roughness {roughness} reflects or transmits",
         lambda: plate(kind, roughness),
-        (f"plate.bsdf.{colour}.value", RECEIVER, *([key] if is_parameter else [])), Stock("prb"), spp=256,
-        signed=is_parameter, open_ended={key: NOISE} if is_noisy else {},
-        elsewhere={key: followed(kind, roughness)} if is_followed else {},
+        (f"plate.bsdf.{colour}.value", RECEIVER, *([key] if differentiated else [])), Stock("prb"), spp=256,
+        signed=differentiated, open_ended={key: NOISE} if is_noisy else {},
     )  # fmt: skip
 
 
@@ -396,8 +389,8 @@ def _followed(kind: str, roughness: str) -> ExtremeCase:
         return made
 
     return ExtremeCase(
-        followed(kind, roughness), f"light whose direction follows the roughness {roughness} of a {kind}", scene, (),
-        Extrapolated(0.05 * float(roughness), 2e-3), image="", spp=256, signed=True,
+        f"{kind}_{roughness}_followed", f"light whose direction follows the roughness {roughness} of a {kind}",
+        scene, (), Extrapolated(0.05 * float(roughness), 2e-3), image="", spp=256, signed=True,
         options={"max_depth": 3},  # from the plate to the floor: the edges beyond do not move
         ours={"attached": True}, equal=5e-4, moves=lambda scene: [Number("plate.bsdf.alpha.value")],
     )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.measure.extreme.suite import Differences, ExtremeCase, Stock, Twin, Zero, exact
+from reslrb_cli.measure.extreme.suite import Differences, ExtremeCase, Stock, exact
 from reslrb_cli.measure.scenes.analytic import (
     DOWN,
     FURNACE,
@@ -201,11 +201,12 @@ def white_box() -> dict:
 
 LIGHTS_CASES = [
     ExtremeCase("emission_1e-25", "a lamp of radiance 1e-25 under a fixed adjoint image", lambda: lit(1e-25),
-                (WALL, LAMP), Twin(lambda: lit(1), {WALL: 1e-25})),
+                (WALL, LAMP), Stock("ptracer", lambda: lit(1), {WALL: 1e-25})),
     ExtremeCase("emission_1e-25_roulette", "a lamp of radiance 1e-25, with Russian roulette on throughput",
-                lambda: lit(1e-25), (WALL, LAMP), Twin(lambda: lit(1), {WALL: 1e-25}), spp=256, options=ROULETTE),
+                lambda: lit(1e-25), (WALL, LAMP), Stock("ptracer", lambda: lit(1), {WALL: 1e-25}), spp=256,
+                options=ROULETTE),
     ExtremeCase("emission_1e+25", "a lamp of radiance 1e+25 under a fixed adjoint image", lambda: lit(1e25),
-                (WALL, LAMP), Twin(lambda: lit(1), {WALL: 1e25})),
+                (WALL, LAMP), Stock("ptracer", lambda: lit(1), {WALL: 1e25})),
     ExtremeCase("emission_1e-25_and_1e+25", "lamps of radiance 1e-25 and 1e+25 in one scene", two_lamps,
                 (WALL, LAMP, "dim.emitter.radiance.value"), Stock("ptracer"), spp=128),
     ExtremeCase("lamp_of_area_1e-8", "a lamp of side 1e-4 and radiance 4e8", lambda: small_lamp(4e8), (WALL, LAMP),
@@ -218,17 +219,17 @@ LIGHTS_CASES = [
                 ("floor.brdf_0.reflectance.value", "light.irradiance.value"), Stock("ptracer"), spp=256),
     ExtremeCase("connection_1e8", "the first connection has 1e8 times the weight of all other connections", speck,
                 ("speck.bsdf.reflectance.value", "box.bsdf.reflectance.value", LAMP), Stock("ptracer"),
-                image="ptracer", spp=256, options={"max_depth": 5}, residual=True),
-    ExtremeCase("no_connection", "no light path connects, because the sensor looks away", away, (WALL, LAMP), Zero()),
-    exact("furnace", "a closed furnace, 16 bounces", lambda: grey(16), FURNACE, 16, residual=True),
+                image="ptracer", spp=256, options={"max_depth": 5}),
+    ExtremeCase("no_connection", "no light path connects, because the sensor looks away", away, (WALL, LAMP),
+                Stock("ptracer"), open_ended=dict.fromkeys((WALL, LAMP), "no path reaches it")),
+    exact("furnace", "a closed furnace, 16 bounces", lambda: grey(16), FURNACE, 16),
     exact("furnace_roulette", "a closed furnace without a depth limit: only Russian roulette ends the paths",
-          lambda: grey(-1), FURNACE, -1, rr_depth=5, seeds=12, residual=True),
+          lambda: grey(-1), FURNACE, -1, options={"max_depth": -1, "rr_depth": 5}, seeds=12),
     exact("furnace_1024", "a furnace of albedo 1, 1024 bounces",
-          lambda: furnace_scene((1, 1, 1), (0.5, 1, 2), 1024, 4), FURNACE, 1024, spp=256, image="", naive=False,
-          residual=True),
+          lambda: furnace_scene((1, 1, 1), (0.5, 1, 2), 1024, 4), FURNACE, 1024, spp=256, image="", naive=False),
     ExtremeCase("white_box_100", "a white box with an obstacle, and more bounces than bits for visibility",
                 white_box, ("box.bsdf.reflectance.value", "cube.bsdf.reflectance.value"), Stock("ptracer"),
-                image="path", options={"max_depth": 100, "hide_emitters": True}, residual=True),
+                image="path", options={"max_depth": 100, "hide_emitters": True}),
     exact("furnace_black", "a furnace of albedo 0: only the first bounce has a derivative",
           lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8), FURNACE, 8),
 ]  # fmt: skip

@@ -14,10 +14,6 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS
-from reslrb_cli.estimators.base import Pass
-from reslrb_cli.estimators.gather import Gathering, Taking
-from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.gradients import Case, extrapolated, integrator
@@ -50,35 +46,26 @@ class ReferenceGradients:
 
 @dataclass(frozen=True)
 class Stock:
-    """A stock integrator in the same scene. The reference never uses Russian roulette (docs/method.md)."""
+    """A stock integrator, without Russian roulette (docs/method.md).
+
+    It renders the case's scene, or another `scene`. The case's gradients are known multiples of the other scene's
+    gradients. `factors` holds the multiple for each parameter. The default multiple is 1.
+    """
 
     name: str
+    scene: Scene | None = None
+    factors: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def reference(self) -> Reference:
         return Reference(self.name)
 
     def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
-        tracer = integrator(self.name, **without_roulette(case))
-        return ReferenceGradients(setup.gradients(tracer, seeds_of(case.seeds, 1), case.spp))
-
-
-@dataclass(frozen=True)
-class Twin:
-    """`ptracer` in another scene. The case's gradients are known multiples of the other scene's gradients.
-
-    `factors` holds the multiple for each parameter. The default multiple is 1.
-    """
-
-    scene: Scene
-    factors: Mapping[str, float] = field(default_factory=dict)
-    reference = Reference.PTRACER
-
-    def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
-        other = Case(self.scene(), case.keys)
+        other = setup if self.scene is None else Case(self.scene(), case.keys)
         other.weights = setup.weights
-        values = other.gradients(integrator("ptracer", **without_roulette(case)), seeds_of(case.seeds, 1), case.spp)
-        scale = [np.full(len(other.initial[key]), self.factors.get(key, 1.0)) for key in case.keys]
+        tracer = integrator(self.name, **without_roulette(case))
+        values = other.gradients(tracer, seeds_of(case.seeds, 1), case.spp)
+        scale = [np.full(len(row), self.factors.get(key, 1.0)) for key, row in other.initial.items()]
         return ReferenceGradients(values * np.concatenate(scale))
 
 
@@ -141,38 +128,7 @@ class Exact:
         return ReferenceGradients(self.known().gradient(setup.weights))
 
 
-@dataclass(frozen=True)
-class Zero:
-    """No light path can connect, so every derivative is exactly zero."""
-
-    reference = Reference.ANALYTIC
-
-    def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
-        return ReferenceGradients(np.zeros(setup.size))
-
-
-Source = Stock | Twin | Differences | Extrapolated | Exact | Zero
-
-
-def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
-    """Return the residual's root mean square, divided by S_0's root mean square, as `relative_l2`."""
-    import drjit as dr
-    import mitsuba as mi
-
-    leaves = setup.leaves()
-    tracer = Reslrb.of(**{"rr_depth": 1000, **case.options, **case.ours, "estimator": "gather"})
-    with dr.suspend_grad(), dr.isolate_grad():
-        [samples] = tracer.passes(Job(setup.scene, setup.scene.sensors()[0], mi.UInt32(seed), case.spp, setup.params))
-        p = Pass(samples, None, samples.film.adjoint(setup.weights))
-        state = p.walk(Gathering(p))
-        dr.eval(state)
-        [S] = state.S
-        left = p.walk(Taking(p, state.visibility, S), state.visibility.last > 0)
-        sizes = [np.linalg.norm(np.array(value, np.float64)) for value in (left.value + left.rest, S.value)]
-    setup.release(leaves)
-    found = float(sizes[0] / sizes[1])
-    verdict = Verdict.HOLDS if found < LIMIT else Verdict.FAILS
-    return Comparison(verdict, relative_l2=found, relative_l2_limit=LIMIT, message="residual of the replay")
+Source = Stock | Differences | Extrapolated | Exact
 
 
 @dataclass(frozen=True)
@@ -188,11 +144,8 @@ class ExtremeCase:
     - `signed` is true if derivatives can have either sign. Otherwise, no derivative may be negative.
     - `equal` is the limit of the relative L2 distance at equal seeds. If there is only one seed, the limit also applies
         to the distance from exact values.
-    - `residual` is true if the residual of `gather`'s replay is checked.
     - `open_ended` lists parameters that no z-test can decide, with the reason. These parameters are compared only at
         equal seeds.
-    - `elsewhere` maps each parameter that another case decides to the case's name. These parameters are compared only
-        at equal seeds.
     - `moves` has the motions of light. With `moves`, the motions' amplitudes are the only parameters, `keys` is empty,
         and dL/dI is smooth. Only estimators with attached derivatives then take part.
     """
@@ -210,10 +163,8 @@ class ExtremeCase:
     weights: Callable[[np.ndarray], np.ndarray] | None = None
     signed: bool = False
     naive: bool = True
-    residual: bool = False
     equal: float = 1e-4
     open_ended: Mapping[str, str] = field(default_factory=dict)
-    elsewhere: Mapping[str, str] = field(default_factory=dict)
     moves: Callable[[Any], Sequence[Move]] | None = None
 
     @property
@@ -229,14 +180,12 @@ class ExtremeCase:
 
 
 def exact(
-    name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int,
-    rr_depth: int | None = None, **more: Any,
-) -> ExtremeCase:  # fmt: skip
+    name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int, **more: Any
+) -> ExtremeCase:
     """Return a case whose image is known in closed form. `keys` are the case's parameters. `more` sets other fields of
     the case.
     """
-    options = {"max_depth": max_depth} | ({} if rr_depth is None else {"rr_depth": rr_depth})
-    shared: dict[str, Any] = {"options": options, **more}
+    shared: dict[str, Any] = {"options": {"max_depth": max_depth}, **more}
     return ExtremeCase(name, about, lambda: known().scene(), tuple(keys.values()), Exact(known), **shared)
 
 
@@ -246,9 +195,6 @@ def without_roulette(case: ExtremeCase) -> dict[str, Any]:
     """
     return {key: value for key, value in case.options.items() if key != "rr_depth"}
 
-
-#: Relative to the root mean square of the sums.
-LIMIT = 1e-5
 
 #: Kind of measurement in the file of samples.
 KIND = "gradcheck --suite"
@@ -377,8 +323,6 @@ def _run_way(case: ExtremeCase, setup: Case, members: Mapping[str, str]) -> Iter
             rows.append((None, Reference(case.image), Kind.IMAGE, _images(images, stock)))
         if not np.isfinite(weights).all():
             rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, _refusals(weights, refused)))
-        if case.residual and name == "gather" and not case.way:
-            rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, residual(case, setup)))
         for row in rows:
             yield _record(case, label, *row)
 
@@ -422,12 +366,10 @@ def _comparisons(
             mine, its = ours[:, columns], naive[:, columns]
             if ESTIMATORS[name].exact:
                 kind, found = Kind.EQUAL_SEEDS, compare_equal_seeds(mine, its, case.equal)
-            elif parameter in case.elsewhere:
-                continue
             else:
                 kind, found = Kind.EXPECTATION, compare_expectations(mine, its, FAMILY, shape=shape)
             yield parameter, Reference.WALK_AD, kind, _settled(case, parameter, found, mine)
-        if reference.along is None and parameter not in case.elsewhere:
+        if reference.along is None:
             mine, its = ours[:, columns], reference.values[..., columns]
             if len(ours) == 1:  # no samples for a standard error
                 found = compare_equal_seeds(mine, np.atleast_2d(its), case.equal)
@@ -451,9 +393,8 @@ def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: 
     """Return the comparison `found`, adjusted to the case's special conditions. A comparison of the suite stays
     undecided only if the case gives a reason.
     """
-    if found.verdict is Verdict.UNREACHED and (isinstance(case.source, Zero) or parameter in case.open_ended):
-        message = "exactly zero" if isinstance(case.source, Zero) else "exactly zero, like the reference"
-        return replace(found, verdict=Verdict.HOLDS, message=message)
+    if found.verdict is Verdict.UNREACHED and parameter in case.open_ended:
+        return replace(found, verdict=Verdict.HOLDS, message="exactly zero, like the reference")
     if found.verdict in (Verdict.UNREACHED, Verdict.HEAVY_TAILED, Verdict.UNRESOLVED):
         reason = case.open_ended.get(parameter or "")
         if reason is None:

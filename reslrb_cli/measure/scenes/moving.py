@@ -161,7 +161,7 @@ Move = Displacement | Pose | Number
 
 @dataclass
 class Displaced:
-    """The scene values that `moves` change. Implements the interface `measure.gradients.Values`. AMPLITUDES has the
+    """The scene values that `moves` change. Replaces a `Selection` in a `Case`. AMPLITUDES has the
     amplitudes of all moves.
     """
 
