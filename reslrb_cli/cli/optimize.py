@@ -170,7 +170,7 @@ def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
         from reslrb_cli.cluster.engine import engine_at
 
         with engine_at(begun.course, workers) as engine:
-            begun.course.compute_with(engine, engine.spent)
+            begun.course.compute_with(engine)
             return _run(begun, None, quiet)
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.terminal import Interrupts

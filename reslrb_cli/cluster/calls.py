@@ -32,7 +32,6 @@ from distributed.scheduler import NoWorkerError
 from reslrb_cli.cluster.bundle import unpack
 from reslrb_cli.cluster.connection import NOBODY_S
 from reslrb_cli.errors import ConfigError, MachineError, ReslrbError, describe, is_machine_fault, is_out_of_memory
-from reslrb_cli.records.clock import SharedTime, WorkerTime
 from reslrb_cli.records.manifest import versions
 
 logger = logging.getLogger(__name__)
@@ -49,14 +48,6 @@ TOPIC, SEND_S = "reslrb", 2.0
 #: Time limit of a call, in seconds: `COLD_S` while kernels are compiled. Afterwards, `CALL_S`, plus a multiple of the
 #: longest call of the same function, plus the time to load the experiment.
 COLD_S, CALL_S, TIMES = 900.0, 10.0, 10.0
-
-
-class Answer(NamedTuple):
-    """The value of a call, the worker's name, and the seconds of the computation."""
-
-    value: Any
-    worker: str
-    seconds: float
 
 
 class _Loaded(NamedTuple):
@@ -106,7 +97,7 @@ class Workload(WorkerPlugin):
     def _folder(self, worker: Worker) -> Path:
         return Path(worker.local_directory) / f"reslrb-{self.key}"  # dask removes it with the worker
 
-    def call(self, worker: Worker, context: bytes, function: Callable[..., Any], arguments: Sequence[Any]) -> Answer:
+    def call(self, worker: Worker, context: bytes, function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
         """Call `function` with the state and `arguments`. `context` is a pickled object whose method `take(state)` sets
         the part of the state that changes from round to round. An empty `context` changes nothing.
         """
@@ -120,10 +111,9 @@ class Workload(WorkerPlugin):
                 pickle.loads(context).take(state)
                 self._context = context
             value = function(state, *arguments)
-        seconds = time.perf_counter() - begin
         if name in longest:
-            longest[name] = max(longest[name], seconds)
-        return Answer(value, _name(worker), seconds)
+            longest[name] = max(longest[name], time.perf_counter() - begin)
+        return value
 
     def _load(self, worker: Worker) -> _Loaded:
         self.setup(worker)
@@ -140,7 +130,7 @@ class Workload(WorkerPlugin):
         return self._loaded
 
 
-def perform(key: str, context: bytes, function: Callable[..., Any], arguments: Sequence[Any]) -> Answer:
+def perform(key: str, context: bytes, function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
     """Compute a call of the workload with this key."""
     worker = get_worker()
     workload = worker.plugins.get(Workload.name)
@@ -195,17 +185,16 @@ def _load(state: object) -> None:
 
 
 class Workers:
-    """The workers of a client, as an `Engine` of `shards.py`. `where` names the workers' place.
+    """The workers of a client, as an `Engine` of `shards.py`.
 
     `context_of` returns the context of the calls (`Workload.call`) for the state of this process. Raises MachineError
     if there are no workers, or if one cannot load the workload.
     """
 
     def __init__(
-        self, client: Client, workload: Workload, where: str, context_of: Callable[[Any], Any]
+        self, client: Client, workload: Workload, context_of: Callable[[Any], Any]
     ) -> None:  # fmt: skip
         self._client, self._key, self._context_of = client, workload.key, context_of
-        self._spent = SharedTime((where,))
         client.subscribe_topic(TOPIC, lambda event: logger.warning(f"--cluster: {event[1]}"))
         with self._explained():
             client.wait_for_workers(1, timeout=NOBODY_S)
@@ -221,20 +210,13 @@ class Workers:
 
         Raises the errors of calls. Raises MachineError if workers fail repeatedly, or if there are no workers.
         """
-        begin, times = time.monotonic(), dict[str, WorkerTime]()
         context = pickle.dumps(self._context_of(state))
         with self._explained():
-            for place, (value, worker, seconds) in self._answers(function, work, context):
-                times[worker] = times.get(worker, WorkerTime()) + WorkerTime(1, seconds)
-                yield place, value
-        computing = [spent.computing_s for spent in times.values()]
-        mean = sum(computing) / max(len(times), 1)
-        waiting = max(computing, default=0.0) - mean
-        self._spent += SharedTime(self._spent.places, time.monotonic() - begin, mean, waiting, times)
+            yield from self._answers(function, work, context)
 
     def _answers(
         self, function: Callable[..., Any], work: Sequence[tuple[Any, ...]], context: bytes
-    ) -> Iterator[tuple[int, Answer]]:
+    ) -> Iterator[tuple[int, Any]]:
         places = {
             self._client.submit(perform, self._key, context, function, given, pure=False): place
             for place, given in enumerate(work)
@@ -260,7 +242,3 @@ class Workers:
             if isinstance(error, CancelledError | CommClosedError) or self._client.status != "running":
                 raise MachineError("--cluster: the scheduler has ended; --resume continues the run") from None
             raise
-
-    def spent(self) -> SharedTime:
-        """Return the times so far."""
-        return self._spent

@@ -141,4 +141,4 @@ def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> 
     """
     with connected(place) as (client, folder):
         workload = workload_of(course, folder, threads or place.threads, own=place.address is None)
-        yield Workers(client, workload, str(place), Standing.of)
+        yield Workers(client, workload, Standing.of)

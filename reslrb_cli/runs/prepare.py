@@ -36,7 +36,6 @@ from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_fil
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
-from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
@@ -193,7 +192,6 @@ class SavedResults:
     images: Images
     certainty: Noted
     best: Least | None = None
-    shared: SharedTime | None = None
     best_values: Arrays = field(default_factory=dict, metadata=entry("best"))
     squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
     last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps"))
@@ -213,25 +211,10 @@ class RunProgress:
         self.nonfinite, self.regularized = NonFiniteTally(), RegularizedTally()
         self.last: Record | None = None
         self.watch = Watch(problem.config)
-        self._shared: SharedTime | None = None
-        self._spent: Callable[[], SharedTime] | None = None
 
-    def compute_with(self, engine: Callable[..., Any], spent: Callable[[], SharedTime] | None = None) -> None:
-        """Let `engine` (`shards.Engine`) compute the shards of a step.
-
-        `spent` returns the time that the engine has spent on shards so far.
-        """
+    def compute_with(self, engine: Callable[..., Any]) -> None:
+        """Let `engine` (`shards.Engine`) compute the shards of a step."""
         self.problem = replace(self.problem, engine=engine)
-        self._spent = spent
-
-    @property
-    def shared(self) -> SharedTime | None:
-        """Time that workers have spent on shards, or None without workers. The time before the run was resumed counts
-        too.
-        """
-        if self._spent is None:
-            return self._shared
-        return self._spent() if self._shared is None else self._shared + self._spent()
 
     @property
     def files(self) -> dict[str, str]:
@@ -304,7 +287,7 @@ class RunProgress:
         `tree.entries`.
         """
         met = SavedResults(
-            self.results.images["initial"], self.certainty.noted, self.best.least, self.shared,
+            self.results.images["initial"], self.certainty.noted, self.best.least,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
         )  # fmt: skip
         return entries(self._settled, state.on_file(self.problem), met)
@@ -328,7 +311,6 @@ class RunProgress:
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.restore(met.certainty, met.squares, met.last_steps)
-        self._shared = met.shared
 
 
 @dataclass(frozen=True)

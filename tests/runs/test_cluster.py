@@ -144,6 +144,7 @@ SCENE = """\
             <texture type="bitmap" name="reflectance"><string name="filename" value="../textures/print.exr"/></texture>
         </bsdf>
     </shape>
+    <shape type="sphere"><bsdf type="conductor"><string name="material" value="Cu"/></bsdf></shape>
 </scene>
 """
 QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
@@ -152,12 +153,13 @@ QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n
 def test_a_bundle_contains_all_files_of_an_experiment(
     llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The bundle contains includes, files from <path> folders, variables, meshes, textures, initial values and cameras,
-    wherever they are. After unpacking, nothing is read from the experiment's own folder.
+    """The bundle contains includes, files from <path> folders, variables, meshes, textures, tables of metals, initial
+    values and cameras, wherever they are. After unpacking, nothing is read from the experiment's own folder.
     """
     rng, where = np.random.default_rng(1), made(tmp_path / "here")
-    for name in ("parts", "textures", "shots"):
+    for name in ("parts", "textures", "shots", "data", "data/ior"):
         made(where / name)
+    (where / "data/ior/Cu.k.spd").write_text("400 2\n700 2\n")
     (where / "parts" / "lamps.xml").write_text(
         f'<scene version="3.0.0"><emitter type="envmap" id="sky"><string name="filename" value="{where}/sky.exr"/>'
         "</emitter></scene>"
@@ -214,7 +216,7 @@ def reads(folder: Path, threads: int | None) -> tuple[str, dict[str, float]]:
 def uppercase(me: SimpleNamespace, workload: object) -> object:
     """Give a worker a workload, and call `str.upper` of the state."""
     me.plugins["reslrb"] = workload
-    return calls.perform(workload.key, b"", str.upper, ()).value
+    return calls.perform(workload.key, b"", str.upper, ())
 
 
 def test_a_worker_reports_missing_requirements(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,7 +345,7 @@ def test_a_call_that_ends_every_worker_ends_the_run(caplog: pytest.LogCaptureFix
     ended = pytest.raises(MachineError, match="--cluster: the same call ended 4 workers, the last one at tls://")
     workload = calls.Workload({"a": b"one"}, reads)
     with connected(Place(1)) as (client, _), ended:
-        list(calls.Workers(client, workload, "local:1", lambda state: Unchanged())(None, fail, [()]))
+        list(calls.Workers(client, workload, lambda state: Unchanged())(None, fail, [()]))
     warnings = [record.message for record in caplog.records if record.name == "reslrb_cli.cluster.calls"]
     assert warnings  # a busy machine may lose some
     assert all("No space left on device; it is restarted" in warning for warning in warnings)

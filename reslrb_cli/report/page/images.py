@@ -116,18 +116,16 @@ def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def seen_table(runs: Sequence[ShownRun]) -> Markup:
-    """Return a table of the perceptual errors at start and end, for the images of all runs."""
+def seen_table(results: Mapping[str, Any]) -> Markup:
+    """Return a table of the perceptual errors of a run's images at start and end."""
     rows: list[dict[str, Any]] = []
-    for run in runs:
-        name = run.name if len(runs) > 1 else ""
-        for suffix, about in (run.results.get("seen") or {}).items():
-            sensor = f"sensor {suffix[1:]}, " if suffix else ""
-            rows += [
-                {"run": name, "name": sensor + title, "errors": about[moment]}
-                for title, moment in (("start", "initial"), ("end", "final"))
-                if moment in about
-            ]
+    for suffix, about in (results.get("seen") or {}).items():
+        sensor = f"sensor {suffix[1:]}, " if suffix else ""
+        rows += [
+            {"name": sensor + title, "errors": about[moment]}
+            for title, moment in (("start", "initial"), ("end", "final"))
+            if moment in about
+        ]
     return lay_out("run.seen", rows) if rows else Markup()
 
 
