@@ -64,7 +64,6 @@ logger = logging.getLogger(__name__)
 class OptimizeOptions(ExperimentOptions):
     """The options of the command, by the names of its parameters."""
 
-    force: bool
     dry_run: bool
     resumed: Path | None
     cluster: str | None
@@ -73,7 +72,6 @@ class OptimizeOptions(ExperimentOptions):
 
 @click.command("optimize")
 @optional_experiment_arguments
-@click.option("--force", is_flag=True, help="Replace the run folder of this name instead of creating a numbered one.")
 @click.option(
     "--dry-run",
     is_flag=True,
@@ -105,8 +103,6 @@ def command(**given: Any) -> int:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING)
     workers = None if options.cluster is None else Place.parse(options.cluster)
     if options.resumed is not None:
-        if options.force:
-            raise click.UsageError("--force replaces a run, --resume continues one; give only one of them")
         if options.dry_run:
             raise click.UsageError("--dry-run is for a new run, --resume continues one; give only one of them")
         if options.config_file is not None:
@@ -130,9 +126,8 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -
     from reslrb_cli.records.run_folder import check_output
 
     config = options.config()
-    run = config.run
     _check_shards(config, workers)
-    check_output(config_file, run.output, run.folder_name, options.force)
+    check_output(config_file, config.run.output)
     if workers is not None:
         workers.check()
     variant = start_variant(config)
@@ -142,7 +137,7 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -
 
     from reslrb_cli.runs.prepare import begin
 
-    return _run(begin(config, variant, options.force, logger.info, logger.warning), workers, options.quiet)
+    return _run(begin(config, variant, logger.info, logger.warning), workers, options.quiet)
 
 
 def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:

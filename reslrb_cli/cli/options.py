@@ -220,6 +220,7 @@ REMOVED = {
         ("bench gradcheck convergence", "--plot", "`reslrb report FILE -o page.html` plots results of --json FILE"),
         ("bench gradcheck convergence", "--resume", "--json FILE continues from the results in FILE"),
         ("bench convergence", "--memory-limit", "the shell's `ulimit -v KIB` limits every process of the command"),
+        ("optimize", "--force", "remove the folder of the earlier run; without that, the new folder has a number"),
         ("optimize", "--verbose", "`reslrb --debug optimize` prints details of the measurements"),
         ("optimize", "-v", "`reslrb --debug optimize` prints details of the measurements"),
         ("sweep", "--verbose", "the folder of each run has its warnings"),

@@ -71,8 +71,6 @@ MAY_CHANGE = re.compile(
 #: Settings for the place of a new run.
 PLACE = ("run.name", "run.output")
 
-#: Maximum number of changed settings that an error names.
-_SHOWN = 3
 Change = tuple[Any, Any]
 
 
@@ -89,20 +87,13 @@ def changes(before: Config, now: Config) -> dict[str, Change]:
 def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], run: Path) -> dict[str, Change]:
     """Return the changed settings. Settings that only determine the run's place do not count as changes.
 
-    Raises ConfigError if a setting must not change. The error names the first few such settings. The error is located
-    at the first such setting. `blame` returns the source of this setting.
+    Raises ConfigError, located at the first setting that must not change. `blame` returns the source of this setting.
     """
-    wrong = [key for key in found if not MAY_CHANGE.fullmatch(key)]
-    if wrong:
-        first, *others = [f"{_shown(found[key][1])}, {_shown(found[key][0])} in the run" for key in wrong[:_SHOWN]]
-        more = [f"{key} is {what}" for key, what in zip(wrong[1:], others, strict=False)]
-        more += [f"{len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
-        also = f"; also {'; '.join(more)}" if more else ""
-        raise ConfigError(
-            blame(wrong[0]),
-            wrong[0],
-            f"is {first}{also}; {run} may change only iterations and learning rates",
-        )
+    wrong = next((key for key in found if not MAY_CHANGE.fullmatch(key)), None)
+    if wrong is not None:
+        before, now = map(_shown, found[wrong])
+        reason = f"is {now}, {before} in the run; {run} may change only iterations and learning rates"
+        raise ConfigError(blame(wrong), wrong, reason)
     return {key: change for key, change in found.items() if key not in PLACE}
 
 
@@ -325,7 +316,7 @@ class PreparedRun:
     place: Callable[[], contextlib.AbstractContextManager[RunFolder]]
 
 
-def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> PreparedRun:
+def begin(config: Config, variant: str, say: Say, warn: Say) -> PreparedRun:
     """Prepare a new run in its own folder. A variant must be set.
 
     Call `check_output` first, to check that the folder can be made. Raises ConfigError and UnsupportedScene.
@@ -335,5 +326,5 @@ def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> Pre
     return PreparedRun(
         course,
         manifest,
-        lambda: RunFolder.create(config.source, run.output, run.folder_name, force, dump(config), manifest),
+        lambda: RunFolder.create(config.source, run.output, run.folder_name, dump(config), manifest),
     )

@@ -34,7 +34,7 @@ from reslrb_cli.report.page.run import guarded
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve
 from reslrb_cli.report.run_summary import units_differ
 from reslrb_cli.report.sources import ShownRun, SweepRuns
-from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
+from reslrb_cli.report.tonemap import exposure_words, shown_exposures
 
 Array = np.ndarray[Any, Any]
 
@@ -310,10 +310,8 @@ def _images(source: SweepRuns) -> Markup:
     if not shown:
         return Markup()
     first, more = shown[0][1], len(shown) - MOST_PICTURES
-    names = ("", "-0")  # the first of several sensors has the suffix -0
-    suffix = next((end for end in names if (first.path / "images" / f"target{end}.exr").exists()), "")
+    suffix, exposure = next(iter(shown_exposures(first.manifest.get("views")).items()))
     target = load_image(first.path / "images" / f"target{suffix}.exr")
-    exposure = shown_exposures(first.manifest.get("views")).get(suffix) or exposure_for(target)
     pictures = [] if target is None else [show(target * exposure, "target", lay_out("titled", "target", ""))]
     for combination, run in shown[:MOST_PICTURES]:
         image, loss = load_image(run.path / "images" / f"final{suffix}.exr"), run.results.get("image_loss") or {}
