@@ -324,11 +324,11 @@ def optimize(
             if instead not in (Path.cwd() / "runs", config.run.output):
                 logger.warning("%s: run.output: %s is not used; folder says where the run is", config.source, instead)
             try:
-                check_output(config.source, config.run.output, config.run.folder_name, False)
+                check_output(config.source, config.run.output)
             except ConfigError as error:
                 raise ConfigError("folder", "", error.message) from None
         variant = keep_variant(config.variant, config.source)
-        begun = begin(config, variant, False, logger.info, logger.warning)
+        begun = begin(config, variant, logger.info, logger.warning)
         return Run(contextlib.ExitStack(), begun, folder is not None)
 
 

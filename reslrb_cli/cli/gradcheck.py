@@ -4,11 +4,10 @@ lack.
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +24,6 @@ from reslrb_cli.cli.options import (
     allow_code_option,
     allowance,
     check_writable,
-    cluster_option,
     is_given,
     json_option,
     optional_experiment_arguments,
@@ -34,7 +32,6 @@ from reslrb_cli.cli.options import (
     read_or_box,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
-from reslrb_cli.cluster.connection import Place
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
@@ -61,7 +58,6 @@ class GradcheckOptions(ExperimentOptions):
     integrators: str | None
     budget: float
     seeds: int | None
-    cluster: str | None
     json_file: Path | None
     spp: int | None
     missing: bool
@@ -72,8 +68,6 @@ class GradcheckOptions(ExperimentOptions):
             raise ConfigError(option, "", "has no effect with --missing, which compares nothing; remove one of them")
         if self.missing and self.config_file is None:
             raise ConfigError("--missing", "", "needs a CONFIG with parameters and a loss")
-        if self.missing and self.cluster is not None:
-            raise ConfigError("--cluster", "", "has no effect with --missing, which distributes nothing; remove one")
         if self.suite is not None and (option := _given(CONFIGURED)):
             raise ConfigError("--suite", "", f"{option} has no effect on a suite; remove it")
         if self.suite is not None and self.suite.partition(":")[0] != "extreme":
@@ -101,16 +95,15 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
         return ExitCode.INTERRUPTED if interrupts.requested else ExitCode.DONE
 
 
-def run_suite(options: GradcheckOptions, place: Place | None) -> int:
+def run_suite(options: GradcheckOptions) -> int:
     """Run the named cases, or all cases without names. Print a line for each case and write the file.
 
-    Cases in the file are not run again. If `place` is given, the workers at this place run the cases.
+    Cases in the file are not run again.
     """
     chosen = None if options.integrators is None else _estimators(options.integrators)
     variant = set_variant("auto")
 
     from reslrb_cli.measure.extreme import CASES, case_records, suite
-    from reslrb_cli.optimization.shards import in_order, serially
     from reslrb_cli.report.tables import summary_lines
 
     seeds, json_file, listed = options.seeds, options.json_file, str(options.suite).partition(":")[2]
@@ -131,16 +124,9 @@ def run_suite(options: GradcheckOptions, place: Place | None) -> int:
         return [record for rows in done.values() for record in rows]
 
     keeper = Keeper(json_file, origin_of(variant), lines, lambda: suite.kept(to_keep, done))
-    work = [(name, chosen, seeds) for name in to_do]
-    with contextlib.ExitStack() as stack:
-        run: Callable[..., Any] = serially
-        if place is not None:
-            from reslrb_cli.cluster.checks import cases_at
-
-            run = stack.enter_context(cases_at(place, variant))
-        interrupts = stack.enter_context(Interrupts())
-        found = in_order(run(lambda: interrupts.requested, case_records, work))
-        for name, rows in zip(to_do, found, strict=True):
+    with Interrupts() as interrupts:
+        for name in to_do:
+            rows = case_records(lambda: interrupts.requested, name, chosen, seeds)
             if interrupts.requested:  # this case may be incomplete
                 break
             done[name] = rows
@@ -201,7 +187,6 @@ logger = logging.getLogger(__name__)
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
               help="Number of seeds, including those in the file of --json, for any time.")  # fmt: skip
 @allow_code_option
-@cluster_option("Distribute samples, or the cases of a suite, to workers", "the result is that of one process")
 @json_option
 @click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, at most run.spp.")  # fmt: skip
@@ -227,10 +212,9 @@ def command(**given: Any) -> int:
     from reslrb_cli.report.tables import summary_lines
 
     options.check()
-    place = None if options.cluster is None else Place.parse(options.cluster)
     check_writable("--json", options.json_file)
     if options.suite is not None:
-        return run_suite(options, place)
+        return run_suite(options)
     config = options.config()
     if options.missing:
         check_code(config)
@@ -240,22 +224,12 @@ def command(**given: Any) -> int:
     checked = settings_of(
         config, options.integrators, options.budget, options.seeds, options.spp, time.monotonic() - began
     )
-    if place is not None:
-        from reslrb_cli.cluster.checks import check_shareable
-
-        check_shareable(checked)
-        place.check()
     variant = set_variant(config.variant)
     to_keep = settings_to_keep(checked, variant, device_name(variant))
     check = Gradcheck(checked, earlier=read_earlier(KIND, options.json_file, to_keep))
     echo(f"{device_name(variant)}, {variant}; {allowance(options.budget, options.seeds, 'seed')}")
     echo(check.conditions())
-    with contextlib.ExitStack() as stack:
-        if place is not None:
-            from reslrb_cli.cluster.checks import samples_at
-
-            check.sampling.engine = stack.enter_context(samples_at(checked, check.participants, place, variant))
-        records, interrupted = _run(check, variant, to_keep, options)
+    records, interrupted = _run(check, variant, to_keep, options)
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
         echo(line)

@@ -17,7 +17,6 @@ from reslrb_cli.cli.options import (
     FOLDER,
     ExperimentOptions,
     allow_code_option,
-    cluster_option,
     optional_experiment_arguments,
     start_variant,
 )
@@ -65,7 +64,6 @@ logger = logging.getLogger(__name__)
 class OptimizeOptions(ExperimentOptions):
     """The options of the command, by the names of its parameters."""
 
-    force: bool
     dry_run: bool
     resumed: Path | None
     cluster: str | None
@@ -74,7 +72,6 @@ class OptimizeOptions(ExperimentOptions):
 
 @click.command("optimize")
 @optional_experiment_arguments
-@click.option("--force", is_flag=True, help="Replace the run folder of this name instead of creating a numbered one.")
 @click.option(
     "--dry-run",
     is_flag=True,
@@ -88,7 +85,11 @@ class OptimizeOptions(ExperimentOptions):
     help="Continue the run in this folder, in place of CONFIG. --set may change iterations and learning rates.",
 )
 @allow_code_option
-@cluster_option("Distribute the shards of each step (run.shards) to workers", "the result is that of one process")
+@click.option("--cluster", metavar="WHERE",
+              help=
+        "Distribute the shards of each step (run.shards) to workers: local:N, N processes on this machine, or "
+        "tls://HOST:PORT, the workers of a dask scheduler; the result is that of one process. Needs `pip install "
+        "reslrb[cluster]`.")  # fmt: skip
 @click.option("--quiet", is_flag=True, help="Print only the last line.")
 def command(**given: Any) -> int:
     """Recover the parameters of CONFIG from its target images.
@@ -102,8 +103,6 @@ def command(**given: Any) -> int:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING)
     workers = None if options.cluster is None else Place.parse(options.cluster)
     if options.resumed is not None:
-        if options.force:
-            raise click.UsageError("--force replaces a run, --resume continues one; give only one of them")
         if options.dry_run:
             raise click.UsageError("--dry-run is for a new run, --resume continues one; give only one of them")
         if options.config_file is not None:
@@ -127,9 +126,8 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -
     from reslrb_cli.records.run_folder import check_output
 
     config = options.config()
-    run = config.run
     _check_shards(config, workers)
-    check_output(config_file, run.output, run.folder_name, options.force)
+    check_output(config_file, config.run.output)
     if workers is not None:
         workers.check()
     variant = start_variant(config)
@@ -139,7 +137,7 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -
 
     from reslrb_cli.runs.prepare import begin
 
-    return _run(begin(config, variant, options.force, logger.info, logger.warning), workers, options.quiet)
+    return _run(begin(config, variant, logger.info, logger.warning), workers, options.quiet)
 
 
 def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
@@ -167,7 +165,7 @@ def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
         from reslrb_cli.cluster.engine import engine_at
 
         with engine_at(begun.course, workers) as engine:
-            begun.course.compute_with(engine, engine.spent)
+            begun.course.compute_with(engine)
             return _run(begun, None, quiet)
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.terminal import Interrupts

@@ -217,6 +217,7 @@ REMOVED = {
         ("bench gradcheck convergence", "--resume", "--json FILE continues from the results in FILE"),
         ("bench convergence", "--memory-limit", "the shell's `ulimit -v KIB` limits every process of the command"),
         ("bench", "--objective", "`reslrb convergence CONFIG --objective loss` measures steps of the loss"),
+        ("optimize", "--force", "remove the folder of the earlier run; without that, the new folder has a number"),
         ("optimize", "--verbose", "`reslrb --debug optimize` prints details of the measurements"),
         ("optimize", "-v", "`reslrb --debug optimize` prints details of the measurements"),
         ("sweep", "--verbose", "the folder of each run has its warnings"),
@@ -225,6 +226,7 @@ REMOVED = {
         ("sweep", "--json", "results.jsonl in the folder of the sweep has the results"),
         ("sweep", "--dry-run", "`reslrb optimize CONFIG --dry-run` measures one of the runs"),
         ("sweep", "--quiet", "redirect the output, as in > sweep.log"),
+        ("gradcheck", "--cluster", "a check runs in one process; --json FILE continues it"),
         ("gradcheck", "--estimators", "name them by --integrators, such as reslrb:stack,reslrb:gather"),
         ("gradcheck", "--case", "name the case after the suite, as in --suite extreme:furnace"),
         ("gradcheck", "--images", "--json FILE keeps the gradients of each seed in FILE.samples.npz"),
@@ -269,16 +271,6 @@ allow_code_option = click.option(
     "--allow-code", is_flag=True,
     help="Run the files of Python code that CONFIG or a list names (type: custom, FILE.py:NAME), with all your rights.",
 )  # fmt: skip
-
-
-def cluster_option(what: str, result: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add the option `--cluster` (argument `cluster`) to a command. In the help text, `what` describes the work of the
-    workers, and `result` describes the result.
-    """
-    where = "local:N, N processes on this machine, or tls://HOST:PORT, the workers of a dask scheduler"
-    return click.option(
-        "--cluster", metavar="WHERE", help=f"{what}: {where}; {result}. Needs `pip install reslrb[cluster]`."
-    )
 
 
 def allowance(budget_s: float, number: int | None, of: str) -> str:

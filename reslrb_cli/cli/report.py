@@ -24,8 +24,8 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     """Write one self-contained page about runs and measurements.
 
     RUN is a run folder of `optimize`, a folder of a `sweep`, or a file that `bench`, `gradcheck` or `convergence` wrote
-    with --json. The page shows losses and errors of several runs in one picture. Images, times and memory of the runs
-    appear side by side. Unfinished runs are shown up to their last iteration.
+    with --json. Several of these follow one another. A sweep compares its runs. Unfinished runs are shown up to their
+    last iteration.
     """
     from reslrb_cli.backend.installation import load_packages
 

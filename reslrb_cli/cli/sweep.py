@@ -140,8 +140,8 @@ def _run(folder: Path, sweep: SweepPlan) -> int:
     from reslrb_cli.records.measurement_files import LivePage, write_lines
     from reslrb_cli.records.sweeps import PAGE_FILE, RESULTS_FILE, Failure, config_file, label, run_name
     from reslrb_cli.report.page import write_page
+    from reslrb_cli.report.page.sweep import lines, run_records
     from reslrb_cli.report.sources import read_sweep_runs
-    from reslrb_cli.report.sweep import lines, run_records
     from reslrb_cli.runs.sweep import command as command_of
     from reslrb_cli.runs.sweep import is_left
 
@@ -194,7 +194,7 @@ def _results(source: SweepRuns) -> list[Line]:
     combinations.
     """
     from reslrb_cli.records.measurement_files import Origin
-    from reslrb_cli.report.sweep import best_records, row_records, run_records
+    from reslrb_cli.report.page.sweep import best_records, row_records, run_records
 
     manifest: dict[str, Any] = dict(next(iter(source.runs.values())).manifest) if source.runs else {}
     origin = Origin(str(manifest.get("device", "")), str(manifest.get("variant", "")))

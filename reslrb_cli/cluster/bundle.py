@@ -85,11 +85,13 @@ def bundle_of(config: Config, values: Values) -> Bundle:
 def _scene_text(bundle: Bundle, config: Config) -> str:
     """Return the scene description as one file. Paths in the file are replaced by the bundle's paths."""
     description = read_description(config.scene.file, config.scene.options)
-    for element in description.root.walk():
-        key = element.file_attribute
-        path = description.find_file(element.attributes[key]) if key else None
+    for element, name in list(description.named_files()):
+        path = description.find_file(name)
         if path is not None and path.is_file():
-            element.attributes[key] = bundle.add(path)
+            if element.file_attribute:
+                element.attributes[element.file_attribute] = bundle.add(path)
+            else:  # a table of a metal, which Mitsuba finds by its name
+                bundle.files[name] = path.read_bytes()
     return "".join(f"{line}\n" for line, _ in tag_lines(description.root))
 
 

@@ -1,4 +1,4 @@
-"""The shards of a run's steps on workers (`crew.Crew`), and the data that workers need to compute the shards.
+"""The shards of a run's steps on workers (`calls.Workers`), and the data that workers need to compute the shards.
 
 A call depends only on the experiment (files by digest), on parameter values and tables (`Standing`), on the shard, and
 on the shard's dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions, or on the
@@ -21,9 +21,8 @@ import numpy as np
 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.bundle import bundle_of, read_bundle
-from reslrb_cli.cluster.calls import Workers
+from reslrb_cli.cluster.calls import Workers, Workload
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.cluster.worker import Workload, set_threads
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.memory import check_step
@@ -87,7 +86,9 @@ def assembled(folder: Path, threads: int | None, allows_code: bool) -> tuple[Pro
         check_step(problem)
         problem = decide_as(problem, stored)
         set_targets(problem.views, dict(targets))
-    set_threads(threads)
+    if threads is not None:
+        dr.sync_thread()
+        dr.set_thread_count(threads)
     return problem, _warmed(problem)
 
 
@@ -140,4 +141,4 @@ def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> 
     """
     with connected(place) as (client, folder):
         workload = workload_of(course, folder, threads or place.threads, own=place.address is None)
-        yield Workers(client, workload, str(place), Standing.of)
+        yield Workers(client, workload, Standing.of)

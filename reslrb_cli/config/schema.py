@@ -24,10 +24,8 @@ from reslrb_cli.config.base import (
     Positive,
     Section,
     Size,
-    each_once,
     few,
     located,
-    must,
     wrong,
 )
 from reslrb_cli.config.integrators import AnyIntegrator, Integrator, Own, passes_obstacle
@@ -80,13 +78,8 @@ class Fabrication(Section):
     receiver: ClassVar[str] = "screen"
 
     kind: Literal["lens", "mirror"] = Field(default="lens", description="Whether the face refracts or reflects light.")
-    faces: Annotated[
-        list[Annotated[str, Field(min_length=1)]],
-        Field(min_length=1, max_length=2),
-        must(each_once, lambda _: "must name each mesh once"),
-    ] = Field(default=["face"])
-    """Ids of the meshes of the faces. The first is the front: a grid about z = 0 that faces +z. The second is the back,
-    if it is free as well: a grid about z = -thickness that faces -z. With one id the back is flat."""
+    face: Annotated[str, Field(min_length=1)] = "face"
+    """Id of the mesh of the face: a grid about z = 0 that faces +z. The back is flat."""
     thickness: Positive = Field(description="Distance from z = 0 down to the back, in mm.")
     outline: Literal["rectangle", "round"] = "rectangle"
     """Outline of the solid. `round`: the ellipse inside the face; the face outside of it is cut off."""

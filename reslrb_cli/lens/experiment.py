@@ -81,22 +81,16 @@ def at_vertices(surface: Surface, nx: int, ny: int) -> Array:
     return np.asarray(spline(*at))
 
 
-def face_ply(setting: Setting, nx: int, ny: int, back: bool = False) -> bytes:
-    """Return the flat face as a binary PLY. The grid has normals along +z and texture coordinates with v along y.
-
-    The `back` is at z = -thickness with normals along -z.
-    """
+def face_ply(setting: Setting, nx: int, ny: int) -> bytes:
+    """Return the flat face as a binary PLY. The grid has normals along +z and texture coordinates with v along y."""
     x, y = vertices(setting, nx, ny)
     u, v = np.meshgrid((np.arange(nx) + 0.5) / nx, (np.arange(ny) + 0.5) / ny)
     zero = np.zeros_like(x)
-    z, normal = (-setting.thickness, -1.0) if back else (0.0, 1.0)
-    points = np.stack([x, y, zero + z, zero, zero, zero + normal, u, v], axis=-1).reshape(-1, 8)
+    points = np.stack([x, y, zero, zero, zero, zero + 1.0, u, v], axis=-1).reshape(-1, 8)
     corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
     cells = np.concatenate([
         np.stack([corner, corner + 1, corner + nx + 1], 1), np.stack([corner, corner + nx + 1, corner + nx], 1)
     ])  # fmt: skip
-    if back:
-        cells = cells[:, ::-1]
     return ply_file(points, cells)
 
 

@@ -1,10 +1,10 @@
 """Solid with a face of heights: a closed mesh in millimetres, its files, and measurements for manufacturing.
 
-The solid has the scene's axes. The face is near z = 0 with its outside towards +z, the back is at z = -thickness, and y
-points up. Front and back consist of the traced triangles, except where a round outline cuts them. A flat rim may
+The solid has the scene's axes. The face is near z = 0 with its outside towards +z, the flat back is at z = -thickness,
+and y points up. The front consists of the traced triangles, except where a round outline cuts them. A flat rim may
 surround the face. The rim is slightly lower than the face's lowest edge, so it casts no shadow on the face.
 
-Faces are height fields over grids, so no two points of a face lie above each other. Front and back therefore cross
+The face is a height field over a grid, so no two points of it lie above each other. Front and back therefore cross
 exactly where the thickness along z is zero or negative.
 """
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import locale
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.lens.workshop import cutter
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -33,7 +32,13 @@ RIM_STEP = 0.1
 #: Vertices closer to a round outline than this part of the grid's pitch are moved onto it, which avoids slivers.
 _NEAR = 0.1
 
-#: Tolerances relative to the size of a face, for equal positions and for the requested size.
+#: Share of the face that the largest ball must reach.
+REACHED = 0.99
+
+#: Height of the scallops between two passes of the tool, in mm.
+SCALLOP = 0.005
+
+#: Tolerances relative to the size of a face, for equal positions and for its centre.
 _SAME, _SIZE = 1e-5, 1e-3
 
 
@@ -91,12 +96,12 @@ class Solid:
 def as_sheet(name: str, points: Array, triangles: Indices, smooth: bool = False) -> Sheet:
     """Convert a mesh to a grid. The mesh has vertices (n, 3) and triangles (m, 3), in either orientation.
 
-    Raises ConfigError, with the key `fabrication.faces`, if the mesh is no grid or no height field.
+    Raises ConfigError, with the key `fabrication.face`, if the mesh is no grid or no height field.
     """
     points = np.asarray(points, np.float64)
 
     def fail(why: str) -> ConfigError:
-        return ConfigError("", "fabrication.faces", f"`{name}` {why}; a solid needs a rectangular grid of heights "
+        return ConfigError("", "fabrication.face", f"`{name}` {why}; a solid needs a rectangular grid of heights "
                                                     "along z, as written by `reslrb lens`")  # fmt: skip
 
     if not np.all(np.isfinite(points)):
@@ -131,41 +136,30 @@ def _areas(points: Array, triangles: Indices) -> Array:
     return np.asarray((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2)
 
 
-def make_solid(sheets: Sequence[Sheet], plan: Fabrication) -> Solid:
-    """Make the solid. The first of `sheets` is the front of the solid. The second sheet, if given, is the back.
-    Otherwise, the back is a plane.
+def make_solid(sheet: Sheet, plan: Fabrication) -> Solid:
+    """Make the solid between a face and the flat back.
 
-    Raises ConfigError, with a key below `fabrication`, if the faces cross or differ in size.
+    Raises ConfigError, with a key below `fabrication`, if front and back cross, or if the face is not centred.
     """
-    half = sheets[0].half
-    for sheet in sheets:
-        if any(abs(a - b) > _SIZE * b for a, b in zip(sheet.half, half, strict=True)):
-            sizes = f"{2 * half[0]:g} x {2 * half[1]:g} mm, but `{sheet.name}` {2 * sheet.half[0]:g} x "
-            raise ConfigError("", "fabrication.faces", f"`{sheets[0].name}` is {sizes}{2 * sheet.half[1]:g}")
-        middle = sheet.x.mean(), sheet.y.mean()
-        if max(map(abs, middle)) > _SIZE * max(half):
-            raise ConfigError("", "fabrication.faces", f"the centre of `{sheet.name}` is at x = {middle[0]:.3g}, y = "
-                                                       f"{middle[1]:.3g}; it must be at 0")  # fmt: skip
-    thin = least_thickness(sheets, plan)
+    middle = sheet.x.mean(), sheet.y.mean()
+    if max(map(abs, middle)) > _SIZE * max(sheet.half):
+        raise ConfigError("", "fabrication.face", f"the centre of `{sheet.name}` is at x = {middle[0]:.3g}, y = "
+                                                  f"{middle[1]:.3g}; it must be at 0")  # fmt: skip
+    thin = least_thickness(sheet, plan)
     if thin <= 0:
         raise ConfigError("", "fabrication.thickness", f"{plan.thickness:g} mm: front and back overlap by {-thin:.3g} "
                                                        f"mm; it must be above {plan.thickness - thin:.4g}")  # fmt: skip
-    build = _Building(sheets[0].half)
-    outer = build.add_face(sheets[0], plan, 1)
-    if len(sheets) == 2:
-        build.zip(build.add_face(sheets[1], plan, -1), outer)
-    else:
-        # A point in the middle and the outline suffice: the flat back needs no grid.
-        below = build.copy(outer, -plan.thickness)
-        build.zip(below, outer)
-        middle_point = build.add(np.array([[0.0, 0.0, -plan.thickness]]))[0]
-        turned = np.roll(below, -1)
-        build.triangles.append(np.stack([np.full_like(below, middle_point), turned, below], 1))
+    build = _Building(sheet.half)
+    outer = build.add_face(sheet, plan)
+    below = build.copy(outer, -plan.thickness)
+    build.add_wall(below, outer)
+    # A point in the middle and the outline suffice: the flat back needs no grid.
+    center = build.add(np.array([[0.0, 0.0, -plan.thickness]]))[0]
+    build.triangles.append(np.stack([np.full_like(below, center), np.roll(below, -1), below], 1))
     solid = Solid(np.concatenate(build.points), np.concatenate(build.triangles))
     if not is_closed(solid.triangles):
-        raise ConfigError(
-            "", "fabrication.faces", "the faces do not form a closed solid: their edges differ from one outline"
-        )
+        raise ConfigError("", "fabrication.face", f"`{sheet.name}` does not form a closed solid: its edge is not one "
+                                                  "outline")  # fmt: skip
     return solid
 
 
@@ -189,48 +183,25 @@ class _Building:
         at = np.concatenate(self.points)[loop]
         return self.add(np.column_stack([at[:, :2] * scale, np.full(len(at), z)]))
 
-    def add_face(self, sheet: Sheet, plan: Fabrication, side: int) -> Indices:
-        """Add a face with its rim. Return the loop of vertices around face and rim. The face's outside is towards +z or
-        -z, depending on `side`.
-        """
-        points, triangles = sheet.points, sheet.triangles
-        if plan.outline == "round":
-            points, triangles = cut_round(sheet, (self.half[0], self.half[1]))
+    def add_face(self, sheet: Sheet, plan: Fabrication) -> Indices:
+        """Add a face with its rim. Return the loop of vertices around face and rim."""
+        points, triangles = cut(sheet, plan)
         first = self.add(points)[0]
-        self.triangles.append(first + (triangles if side > 0 else triangles[:, ::-1]))
+        self.triangles.append(first + triangles)
         edge = first + edge_loop(triangles)
         if plan.rim == 0:
             return edge
-        z = side * (float(np.min(side * points[edge - first, 2])) - RIM_STEP)
+        z = float(np.min(points[edge - first, 2])) - RIM_STEP
         inner = self.copy(edge, z)
         outer = self.copy(edge, z, 1 + plan.rim / self.half)
-        self.zip(*((inner, edge) if side > 0 else (edge, inner)))
-        self.zip(*((outer, inner) if side > 0 else (inner, outer)))
+        self.add_wall(inner, edge)
+        self.add_wall(outer, inner)
         return outer
 
-    def zip(self, lower: Indices, upper: Indices) -> None:
-        """Add the wall between two loops, which may have different numbers of vertices. The wall's outside points
-        outwards.
-        """
-        points = np.concatenate(self.points)
-        loops, angles = [], []
-        for loop in (lower, upper):
-            x, y = (points[loop, :2] / self.half).T
-            angle = np.arctan2(y, x) % (2 * np.pi)
-            start = int(np.argmin(angle))
-            loop, angle = np.roll(loop, -start), np.roll(angle, -start)
-            loops.append([*loop.tolist(), int(loop[0])])
-            angles.append([*angle.tolist(), float(angle[0]) + 2 * np.pi])
-        (low, high), (at, beside) = loops, angles
-        i, j, made = 0, 0, []
-        while i < len(low) - 1 or j < len(high) - 1:
-            if j == len(high) - 1 or (i < len(low) - 1 and at[i + 1] <= beside[j + 1]):
-                made.append((low[i], low[i + 1], high[j]))
-                i += 1
-            else:
-                made.append((low[i], high[j + 1], high[j]))
-                j += 1
-        self.triangles.append(np.array(made, np.int64))
+    def add_wall(self, lower: Indices, upper: Indices) -> None:
+        """Add the wall between a loop of vertices and its copy. The wall's outside points outwards."""
+        after, above = np.roll(lower, -1), np.roll(upper, -1)
+        self.triangles += [np.stack([lower, after, upper], 1), np.stack([after, above, upper], 1)]
 
 
 def edge_loop(triangles: Indices) -> Indices:
@@ -255,6 +226,11 @@ def is_closed(triangles: Indices) -> bool:
     n = int(edges.max()) + 1
     there, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
     return len(np.unique(there)) == len(there) and np.array_equal(np.sort(there), np.sort(back))
+
+
+def cut(sheet: Sheet, plan: Fabrication) -> tuple[Array, Indices]:
+    """Return vertices and triangles of a face within its outline."""
+    return cut_round(sheet, sheet.half) if plan.outline == "round" else (sheet.points, sheet.triangles)
 
 
 def cut_round(sheet: Sheet, half: tuple[float, float]) -> tuple[Array, Indices]:
@@ -312,45 +288,23 @@ def within(sheet: Sheet, plan: Fabrication) -> NDArray[np.bool_]:
     return np.asarray((sheet.x[None, :] / a) ** 2 + (sheet.y[:, None] / b) ** 2 <= 1)
 
 
-def least_thickness(sheets: Sequence[Sheet], plan: Fabrication) -> float:
+def least_thickness(sheet: Sheet, plan: Fabrication) -> float:
     """Return the least thickness along z inside the outline, including the rim, in mm. It is negative if front and back
     cross.
     """
-    from scipy.interpolate import RegularGridInterpolator
-
-    front = sheets[0]
-    low = [sheet.z[within(sheet, plan)] for sheet in sheets]
-    if len(sheets) == 1:
-        thin = float(low[0].min()) + plan.thickness
-    else:
-        thin = np.inf
-        for sheet, other, sign in ((front, sheets[1], 1), (sheets[1], front, -1)):
-            points = sheet.points[within(sheet, plan).ravel()]
-            places = np.clip(points[:, 1::-1], [other.y[0], other.x[0]], [other.y[-1], other.x[-1]])
-            there = RegularGridInterpolator((other.y, other.x), other.z)(places)
-            thin = min(thin, float(np.min(sign * (points[:, 2] - there))))
+    lowest = float(sheet.z[within(sheet, plan)].min())
     if plan.rim > 0:
-        edges = [_edge_heights(sheet, plan) for sheet in sheets]
-        back = -plan.thickness if len(sheets) == 1 else float(edges[1].max()) + RIM_STEP
-        thin = min(thin, float(edges[0].min()) - RIM_STEP - back)
-    return thin
+        points, triangles = cut(sheet, plan)
+        lowest = min(lowest, float(points[edge_loop(triangles), 2].min()) - RIM_STEP)
+    return lowest + plan.thickness
 
 
-def _edge_heights(sheet: Sheet, plan: Fabrication) -> Array:
-    """Return z of the vertices on a face's edge."""
-    points, triangles = sheet.points, sheet.triangles
-    if plan.outline == "round":
-        points, triangles = cut_round(sheet, sheet.half)
-    return np.asarray(points[edge_loop(triangles), 2])
-
-
-def hollows(sheet: Sheet, plan: Fabrication, side: int) -> Array:
+def hollows(sheet: Sheet, plan: Fabrication) -> Array:
     """Return the larger principal curvature (1/mm) of each inner vertex inside the outline. It is positive in hollows.
 
-    The function uses central differences of the heights as seen from outside. `side` tells whether the outside is
-    towards +z or -z.
+    The function uses central differences of the heights.
     """
-    h, dx, dy = side * sheet.z, float(np.diff(sheet.x).mean()), float(np.diff(sheet.y).mean())
+    h, dx, dy = sheet.z, float(np.diff(sheet.x).mean()), float(np.diff(sheet.y).mean())
     c = h[1:-1, 1:-1]
     p, q = (h[1:-1, 2:] - h[1:-1, :-2]) / (2 * dx), (h[2:, 1:-1] - h[:-2, 1:-1]) / (2 * dy)
     r, t = (h[1:-1, 2:] - 2 * c + h[1:-1, :-2]) / dx**2, (h[2:, 1:-1] - 2 * c + h[:-2, 1:-1]) / dy**2
@@ -362,21 +316,44 @@ def hollows(sheet: Sheet, plan: Fabrication, side: int) -> Array:
     return np.asarray(larger[within(sheet, plan)[1:-1, 1:-1]])
 
 
+def largest_ball_radius(curvature: Array) -> float | None:
+    """Return the largest radius (mm) of a ball that fits into the hollows of 99 % of a face, or None if any ball fits.
+
+    `curvature` (n,) is the larger principal curvature at each vertex in 1/mm, positive in hollows. The function
+    considers only curvature. A ball may still not reach a narrow gap between ridges.
+    """
+    if not curvature.size:
+        return None
+    sharp = float(np.quantile(curvature, REACHED, method="higher"))
+    return 1 / sharp if sharp > 1e-9 else None
+
+
+def stepover(radius: float, scallop: float = SCALLOP) -> float:
+    """Return the distance (mm) between passes of a ball with this `radius`. The passes leave scallops of the height
+    `scallop` (mm).
+    """
+    height = min(scallop, radius)
+    return float(2 * np.sqrt(2 * radius * height - height**2))
+
+
+def cutter(curvature: Array, radius: float | None) -> dict[str, float | None]:
+    """Return the largest radius of a ball cutter for a face, and the step between passes of the cutter, in mm.
+
+    `radius` is the radius of the cutter. If `radius` is None, the largest radius is used. `curvature` is as in
+    `largest_ball_radius`.
+    """
+    largest = largest_ball_radius(curvature)
+    used = largest if radius is None else radius
+    step = None if used is None else stepover(used)
+    return {"largest_radius": largest, "radius": used, "stepover": step, "scallop": SCALLOP}
+
+
 def steepest(sheet: Sheet, plan: Fabrication) -> float:
     """Return the largest angle (degrees) between the plane z = 0 and a triangle of the face inside the outline."""
-    points, triangles = sheet.points, sheet.triangles
-    if plan.outline == "round":
-        points, triangles = cut_round(sheet, sheet.half)
+    points, triangles = cut(sheet, plan)
     a, b, c = (points[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     return float(np.degrees(np.arctan2(np.linalg.norm(normal[:, :2], axis=1), np.abs(normal[:, 2])).max()))
-
-
-def outwards(sheet: Sheet, plan: Fabrication, side: int) -> Array:
-    """Return heights (ny, nx) above the flat face in mm, positive outwards. Row 0 has the greatest y, and columns go
-    along x.
-    """
-    return (sheet.z if side > 0 else -plan.thickness - sheet.z)[::-1]
 
 
 def scaled(heights: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.uint16], float, float]:
@@ -389,33 +366,29 @@ def scaled(heights: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.uint16
     return numbers.astype(np.uint16), low, step
 
 
-def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[str, Any]:
+def measured(solid: Solid, sheet: Sheet, plan: Fabrication) -> dict[str, Any]:
     """Return the content of fabrication.json, in mm, mm^3 and degrees. `warnings` are sentences."""
-    thin, warnings, faces = least_thickness(sheets, plan), [], {}
-    for sheet, side in zip(sheets, (1, -1), strict=False):
-        inside, curvature = within(sheet, plan), hollows(sheet, plan, side)
-        sharpest = float(curvature.max(initial=0.0))
-        z = sheet.z[inside]
-        face: dict[str, Any] = {
-            "grid": [len(sheet.x), len(sheet.y)],
-            "relief": float(np.ptp(z)),
-            "smallest_concave_radius": 1 / sharpest if sharpest > 1e-9 else None,
-            "steepest_slope_degrees": steepest(sheet, plan),
-            "cutter": cutter(curvature, plan.tool_radius),
-        }
-        if plan.tool_radius is not None:
-            narrow = float(np.mean(curvature > 1 / plan.tool_radius)) if curvature.size else 0.0
-            face["share_narrower_than_tool"] = narrow
-            if narrow > 0:
-                warnings.append(
-                    f"the tool does not reach {100 * narrow:.2g} % of `{sheet.name}`: its radius is "
-                    f"{plan.tool_radius:g} mm, and hollows have radii from {1 / sharpest:.3g} mm"
-                )
-        faces[sheet.name] = face
-        if sheet.smooth:
-            warnings.append(f"`{sheet.name}` was shaped with interpolated normals, which a solid does not have, so its "
-                            'picture will differ; add <boolean name="face_normals" value="true"/> to the mesh in the '
-                            "scene's file, and run `reslrb optimize` again")  # fmt: skip
+    curvature, warnings = hollows(sheet, plan), []
+    sharpest = float(curvature.max(initial=0.0))
+    face: dict[str, Any] = {
+        "grid": [len(sheet.x), len(sheet.y)],
+        "relief": float(np.ptp(sheet.z[within(sheet, plan)])),
+        "smallest_concave_radius": 1 / sharpest if sharpest > 1e-9 else None,
+        "steepest_slope_degrees": steepest(sheet, plan),
+        "cutter": cutter(curvature, plan.tool_radius),
+    }
+    if plan.tool_radius is not None:
+        narrow = float(np.mean(curvature > 1 / plan.tool_radius)) if curvature.size else 0.0
+        face["share_narrower_than_tool"] = narrow
+        if narrow > 0:
+            warnings.append(
+                f"the tool does not reach {100 * narrow:.2g} % of `{sheet.name}`: its radius is "
+                f"{plan.tool_radius:g} mm, and hollows have radii from {1 / sharpest:.3g} mm"
+            )
+    if sheet.smooth:
+        warnings.append(f"`{sheet.name}` was shaped with interpolated normals, which a solid does not have, so its "
+                        'picture will differ; add <boolean name="face_normals" value="true"/> to the mesh in the '
+                        "scene's file, and run `reslrb optimize` again")  # fmt: skip
     return {
         "unit": "mm",
         "kind": plan.kind,
@@ -423,12 +396,12 @@ def measured(solid: Solid, sheets: Sequence[Sheet], plan: Fabrication) -> dict[s
         "extent": solid.extent,
         "thickness": plan.thickness,
         "ior": plan.ior if plan.kind == "lens" else None,
-        "least_thickness": thin,
+        "least_thickness": least_thickness(sheet, plan),
         "rim": plan.rim,
         "volume_mm3": solid.volume,
         "triangles": len(solid.triangles),
         "tool_radius": plan.tool_radius,
-        "faces": faces,
+        "faces": {sheet.name: face},
         "warnings": warnings,
     }
 

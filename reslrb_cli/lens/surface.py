@@ -199,18 +199,11 @@ def shape_surface(
     if floor == "auto":
         with np.errstate(invalid="ignore", divide="ignore"):  # of trials that send no light
             found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
-            is_lit = found is not None or transport.least_floor(
-                rays, target, setting.size, setting.picture_size, start, [0.9]
-            ) is not None  # fmt: skip
-        if not is_lit:
-            near = np.isfinite(setting.light_distance)
-            key, what = ("light_distance", "a more distant light") if near else ("distance", "a larger distance")
-            raise ConfigError("", key, f"is {getattr(setting, key):g} mm, at which no {setting.kind} was found that "
-                                       f"lights the receiver evenly; try {what}, or a smaller size")  # fmt: skip
         if found is None:
+            near = "a more distant light, " if np.isfinite(setting.light_distance) else ""
             raise ConfigError("", "picture", f"has too much contrast for this {setting.kind}: even with a floor of "
                                              f"{transport.FLOORS[-1]:g} of its maximum, light would be torn apart; try "
-                                             "a larger distance, brighter dark parts, or a crop")  # fmt: skip
+                                             f"a larger distance, {near}brighter dark parts, or a crop")  # fmt: skip
         floor = found
     longer = max(setting.size)
     shape = (max(8, round(cells * setting.size[1] / longer)), max(8, round(cells * setting.size[0] / longer)))

@@ -15,7 +15,6 @@ inverts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -167,14 +166,14 @@ def solve(
         nu = nu / nu.mean()
         if n == levels[-1]:  # from uniform light to the picture's contrasts
             for contrast in CONTRASTS:
-                _newton(state, optics, nu, target, STEPS, contrast)
+                _newton(state, optics, nu, target, contrast)
         before = _copied(state)
-        _newton(state, optics, nu, target, STEPS)
+        _newton(state, optics, nu, target)
         if state.residual > GOOD:  # steps end at the picture's edges, so start with a picture without edges
             steps, state = state.steps, before
             for width in BLURS:
                 trial = _copied(state)
-                _newton(trial, optics, nu, target, STEPS, blur=width)
+                _newton(trial, optics, nu, target, blur=width)
                 if trial.residual > GOOD and state.residual < GOOD:
                     break
                 state = trial
@@ -374,13 +373,12 @@ def _newton(
     optics: Optics,
     nu: Array,
     target: tuple[float, float],
-    steps: int,
     contrast: float = 1.0,
     blur: float = 0.0,
 ) -> None:
-    """Take Newton steps on one grid. The length of each step is chosen so that the residual falls."""
+    """Take at most `STEPS` Newton steps on one grid. The length of each step is chosen so that the residual falls."""
     equation = _started(state, optics, nu, target, contrast, blur)
-    for _ in range(steps):
+    for _ in range(STEPS):
         if not equation.fits or equation.merit < TOLERANCE:
             break
         equation.linearize()
@@ -535,10 +533,9 @@ def lifted(picture: Array, floor: float) -> Array:
 
 
 def least_floor(
-    optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array,
-    floors: Sequence[float] = FLOORS,
-) -> float | None:  # fmt: skip
-    """Return the lowest of `floors` for which the transport neither folds nor tears, or None if the highest one
+    optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array
+) -> float | None:
+    """Return the lowest of `FLOORS` for which the transport neither folds nor tears, or None if the highest one
     fails.
     """
     ratio = size[0] / size[1]
@@ -549,8 +546,8 @@ def least_floor(
         made = solve(optics, lifted(small, floor), size, target, shape, start)
         return made.converged and not made.folded and made.stretch < TORN
 
-    low, high = -1, len(floors)  # the highest floor known to be too low, and the lowest that suffices
+    low, high = -1, len(FLOORS)  # the highest floor known to be too low, and the lowest that suffices
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if good(floors[middle]) else (middle, high)
-    return floors[high] if high < len(floors) else None
+        low, high = (low, middle) if good(FLOORS[middle]) else (middle, high)
+    return FLOORS[high] if high < len(FLOORS) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -101,8 +101,6 @@ class CheckSettings:
 
     - `named` tells whether the user named the integrators. Otherwise integrators that cannot take part are left out.
     - `spent_s` is the part of the budget that earlier sessions used.
-    - `initial` has values of parameters, as `Selection.array` returns them. These values replace the values in
-        `config`.
     """
 
     config: Config
@@ -112,7 +110,6 @@ class CheckSettings:
     spp: int | None = None
     named: bool = True
     spent_s: float = 0.0
-    initial: Mapping[str, np.ndarray[Any, Any]] | None = None
 
     @property
     def known(self) -> bool:
@@ -189,7 +186,7 @@ class Participants:
         first = configs[settings.integrators[follows.index(True) if any(follows) else 0].label].with_exposures_fixed()
         built_in = config.scene.file == small.FILE
         box = small.build(config.scene.options) if built_in else None
-        problem = assemble_scene(first, box, settings.initial)
+        problem = assemble_scene(first, box)
         self.selection = problem.selection
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)

@@ -1,7 +1,7 @@
 """Samples of a gradcheck's participants. Samples are taken on demand until they suffice or the time is up.
 
-A session can continue from an earlier session's samples, with the next seeds. An `Engine` can take samples in another
-process. A sample depends only on the participants, the finite-difference steps, and its seed.
+A session can continue from an earlier session's samples, with the next seeds. A sample depends only on the
+participants, the finite-difference steps, and its seed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import code_files, kept_settings
 from reslrb_cli.measure.participants import CheckSettings, Participants
-from reslrb_cli.optimization.shards import in_order, serially
 from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 
 #: Kind of measurement in the file of samples.
@@ -25,10 +24,6 @@ KIND = "gradcheck"
 
 #: Name of samples: `gradient` or `image` and an integrator's label, or `differences` or `tangents` and a parameter.
 Name = tuple[str, str]
-
-#: Takes samples: calls a function with the participants and further arguments. Yields position and result of each call,
-#: in any order (`shards.serially`).
-Engine = Callable[[Participants, Callable[..., Any], Sequence[tuple[Any, ...]]], Iterable[tuple[int, Any]]]
 
 
 @dataclass(frozen=True)
@@ -76,11 +71,8 @@ class Sampling:
     name includes compilation. The first sample of a name is skipped if it would probably exceed the remaining time.
     Earlier samples of the same kind, or else of other kinds, predict the duration.
 
-    Samples of an `earlier` session count. New samples use the seeds that follow. If there is no budget, `engine` takes
-    the samples. With a budget, this process takes the samples, because the budget limits the time of this process.
+    Samples of an `earlier` session count. New samples use the seeds that follow.
     """
-
-    engine: Engine = staticmethod(serially)
 
     def __init__(
         self, settings: CheckSettings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
@@ -137,13 +129,13 @@ class Sampling:
             return
         before = first_s = 0.0
         begun = len(samples)
-        work = [(*name, seed) for seed in seeds(self._most(name))[begun:]]
-        if not work or stop():
+        left = seeds(self._most(name))[begun:]
+        if not left or stop():
             return
         if kind == "differences" and not samples:
             self.participants.choose_steps(name[1])
-        for sample in in_order(self.engine(self.participants, Participants.sample, work)):
-            samples.append(sample.astype(np.float32))
+        for seed in left:
+            samples.append(self.participants.sample(*name, seed).astype(np.float32))
             self.between()
             now = self._now()
             next_s = now - before
@@ -154,7 +146,7 @@ class Sampling:
                 ends = self._ends(name, now)
             if limited and now + next_s >= next(end for least, end in ends if len(samples) < least):
                 break
-            if len(samples) < begun + len(work) and stop():
+            if len(samples) < begun + len(left) and stop():
                 break
         if len(samples) > begun:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")

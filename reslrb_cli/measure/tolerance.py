@@ -88,8 +88,8 @@ def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, targ
     """
     rows, columns = picture_within(target)
     shapes = {shape.id(): shape for shape in scene.shapes()}
-    front, receiver = mi.ShapePtr(shapes[plan.faces[0]]), mi.ShapePtr(shapes[plan.receiver])
-    solid = [mi.ShapePtr(shape) for name, shape in shapes.items() if name in (*plan.faces, "back")]
+    front, receiver = mi.ShapePtr(shapes[plan.face]), mi.ShapePtr(shapes[plan.receiver])
+    solid = [mi.ShapePtr(shape) for name, shape in shapes.items() if name in (plan.face, "back")]
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, RAYS)
     ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
@@ -209,24 +209,20 @@ class OpticalBench:
         return found
 
     def solid_parts(self) -> list[str]:
-        """Return the ids of the faces and of the flat back."""
-        return [*self.plan.faces, *(["back"] if "back" not in self.plan.faces else [])]
+        """Return the ids of the face and of the flat back."""
+        return [self.plan.face, "back"]
 
-    def tooled(self, sheets: Sequence[Sheet], radius: float) -> dict[str, Any]:
-        """Return the vertex positions of the faces after cutting with a ball-end cutter of this `radius`."""
-        values = {}
-        for sheet, side in zip(sheets, (1, -1), strict=False):
-            pitch = [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)]
-            left = side * closed_by_ball(side * sheet.z, pitch, radius)
-            key = f"{sheet.name}.vertex_positions"
-            points = np.array(self.params[key]).reshape(-1, 3)
-            column, row = (
-                np.rint((points[:, axis] - line[0]) / step).astype(int)
-                for axis, (line, step) in enumerate(zip((sheet.x, sheet.y), pitch, strict=True))
-            )
-            points[:, 2] = left[row, column]
-            values[key] = mi.Float(points.astype(np.float32).ravel())
-        return values
+    def tooled(self, sheet: Sheet, radius: float) -> dict[str, Any]:
+        """Return the vertex positions of the face after cutting with a ball-end cutter of this `radius`."""
+        pitch = [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)]
+        key = f"{sheet.name}.vertex_positions"
+        points = np.array(self.params[key]).reshape(-1, 3)
+        column, row = (
+            np.rint((points[:, axis] - line[0]) / step).astype(int)
+            for axis, (line, step) in enumerate(zip((sheet.x, sheet.y), pitch, strict=True))
+        )
+        points[:, 2] = closed_by_ball(sheet.z, pitch, radius)[row, column]
+        return {key: mi.Float(points.astype(np.float32).ravel())}
 
     def image(self, values: dict[str, Any], spp: int, seed: int = 0) -> Array:
         """Render the scene with these parameters."""
@@ -245,7 +241,7 @@ class OpticalBench:
 
 def tolerances(
     bench: OpticalBench,
-    sheets: Sequence[Sheet],
+    sheet: Sheet,
     planned: Array,
     target: Array,
     spp: int,
@@ -291,5 +287,5 @@ def tolerances(
                 turned = bench.image(bench.turned(ids, axis, TURN), spp)
                 tell(f"{what} turned by {TURN:g} degree about {name}", turned, turned=True)
     if plan.tool_radius is not None:
-        tell(f"cut by a ball of {plan.tool_radius:g} mm", bench.image(bench.tooled(sheets, plan.tool_radius), spp))
+        tell(f"cut by a ball of {plan.tool_radius:g} mm", bench.image(bench.tooled(sheet, plan.tool_radius), spp))
     return found

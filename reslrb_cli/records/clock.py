@@ -6,7 +6,7 @@ import gc
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -66,54 +66,6 @@ class StepClock:
         yield
         dr.sync_thread()
         self.elapsed_s += time.perf_counter() - start
-
-
-@dataclass(frozen=True)
-class WorkerTime:
-    """Work of one worker: the calls that it answered and the seconds that it computed."""
-
-    calls: int = 0
-    computing_s: float = 0.0
-
-    def __add__(self, other: WorkerTime) -> WorkerTime:
-        return WorkerTime(self.calls + other.calls, self.computing_s + other.computing_s)
-
-
-@dataclass(frozen=True)
-class SharedTime:
-    """Times in seconds of a computation shared by workers, split into parts. `workers` holds the work of each worker by
-    name.
-
-    `wall_s` is the time from a round's first call to the round's last answer. `computing_s` is the mean time in which
-    workers compute. `waiting_s` is the mean time in which workers wait for the slowest worker. `sending_s` is the
-    remaining time, which includes distributing the calls. `places` are the places of the workers, as given to
-    `--cluster`.
-    """
-
-    places: tuple[str, ...] = ()
-    wall_s: float = 0.0
-    computing_s: float = 0.0
-    waiting_s: float = 0.0
-    workers: dict[str, WorkerTime] = field(default_factory=dict)
-
-    @property
-    def sending_s(self) -> float:
-        """The part of `wall_s` that is neither `computing_s` nor `waiting_s`."""
-        return max(self.wall_s - self.computing_s - self.waiting_s, 0.0)
-
-    def __add__(self, other: SharedTime) -> SharedTime:
-        """Add the times of another part of the run."""
-        workers = dict(self.workers)
-        for name, spent in other.workers.items():
-            workers[name] = workers.get(name, WorkerTime()) + spent
-        return replace(
-            self,
-            places=tuple(dict.fromkeys([*self.places, *other.places])),
-            wall_s=self.wall_s + other.wall_s,
-            computing_s=self.computing_s + other.computing_s,
-            waiting_s=self.waiting_s + other.waiting_s,
-            workers=workers,
-        )
 
 
 def summarise(history: list[dict[str, Any]]) -> tuple[float, float]:

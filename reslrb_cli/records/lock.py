@@ -109,11 +109,12 @@ class Holder:
 
     @staticmethod
     def from_json(data: Mapping[str, Any] | None) -> Holder | None:
-        """Return the holder recorded in a manifest, or None if there is none."""
+        """Return the holder recorded in a manifest, or None if there is none, or if it is damaged."""
         try:
-            return Holder(**data) if data is not None else None
+            found = Holder(**(data or {}))
         except TypeError:
             return None
+        return found if isinstance(found.pid, int) else None
 
     def is_gone(self, folder: Path) -> bool:
         """Whether this process, which used `folder`, has certainly ended.

@@ -62,7 +62,6 @@ class Manifest:
     - `decisions`: settings of the integrator that were `auto` (`Decision`).
     - `incomplete`: the missing share of the derivative, for each parameter that moves light (`MissingRecord`).
     - `scaling`: the measurements of each parameter for `scale: auto`.
-    - `shared`: the time of workers (`SharedTime`).
     - `views`: for each view, the share of the loss, the excluded pixels of each kind, and the factor for viewing
         (`shown`).
     - `results`: `iterations`, values and errors by key, `certainty`, `warnings`, perceptual errors (`seen`), ...
@@ -90,7 +89,6 @@ class Manifest:
     scaling: list[dict[str, Any]] | None = None
     views: list[dict[str, Any]] | None = None
     incomplete: list[dict[str, Any]] = field(default_factory=list)
-    shared: dict[str, Any] | None = None
     resumed: list[dict[str, Any]] = field(default_factory=list)
     results: dict[str, Any] = field(default_factory=dict)
 

@@ -2,7 +2,7 @@
 
 - `read_value`: read a recovered parameter value of a run that is finished, interrupted or in progress.
 - `recovered`: make the experiment that starts from the recovered values.
-- `RunFolder`: create and replace folders.
+- `RunFolder`: create folders.
 - `opened`: lock the folder of a run to resume it.
 """
 
@@ -14,7 +14,6 @@ import errno
 import itertools
 import os
 import re
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,11 +26,10 @@ from reslrb_cli.config.loader import Override, load
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
-from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records import metrics
 from reslrb_cli.records.atomic import remove_parts, unfinished_folder, write_atomically
 from reslrb_cli.records.checkpoint import STATE_FILE, newest_checkpoint, open_archive
-from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
+from reslrb_cli.records.lock import FolderLock, Holder, InUse
 from reslrb_cli.records.manifest import Manifest, Status, read_manifest
 
 Array = np.ndarray[Any, Any]
@@ -111,13 +109,10 @@ def _manifest_of(run: Path) -> dict[str, Any]:
 
 
 SUBFOLDERS = ("images", "parameters", "checkpoint")
-OWN_ENTRIES = (
-    "config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", FABRICATION_FILE, *SUBFOLDERS
-)  # fmt: skip
 
 
-def check_output(source: object, output: Path, name: str, force: bool) -> None:
-    """Raise a ConfigError (key `run.output` or `run.name`) if a run folder cannot be made in `output`.
+def check_output(source: object, output: Path) -> None:
+    """Raise a ConfigError (key `run.output`) if a run folder cannot be made in `output`.
 
     The check tries to make a folder, because permissions do not apply to root. The folder is then removed. Raises
     MachineError for a full disk.
@@ -130,13 +125,6 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
             (folder / "file").write_text("is there room?")
     except OSError as error:
         raise _output_error(source, ancestor, error) from None
-    if force:
-        _check_replaceable(source, output / name)
-        with contextlib.suppress(OSError):  # such as a missing folder
-            try:
-                FolderLock(output / name, READER_WAIT_SECONDS, shared=True).release()
-            except InUse:
-                raise _in_use(source, output / name) from None
 
 
 @dataclass(frozen=True)
@@ -150,13 +138,11 @@ class RunFolder:
     lock: FolderLock | None = field(default=None, compare=False, repr=False)
 
     @classmethod
-    def create(cls, source: object, output: Path, name: str, force: bool, config: str, manifest: Manifest) -> RunFolder:
+    def create(cls, source: object, output: Path, name: str, config: str, manifest: Manifest) -> RunFolder:
         """Create `<output>/<name>/` with its configuration, manifest and empty subfolders, and lock it.
 
-        If the name is taken, the folder is `<name>-2/` and so on. With `force`, the new folder replaces the run with
-        that name. Only files that a run writes are removed. The folder appears under its name only when it is complete.
-        Raises ConfigError if `force` would replace a folder that is not a run folder or is in use. Raises MachineError
-        for a full disk.
+        If the name is taken, the folder is `<name>-2/` and so on. The folder appears under its name only when it is
+        complete. Raises ConfigError if it cannot be made, and MachineError for a full disk.
         """
         try:
             output.mkdir(parents=True, exist_ok=True)
@@ -167,10 +153,8 @@ class RunFolder:
                 (part / "config.yaml").write_text(config, encoding="utf-8")
                 manifest.process = Holder.here(locked=lock.real)
                 manifest.write(part)
-                own = cls(part, lock)
-                folder = own._replace(source, output / name) if force else own._place(output / name)
-                if folder.lock is lock:
-                    stack.pop_all()
+                folder = cls(part, lock)._place(output / name)
+                stack.pop_all()
                 return folder
         except OSError as error:
             raise _output_error(source, output, error) from None
@@ -191,37 +175,6 @@ class RunFolder:
                 raise
             return False
         return True
-
-    def _replace(self, source: object, path: Path) -> RunFolder:
-        """Move the folder's content over the run folder at `path`, which is locked meanwhile."""
-        while not self._take_name(path):
-            _check_replaceable(source, path)
-            try:
-                lock = FolderLock(path)
-            except InUse:
-                raise _in_use(source, path) from None
-            except FileNotFoundError:  # removed just now
-                continue
-            if not lock.is_of(path):  # moved or replaced since
-                lock.release()
-                continue
-            try:
-                # The manifest comes first, so that it names the right run even if the process ends here.
-                os.replace(self.path / manifests.MANIFEST_FILE, path / manifests.MANIFEST_FILE)
-                remove_parts(path)
-                for name in OWN_ENTRIES:
-                    entry = path / name
-                    if entry.is_dir() and not entry.is_symlink():
-                        shutil.rmtree(entry)
-                    elif name != manifests.MANIFEST_FILE:
-                        entry.unlink(missing_ok=True)
-                for name in ("config.yaml", *SUBFOLDERS):
-                    os.replace(self.path / name, path / name)
-            except BaseException:
-                lock.release()
-                raise
-            return RunFolder(path, lock)
-        return replace(self, path=path)
 
     @property
     def is_there(self) -> bool:
@@ -257,20 +210,6 @@ class RunFolder:
     def __exit__(self, *_: object) -> None:
         if self.lock is not None:
             self.lock.release()
-
-
-def _check_replaceable(source: object, path: Path) -> None:
-    if not os.path.lexists(path):
-        return
-    if path.is_symlink() or not path.is_dir() or manifests.read_manifest(path) is None:
-        reason = f"{path} exists and is not a run folder, so --force does not replace it; give another name"
-        raise ConfigError(source, "run.name", reason)
-
-
-def _in_use(source: object, path: Path) -> ConfigError:
-    who = _who_works(manifests.read_manifest(path) or {})
-    reason = f"{path} is in use by a run ({who}), so --force does not replace it; end that run, or give another name"
-    return ConfigError(source, "run.name", reason)
 
 
 def _who_works(content: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import write_atomically
-from reslrb_cli.records.measurements import Band, Range
+from reslrb_cli.records.measurements import Band
 from reslrb_cli.records.metrics import Line
 from reslrb_cli.version import __version__
 
@@ -196,11 +196,6 @@ class SweepRunRecord(Line):
 class SweepRowRecord(Line):
     """Result of one combination: median, minimum and maximum over its finished runs. `runs` of its `of` runs are
     finished.
-
-    `loss_ratio` and `error_ratio` divide the combination's median by the median of the first comparable combination.
-    The 95 % intervals of the ratios come from a bootstrap over the seeds. Combinations that differ only in learning
-    rates are compared at their best rate. Only the combination with the best rate has a ratio. Ratios are None for
-    fewer than 5 seeds.
     """
 
     KIND: ClassVar[str] = "sweep_row"
@@ -215,8 +210,6 @@ class SweepRowRecord(Line):
     error: Band | None
     elapsed_s: Band | None
     peak_mib: Band | None
-    loss_ratio: Range | None = None
-    error_ratio: Range | None = None
     message: str = ""
 
 
@@ -225,9 +218,7 @@ class SweepBestRecord(Line):
     """Combination with the lowest median of the quantity `of`, which is `loss` or `error`. The median is over the
     `seeds` seeds that all combinations have.
 
-    Combinations that differ only in learning rates are compared at their best rate. `second` has the next median.
-    `ratio` is the best median divided by the median of `second`. The 95 % interval of `ratio` comes from a bootstrap
-    over the seeds. It is None for fewer than 5 seeds. `line` is the record in words.
+    `second` has the next median. `lower` is the number of seeds with a lower value than that of `second`.
     """
 
     KIND: ClassVar[str] = "sweep_best"
@@ -236,5 +227,4 @@ class SweepBestRecord(Line):
     best: str
     second: str
     seeds: int
-    ratio: Range | None
-    line: str
+    lower: int

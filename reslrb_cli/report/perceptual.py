@@ -5,7 +5,6 @@ Colours are linear sRGB (BT.709 primaries, D65), as in Mitsuba's RGB variants. A
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.records.images import load_image
-from reslrb_cli.report.tonemap import encode, exposure_for, shown_exposures
+from reslrb_cli.report.tonemap import encode, shown_exposures
 
 Array = np.ndarray[Any, Any]
 
@@ -94,22 +93,17 @@ def ssim(first: Array, second: Array) -> float | None:
     return float(structural_similarity(first, second, channel_axis=2, data_range=1.0, **options))
 
 
-_TARGET = re.compile(r"target(-\d+)?\.exr")
-
-
-def seen_errors(folder: Path, views: Sequence[Mapping[str, Any]] | None = None) -> dict[str, Any]:
+def seen_errors(folder: Path, views: Sequence[Mapping[str, Any]] | None) -> dict[str, Any]:
     """Return the perceptual errors of the images of the run in `folder`, for `results.seen` in its manifest.
 
     Each sensor (`""`, `"-0"`, ...) has the `exposure` for viewing the target, and the `image_errors` of the `initial`
     and the `final` image. `views` comes from the run's manifest. Missing and damaged files are left out.
     """
-    images, exposures = {}, shown_exposures(views)
-    for path in sorted((folder / "images").glob("target*.exr")):
-        match, target = _TARGET.fullmatch(path.name), load_image(path)
-        if match is None or target is None:
+    images = {}
+    for suffix, exposure in shown_exposures(views).items():
+        target = load_image(folder / "images" / f"target{suffix}.exr")
+        if target is None:
             continue
-        suffix = match[1] or ""
-        exposure = exposures.get(suffix) or exposure_for(target)
         found: dict[str, Any] = {}
         for moment in ("initial", "final"):
             image = load_image(folder / "images" / f"{moment}{suffix}.exr")

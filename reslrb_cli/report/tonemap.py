@@ -69,9 +69,7 @@ def _brightest(image: Array) -> Array:
 
 
 def shown_exposures(views: Sequence[Mapping[str, Any]] | None) -> dict[str, float]:
-    """Return the exposure of each of a manifest's `views`. The keys are the suffixes of the image names. The result is
-    empty for older runs.
-    """
+    """Return the exposure of each of a manifest's `views`. The keys are the suffixes of the image names."""
     found = {}
     for view in views or ():
         exposure = view.get("shown")

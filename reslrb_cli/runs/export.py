@@ -6,7 +6,7 @@ import importlib.util
 import json
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from reslrb_cli.lens.solid import (
     as_sheet,
     make_solid,
     measured,
-    outwards,
     scaled,
     summary,
     within,
@@ -84,13 +83,13 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
     selection, sensors = select_parameters(scene, config.parameters, config.source), choose_sensors(config, scene)
     beside: dict[str, Callable[[Path], object]] = {}
     if plan is not None:
-        sheets, solid = read_solid(config, plan, selection.params)
+        sheet, solid = read_solid(config, plan, selection.params)
         if writer is not None:
             with writing("--output", output):
                 output.parent.mkdir(parents=True, exist_ok=True)
                 content = writer(solid)
                 write_atomically(output, lambda file: file.write(content))
-            tell_solid(output, measured(solid, sheets, plan), say)
+            tell_solid(output, measured(solid, sheet, plan), say)
             return
     moves = moves_anything(config, selection)
     check_integrator(config, config.integrator, scene, sensors, moves)
@@ -99,21 +98,21 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
     numbers: dict[str, Any] = {}
     pictures: dict[str, Array] = {}
     if plan is not None:
-        numbers = measured(solid, sheets, plan)
+        numbers = measured(solid, sheet, plan)
         target = read_target(config, scene.sensors()[sensors[0]], needed=tolerances)
         if target is not None:
             image, numbers["loss"] = measure_loss(config, scene, sensors[0], integrator, target)
-            pictures = add_sheet(numbers, plan, scene, sensors[0], sheets, luminance(image), luminance(target))
+            pictures = add_sheet(numbers, plan, scene, sensors[0], sheet, luminance(image), luminance(target))
             if tolerances:
                 try:
                     bench = OpticalBench(scene, selection.params, plan, mi.load_dict(dict(integrator)), sensors[0])
                 except ConfigError as error:
                     raise ConfigError(config.source, error.key, error.message) from None
                 pictures |= add_tolerances(
-                    numbers, bench, sheets, luminance(image), luminance(target), config.run.final_spp, say
+                    numbers, bench, sheet, luminance(image), luminance(target), config.run.final_spp, say
                 )
         pictures |= pictures_of(solid)
-        beside = solid_files(plan, sheets, solid, numbers, pictures)
+        beside = solid_files(plan, sheet, solid, numbers, pictures)
     exposure = exposure_line(run)
     with writing("--output", output):
         export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run, beside, exposure)
@@ -122,9 +121,7 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
         say(exposure)
     faces = [spec.heightmap.mesh[0] for spec in config.parameters if spec.heightmap is not None]
     if plan is None and faces:
-        how = (
-            "fabrication.thickness=25" if faces == ["face"] else f"'fabrication={{thickness: 25, faces: [{faces[0]}]}}'"
-        )
+        how = "fabrication.thickness=25" if faces == ["face"] else f"'fabrication={{thickness: 25, face: {faces[0]}}}'"
         say(f"no solid was made of `{faces[0]}`: --set {how} makes one of that thickness if the scene is in mm")
     if plan is not None:
         tell_solid(output / f"{plan.kind}.stl", numbers, say)
@@ -161,10 +158,10 @@ def keep_solid(
     number `sensor`. Raises ConfigError if there is no solid between the faces.
     """
     assert config.fabrication is not None
-    sheets, solid = read_solid(config, config.fabrication, params)
-    numbers = measured(solid, sheets, config.fabrication)
+    sheet, solid = read_solid(config, config.fabrication, params)
+    numbers = measured(solid, sheet, config.fabrication)
     pictures = add_sheet(
-        numbers, config.fabrication, scene, sensor, sheets, luminance(image), luminance(target)
+        numbers, config.fabrication, scene, sensor, sheet, luminance(image), luminance(target)
     ) | pictures_of(solid)
     for name, image in pictures.items():
         write_image(run / "images" / workshop_file(name), image)
@@ -218,19 +215,15 @@ def _writes_3mf() -> bool:
     return importlib.util.find_spec("lib3mf") is not None
 
 
-def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) -> tuple[list[Sheet], Solid]:
-    """Return the faces in the scene and the solid between them. Raises ConfigError."""
-
-    sheets = []
+def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) -> tuple[Sheet, Solid]:
+    """Return the face in the scene and the solid below it. Raises ConfigError."""
+    keys = [f"{plan.face}.vertex_positions", f"{plan.face}.faces"]
+    if any(key not in params.properties for key in keys):
+        raise ConfigError(config.source, "fabrication.face", f"there is no mesh `{plan.face}` in the scene")
+    points, triangles = (np.array(params[key]).reshape(-1, 3) for key in keys)
     try:
-        for i, name in enumerate(plan.faces):
-            keys = [f"{name}.vertex_positions", f"{name}.faces"]
-            if any(key not in params.properties for key in keys):
-                raise ConfigError("", f"fabrication.faces[{i}]", f"there is no mesh `{name}` in the scene")
-            points, triangles = (np.array(params[key]).reshape(-1, 3) for key in keys)
-            smooth = interpolates_normals(params.properties[keys[0]][2])
-            sheets.append(as_sheet(name, points, triangles, smooth))
-        return sheets, make_solid(sheets, plan)
+        sheet = as_sheet(plan.face, points, triangles, interpolates_normals(params.properties[keys[0]][2]))
+        return sheet, make_solid(sheet, plan)
     except ConfigError as error:
         raise ConfigError(config.source, error.key, error.message) from None
 
@@ -273,7 +266,7 @@ def measure_loss(
 
 def solid_files(
     plan: Fabrication,
-    sheets: Sequence[Sheet],
+    sheet: Sheet,
     solid: Solid,
     numbers: dict[str, Any],
     pictures: dict[str, Array],
@@ -289,22 +282,16 @@ def solid_files(
     for suffix, made in WRITERS.items():
         if suffix != ".3mf" or _writes_3mf():
             files[plan.kind + suffix] = lambda path, made=made: path.write_bytes(made(solid))  # type: ignore[misc]
-    for i, sheet in enumerate(sheets):
-        stem = "heights" if i == 0 else "heights-back"
-        heights = outwards(sheet, plan, 1 - 2 * i)
-        image, offset, step = scaled(heights, within(sheet, plan)[::-1])
-        files[f"{stem}.exr"] = lambda path, heights=heights: write_file(  # type: ignore[misc]
-            path, heights.astype(np.float32)[:, :, None], linear=True
-        )
-        files[f"{stem}.png"] = lambda path, image=image: write_bitmap(  # type: ignore[misc]
-            path, mi.Bitmap(image[:, :, None])
-        )
-        numbers["faces"][sheet.name]["heights"] = {
-            "files": [f"{stem}.png", f"{stem}.exr"],
-            "png": {"offset": offset, "step": step},
-            "rows": "from the greatest y to the least; columns from the least x",
-            "pitch": [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)],
-        }
+    heights = sheet.z[::-1]
+    image, offset, step = scaled(heights, within(sheet, plan)[::-1])
+    files["heights.exr"] = lambda path: write_file(path, heights.astype(np.float32)[:, :, None], linear=True)
+    files["heights.png"] = lambda path: write_bitmap(path, mi.Bitmap(image[:, :, None]))
+    numbers["faces"][sheet.name]["heights"] = {
+        "files": ["heights.png", "heights.exr"],
+        "png": {"offset": offset, "step": step},
+        "rows": "from the greatest y to the least; columns from the least x",
+        "pitch": [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)],
+    }
     files["fabrication.json"] = lambda path: path.write_text(json.dumps(finite(numbers), indent=2) + "\n")
     page = sheet_page(numbers, pictures, f"{plan.kind.capitalize()} for the workshop")
     files["sheet.html"] = lambda path: path.write_text(page, encoding="utf-8")

@@ -36,7 +36,6 @@ from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_fil
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
-from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
@@ -72,8 +71,6 @@ MAY_CHANGE = re.compile(
 #: Settings for the place of a new run.
 PLACE = ("run.name", "run.output")
 
-#: Maximum number of changed settings that an error names.
-_SHOWN = 3
 Change = tuple[Any, Any]
 
 
@@ -90,20 +87,13 @@ def changes(before: Config, now: Config) -> dict[str, Change]:
 def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], run: Path) -> dict[str, Change]:
     """Return the changed settings. Settings that only determine the run's place do not count as changes.
 
-    Raises ConfigError if a setting must not change. The error names the first few such settings. The error is located
-    at the first such setting. `blame` returns the source of this setting.
+    Raises ConfigError, located at the first setting that must not change. `blame` returns the source of this setting.
     """
-    wrong = [key for key in found if not MAY_CHANGE.fullmatch(key)]
-    if wrong:
-        first, *others = [f"{_shown(found[key][1])}, {_shown(found[key][0])} in the run" for key in wrong[:_SHOWN]]
-        more = [f"{key} is {what}" for key, what in zip(wrong[1:], others, strict=False)]
-        more += [f"{len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
-        also = f"; also {'; '.join(more)}" if more else ""
-        raise ConfigError(
-            blame(wrong[0]),
-            wrong[0],
-            f"is {first}{also}; {run} may change only iterations and learning rates",
-        )
+    wrong = next((key for key in found if not MAY_CHANGE.fullmatch(key)), None)
+    if wrong is not None:
+        before, now = map(_shown, found[wrong])
+        reason = f"is {now}, {before} in the run; {run} may change only iterations and learning rates"
+        raise ConfigError(blame(wrong), wrong, reason)
     return {key: change for key, change in found.items() if key not in PLACE}
 
 
@@ -193,7 +183,6 @@ class SavedResults:
     images: Images
     certainty: Noted
     best: Least | None = None
-    shared: SharedTime | None = None
     best_values: Arrays = field(default_factory=dict, metadata=entry("best"))
     squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
     last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps"))
@@ -213,25 +202,10 @@ class RunProgress:
         self.nonfinite, self.regularized = NonFiniteTally(), RegularizedTally()
         self.last: Record | None = None
         self.watch = Watch(problem.config)
-        self._shared: SharedTime | None = None
-        self._spent: Callable[[], SharedTime] | None = None
 
-    def compute_with(self, engine: Callable[..., Any], spent: Callable[[], SharedTime] | None = None) -> None:
-        """Let `engine` (`shards.Engine`) compute the shards of a step.
-
-        `spent` returns the time that the engine has spent on shards so far.
-        """
+    def compute_with(self, engine: Callable[..., Any]) -> None:
+        """Let `engine` (`shards.Engine`) compute the shards of a step."""
         self.problem = replace(self.problem, engine=engine)
-        self._spent = spent
-
-    @property
-    def shared(self) -> SharedTime | None:
-        """Time that workers have spent on shards, or None without workers. The time before the run was resumed counts
-        too.
-        """
-        if self._spent is None:
-            return self._shared
-        return self._spent() if self._shared is None else self._shared + self._spent()
 
     @property
     def files(self) -> dict[str, str]:
@@ -304,7 +278,7 @@ class RunProgress:
         `tree.entries`.
         """
         met = SavedResults(
-            self.results.images["initial"], self.certainty.noted, self.best.least, self.shared,
+            self.results.images["initial"], self.certainty.noted, self.best.least,
             self.best_values(), self.certainty.squares, self.certainty.last_steps(),
         )  # fmt: skip
         return entries(self._settled, state.on_file(self.problem), met)
@@ -328,7 +302,6 @@ class RunProgress:
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.restore(met.certainty, met.squares, met.last_steps)
-        self._shared = met.shared
 
 
 @dataclass(frozen=True)
@@ -343,7 +316,7 @@ class PreparedRun:
     place: Callable[[], contextlib.AbstractContextManager[RunFolder]]
 
 
-def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> PreparedRun:
+def begin(config: Config, variant: str, say: Say, warn: Say) -> PreparedRun:
     """Prepare a new run in its own folder. A variant must be set.
 
     Call `check_output` first, to check that the folder can be made. Raises ConfigError and UnsupportedScene.
@@ -353,5 +326,5 @@ def begin(config: Config, variant: str, force: bool, say: Say, warn: Say) -> Pre
     return PreparedRun(
         course,
         manifest,
-        lambda: RunFolder.create(config.source, run.output, run.folder_name, force, dump(config), manifest),
+        lambda: RunFolder.create(config.source, run.output, run.folder_name, dump(config), manifest),
     )

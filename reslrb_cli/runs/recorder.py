@@ -8,7 +8,7 @@ import os
 import shlex
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -124,7 +124,6 @@ class Recording:
         """Mark the run as interrupted in the manifest. The process is about to exit during an iteration."""
         if not self.manifest.results and self.course.last is not None:
             self.manifest.results = {"iterations": self.done, "elapsed_s": self.course.last.elapsed_s}
-        self._note_shared()
         if self.folder.is_there:
             self.manifest.end_for_good(self.folder.path, Status.INTERRUPTED)
 
@@ -245,9 +244,8 @@ class Recording:
         if self.course.last is None:  # there is nothing to draw yet
             write_report(self.folder.path, self.manifest.content(), {})
         else:
-            found = self._found()
-            self._note_shared()
-            write_report(self.folder.path, self.manifest.content() | {"results": found}, self.problem.values())
+            content = self.manifest.content() | {"results": self._found()}
+            write_report(self.folder.path, content, self.problem.values())
 
     def _add(self, failed: str, measure: Callable[[], None]) -> None:
         """Add the results of `measure`. An error does not fail the run. It is logged after the text `failed`."""
@@ -296,13 +294,7 @@ class Recording:
         self._note_results()
 
     def _note_results(self) -> None:
-        self._note_shared()
         self.manifest.results = self._found()
-
-    def _note_shared(self) -> None:
-        """Record the workers' time so far."""
-        if self.course.shared is not None:
-            self.manifest.shared = finite(asdict(self.course.shared))
 
     def _found(self) -> dict[str, Any]:
         """Return the results of the run so far."""

@@ -9,6 +9,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import os
+import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -316,5 +318,8 @@ def command(folder: Path, sweep: SweepPlan, combination: Combination, seed: int)
     words = ["optimize", str(config_file(folder, combination)), *allowed]
     for key, value in (("run.seed", seed), ("run.output", str(folder)), ("run.name", name)):
         words += ["--set", f"{key}={json.dumps(value)}"]
-    # a run that was killed before its first checkpoint is replaced
-    return [*words, "--force"]
+    if read_manifest(run) is not None:  # the run was killed before its first checkpoint
+        shutil.rmtree(run)
+    elif os.path.lexists(run):
+        raise ConfigError(run, "", "is no run's folder, and a run of the sweep needs the name; remove or rename it")
+    return words

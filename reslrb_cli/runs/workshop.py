@@ -6,7 +6,7 @@ in mm. Directions are unit vectors in the axes of the scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mitsuba as mi
@@ -14,7 +14,6 @@ import numpy as np
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.lens.solid import Sheet
-from reslrb_cli.lens.workshop import allowed_errors, blacks, light_warnings, unlit_corners
 from reslrb_cli.measure.tolerance import (
     DISTANCE,
     INDEX,
@@ -26,9 +25,25 @@ from reslrb_cli.measure.tolerance import (
     where_light_goes,
 )
 from reslrb_cli.records.images import luminance
+from reslrb_cli.report.page.workshop import shown_ssim
 from reslrb_cli.scene.images import read_image
 
 Array = np.ndarray[Any, Any]
+
+#: Loss of SSIM that counts as still acceptable.
+ALLOWED_LOSS = 0.05
+
+#: Errors that a careful workshop keeps: distance in mm, rotations in degrees, index of refraction.
+TOLERANCES = {"distance": 1.0, "light turned": 0.5, "solid turned": 0.5, "index": 0.002}
+
+#: Share of the darkest pixels of a picture, and the brightness up to which they count as black, in means.
+DARKEST, BLACK = 0.05, 0.2
+
+#: Brightness in means by which black may be brighter than in the picture.
+GREY = 0.05
+
+#: Side of a corner as a fraction of the picture, and the least share of its light. Darker corners count as black.
+CORNER, LIT = 0.1, 0.5
 
 
 def add_sheet(
@@ -36,7 +51,7 @@ def add_sheet(
     plan: Fabrication,
     scene: mi.Scene,
     sensor: int,
-    sheets: Sequence[Sheet],
+    sheet: Sheet,
     thrown: Array,
     wanted: Array,
 ) -> dict[str, Array]:
@@ -49,9 +64,9 @@ def add_sheet(
     numbers["thrown"] = figures(thrown, wanted)
     if original is not None:
         numbers["thrown"]["ssim_of_picture"] = figures(thrown, original)["ssim"]
-    if {plan.faces[0], plan.receiver} <= {shape.id() for shape in scene.shapes()}:
+    if {plan.face, plan.receiver} <= {shape.id() for shape in scene.shapes()}:
         numbers["light"] = where_light_goes(scene, scene.sensors()[sensor], plan, wanted)
-        numbers["setup"] = setup_of(scene, scene.sensors()[sensor], plan, sheets[0], wanted)
+        numbers["setup"] = setup_of(scene, scene.sensors()[sensor], plan, sheet, wanted)
     shown = wanted if original is None else original
     inside = picture_within(wanted)
     numbers["blacks"] = blacks(thrown[inside], shown[inside])
@@ -63,7 +78,7 @@ def add_sheet(
 def add_tolerances(
     numbers: dict[str, Any],
     bench: OpticalBench,
-    sheets: Sequence[Sheet],
+    sheet: Sheet,
     planned: Array,
     wanted: Array,
     spp: int,
@@ -77,7 +92,7 @@ def add_tolerances(
     def keep(name: str, image: Array) -> None:
         pictures[name] = as_picture(image, shown, inside)
 
-    found = tolerances(bench, sheets, planned, wanted, spp, say, original, keep)
+    found = tolerances(bench, sheet, planned, wanted, spp, say, original, keep)
     setup = numbers.get("setup")
     deviations = {"turn": TURN, "index": INDEX}
     if setup is not None:
@@ -108,6 +123,100 @@ def as_picture(image: Array, original: Array, inside: tuple[slice, slice]) -> Ar
     return np.asarray(scaled, dtype=np.float32)[:, :, None]
 
 
+# --- allowed errors, grey blacks and unlit corners --------------------------------------------------------------------
+
+
+def allowed_errors(
+    found: Mapping[str, Mapping[str, Any]], kind: str, deviations: Mapping[str, float]
+) -> dict[str, dict[str, Any]]:
+    """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, for each measured kind of deviation.
+
+    `found` holds the figures of each image, by image name, as returned by `tolerances`. `kind` is `lens` or `mirror`.
+    `deviations` are the measured amounts: `distance` in mm, `index`, and `turn` in degrees. The result has the keys of
+    `TOLERANCES`.
+
+    Each entry has the `value`, its `unit` and the stated `tolerance`. `at_least` is true if SSIM falls by less than
+    `ALLOWED_LOSS` even at the measured deviation. `passes` tells whether the tolerance is met. `passes` is None if the
+    answer is unknown. The answer is unknown if the measured deviation is below the tolerance and SSIM falls by less
+    than `ALLOWED_LOSS`.
+    """
+    planned = found.get("as planned")
+    if planned is None:
+        return {}
+    kinds = {
+        "distance": ("distance ", "mm", deviations.get("distance")),
+        "light turned": ("light turned", "degrees", deviations["turn"]),
+        "solid turned": (f"{kind} turned", "degrees", deviations["turn"]),
+        "index": ("index ", "", deviations["index"]),
+    }
+    allowed = {}
+    for name, (prefix, unit, deviation) in kinds.items():
+        entries = [entry for key, entry in found.items() if key.startswith(prefix)]
+        if entries and deviation:
+            fall = max(shown_ssim(planned) - shown_ssim(entry) for entry in entries)
+            value, tolerance = allowed_error(fall, deviation), TOLERANCES[name]
+            at_least = fall < ALLOWED_LOSS
+            passes = None if at_least and value < tolerance else value >= tolerance
+            allowed[name] = {"value": value, "unit": unit, "tolerance": tolerance, "at_least": at_least,
+                             "passes": passes}  # fmt: skip
+    return allowed
+
+
+def allowed_error(fall: float, deviation: float) -> float:
+    """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, at most `deviation`.
+
+    The function assumes that SSIM falls linearly, and that SSIM has fallen by `fall` at `deviation`. Nothing larger was
+    measured.
+    """
+    return deviation * min(1.0, ALLOWED_LOSS / fall) if fall > 0 else deviation
+
+
+def blacks(image: Array, picture: Array) -> dict[str, float]:
+    """Return the mean brightness of the darkest 5 % of a `picture` (H, W). Also return the mean brightness of the same
+    pixels of an `image`.
+
+    Both images are divided by their means.
+    """
+    seen, wanted = (each / max(float(each.mean()), 1e-30) for each in (image, picture))
+    dark = wanted <= np.quantile(wanted, DARKEST)
+    return {"image": float(seen[dark].mean()), "picture": float(wanted[dark].mean())}
+
+
+def unlit_corners(image: Array, picture: Array) -> list[str]:
+    """Return the names of the corners in which an `image` (H, W) has less than half the light of the `picture` (H, W).
+
+    A corner spans a tenth of the width and a tenth of the height. Both images are divided by their means. Black corners
+    of the picture do not count.
+    """
+    seen, wanted = (each / max(float(each.mean()), 1e-30) for each in (image, picture))
+    height, width = (max(1, round(CORNER * size)) for size in picture.shape)
+    rows = {"top": slice(None, height), "bottom": slice(-height, None)}
+    columns = {"left": slice(None, width), "right": slice(-width, None)}
+    return [
+        f"{row} {column}"
+        for row, of_row in rows.items()
+        for column, of_column in columns.items()
+        if (light := float(wanted[of_row, of_column].mean())) > GREY
+        and float(seen[of_row, of_column].mean()) < LIT * light
+    ]
+
+
+def light_warnings(dark: Mapping[str, float], corners: list[str]) -> list[str]:
+    """Return a warning sentence if black comes out grey. Return another sentence if `corners` are unlit. `dark` is a
+    result of `blacks`.
+    """
+    lines = []
+    if dark["picture"] <= BLACK and dark["image"] > dark["picture"] + GREY:
+        lines.append(f"Black parts of the picture come out at {100 * dark['image']:.0f} % of the mean brightness "
+                     f"({100 * dark['picture']:.0f} % in the picture), so they look grey")  # fmt: skip
+    if corners:
+        named = ", ".join(corners[:-1]) + " and " + corners[-1] if len(corners) > 1 else corners[0]
+        lines.append(f"The {named} corner{'s' if len(corners) > 1 else ''} of the picture "
+                     f"get{'' if len(corners) > 1 else 's'} less than half of {'their' if len(corners) > 1 else 'its'} "
+                     "light")  # fmt: skip
+    return lines
+
+
 # --- the set-up -------------------------------------------------------------------------------------------------------
 
 #: Rays from the lamps. A lamp farther away than this multiple of the face's size counts as parallel light.
@@ -136,7 +245,7 @@ def setup_of(
         return None
     center = np.ravel(shapes[plan.receiver].bbox().center()).astype(float)
     normal = _normal(scene, sensor, shapes[plan.receiver])
-    light = _light(scene, [shapes[name] for name in (*plan.faces, "back") if name in shapes])
+    light = _light(scene, [shapes[name] for name in (plan.face, "back") if name in shapes])
     if normal is None or light is None:
         return None
     points, directions = light

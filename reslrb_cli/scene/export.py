@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.backend.installation import looking_in
+from reslrb_cli.backend.installation import looking_in, package_folder
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.images import file_stem, write_file
@@ -185,22 +185,25 @@ class Replacing:
     def copy_assets(self) -> None:
         """Copy every file that the scene's elements name. Change the elements so that they name the copies.
 
-        A file in the folder of the scene keeps its relative path. Other files go to a separate folder.
+        A file in the folder of the scene keeps its relative path. Other files go to a separate folder. The tables of a
+        metal's `material` keep their names, by which Mitsuba finds them.
         """
         own = {name.casefold() for name in (SCENE, *self.writers)}
         home = self.description.root.source.file.absolute().parent.resolve()
         copies: dict[Path, str] = {}
-        for element in self.description.root.walk("string", "spectrum"):
-            attribute = element.file_attribute
-            if not attribute or element in self._made:
+        for element, name in list(self.description.named_files()):
+            path = self.description.find_file(name)
+            if element in self._made or path is None or not path.is_file():
                 continue
-            path = self.description.find_file(element.attributes[attribute])
-            if path is not None and path.is_file():
-                source = path.resolve()
-                if source not in copies:
-                    copies[source] = _free(source, home, own)
-                    own.add(copies[source].casefold())
-                element.attributes[attribute] = copies[source]
+            source = path.resolve()
+            if not element.file_attribute:
+                if not (package_folder() / name).exists():  # otherwise the run has read Mitsuba's own table
+                    self.writers[name] = functools.partial(shutil.copyfile, source)
+                continue
+            if source not in copies:
+                copies[source] = _free(source, home, own)
+                own.add(copies[source].casefold())
+            element.attributes[element.file_attribute] = copies[source]
         for source, name in copies.items():
             self.writers[name] = functools.partial(shutil.copyfile, source)
 

@@ -139,7 +139,7 @@ def _grid_file(width: int, height: int) -> Path:
     from reslrb_cli.lens.surface import Setting
 
     path = Path(_grid_folder().name) / f"grid_{width}x{height}.ply"
-    path.write_bytes(face_ply(Setting(size=(2.0, 2.0), thickness=0.0), width, height))
+    path.write_bytes(face_ply(Setting(size=(2.0, 2.0)), width, height))
     return path
 
 

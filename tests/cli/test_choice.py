@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
 from pathlib import Path
 
 import drjit as dr
@@ -47,8 +48,9 @@ def optimize(capsys, *settings: str, verbose: bool = False) -> tuple[int, str]:
     logging.getLogger("reslrb_cli").setLevel(logging.INFO)
     capsys.readouterr()
     sets = [text for setting in settings for text in ("--set", setting)]
+    shutil.rmtree("runs", ignore_errors=True)
     with pytest.raises(SystemExit) as end:
-        main([*(["--debug"] if verbose else []), "optimize", "box.yaml", *sets, "--force"])
+        main([*(["--debug"] if verbose else []), "optimize", "box.yaml", *sets])
     return int(end.value.code or 0), capsys.readouterr().err
 
 

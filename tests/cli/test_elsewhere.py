@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -225,7 +226,8 @@ def test_colours_and_exposure_from_a_photograph(tmp_path: Path, monkeypatch: pyt
     verdicts = {key: about["verdict"] for key, about in manifest["results"]["certainty"]["parameters"].items()}
     assert set(verdicts.values()) == {"settled"}, verdicts
     without = settings("target.mask=none", "target.exposure=1", "integrator.estimator=stack")
-    done("optimize", "room.yaml", "--force", *without)
+    shutil.rmtree("runs/room")
+    done("optimize", "room.yaml", *without)
     assert {"exposure", *TRUE} & set(misses(run)) > {"exposure"}
 
 
@@ -272,5 +274,6 @@ def test_colours_of_a_real_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     check_mask(Path("runs/room"), mirror=False)
     assert misses(Path("runs/room"), COLOUR, TRUE_OF_ROOM) == []
     without = settings("target.mask=none", "target.exposure=1", "integrator.estimator=stack")
-    done("optimize", "room.yaml", "--force", *without)
+    shutil.rmtree("runs/room")
+    done("optimize", "room.yaml", *without)
     assert misses(Path("runs/room"), COLOUR, TRUE_OF_ROOM) == [*TRUE_OF_ROOM, "exposure"]

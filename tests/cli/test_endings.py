@@ -97,25 +97,6 @@ def test_there_is_a_checkpoint_before_the_first_iteration(optimize, monkeypatch)
     assert seen == [(0, 0.5)]
 
 
-def test_a_running_run_is_not_replaced(optimize, during):
-    seen = []
-
-    def force(record):
-        if record.iteration == 1:
-            seen.append(optimize("--force"))
-            seen.append(read_content(RUN)["status"])
-
-    during(force)
-    code, _, err = optimize()
-    assert (code, faults(RUN, code, err)) == (0, [])
-    (refused, out, err), status = seen
-    assert (refused, out, status) == (2, "", "running")
-    [line] = lines(err)
-    assert line.startswith("tiny.yaml: run.name: ")
-    assert f"in use by a run (process {os.getpid()} on " in line
-    assert len(read_metrics(RUN)) == 5
-
-
 #: For each failing part: the function that writes it, the number of calls before the end of the run, and the files that
 #: are then absent.
 PARTS = {

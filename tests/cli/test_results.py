@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,8 @@ def _experiment(llvm, tmp_path, monkeypatch):
 
 def optimize(*sets, options=()):
     """Run `reslrb optimize`, and return the last line, all of standard output, and the manifest's results."""
-    code, out, err = outcome("optimize", "box.yaml", "--force", *options, *settings(*sets))
+    shutil.rmtree("runs/box", ignore_errors=True)
+    code, out, err = outcome("optimize", "box.yaml", *options, *settings(*sets))
     assert code == 0, err
     return out.splitlines()[-1], out, read_manifest("runs/box")["results"]
 

@@ -56,23 +56,14 @@ def plan(**options: Any) -> Fabrication:
     return Fabrication(**{"thickness": 8.0, **options})
 
 
-def under(height: Heights) -> Heights:
-    """Return the heights of a free back of another shape, 8 mm below the face."""
-    return lambda x, y: -8 - 0.7 * height(y, x)
-
-
-#: For each solid of a height field: its options, whether its back is free, and the area around the face.
-SHAPES: dict[str, tuple[dict[str, Any], bool, float]] = {
-    "rectangle": ({}, False, 0.0),
-    "both faces": ({"faces": ["face", "back"]}, True, 0.0),
-    "rim": ({"rim": 5.0}, False, 70.0 * 50 - 60 * 40),
-    "both faces, rim": ({"faces": ["face", "back"], "rim": 5.0}, True, 70.0 * 50 - 60 * 40),
-    "round": ({"outline": "round"}, False, 0.0),
-    "round, rim": ({"outline": "round", "rim": 5.0}, False, np.pi * (35 * 25 - 30 * 20)),
-    "round, both faces, rim": ({"outline": "round", "faces": ["face", "back"], "rim": 2.0}, True,
-                               np.pi * (32 * 22 - 30 * 20)),
-    "mirror": ({"kind": "mirror"}, False, 0.0),
-}  # fmt: skip
+#: For each solid of a height field: its options, and the area around the face.
+SHAPES: dict[str, tuple[dict[str, Any], float]] = {
+    "rectangle": ({}, 0.0),
+    "rim": ({"rim": 5.0}, 70.0 * 50 - 60 * 40),
+    "round": ({"outline": "round"}, 0.0),
+    "round, rim": ({"outline": "round", "rim": 5.0}, np.pi * (35 * 25 - 30 * 20)),
+    "mirror": ({"kind": "mirror"}, 0.0),
+}
 
 
 def integral(heights: Heights, outline: str) -> float:
@@ -90,19 +81,13 @@ def edge_heights(heights: Heights, outline: str) -> np.ndarray:
     return heights(x * SIZE[0] / 2, y * SIZE[1] / 2)
 
 
-@pytest.mark.parametrize("name", a_few(SHAPES, ["both faces, rim", "round, rim", "mirror"]))
+@pytest.mark.parametrize("name", a_few(SHAPES, ["rim", "round, rim", "mirror"]))
 def test_a_solid_is_closed_oriented_outward_and_has_the_volume_of_its_heights(name: str) -> None:
-    options, both, beside = SHAPES[name]
+    options, beside = SHAPES[name]
     wanted = plan(**options)
-    # The two grids have different numbers of vertices, and the walls between them must meet both.
-    sheets = [sheet(ripples, 241, 161)] + ([sheet(under(ripples), 150, 101, name="back")] if both else [])
-    solid = make_solid(sheets, wanted)
-    volume = integral(ripples, wanted.outline) - integral(
-        under(ripples) if both else lambda x, y: np.full_like(x, -8.0), wanted.outline
-    )
-    front = edge_heights(ripples, wanted.outline).min() - 0.1
-    back = edge_heights(under(ripples), wanted.outline).max() + 0.1 if both else -8.0
-    volume += beside * (front - back)
+    solid = make_solid(sheet(ripples, 241, 161), wanted)
+    volume = integral(ripples, wanted.outline) - integral(lambda x, y: np.full_like(x, -8.0), wanted.outline)
+    volume += beside * (edge_heights(ripples, wanted.outline).min() - 0.1 + 8)
     assert solid.volume == pytest.approx(volume, rel=1e-3)
     for kind, written in (("stl", solids.stl), ("ply", solids.ply)):
         read = trimesh.load(io.BytesIO(written(solid)), file_type=kind)
@@ -116,7 +101,7 @@ def test_a_solid_is_closed_oriented_outward_and_has_the_volume_of_its_heights(na
 
 
 def test_stl_has_the_normals_of_its_triangles() -> None:
-    content = solids.stl(make_solid([sheet()], plan()))
+    content = solids.stl(make_solid(sheet(), plan()))
     records = np.frombuffer(content[84:], [("n", "<f4", 3), ("at", "<f4", (3, 3)), ("extra", "<u2")])
     assert int(np.frombuffer(content[80:84], "<u4")[0]) == len(records)
     read = trimesh.load(io.BytesIO(content), file_type="stl", process=False)
@@ -128,7 +113,7 @@ def test_the_front_equals_the_traced_mesh() -> None:
     shuffled = np.random.default_rng(3).permutation(len(points))
     inverse = np.argsort(shuffled)
     mixed = as_sheet("face", points[shuffled], inverse[triangles][:, ::-1])
-    solid = make_solid([mixed], plan())
+    solid = make_solid(mixed, plan())
     corners = {tuple(sorted(map(tuple, solid.points[t]))) for t in solid.triangles}
     assert {tuple(sorted(map(tuple, points[t]))) for t in triangles} <= corners
     assert mixed.z == pytest.approx(sheet().z)
@@ -152,8 +137,8 @@ def test_radius_slope_and_relief_of_a_sphere_are_reported(sign: int, outline: st
         return sign * (radius - np.sqrt(radius**2 - x**2 - y**2))
 
     wanted = plan(outline=outline, thickness=9.0, tool_radius=100.0)
-    faces = [sheet(cap)]
-    told = measured(make_solid(faces, wanted), faces, wanted)
+    made = sheet(cap)
+    told = measured(make_solid(made, wanted), made, wanted)
     face = told["faces"]["face"]
     far = np.hypot(30, 20) if outline == "rectangle" else 30
     relief = radius - np.sqrt(radius**2 - far**2)
@@ -167,9 +152,7 @@ def test_radius_slope_and_relief_of_a_sphere_are_reported(sign: int, outline: st
     else:
         assert face["smallest_concave_radius"] is None
         assert face["share_narrower_than_tool"] == 0
-    # The outside of a back is below it, so that the opposite sign is hollow.
-    below = solids.hollows(faces[0], wanted, -1)
-    assert below.max() == pytest.approx(-1 / radius if sign > 0 else 1 / radius, rel=2e-3)
+    assert solids.hollows(made, wanted).max() == pytest.approx(sign / radius, rel=2e-3)
 
 
 def test_hollows_are_found_in_every_direction() -> None:
@@ -180,7 +163,7 @@ def test_hollows_are_found_in_every_direction() -> None:
             return (x * np.cos(angle) + y * np.sin(angle)) ** 2 / (2 * 25)
 
         # A parabola has its smallest radius where it is flat.
-        assert 1 / solids.hollows(sheet(trough), wanted, 1).max() == pytest.approx(25, rel=1e-3)
+        assert 1 / solids.hollows(sheet(trough), wanted).max() == pytest.approx(25, rel=1e-3)
 
 
 def test_heights_survive_16_bits() -> None:
@@ -199,27 +182,22 @@ def test_invalid_solids_are_refused() -> None:
     torn[5, 2] = np.nan
     scattered[900, 0] += 0.3
     dome = sheet(lambda x, y: -(x**2) / 450)  # 2 mm deep at its edge
-    back = as_sheet("back", *grid(lambda x, y: np.full_like(x, -1.5)))
-    points_, triangles_ = grid(lambda x, y: np.full_like(x, -9.0))
-    one, wide = sheet(), as_sheet("back", points_ * np.array([1.1, 1.1, 1]), triangles_)
     cases: list[tuple[Callable[[], object], str]] = [
-        (lambda: as_sheet("face", torn, triangles), "fabrication.faces: `face` has vertices that are not finite"),
+        (lambda: as_sheet("face", torn, triangles), "fabrication.face: `face` has vertices that are not finite"),
         (lambda: as_sheet("face", scattered, triangles), "vertices that are not on a grid"),
         (lambda: as_sheet("face", points[:-1], triangles[:10]), "vertices that are not on a grid"),
         (lambda: as_sheet("face", points, holed), "folds, or has holes"),
         (lambda: as_sheet("face", points, np.concatenate([triangles, triangles[:1, ::-1]])), "folds, or has holes"),
-        (lambda: make_solid([dome], plan(thickness=1.5)),
+        (lambda: make_solid(dome, plan(thickness=1.5)),
          "fabrication.thickness: 1.5 mm: front and back overlap by 0.5 mm; it must be above 2"),
-        (lambda: make_solid([one, back], plan(faces=["face", "back"])), "front and back overlap"),
-        (lambda: make_solid([dome], plan(thickness=2.05, rim=3.0)), "overlap by 0.05 mm"),
-        (lambda: make_solid([one, wide], plan(faces=["face", "back"])), "`face` is 60 x 40 mm, but `back` 66 x 44"),
-        (lambda: make_solid([as_sheet("face", points + np.array([1.0, 0, 0]), triangles)], plan()), "must be at 0"),
+        (lambda: make_solid(dome, plan(thickness=2.05, rim=3.0)), "overlap by 0.05 mm"),
+        (lambda: make_solid(as_sheet("face", points + np.array([1.0, 0, 0]), triangles), plan()), "must be at 0"),
     ]  # fmt: skip
     for make, line in cases:
         with pytest.raises(ConfigError) as error:
             make()
         assert line in str(error.value)
-    assert make_solid([dome], plan(thickness=2.05)).volume > 0  # the overlap above comes from the rim
+    assert make_solid(dome, plan(thickness=2.05)).volume > 0  # the overlap above comes from the rim
 
 
 # ---- by the command
@@ -372,8 +350,8 @@ def test_invalid_files_are_refused_in_one_line(run: Path, tmp_path: Path, monkey
         ("a.3mf", (), "a.3mf: 3MF needs lib3mf, which is missing: pip install 'reslrb[fabrication]'"),
         ("a.stl", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back overlap by"),
         ("out", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back overlap by"),
-        ("a.stl", ("fabrication.faces=[plate]",), "fabrication.faces[0]: there is no mesh `plate` in the scene"),
-        ("a.stl", ("fabrication.faces=[face, face]",), "fabrication.faces: must name each mesh once"),
+        ("a.stl", ("fabrication.face=plate",), "fabrication.face: there is no mesh `plate` in the scene"),
+        ("a.stl", ("fabrication.faces=[face]",), "fabrication.faces: was removed; name the mesh by fabrication.face"),
         ("a.stl", ("fabrication.thickness=0",), "fabrication.thickness: must be"),
     ):
         options = [word for setting in settings for word in ("--set", setting)]

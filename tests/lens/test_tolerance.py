@@ -218,13 +218,13 @@ def test_a_tool_ball_touches_the_vertices_of_the_face(folder: Path) -> None:
     made = bench(folder)
     before = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
     sheet = as_sheet("face", before, np.array(made.params["face.faces"]).reshape(-1, 3))
-    after = np.array(made.tooled([sheet], 1e-3)["face.vertex_positions"]).reshape(-1, 3)
+    after = np.array(made.tooled(sheet, 1e-3)["face.vertex_positions"]).reshape(-1, 3)
     assert after == pytest.approx(before, abs=1e-4)  # this ball fits everywhere
     before[np.argsort(np.hypot(before[:, 0] - 10, before[:, 1]))[:2], 2] -= (
         0.5  # two pits that a ball of 60 mm cannot enter
     )
     sheet = as_sheet("face", before, np.array(made.params["face.faces"]).reshape(-1, 3))
-    rough = np.array(made.tooled([sheet], 60.0)["face.vertex_positions"]).reshape(-1, 3)
+    rough = np.array(made.tooled(sheet, 60.0)["face.vertex_positions"]).reshape(-1, 3)
     assert np.all(rough[:, 2] >= before[:, 2] - 1e-4)
     assert np.max(rough[:, 2] - before[:, 2]) == pytest.approx(0.5, abs=0.05)
 

@@ -11,20 +11,12 @@ from cli.tiny import done
 from lens.test_experiment import picture
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.lens.workshop import (
-    SCALLOP,
-    allowed_errors,
-    blacks,
-    cutter,
-    light_warnings,
-    stepover,
-    unlit_corners,
-)
+from reslrb_cli.lens.solid import SCALLOP, cutter, stepover
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import luminance, write_file
 from reslrb_cli.report.page.workshop import material, setup_facts, sketch
 from reslrb_cli.runs.export import read_solid
-from reslrb_cli.runs.workshop import setup_of
+from reslrb_cli.runs.workshop import allowed_errors, blacks, light_warnings, setup_of, unlit_corners
 
 
 def test_the_step_of_a_ball_leaves_scallops_of_the_given_height() -> None:
@@ -82,9 +74,9 @@ def test_a_set_up_matches_the_options_of_the_command(name: str, tmp_path: Path, 
     config = load(tmp_path / "l/lens.yaml")
     assert config.fabrication is not None
     scene = load_configured(config)
-    sheets, _ = read_solid(config, config.fabrication, mi.traverse(scene))
+    sheet, _ = read_solid(config, config.fabrication, mi.traverse(scene))
     target = luminance(np.array(mi.Bitmap(str(tmp_path / "l/target.exr")))[:, :, :3])
-    setup = setup_of(scene, scene.sensors()[0], config.fabrication, sheets[0], target)
+    setup = setup_of(scene, scene.sensors()[0], config.fabrication, sheet, target)
     assert setup is not None
     far = setup["light_distance"]
     assert (setup["lit_side"], far if light == "parallel" else round(far), setup["through"]) == (side, light, through)

@@ -142,5 +142,5 @@ def test_a_holder_is_read_back() -> None:
     here = Holder.here(locked=True)
     assert Holder.from_json(asdict(here)) == here
     assert str(here) == f"process {os.getpid()} on {here.host}"
-    for nothing in (None, {}, {"host": "x"}):
+    for nothing in (None, {}, {"host": "x"}, [3], asdict(here) | {"pid": "text"}):
         assert Holder.from_json(nothing) is None

@@ -117,10 +117,12 @@ def make_run(folder, keys=(FLOOR, LAMP), sensors=1, truth=True, iterations=30, s
     if truth:
         write_parameters(folder / "parameters" / "true", values["true"])
         write_mask(folder / "parameters", keys[0], mask)
-    maps = {}
+    maps, views = {}, []
     for sensor in range(sensors):
         suffix = f"-{sensor}" if sensors > 1 else ""
         target = texture(*size, seed=sensor)
+        views.append({"sensor": sensor, "share": 1 / sensors, "held_out": False, "exposure": 1.0, "pixels": 768,
+                      "left_out": 0, "kinds": {}, "counted": {}, "shown": 1.0})  # fmt: skip
         for name, part in (("initial", 0.5), ("final", 0.9), ("target", 1.0)):
             write_image(folder / "images" / f"{name}{suffix}", target * np.float32(part))
         image = target * np.float32(0.9)
@@ -140,7 +142,9 @@ def make_run(folder, keys=(FLOOR, LAMP), sensors=1, truth=True, iterations=30, s
         "loss_trend": None, "worse": [], "error_maps": maps,
     }  # fmt: skip
     results |= manifest.pop("results", {})
-    done = Manifest(variant="llvm_ad_rgb", device="a machine", seed=3, config="box.yaml", results=results)
+    done = Manifest(
+        variant="llvm_ad_rgb", device="a machine", seed=3, config="box.yaml", results=results, views=views
+    )  # fmt: skip
     for name, value in manifest.items():
         setattr(done, name, value)
     done.end(folder, manifest.get("status", Status.FINISHED), manifest.get("error"))

@@ -82,7 +82,8 @@ def test_grey_images_and_alpha():
 
 def test_files_of_a_run_folder(tmp_path):
     folder = make_run(tmp_path / "lamp", sensors=2)
-    found = seen_errors(folder)
+    views = [{"sensor": sensor, "shown": 1.0} for sensor in range(2)]
+    found = seen_errors(folder, views)
     assert list(found) == ["-0", "-1"]
     target, final = (load_image(folder / "images" / f"{name}-1.exr") for name in ("target", "final"))
     again = image_errors(final, target, 1.0)
@@ -90,6 +91,6 @@ def test_files_of_a_run_folder(tmp_path):
     for path in folder.glob("images/final*.exr"):
         path.write_bytes(path.read_bytes()[:200])
     (folder / "images" / "target-0.exr").unlink()
-    assert list(seen_errors(folder)) == ["-1"]
-    assert "final" not in seen_errors(folder)["-1"]
-    assert seen_errors(tmp_path) == {}
+    assert list(seen_errors(folder, views)) == ["-1"]
+    assert "final" not in seen_errors(folder, views)["-1"]
+    assert seen_errors(tmp_path, views) == seen_errors(folder, None) == {}

@@ -25,7 +25,7 @@ from runs.going_on import MOTION, one_thread, optimize
 from runs.hosts import hosts, make_certificates, missing
 
 from reslrb_cli.cluster import bundle
-from reslrb_cli.cluster.connection import Place
+from reslrb_cli.cluster.connection import Place, connected
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
@@ -34,8 +34,7 @@ from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.runs.prepare import RunProgress, prepare
 
-worker = pytest.importorskip("reslrb_cli.cluster.worker", reason="pip install reslrb[cluster]", exc_type=ImportError)
-checks = pytest.importorskip("reslrb_cli.cluster.checks", reason="pip install reslrb[cluster]", exc_type=ImportError)
+calls = pytest.importorskip("reslrb_cli.cluster.calls", reason="pip install reslrb[cluster]", exc_type=ImportError)
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
 SETS = ["run.iterations=3", "run.spp=8", "run.measuring=0", "run.certainty=false"]
@@ -145,6 +144,7 @@ SCENE = """\
             <texture type="bitmap" name="reflectance"><string name="filename" value="../textures/print.exr"/></texture>
         </bsdf>
     </shape>
+    <shape type="sphere"><bsdf type="conductor"><string name="material" value="Cu"/></bsdf></shape>
 </scene>
 """
 QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
@@ -153,12 +153,13 @@ QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n
 def test_a_bundle_contains_all_files_of_an_experiment(
     llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The bundle contains includes, files from <path> folders, variables, meshes, textures, initial values and cameras,
-    wherever they are. After unpacking, nothing is read from the experiment's own folder.
+    """The bundle contains includes, files from <path> folders, variables, meshes, textures, tables of metals, initial
+    values and cameras, wherever they are. After unpacking, nothing is read from the experiment's own folder.
     """
     rng, where = np.random.default_rng(1), made(tmp_path / "here")
-    for name in ("parts", "textures", "shots"):
+    for name in ("parts", "textures", "shots", "data", "data/ior"):
         made(where / name)
+    (where / "data/ior/Cu.k.spd").write_text("400 2\n700 2\n")
     (where / "parts" / "lamps.xml").write_text(
         f'<scene version="3.0.0"><emitter type="envmap" id="sky"><string name="filename" value="{where}/sky.exr"/>'
         "</emitter></scene>"
@@ -202,9 +203,9 @@ def me(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     reasons: list[str] = []
     made = SimpleNamespace(address="tls://here:1", local_directory=str(tmp_path), name=1, plugins={}, reasons=reasons,
                            log_event=lambda topic, text: reasons.append(text))  # fmt: skip
-    monkeypatch.setattr(worker, "get_worker", lambda: made)
-    monkeypatch.setattr(worker.os, "_exit", end)
-    monkeypatch.setattr(worker, "SEND_S", 0.0)
+    monkeypatch.setattr(calls, "get_worker", lambda: made)
+    monkeypatch.setattr(calls.os, "_exit", end)
+    monkeypatch.setattr(calls, "SEND_S", 0.0)
     return made
 
 
@@ -215,35 +216,35 @@ def reads(folder: Path, threads: int | None) -> tuple[str, dict[str, float]]:
 def uppercase(me: SimpleNamespace, workload: object) -> object:
     """Give a worker a workload, and call `str.upper` of the state."""
     me.plugins["reslrb"] = workload
-    return worker.perform(workload.key, b"", str.upper, ()).value
+    return calls.perform(workload.key, b"", str.upper, ())
 
 
 def test_a_worker_reports_missing_requirements(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reason is a different version, users' own code without permission, a faulty file, or another run."""
     files = {"a": b"one"}
-    other = worker.Workload(files, reads, versions={"mitsuba": "0.1"})
+    other = calls.Workload(files, reads, versions={"mitsuba": "0.1"})
     with pytest.raises(MachineError, match=r"^worker 1 \(here\) has mitsuba .*, but the run has 0.1: install the same"):
         other.setup(me)
-    asking = worker.Workload(files, reads, asks_for_code=True)
+    asking = calls.Workload(files, reads, asks_for_code=True)
     for use in (asking.setup, lambda me: uppercase(me, asking)):
         with pytest.raises(MachineError, match="does not run users' own code"):
             use(me)
-    monkeypatch.setenv(worker.ALLOW_CODE, "1")
+    monkeypatch.setenv(calls.ALLOW_CODE, "1")
     assert uppercase(me, asking) == "ONE"
     with pytest.raises(MachineError, match="lacks the experiment; another run may use it"):
-        worker.perform("another", b"", str.upper, ())
+        calls.perform("another", b"", str.upper, ())
     with pytest.raises(MachineError, match=r"^worker 1 \(here\) cannot load the experiment: UnicodeDecodeError"):
-        uppercase(me, worker.Workload({"a": b"\xff"}, reads))
+        uppercase(me, calls.Workload({"a": b"\xff"}, reads))
     assert me.reasons == []
 
 
 def test_a_worker_ends_if_its_machine_fails(me: SimpleNamespace) -> None:
     with pytest.raises(SystemExit):
-        uppercase(me, worker.Workload({}, reads))
-    workload = worker.Workload({"a": b"one"}, reads)
+        uppercase(me, calls.Workload({}, reads))
+    workload = calls.Workload({"a": b"one"}, reads)
     assert uppercase(me, workload) == "ONE"
     with pytest.raises(SystemExit):
-        worker.perform(workload.key, b"", fail, ())
+        calls.perform(workload.key, b"", fail, ())
     assert [text.partition(" failed: ")[0] for text in me.reasons] == ["worker 1 (here)"] * 2
     assert me.reasons[1].endswith("No space left on device; it is restarted")
 
@@ -251,7 +252,7 @@ def test_a_worker_ends_if_its_machine_fails(me: SimpleNamespace) -> None:
 @pytest.mark.parametrize(("shown", "seen"), [("3,5", "5"), ("7", "7"), ("0,1,2", "1")])
 def test_each_worker_sees_one_gpu(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, shown: str, seen: str) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
-    uppercase(me, worker.Workload({"a": b""}, reads))
+    uppercase(me, calls.Workload({"a": b""}, reads))
     assert os.environ["CUDA_VISIBLE_DEVICES"] == seen
 
 
@@ -331,12 +332,20 @@ def fail(state: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
+class Unchanged:
+    """Context that sets nothing in a worker's state."""
+
+    def take(self, state: object) -> None:
+        pass
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("llvm")
 def test_a_call_that_ends_every_worker_ends_the_run(caplog: pytest.LogCaptureFixture) -> None:
     ended = pytest.raises(MachineError, match="--cluster: the same call ended 4 workers, the last one at tls://")
-    with checks.cases_at(Place(1), "llvm_ad_rgb", threads=1) as run, ended:
-        list(run(None, fail, [()]))
+    workload = calls.Workload({"a": b"one"}, reads)
+    with connected(Place(1)) as (client, _), ended:
+        list(calls.Workers(client, workload, lambda state: Unchanged())(None, fail, [()]))
     warnings = [record.message for record in caplog.records if record.name == "reslrb_cli.cluster.calls"]
     assert warnings  # a busy machine may lose some
     assert all("No space left on device; it is restarted" in warning for warning in warnings)

@@ -255,6 +255,24 @@ def test_inexpressible_values_are_refused_without_output(key: str, reason: str, 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_scenes_own_tables_of_a_metal_are_copied(llvm: str, tmp_path: Path) -> None:
+    """The run has read Mitsuba's own table of copper."""
+    (tmp_path / "room/data/ior").mkdir(parents=True)
+    for name, value in (("Cu.eta", 1.75), ("mine.k", 2.5), ("mine.eta", 0.5)):
+        (tmp_path / f"room/data/ior/{name}.spd").write_text(f"400 {value}\n700 {value}\n")
+    metals = "".join(
+        f'<shape type="sphere"><bsdf type="roughconductor"><string name="material" value="{name}"/></bsdf></shape>'
+        for name in ("Cu", "mine")
+    )
+    lamp = '<emitter type="constant"/><sensor type="perspective"/>'
+    (tmp_path / "room/scene.xml").write_text(f'<scene version="3.0.0">{lamp}{metals}</scene>')
+    found: list[Description] = []
+    scene = load_scene(tmp_path / "room/scene.xml", {}, look=found.append)
+    selection = select_parameters(scene, [ParameterSpec(key="Sphere_1.bsdf.alpha.value", initial=0.5)], "c.yaml")
+    export(found[0], selection, tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out/data/ior").iterdir()} == {"mine.k.spd", "mine.eta.spd"}
+
+
 def test_values_that_mitsuba_reads_differently_are_refused_without_output(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

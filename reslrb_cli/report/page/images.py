@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,6 @@ from reslrb_cli.report.tonemap import (
     color_stops,
     colored,
     encode,
-    exposure_for,
     exposure_words,
     read_comparison,
     shown_exposures,
@@ -116,40 +114,31 @@ def _recovered(exposure: object, results: Mapping[str, Any]) -> list[float]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def seen_table(runs: Sequence[ShownRun]) -> Markup:
-    """Return a table of the perceptual errors at start and end, for the images of all runs."""
+def seen_table(results: Mapping[str, Any]) -> Markup:
+    """Return a table of the perceptual errors of a run's images at start and end."""
     rows: list[dict[str, Any]] = []
-    for run in runs:
-        name = run.name if len(runs) > 1 else ""
-        for suffix, about in (run.results.get("seen") or {}).items():
-            sensor = f"sensor {suffix[1:]}, " if suffix else ""
-            rows += [
-                {"run": name, "name": sensor + title, "errors": about[moment]}
-                for title, moment in (("start", "initial"), ("end", "final"))
-                if moment in about
-            ]
+    for suffix, about in (results.get("seen") or {}).items():
+        sensor = f"sensor {suffix[1:]}, " if suffix else ""
+        rows += [
+            {"name": sensor + title, "errors": about[moment]}
+            for title, moment in (("start", "initial"), ("end", "final"))
+            if moment in about
+        ]
     return lay_out("run.seen", rows) if rows else Markup()
-
-
-_OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 
 def image_rows(run: ShownRun) -> Markup:
     """Return a row per sensor: the initial image, the final image, the target, and maps of the error and dL/dI.
 
-    All images of a sensor share one exposure. The exposure comes from the manifest, or else is chosen for the target.
-    Missing images are left out.
+    All images of a sensor have the exposure in the manifest. Missing images are left out.
     """
-    folder, exposures = run.path / "images", shown_exposures(run.manifest.get("views"))
-    suffixes = {match[1] or "" for path in folder.glob("*.exr") if (match := _OF_A_SENSOR.fullmatch(path.name))}
-    ordered = sorted(suffixes, key=lambda suffix: int(suffix[1:] or 0))
-    return Markup().join(_row(folder, suffix, run.results, exposures.get(suffix)) for suffix in ordered)
+    exposures = shown_exposures(run.manifest.get("views"))
+    return Markup().join(_row(run.path / "images", suffix, run.results, exposures[suffix]) for suffix in exposures)
 
 
-def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float | None) -> Markup:
+def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float) -> Markup:
     names = {"start": "initial", "end": "final", "target": "target"}
     loaded = {title: load_image(folder / f"{name}{suffix}.exr") for title, name in names.items()}
-    exposure = exposure_for(loaded["target"]) if exposure is None else exposure
     sensor = f" of sensor {suffix[1:]}" if suffix else ""
     shown = []
     for title, image in loaded.items():
@@ -161,6 +150,8 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float 
         share = weights[:, :, :1] / max(float(weights.max()), 1e-30)
         shown.append(show(share, f"mask{sensor}", lay_out("titled", "mask", ": black is left out of the loss")))
     shown += _error_maps(folder, suffix, results)
+    if not shown:
+        return Markup()
     title = f"Sensor {suffix[1:]}" if suffix else ""
     return lay_out("gallery", shown, title, exposure_words(exposure, loaded["target"]))
 

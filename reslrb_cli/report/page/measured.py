@@ -1,4 +1,4 @@
-"""Parts of a page about files of measurements, and about several runs."""
+"""Parts of a page about files of measurements, and of a page about several sources."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ from markupsafe import Markup
 
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, SummaryRecord, Verdict, record_of
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.images import image_rows, seen_table
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
-from reslrb_cli.report.page.run import guarded, problems, record_parts, step_ms
+from reslrb_cli.report.page.run import guarded, outcome, run_parts
 from reslrb_cli.report.page.sweep import sweep_parts
-from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.plots import Curve
-from reslrb_cli.report.run_summary import worst
 from reslrb_cli.report.sources import Measurements, ShownRun, Source, SweepRuns
 from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 
@@ -128,72 +125,22 @@ Parts = list[tuple[str, Markup]]
 
 
 def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
-    """Return three results for a page about `sources`: title, header, and parts as titles and markup."""
+    """Return three results for a page about `sources`, one after the other: title, header, and parts as titles and
+    markup.
+    """
     names = [source.name for source in sources]
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    title = ", ".join(names[:MOST_NAMED]) + more
-    runs = [source for source in sources if isinstance(source, ShownRun)]
-    parts = run_comparison(runs) if runs else []
+    title, parts = ", ".join(names[:MOST_NAMED]) + more, []
     for source in sources:
-        if isinstance(source, SweepRuns):
-            title_of = (lambda part, name=source.name: f"{part}: {name}") if len(sources) > 1 else str
-            parts += [(title_of(part), markup) for part, markup in sweep_parts(source).items()]
-        elif not isinstance(source, ShownRun):
-            parts.append((f"{HEADINGS[source.kind]}: {source.name}", guarded(partial(measured, source))))
-    for run in runs:
-        own = record_parts(run)
-        facts = own.pop("Run")
-        folds = Markup().join(lay_out("folded", name, markup) for name, markup in own.items())
-        parts.append((f"Run {run.name}", guarded(partial(problems, run)) + facts + folds))
+        if isinstance(source, ShownRun):
+            own = {"Outcome": guarded(partial(outcome, source)), **run_parts(source)}
+        elif isinstance(source, SweepRuns):
+            own = sweep_parts(source)
+        else:
+            own = {HEADINGS[source.kind]: guarded(partial(measured, source))}
+        named = len(sources) > 1 or isinstance(source, Measurements)
+        parts += [(f"{part}: {source.name}" if named else part, markup) for part, markup in own.items()]
     return title, lay_out("header", title), parts
-
-
-def run_comparison(runs: Sequence[ShownRun]) -> Parts:
-    """Return the parts of the page that show several runs side by side."""
-    made: dict[str, Callable[[], Markup]] = {
-        "Runs": lambda: overview(runs),
-        "Convergence": lambda: convergence_of_all(runs),
-        "Images": lambda: _each(runs, image_rows),
-        "Errors as people see them": lambda: seen_table(runs),
-        "Parameters": lambda: _each(runs, lambda run: parameter_table(run.results)),
-        "Textures": lambda: _each(runs, texture_pictures),
-    }
-    return [(title, guarded(make)) for title, make in made.items()]
-
-
-def overview(runs: Sequence[ShownRun]) -> Markup:
-    """Return a table of the runs: how each ended, its results, and the time of an iteration."""
-    rows = [
-        {"run": run, "place": place, "estimator": _estimator(run), "error": _final_error(run),
-         "loss": run.last("loss") if (loss := run.results.get("loss")) is None else loss,
-         "step": step_ms(run.records)}
-        for place, run in enumerate(runs)
-    ]  # fmt: skip
-    return lay_out("run.overview", rows)
-
-
-def _estimator(run: ShownRun) -> str:
-    """Return the estimator or the integrator of the gradients, if the manifest names one."""
-    plan = run.manifest.get("plan") or {}
-    return str(plan.get("estimator") or plan.get("integrator") or "")
-
-
-def _final_error(run: ShownRun) -> str:
-    """Return the final error of all parameters, or the largest relative error if the units differ."""
-    total = run.results.get("rmse") or {}
-    if total.get("final") is not None:
-        return f"RMSE {number(total['final'], 3)}"
-    key = worst(run.results)
-    if key is not None:
-        return f"{number(run.results['relative_error'][key]['final'], 3)} of the truth at worst"
-    known = run.last("parameter_rmse")
-    return "" if known is None else f"RMSE {number(known, 3)}"
-
-
-def _each(runs: Sequence[ShownRun], make: Callable[[ShownRun], Markup]) -> Markup:
-    """Return the results of `make` for all runs, each below the run's name. If its data are damaged, a line says so."""
-    made = [(run, guarded(partial(make, run))) for run in runs]
-    return Markup().join(lay_out("heading", key(run.name)) + markup for run, markup in made if markup)
 
 
 #: Heading of a source, before its name.

@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
-from pydantic import TypeAdapter
 
 from reslrb_cli.config.files import duration
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.clock import SharedTime
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.measurements import incomplete_records
@@ -31,16 +29,10 @@ from reslrb_cli.report.sources import ShownRun
 WARM_UP = 5
 
 
-def step_ms(records: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the median milliseconds of a step. The first steps do not count. Return None if unknown."""
-    known = [record["step_ms"] for record in records[WARM_UP:] or records if record.get("step_ms") is not None]
-    return statistics.median(known) if known else None
-
-
 def step_words(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the time of a step in words."""
-    step = step_ms(records)
-    return "" if step is None else f"{duration(step / 1e3)} (median)"
+    """Return the median time of a step in words. The first steps do not count. The result is empty if unknown."""
+    known = [record["step_ms"] for record in records[WARM_UP:] or records if record.get("step_ms") is not None]
+    return f"{duration(statistics.median(known) / 1e3)} (median)" if known else ""
 
 
 def _wall(manifest: Mapping[str, Any]) -> str:
@@ -50,21 +42,6 @@ def _wall(manifest: Mapping[str, Any]) -> str:
         return ""
     pauses = ", and the time in which it was not at work" if manifest.get("resumed") else ""
     return f"{duration((end - start).total_seconds())}, with its images and files{pauses}"
-
-
-def workers(shared: Mapping[str, Any] | None, elapsed_s: float | None) -> Markup:
-    """Return the time of all iterations by part and by worker. The result is empty without workers."""
-    if not shared:
-        return Markup()
-    time = TypeAdapter(SharedTime).validate_python(shared)
-    parts = {
-        "computing, the mean of the workers": time.computing_s,
-        "waiting for the worker that had most": time.waiting_s,
-        "sending and handing out": time.sending_s,
-    }
-    if elapsed_s is not None:
-        parts["the rest of the iterations, here"] = max(elapsed_s - time.wall_s, 0.0)
-    return lay_out("run.workers", time, parts, sum(parts.values()) or 1.0)
 
 
 DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
@@ -83,54 +60,43 @@ def fabrication(run: ShownRun) -> Markup:
 
 def header(run: ShownRun) -> Markup:
     """Return the run's name, its outcome in a sentence, what to do next, its results and its warnings."""
+    found = outcome_of(run.manifest, run.results, str(run.path))
+    status = run.manifest.get("status", "unknown")
+    return (
+        lay_out("header", run.name, status, found.grade, found.sentence)
+        + lay_out("next_step", found.proposal, found.command)
+        + outcome(run)
+    )
+
+
+def outcome(run: ShownRun) -> Markup:
+    """Return the results, the error and the warnings of a run."""
     seconds, loss = run.last("elapsed_s"), run.results.get("loss")
     parts = (
         "" if seconds is None else f"{count(len(run.records), 'iteration')} in {duration(seconds)}",
         "" if loss is None else f"loss {number(loss)}",
         error_line(run.results),
     )
-    lead = ", ".join(part for part in parts if part)
-    outcome = outcome_of(run.manifest, run.results, str(run.path))
-    status = run.manifest.get("status", "unknown")
-    return (
-        lay_out("header", run.name, status, outcome.grade, outcome.sentence)
-        + lay_out("next_step", outcome.proposal, outcome.command)
-        + lay_out("paragraph", lead)
-        + problems(run)
-    )
-
-
-def problems(run: ShownRun) -> Markup:
-    """Return the error and the warnings of a run."""
     lines, error = warnings(run.results, "±"), run.manifest.get("error")
-    return lay_out("note", [error] if error else [], "failed") + lay_out("note", lines)
+    lead = lay_out("paragraph", ", ".join(part for part in parts if part))
+    return lead + lay_out("note", [error] if error else [], "failed") + lay_out("note", lines)
 
 
 def run_parts(run: ShownRun) -> dict[str, Markup]:
     """Return the parts of a run below its header, by title and in order. Parts that do not apply are empty."""
-    results = run.results
+    results, manifest = run.results, run.manifest
     parts: dict[str, Callable[[], Markup]] = {
         "Images": lambda: image_rows(run),
         "Parameters": lambda: (
-            parameter_table(results, "now" if run.at_work else "end", notes=True)
+            parameter_table(results, "now" if run.at_work else "end")
             + Markup().join(soft(found.line()) for found in incomplete_records(run.manifest.get("incomplete") or ()))
             + lay_out("run.certainty", results.get("certainty") or {})
         ),
         "Fabrication": lambda: fabrication(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
-        "Errors as people see them": lambda: seen_table([run]),
+        "Errors as people see them": lambda: seen_table(results),
         "Textures": lambda: texture_pictures(run),
         "Convergence": lambda: convergence(run),
-    }
-    return {title: guarded(make) for title, make in parts.items()} | record_parts(run)
-
-
-def record_parts(run: ShownRun) -> dict[str, Markup]:
-    """Return the parts about the execution of one run, by title. A comparison with other runs leaves these parts
-    out.
-    """
-    results, manifest = run.results, run.manifest
-    parts: dict[str, Callable[[], Markup]] = {
         "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
         "Regularizers": lambda: lay_out("run.regularized", results.get("regularized") or {}),
         "Run": lambda: lay_out("run.run", run, step_words(run.records), _wall(manifest)),
@@ -139,7 +105,6 @@ def record_parts(run: ShownRun) -> dict[str, Markup]:
             soft(Decision.from_json(each).line(cost=True)) for each in manifest.get("decisions") or ()
         ),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
-        "Workers": lambda: workers(manifest.get("shared"), run.last("elapsed_s")),
         "Configuration": lambda: lay_out("pre", _read(run.path / "config.yaml")),
     }
     return {title: guarded(make) for title, make in parts.items()}

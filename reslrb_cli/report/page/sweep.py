@@ -1,42 +1,210 @@
-"""Parts of a page about a sweep: its table, curves of medians with bands, and final images side by side."""
+"""Results of a sweep: a record of each run and of each combination, the best combination, the table, and the page.
+
+Losses are those of the final images, with `run.final_spp` samples. Runs with the same seed use the same random numbers.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
+from reslrb_cli.config.files import duration
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.manifest import Status
-from reslrb_cli.records.sweeps import Combination, in_words, label, run_name, short_keys
-from reslrb_cli.report.format import count, number, shorten
+from reslrb_cli.records.measurements import Band
+from reslrb_cli.records.sweeps import (
+    Combination,
+    SweepBestRecord,
+    SweepPlan,
+    SweepRowRecord,
+    SweepRunRecord,
+    in_words,
+    label,
+    run_name,
+    short_keys,
+)
+from reslrb_cli.report.format import count, number, shorten, table
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, lay_out, soft
 from reslrb_cli.report.page.run import guarded
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve
 from reslrb_cli.report.run_summary import units_differ
 from reslrb_cli.report.sources import ShownRun, SweepRuns
-from reslrb_cli.report.sweep import (
-    RATIOS,
-    RATIOS_LINE,
-    best_records,
-    figures_of,
-    notes,
-    row_figures,
-    row_records,
-    run_records,
-)
-from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
+from reslrb_cli.report.tonemap import exposure_words, shown_exposures
 
 Array = np.ndarray[Any, Any]
+
+#: Settings that make losses, or errors, incomparable if they vary.
+OTHERS = {
+    "loss": ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out"),
+    "error": ("scene", "parameters"),
+}
+
+#: Maximum width of a setting's value in the table, and of a combination in a line.
+VALUE_WIDTH, LABEL_WIDTH = 32, 60
+
+#: Maximum number of combinations named in a line.
+MOST_NAMED = 4
+
+#: Titles of the columns of results.
+FIGURES = {"loss": "final loss", "error": "parameter RMSE", "elapsed_s": "time", "peak_mib": "peak memory"}
+
+
+def run_records(source: SweepRuns) -> list[SweepRunRecord]:
+    """Return the result of each run, in order. Runs that have not started are `waiting`."""
+    return [_run_record(source, combination, seed) for combination, seed in source.sweep.runs]
+
+
+def _run_record(source: SweepRuns, combination: Combination, seed: int) -> SweepRunRecord:
+    name = run_name(combination, seed)
+    run, failure = source.runs.get(name), source.sweep.failures.get(name)
+    if run is None or failure is not None:
+        status, line = ("failed", failure.line) if failure is not None else ("waiting", "")
+        done = 0 if run is None else len(run.records)
+        return SweepRunRecord(name, combination.settings, seed, status, done, message=line)
+    results, relative = run.results, units_differ(run.results)
+    status = str(run.manifest.get("status", ""))
+    return SweepRunRecord(
+        name, combination.settings, seed, status, len(run.records),
+        (results.get("image_loss") or {}).get("final"), _error(run, relative), relative, results.get("elapsed_s"),
+        max((record["peak_mib"] for record in run.records), default=None),
+        str(run.manifest.get("error") or ""),
+    )  # fmt: skip
+
+
+def _error(run: ShownRun, relative: bool) -> float | None:
+    """Return the final error of all parameters. If `relative`, return the root mean square of their relative errors."""
+    if not relative:
+        return (run.results.get("rmse") or {}).get("final")
+    pairs = (run.results.get("relative_error") or {}).values()
+    known = [pair["final"] for pair in pairs if pair.get("final") is not None]
+    return math.sqrt(sum(error**2 for error in known) / len(known)) if known else None
+
+
+def row_records(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[SweepRowRecord]:
+    """Return the results of the finished runs of each combination."""
+    return [_row(each, [run for run in runs if run.settings == each.settings]) for each in sweep.combinations]
+
+
+def _row(combination: Combination, runs: Sequence[SweepRunRecord]) -> SweepRowRecord:
+    done, failed = [run for run in runs if run.is_done], [run for run in runs if run.status == "failed"]
+
+    def band(name: str) -> Band | None:
+        return Band.of([value for run in done if (value := getattr(run, name)) is not None])
+
+    return SweepRowRecord(
+        combination.name, combination.settings, len(done), len(runs), len(failed), band("iterations"), band("loss"),
+        band("error"), band("elapsed_s"), band("peak_mib"),
+        f"seed {failed[0].seed}: {failed[0].message}" if failed else "",
+    )  # fmt: skip
+
+
+def best_records(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[SweepBestRecord]:
+    """Return the best combination by loss and the best by error, if the combinations can be compared. The result is
+    empty for a single combination.
+
+    Only seeds that all combinations have are compared. Combinations with a run that failed or lacks the value are left
+    out, because their other runs are a biased sample.
+    """
+    found = []
+    for of in OTHERS:
+        values = {} if incomparable(sweep, of) else _paired(sweep, runs, of)
+        if len(values) > 1:
+            best, second = sorted(values, key=lambda name: float(np.median(values[name])))[:2]
+            pairs = list(zip(values[best], values[second], strict=True))
+            found.append(SweepBestRecord(of, best, second, len(pairs), sum(one < other for one, other in pairs)))
+    return found
+
+
+def incomparable(sweep: SweepPlan, of: str) -> str:
+    """Return the first varied setting that changes the meaning of the loss or the error. The result is empty if there
+    is none. Learning rates change neither.
+    """
+    keys = [key for key in sweep.keys if not key.endswith("learning_rate")]
+    return next((key for key in keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in OTHERS[of])), "")
+
+
+def _paired(sweep: SweepPlan, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
+    """Return the values of each combination by its name, one for each seed that all combinations have."""
+    found: dict[str, dict[int, float]] = {}
+    for combination in sweep.combinations:
+        own = [run for run in runs if run.settings == combination.settings]
+        values = {run.seed: getattr(run, of) for run in own if run.is_done}
+        if values and None not in values.values() and not any(run.status == "failed" for run in own):
+            found[combination.name] = values
+    seeds = [seed for seed in sweep.seeds if all(seed in values for values in found.values())]
+    return {name: [values[seed] for seed in seeds] for name, values in found.items()} if seeds else {}
+
+
+def notes(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
+    """Return lines about the table: the best combinations, what is not compared, and what failed."""
+    labels = {each.name: shorten(label(each.settings), LABEL_WIDTH) for each in sweep.combinations}
+    lines = [
+        f"lowest median {FIGURES[best.of]}: {labels[best.best]}; lower than the next, {labels[best.second]}, with "
+        f"{best.lower} of {count(best.seeds, 'seed')}"
+        for best in best_records(sweep, runs)
+    ]
+    if key := incomparable(sweep, "loss"):
+        lines.append(f"losses of different `{key}` are not of the same, and not compared")
+    elif any(key.partition(".")[0] == "integrator" for key in sweep.keys):
+        lines.append(
+            "the loss of each integrator has its own noise, and what its paths lack: raise run.final_spp until that "
+            "makes no difference"
+        )
+    failed = [run for run in runs if run.status == "failed"]
+    lines += [f"{run.name} failed: {run.message}" for run in failed[:MOST_NAMED]]
+    if len(failed) > MOST_NAMED:
+        lines.append(f"and so did {len(failed) - MOST_NAMED} more")
+    return lines
+
+
+def figures_of(runs: Sequence[SweepRunRecord]) -> dict[str, str]:
+    """Return the titles of the columns of results, by field name. Columns for unknown errors, and for equal numbers of
+    iterations, are left out.
+    """
+    differ = len({run.iterations for run in runs if run.is_done}) > 1
+    found = ({"iterations": "iterations"} if differ else {}) | FIGURES
+    if not any(run.error is not None for run in runs):
+        del found["error"]
+    elif any(run.relative for run in runs):
+        found["error"] = "relative error"
+    return found
+
+
+# --- the table on the terminal ----------------------------------------------------------------------------------------
+
+
+def lines(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
+    """Return the table with one line per combination, and the notes."""
+    keys, figures, short = sweep.keys, figures_of(runs), short_keys(sweep.keys)
+    rows: list[tuple[str, ...]] = [(*(short[key] for key in keys), "runs", *figures.values())]
+    for row in row_records(sweep, runs):
+        values = [shorten(in_words(row.settings[key]), VALUE_WIDTH) for key in keys]
+        bands = [_cell(name, getattr(row, name)) for name in figures]
+        rows.append((*values, f"{row.runs} of {row.of}" + (f", {row.failed} failed" if row.failed else ""), *bands))
+    return [*table(rows), "medians over the seeds, in brackets the least and the greatest", *notes(sweep, runs)]
+
+
+def _cell(name: str, band: Band | None) -> str:
+    """Return a median as text. The ends of its band follow if they differ."""
+    if band is None:
+        return ""
+    write = {"elapsed_s": duration, "peak_mib": lambda size: f"{number(size)} MiB"}.get(name, lambda v: number(v, 4))
+    ends = "" if band.low == band.high else f" [{write(band.low)}, {write(band.high)}]"
+    return write(band.median) + ends
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
 
 #: Maximum numbers of combinations with curves, and of combinations with pictures.
 MOST_CURVES, MOST_PICTURES = 2 * len(COLORS), 24
 
-#: Maximum width of a combination below a picture, and of a setting's value in the table.
-CAPTION_WIDTH, VALUE_WIDTH = 80, 60
+#: Maximum width of a combination below a picture, and of a setting's value in the table of the page.
+CAPTION_WIDTH, PAGE_WIDTH = 80, 60
 
 
 def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
@@ -46,31 +214,26 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
     drawn = sweep.combinations[:MOST_CURVES]
 
     def settings() -> Markup:
-        records = row_records(sweep, runs)
         rows = [
             {"place": place if place < len(drawn) else None, "record": record,
-             "values": [shorten(in_words(value), VALUE_WIDTH) for value in record.settings.values()]
+             "values": [shorten(in_words(value), PAGE_WIDTH) for value in record.settings.values()]
              or [label(record.settings)]}
-            for place, record in enumerate(records)
+            for place, record in enumerate(row_records(sweep, runs))
         ]  # fmt: skip
         done = sum(run.is_done for run in runs)
         told = f"{count(len(sweep.combinations), 'combination')} with {count(len(sweep.seeds), 'seed')}: "
-        told += f"{done} of {count(len(runs), 'run')} finished"
-        lines = [f"{told}.", *(f"{best.line}." for best in best_records(sweep, runs))]
-        columns = row_figures(records, runs)
-        remarks = notes(sweep, runs) + ([f"{RATIOS_LINE}."] if RATIOS.keys() & columns.keys() else [])
-        return lay_out("sweep.rows", rows, [short[name] for name in sweep.keys], columns, lines, remarks)
+        told += f"{done} of {count(len(runs), 'run')} finished."
+        return lay_out("sweep.rows", rows, [short[name] for name in sweep.keys], figures, told, notes(sweep, runs))
 
     parts: dict[str, Callable[[], Markup]] = {
         "Settings": settings,
         "Convergence": lambda: _curves(source, drawn),
         "Images": lambda: _images(source),
-        "Runs of the sweep": lambda: lay_out("sweep.runs", runs, figures),
+        "Runs of the sweep": lambda: lay_out(
+            "sweep.runs", runs, {name: title for name, title in figures.items() if name != "iterations"}
+        ),
     }
     return {title: guarded(make) for title, make in parts.items()}
-
-
-# --- curves -----------------------------------------------------------------------------------------------------------
 
 
 def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
@@ -136,9 +299,6 @@ def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
     return Curve(title, xs.tolist(), np.median(values, axis=0).tolist(), place, band)
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
-
-
 def _images(source: SweepRuns) -> Markup:
     """Return the target, and the final image of the first sensor of each combination's first finished run. All images
     have one exposure.
@@ -150,10 +310,8 @@ def _images(source: SweepRuns) -> Markup:
     if not shown:
         return Markup()
     first, more = shown[0][1], len(shown) - MOST_PICTURES
-    names = ("", "-0")  # the first of several sensors has the suffix -0
-    suffix = next((end for end in names if (first.path / "images" / f"target{end}.exr").exists()), "")
+    suffix, exposure = next(iter(shown_exposures(first.manifest.get("views")).items()))
     target = load_image(first.path / "images" / f"target{suffix}.exr")
-    exposure = shown_exposures(first.manifest.get("views")).get(suffix) or exposure_for(target)
     pictures = [] if target is None else [show(target * exposure, "target", lay_out("titled", "target", ""))]
     for combination, run in shown[:MOST_PICTURES]:
         image, loss = load_image(run.path / "images" / f"final{suffix}.exr"), run.results.get("image_loss") or {}

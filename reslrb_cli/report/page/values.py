@@ -1,10 +1,8 @@
-"""Parameters on the page as numbers, swatches and pictures, and curves of loss and errors of one or several runs."""
+"""Parameters on the page as numbers, swatches and pictures, and curves of loss and errors."""
 
 from __future__ import annotations
 
-import math
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,7 @@ from reslrb_cli.records.images import finite_range, in_range, read_mask, read_pa
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
-from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve, points_together
+from reslrb_cli.report.plots import COLORS, Curve, points_together
 from reslrb_cli.report.run_summary import MOMENTS, is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import ShownRun
 from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
@@ -37,10 +35,9 @@ def is_color(key: str, quantity: str) -> bool:
     return quantity not in PLACES and not any(part in NO_COLORS for part in key.split(".")[-2:])
 
 
-def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = False) -> Markup:
-    """Return a table with each parameter's value and error at start and end, and its true value if known.
-
-    `notes` adds a remark on how errors are computed.
+def parameter_table(results: Mapping[str, Any], end: str) -> Markup:
+    """Return a table with each parameter's value and error at start and end, and its true value if known. `end` is the
+    title of the column of final values.
     """
     parameters = results.get("parameters") or {}
     has_truth = any(about.get("true") for about in parameters.values())
@@ -57,7 +54,7 @@ def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = 
         for name, about in parameters.items()
     ]  # fmt: skip
     moments = {"initial": "start", "final": end} | ({"true": "true"} if has_truth else {})
-    noted = notes and bool(results.get("parameter_rmse"))
+    noted = bool(results.get("parameter_rmse"))
     return lay_out("run.parameters", rows, moments, list(errors), noted, relative)
 
 
@@ -125,8 +122,6 @@ def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
 #: Maximum number of curves in a diagram of one run, for the parameters with the largest final errors.
 MOST_CURVES = len(COLORS)
 
-#: Maximum number of parameters of several runs with their own diagrams.
-MOST_SHARED = 6
 ABSCISSAE = (("iteration", "iteration"), ("elapsed_s", "time in steps and updates (s)"))
 Figures = list[float | None]
 
@@ -144,67 +139,26 @@ def convergence(run: ShownRun) -> Markup:
     names = sorted(known, key=lambda name: -known[name])
     drawn = names[:MOST_CURVES]
     what = "relative error" if relative else "RMSE"
-    curves = _both("loss", [(run, "loss", 0, run.column("loss"))])
-    curves += _both(f"{what} by parameter", [(run, name, k, errors[name]) for k, name in enumerate(drawn)])
+    curves = _both(run, "loss", {"loss": run.column("loss")})
+    curves += _both(run, f"{what} by parameter", {name: errors[name] for name in drawn})
     curves += lay_out("legend", drawn)
-    more, words = len(names) - len(drawn), f"The {MOST_CURVES} parameters that are the farthest off at the end; "
-    return curves + soft(f"{words}{more} more are not drawn." if more else "") + _thinning([run])
+    more, together = len(names) - len(drawn), points_together(len(run.records))
+    words = f"The {MOST_CURVES} parameters that are the farthest off at the end; {more} more are not drawn."
+    return curves + soft(words if more else "") + soft(
+        f"Each point is the mean of {together} iterations." if together > 1 else "")  # fmt: skip
 
 
-def convergence_of_all(runs: Sequence[ShownRun]) -> Markup:
-    """Return diagrams of the loss and the error of several runs. Add one diagram for each parameter that several runs
-    share.
-    """
-    begun = [(place, run) for place, run in enumerate(runs) if run.records]
-    if not begun:
-        return lay_out("paragraph", "No iteration was completed.")
-    parts = lay_out("legend", [run.name if run.records else "" for run in runs])
-    parts += _both("loss", [(run, run.name, place, run.column("loss")) for place, run in begun])
-    if any(units_differ(run.results) for run in runs):
-        totals, label = [_total_relative(run) for _, run in begun], "relative error"
-    else:
-        totals, label = [run.column("parameter_rmse") for _, run in begun], "parameter RMSE"
-    curves = [(run, run.name, place, total) for (place, run), total in zip(begun, totals, strict=True)]
-    parts += _both(f"{label}, all parameters", curves)
-    counts = Counter(name for _, run in begun for name in run.records[-1]["parameter_errors"])
-    shared = [name for name, count in counts.items() if count > 1] if len(counts) > 1 else []
-    for name in shared[:MOST_SHARED]:
-        drawn = _both("RMSE", [(run, run.name, place, _errors(run, name, None)) for place, run in begun])
-        parts += lay_out("heading", key(name)) + drawn if drawn else drawn
-    if len(shared) > MOST_SHARED:
-        parts += soft(f"{len(shared) - MOST_SHARED} more parameters that several runs have are not drawn.")
-    missing = [run.name for run in runs if not run.records]
-    parts += soft(f"No iteration was completed by: {', '.join(missing)}." if missing else "")
-    return parts + _thinning(runs)
-
-
-def _both(label: str, curves: Sequence[tuple[ShownRun, str, int, Figures]]) -> Markup:
+def _both(run: ShownRun, label: str, curves: Mapping[str, Figures]) -> Markup:
     """Return the same curves in two diagrams side by side, over iterations and over time."""
     drawn = [
-        ("", diagram([Curve(title, run.column(name), ys, k) for run, title, k, ys in curves], caption, label))
+        ("", diagram([Curve(title, run.column(name), ys, k) for k, (title, ys) in enumerate(curves.items())],
+                     caption, label))
         for name, caption in ABSCISSAE
-    ]
+    ]  # fmt: skip
     return lay_out("diagrams", drawn)
-
-
-def _thinning(runs: Sequence[ShownRun]) -> Markup:
-    most = max((points_together(len(run.records)) for run in runs), default=1)
-    if most <= 1:
-        return Markup()
-    if len(runs) == 1:
-        return soft(f"Each point is the mean of {most} iterations.")
-    return soft(f"Of runs with more than {MOST_POINTS} iterations each point is the mean of some, at most {most}.")
 
 
 def _errors(run: ShownRun, name: str, scale: float | None) -> Figures:
     """Return the errors of one parameter, divided by `scale` if given."""
     errors = [record["parameter_errors"].get(name) for record in run.records]
     return [None if error is None else error / (scale or 1.0) for error in errors]
-
-
-def _total_relative(run: ShownRun) -> Figures:
-    """Return the root mean square of the relative errors of all parameters."""
-    curves = [_errors(run, name, scale) for name, scale in run.scales.items() if scale]
-    known = [[error for error in errors if error is not None] for errors in zip(*curves, strict=True)]
-    return [math.sqrt(sum(error**2 for error in errors) / len(errors)) if errors else None for errors in known] or (
-        [None] * len(run.records))  # fmt: skip

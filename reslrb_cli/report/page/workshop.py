@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from reslrb_cli.lens.workshop import shown_ssim
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import document, lay_out
@@ -76,6 +75,14 @@ def parts(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> dict[str
         ),
         "Deviations": lay_out("gallery", [each for each in off if each]) + lay_out("workshop.deviations", found),
     }  # fmt: skip
+
+
+def shown_ssim(entry: Mapping[str, Any]) -> float:
+    """Return the SSIM that the sheet shows. The SSIM refers to the original picture if that picture is known, otherwise
+    to the target.
+    """
+    value = entry.get("ssim_of_picture")
+    return float(entry["ssim"] if value is None else value)
 
 
 def _picture(name: str, caption: str, pictures: Mapping[str, Array]) -> Any:
