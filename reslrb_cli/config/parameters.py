@@ -346,10 +346,10 @@ class ParameterSpec(Section):
     resolution: Annotated[Size, few("texels")] | None = None
     """[width, height] in texels. The texture is resampled to this size before the start. null: it keeps its size."""
     precondition: Annotated[float, Field(gt=0, le=10)] | None = None
-    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021), for textures, heightmaps and mesh vertices: a
-    length l, as a fraction of the longer side. The optimizer moves v, and the parameter is (1 - l² Δ)⁻¹ v. Details
-    smaller than l move less in a step: with gradient descent, by the fourth power of their size divided by l. The
-    effect does not depend on the resolution. null: off."""
+    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021), for textures and heightmaps: a length l, as a
+    fraction of the longer side. The optimizer moves v, and the parameter is (1 - l² Δ)⁻¹ v. Details smaller than l move
+    less in a step: with gradient descent, by the fourth power of their size divided by l. The effect does not depend on
+    the resolution. null: off."""
     regularizers: list[AnyRegularizer] = Field(default=[], max_length=16)
     """Costs of the value itself. They are integrals over its surface, added to the loss once per step and recorded
     separately. Lengths are in scene units, and for a bitmap in units of its texture coordinates. The integrals hardly

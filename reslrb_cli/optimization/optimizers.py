@@ -8,8 +8,16 @@ Transforms (`Transform`, `Variable`): the optimiser moves an unconstrained varia
     softplus  x = log(1 + exp(u))                        positive; relative well below 1, absolute well above
 
 By the chain rule, dL/du = dL/dx T'(u). The factor T'(u) is applied to the accumulated gradient, so the kernels of a
-step do not depend on the factor. T is increasing in each entry. The smoother S (`precondition`) acts before the
-transform T: x = T(S v).
+step do not depend on the factor. T is increasing in each entry.
+
+Smooth steps (`precondition`, `Smoother`) move v instead of u: x = T(S v).
+
+    S = (1 - l^2 Δ)^-1,   dL/dv = S dL/du                Nicolet, Jacobson and Jakob 2021 ("large steps"), eq. 9 to 12
+
+S is symmetric, and a step of gradient descent is S^2 dL/du. A step therefore moves details finer than l by a smaller
+amount. The reduction factor is the fourth power of the ratio of the detail's size to l. Refracting surfaces need this.
+The light from refracting surfaces depends on the surface's second derivatives. The curvature of a loss therefore grows
+with the fourth power of the spatial frequency. Without S, the map's finest ripple limits the step.
 
 Updates (`Optimizer`): each parameter has its own optimiser. A parameter whose gradient is not finite can therefore keep
 its moments and its number of steps.
@@ -30,9 +38,10 @@ from typing import Any
 import drjit as dr
 import drjit.opt as dropt
 import numpy as np
+import scipy.fft
 
 from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
-from reslrb_cli.optimization.precondition import Smoother
+from reslrb_cli.statistics import Array
 
 Bounds = tuple[float, float] | None
 
@@ -90,6 +99,36 @@ def _inverse_softplus(x: Any) -> Any:
     return x + dr.log(2 * dr.sinh(half)) - half
 
 
+class Smoother:
+    """Smoothing operator S for textures and heightmaps of the shape (height, width, channels) with at least two texels.
+
+    `length` is l, as a fraction of the longer side, so the effect does not depend on the resolution. Δ is a sum of
+    differences of neighbours without flow through the edges, so the cosine transform diagonalises S. `gain` is the mean
+    of the diagonal of S^2, which is each entry's response to a gradient of the entry alone.
+    """
+
+    def __init__(self, shape: tuple[int, ...], length: float) -> None:
+        texels = length * max(shape[:2])  # l in texels, which are square
+        along = [2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in shape[:2]]
+        self._shape = shape
+        self._eigenvalues = 1 + texels**2 * (along[0][:, None] + along[1])[:, :, None]
+        self.gain = float(np.mean(self._eigenvalues**-2.0))
+
+    def smooth(self, value: Any) -> Any:
+        """Return S `value`, evaluated. S is symmetric, so S also turns the gradient by S v into the gradient by v."""
+        return self._scaled(value, 1 / self._eigenvalues)
+
+    def roughen(self, value: Any) -> Any:
+        """Return the inverse of `smooth`."""
+        return self._scaled(value, self._eigenvalues)
+
+    def _scaled(self, value: Any, factors: Array) -> Any:
+        array = np.array(dr.detach(value), dtype=np.float64)
+        spectrum = scipy.fft.dctn(array.reshape(self._shape), axes=(0, 1), norm="ortho")
+        result = np.asarray(scipy.fft.idctn(spectrum * factors, axes=(0, 1), norm="ortho"))
+        return type(value)(result.reshape(array.shape).astype(np.float32))
+
+
 @dataclass
 class Variable:
     """Variable v of the optimiser for a parameter x: x = T(length * S v), with x within its bounds.
@@ -135,7 +174,7 @@ class Variable:
         result = gradient * _opaque(v, self.length) * _opaque(v, self.gain)
         if self.transform is not None:
             result = result * self.transform.derivative(self._u(v))
-        return result if self.smoother is None else self.smoother.adjoint(result)
+        return result if self.smoother is None else self.smoother.smooth(result)
 
     def _u(self, v: Any) -> Any:
         u = v * _opaque(v, self.length)

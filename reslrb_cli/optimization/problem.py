@@ -17,8 +17,7 @@ from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
-from reslrb_cli.optimization.optimizers import Optimizer, make_transform
-from reslrb_cli.optimization.precondition import make_smoother
+from reslrb_cli.optimization.optimizers import Optimizer, Smoother, make_transform
 from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.decisions import Decision
@@ -245,7 +244,7 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
         bounds={key: spec.bounds for key, spec in specs.items()},
         transforms={key: make_transform(spec.transform, spec.bounds) for key, spec in specs.items()},
         smoothers={
-            key: make_smoother(selection.array(key), selection.faces(key), spec.smoothing)
+            key: Smoother(selection.array(key).shape, spec.smoothing)
             for key, spec in specs.items()
             if spec.smoothing is not None
         },

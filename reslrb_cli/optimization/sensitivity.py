@@ -100,15 +100,6 @@ AIM, LEAST, MOST = 0.03, 0.003, 0.3
 TRIALS = 8
 #: Gradient samples of a run.
 SAMPLES = 4
-#: The optimiser's variable in place of a parameter x, by transform.
-_MOVED = {
-    "none": "",
-    "log": " in its logarithm",
-    "sigmoid": " in its logit between the bounds",
-    "softplus": " in log(exp(x) - 1)",
-}
-
-
 #: Quantities whose spread is measured.
 QUANTITIES = ("gradient", "change", "curvature", "length")
 
@@ -372,24 +363,9 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
     return float(distance.mean())
 
 
-def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
-    """Return a line for the user about one parameter. `transform` and `learning_rate` come from the parameter's
-    configuration.
-
-    A step is in units of the optimiser's variable. The line also has the parameter's movement in the first step.
-    """
+def scale_line(row: Scaled) -> str:
+    """Return a line for the user about the scale of one parameter."""
     if row.own_length is None:
-        lacks = "no effect on the image" if row.length is None else "no gradient"
+        lacks = "no effect on the image" if row.length is None and row.curvature is None else "no gradient"
         return f"{row.key} has {lacks} at its start; it is not scaled"
-    first = f"about {row.first_step or 0.0:.3g}"
-    if transform == "log":
-        first = f"a factor of {math.exp(min(row.own_length * learning_rate, 700.0)):.3g}, up or down"
-    steps = f"{row.own_length:.3g} times the learning rate{_MOVED[transform]}"
-    return f"{row.key} moves in steps of {steps}, at first by {first}"
-
-
-def curvature_line(row: Scaled, learning_rate: float) -> str:
-    """Return a line for the user about one parameter with a scale from its curvature."""
-    if row.own_length is None:
-        return f"{row.key} has no effect on the image at its start; it is not scaled"
-    return f"{row.key} moves by {row.first_step or 0.0:.3g} at first, {learning_rate:g} of the largest stable step"
+    return f"{row.key} moves by about {row.first_step or 0.0:.3g} at first"
