@@ -9,6 +9,7 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.loader import check_code
@@ -18,7 +19,6 @@ from reslrb_cli.integrators.baselines import Projective
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization.autotune.sampling import settle
-from reslrb_cli.optimization.errors import quantity
 from reslrb_cli.optimization.identifiability import check_exposures, find_reached
 from reslrb_cli.optimization.loading import (
     check_integrator,
@@ -41,6 +41,35 @@ from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.parameters import Selection, select_parameters
 
 Array = np.ndarray[Any, Any]
+
+#: Parameters of emission; parameters of the same quantity have the same unit.
+_EMITTED = {
+    "AreaLight": "radiance",
+    "ConstantBackgroundEmitter": "radiance",
+    "DirectionalArea": "radiance",
+    "EnvironmentMapEmitter": "radiance",
+    "PointLight": "intensity",
+    "SpotLight": "intensity",
+    "DirectionalEmitter": "irradiance",
+    "Projector": "irradiance",
+}
+
+
+def quantity(params: Any, key: str) -> str:
+    """Return the quantity of a `mi.traverse` entry: `radiance`, `irradiance`, `intensity`, `length`, or "" without a
+    unit.
+
+    Parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`) have no unit.
+    """
+    if key.endswith((".vertex_positions", ".position")):
+        return "length"
+    node = own = params.properties[key][2]
+    while node is not None and not isinstance(node, mi.Emitter):
+        node = params.hierarchy[node][0]
+    is_factor = own is node and not key.endswith(".data") and key != "data"
+    if node is None or is_factor or ".texture." in f".{key}":
+        return ""
+    return _EMITTED.get(node.class_name(), "")
 
 
 def assemble(

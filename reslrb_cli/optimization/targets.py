@@ -15,7 +15,6 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.errors import comparison_grid
 from reslrb_cli.optimization.loading import (
     are_upright,
     check_integrator,
@@ -30,6 +29,7 @@ from reslrb_cli.records.images import luminance
 from reslrb_cli.scene.images import Photo, read_photo, turned_line
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
+from reslrb_cli.scene.values import resample
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
 
 #: The seed of rendered targets.
@@ -209,16 +209,17 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
 
 
 def _truth(problem: Problem, true_values: Selection, say: Callable[[str], None]) -> dict[str, Array]:
-    """Return the parameters' true values."""
+    """Return the parameters' true values, with textures in the resolution of the parameters."""
     truth: dict[str, Array] = {}
     for key in problem.selection.keys:
+        shape = problem.selection.array(key).shape
         if key in problem.selection.factors:  # the target is an image of the scene itself
-            truth[key] = np.ones_like(problem.selection.array(key))
+            truth[key] = np.ones(shape, np.float32)
             continue
         truth[key] = true_values.array(key)
-        grid = comparison_grid(problem.selection.array(key).shape, truth[key].shape)
-        if grid is not None:
-            say(f"{key} and its true value have different resolutions: compared at {grid[1]}x{grid[0]}")
+        if len(shape) == 3 and truth[key].shape[:2] != shape[:2]:
+            say(f"the true value of {key} is resampled to its resolution, {shape[1]}x{shape[0]}")
+            truth[key] = resample(truth[key], (shape[1], shape[0]))
     return truth
 
 
