@@ -30,7 +30,7 @@ from reslrb_cli.optimization.loading import (
     paths_of,
     samples_per_pass,
 )
-from reslrb_cli.optimization.memory import check_announced, check_described, check_films, check_step, plans
+from reslrb_cli.optimization.memory import check_described, check_films, check_step, plans
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
@@ -38,7 +38,7 @@ from reslrb_cli.optimization.views import expose, make_views
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.deformation import where_moved
-from reslrb_cli.scene.parameters import Selection, select_parameters
+from reslrb_cli.scene.parameters import select_parameters
 
 Array = np.ndarray[Any, Any]
 
@@ -164,10 +164,8 @@ def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
 def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:
     """Load and check the experiment of `config` without its targets.
 
-    `scene` replaces `scene.file`, and `values` replace the initial values of the parameters. Raises ValueError unless
-    `values` has one finite array of the right shape for each parameter.
+    `scene` replaces `scene.file`, and `values` replace the initial values of the parameters.
     """
-    check_announced(config)
     scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
     views = make_views(config, scene)
     check_films(config, scene, [view.sensor for view in views])
@@ -178,7 +176,6 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     paths = paths_of(config.integrator, scene, sensors, moves)
     expose(views, scene, selection)
     if values is not None:
-        _check_values(selection, values)
         selection.set_arrays(values)
     motions = selection.deformation.quantities
     problem = Problem(
@@ -233,15 +230,3 @@ def _check_moving(problem: Problem) -> None:
             reason = f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a "
             reason += "pixel; use a smooth filter, such as gaussian, for derivatives of moving light"
             raise ConfigError(config.source, "scene.file", reason)
-
-
-def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
-    foreign = sorted(set(values) ^ set(selection.keys))
-    if foreign:
-        raise ValueError(f"it {'has' if foreign[0] in values else 'lacks'} `{foreign[0]}`")
-    for key, value in values.items():
-        shape = selection.array(key).shape
-        if value.shape != shape or value.dtype.kind != "f":
-            raise ValueError(f"`{key}` is {value.dtype} of shape {value.shape}, not numbers of shape {shape}")
-        if not np.isfinite(value).all():
-            raise ValueError(f"`{key}` has a value that is not finite")

@@ -1,7 +1,7 @@
 """Limits of a run's memory: films, textures and steps that need more memory than is free are refused.
 
-Sizes in the configuration and the scene file are checked before anything is built (`check_announced`,
-`check_described`). Films and textures of a hundred million entries would take a minute to make. The memory estimates
+Sizes in the configuration and the scene file are checked before anything is built (`check_described`). Films and
+textures of a hundred million entries would take a minute to make. The memory estimates
 are lower bounds, so the checks refuse nothing that fits into the machine's memory.
 """
 
@@ -109,17 +109,9 @@ def allocated(size: int) -> int:
 # --- checks of memory -------------------------------------------------------------------------------------------------
 
 
-def check_announced(config: Config) -> None:
-    """Raise ConfigError if the configured film or a configured parameter needs more memory than is free."""
-    if config.scene.size is not None:
-        _check_film(config, "scene.size", config.scene.size)
-    for key, size in _textures(config).items():
-        _check_size(config, key, f"{size[0]}x{size[1]} texels", size, ENTRY_BYTES)
-
-
 def check_described(config: Config, description: Description) -> None:
-    """Raise ConfigError if the scene's film is too large for the sample count of a step. Also raise ConfigError if a
-    step needs more than the free memory.
+    """Raise ConfigError if the scene's film has too many samples for a step. Also raise ConfigError if a step needs
+    more than the free memory.
 
     The check uses the scene's smallest film, because the sensors of the run are not known yet. Large steps that fit are
     logged.
@@ -128,8 +120,6 @@ def check_described(config: Config, description: Description) -> None:
     if film is None or not film.cropped:
         return  # without a size in the file, Mitsuba's own film is used, which is small
     key = "scene.file" if config.scene.size is None else "scene.size"
-    is_whole = film.cropped == film.width * film.height
-    _check_film(config, key, (film.width, film.height) if is_whole else (film.cropped, 1))
     _check_samples(config, film.width * film.height)
     textures, pixels = _textures(config), film.cropped * PIXEL_BYTES
     texels = {name: width * height * ENTRY_BYTES for name, (width, height) in textures.items()}
@@ -165,29 +155,9 @@ def _textures(config: Config) -> dict[str, tuple[int, int]]:
 
 
 def check_films(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> None:
-    """Raise ConfigError if a film is too large, or has too many samples for a step."""
-    for index, pixels in zip(sensors, pixels_of(scene, sensors), strict=True):
-        width, height = (int(n) for n in scene.sensors()[index].film().crop_size())
-        _check_film(config, "scene.file", (width, height))
+    """Raise ConfigError if a film has too many samples for a step."""
+    for pixels in pixels_of(scene, sensors):
         _check_samples(config, pixels)
-
-
-def _check_film(config: Config, key: str, size: tuple[int, int]) -> None:
-    """Raise ConfigError at `key` if the images of a film of this (width, height) need more memory than is free."""
-    _check_size(config, key, f"a film of {size[0]}x{size[1]} pixels", size, PIXEL_BYTES)
-
-
-def _check_size(config: Config, key: str, what: str, size: tuple[int, int], each: int) -> None:
-    """Raise ConfigError at `key` if an array of (width, height) entries of `each` bytes needs more memory than is free.
-
-    The error names the largest size with the same aspect ratio that fits.
-    """
-    needed = size[0] * size[1] * each
-    free = free_for(needed)
-    if needed > free:
-        fits = "x".join(str(max(int(n * (free / needed) ** 0.5), 1)) for n in size)
-        reason = f"{what} takes at least {in_words(needed)}, and {in_words(free)} are free; use at most {fits}"
-        raise ConfigError(config.source, key, reason)
 
 
 def _check_samples(config: Config, pixels: int) -> None:

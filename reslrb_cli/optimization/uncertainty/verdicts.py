@@ -203,8 +203,8 @@ def judge_together(
         if direction.entry is not None:
             noise[place] = own.noise[direction.entry]
             free[place] = not own.at_bound[direction.entry]
-            if own.last:
-                gradients, values = (each[:, direction.entry] for each in (own.last.gradients, own.last.values))
+            if own.last is not None:
+                gradients, values = own.last[:, 0, direction.entry], own.last[:, 1, direction.entry]
                 steps[place], pull[place] = len(own.last), gradients.mean()
                 mean[place], came[place] = own.value[direction.entry] - (values.mean(), values[0])
         free[place] = free[place] and np.any(along)
