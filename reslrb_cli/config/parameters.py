@@ -247,16 +247,6 @@ class Regularizer(Choice):
     """Factor of the integral in the objective."""
 
 
-class Curvature(Regularizer, json_schema_extra={"required": ["type", "radius"]}):
-    """Hollows of a heightmap that are too narrow for a tool: integral of max(0, k - 1/radius)². Here k is the larger
-    principal curvature. The curvature k is positive in hollows, seen from outside.
-    """
-
-    type: Literal["curvature"] = "curvature"
-    """For a heightmap: integral of max(0, k - 1/radius)². k is the larger principal curvature, positive in hollows."""
-    radius: Positive = Field(description="Radius of the ball of the tool, in scene units.")
-
-
 class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness", "least"]}):
     """A plate that is too thin: integral of max(0, least - (thickness + h))², with the heightmap h. After each step,
     heights are clamped so that the plate keeps a tenth of `least`, and its faces never cross. The run records the
@@ -289,11 +279,11 @@ class TotalVariation(Regularizer, json_schema_extra=NEEDS_TYPE):
     epsilon: Positive = Field(default=1e-3, description="Gradients well below this value have a quadratic cost.")
 
 
-AnyRegularizer = Annotated[Curvature | Thickness | TotalVariation, ByType("")]
+AnyRegularizer = Annotated[Thickness | TotalVariation, ByType("")]
 
 #: The regularizers of each kind of parameter.
 REGULARIZERS = {
-    "heightmap": ("curvature", "thickness", "total_variation"),
+    "heightmap": ("thickness", "total_variation"),
     "bitmap": ("total_variation",),
     "mesh": (),
 }
