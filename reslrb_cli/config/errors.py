@@ -71,6 +71,7 @@ REMOVED = {
     "regularizers.type: slope": "take total_variation",
     "regularizers.type: laplacian": "take total_variation, or set `precondition`",
     "regularizers.opposite": "only one face is free; the face on the other side is flat",
+    "parameters.transform: softplus": "take log, for positive values",
     "run.adjoint: others": "take auto, which does the same",
     "run.first_batch": "the first batch always gives an image alone; remove it",
     "run.memory_budget": "set integrator.samples_per_pass; `reslrb optimize --dry-run` prints the memory of a step",

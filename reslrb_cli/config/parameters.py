@@ -81,7 +81,7 @@ _NumberOrList = Annotated[
 
 _Bound = Annotated[float, Field(allow_inf_nan=True)]
 Bounds = Annotated[tuple[_Bound, _Bound], Field(strict=False)]
-TransformName = Literal["none", "sigmoid", "log", "softplus"]
+TransformName = Literal["none", "sigmoid", "log"]
 
 
 class MotionInitial(ByWord[_NumberOrList]):
@@ -328,9 +328,8 @@ class ParameterSpec(Section):
     leave a side open."""
     transform: _AnyTransform = "none"
     """Variable that the optimizer moves instead of the value x. `sigmoid`: the logit of x between its `bounds`, which x
-    never reaches. `log`: log(x), for positive values that are known to an order of magnitude at best. `softplus`:
-    log(exp(x) - 1), for positive values; acts like `log` well below 1, and like `none` well above. Learning rates are
-    in units of this variable."""
+    never reaches. `log`: log(x), for positive values that are known to an order of magnitude at best. Learning rates
+    are in units of this variable."""
     learning_rate: _AnyRate | None = None
     """Step size of this parameter, in the units of `optimizer.learning_rate`. null: `optimizer.learning_rate`."""
     resolution: Annotated[Size, few("texels")] | None = None
@@ -457,7 +456,7 @@ class ParameterSpec(Section):
             if said.transform == "sigmoid" and not (math.isfinite(low) and math.isfinite(high)):
                 has = "has none" if said.bounds is None else f"has [{low:g}, {high:g}]"
                 raise located(at("transform"), f"sigmoid maps to finite `bounds`, [low, high]; this parameter {has}")
-            if said.transform in ("log", "softplus") and high <= 0:
+            if said.transform == "log" and high <= 0:
                 reason = f"exclude positive values, but transform: {said.transform} yields only these"
                 raise located(at("bounds"), reason)
             numbers = [said.initial] if isinstance(said.initial, float) else said.initial

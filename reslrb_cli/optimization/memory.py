@@ -7,7 +7,6 @@ are lower bounds, so the checks refuse nothing that fits into the machine's memo
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 
 import drjit as dr
@@ -26,8 +25,6 @@ from reslrb_cli.scene.xml.check import film_sizes
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.transport.plan import Plan
 
-logger = logging.getLogger(__name__)
-
 #: Images of the film's size in memory during a step: block, image, parts of the loss, gradient, adjoint; also those of
 #: a batch.
 FILM_IMAGES = 12
@@ -41,9 +38,8 @@ ENTRY_BYTES = 4 * 4
 #: Minimum bytes per pixel: five images (block, image, dL/dI, its adjoint, target) of three floats.
 PIXEL_BYTES = 5 * 3 * 4
 
-#: Bytes that every machine has, and bytes of a step above which a message appears at once, because such a step takes a
-#: while.
-SMALL, MUCH = 2**28, 2**31
+#: Bytes that every machine has.
+SMALL = 2**28
 
 #: Minimum share of the estimated memory that a step takes, by `run.adjoint`: 0.93, 0.58 and 0.44 were measured.
 SURE = {"batched": 0.8, "independent": 0.5, "correlated": 0.4}
@@ -113,8 +109,7 @@ def check_described(config: Config, description: Description) -> None:
     """Raise ConfigError if the scene's film has too many samples for a step. Also raise ConfigError if a step needs
     more than the free memory.
 
-    The check uses the scene's smallest film, because the sensors of the run are not known yet. Large steps that fit are
-    logged.
+    The check uses the scene's smallest film, because the sensors of the run are not known yet.
     """
     film = min(film_sizes(description), key=lambda size: size.cropped, default=None)
     if film is None or not film.cropped:
@@ -137,9 +132,6 @@ def check_described(config: Config, description: Description) -> None:
         key = largest if texels.get(largest, 0) > pixels else key
         reason = f"{what}: a step takes at least {in_words(needed)}, and {in_words(free)} are free"
         raise ConfigError(config.source, key, f"{reason}; {COARSER}")
-    if needed > MUCH:
-        least = f"a step takes at least {in_words(needed)}, and {in_words(free)} are free"
-        logger.info(f"{what}: {least}; loading takes a while")
 
 
 def _textures(config: Config) -> dict[str, tuple[int, int]]:

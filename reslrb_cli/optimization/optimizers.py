@@ -5,7 +5,6 @@ Transforms (`Transform`, `Variable`): the optimiser moves an unconstrained varia
     none      x = u
     sigmoid   x = low + (high - low) / (1 + exp(-u))     between the bounds, which it never reaches
     log       x = exp(u)                                 positive; a step is a relative change
-    softplus  x = log(1 + exp(u))                        positive; relative well below 1, absolute well above
 
 By the chain rule, dL/du = dL/dx T'(u). The factor T'(u) is applied to the accumulated gradient, so the kernels of a
 step do not depend on the factor. T is increasing in each entry.
@@ -77,26 +76,14 @@ def make_transform(name: str, bounds: Bounds) -> Transform | None:
             low=-SIGMOID_END,
             high=SIGMOID_END,
         )
-    forward, inverse, derivative, end = {
-        "log": (dr.exp, dr.log, dr.exp, EXPONENT_END),
-        "softplus": (_softplus, _inverse_softplus, _logistic, math.inf),
-    }[name]
-    least = -EXPONENT_END if low <= 0 else max(float(inverse(low)), -EXPONENT_END)
-    return Transform(forward, inverse, derivative, least, end if math.isinf(high) else min(float(inverse(high)), end))
+    if name != "log":
+        raise KeyError(name)
+    least = -EXPONENT_END if low <= 0 else max(math.log(low), -EXPONENT_END)
+    return Transform(dr.exp, dr.log, dr.exp, least, min(math.log(high), EXPONENT_END))
 
 
 def _logistic(u: Any) -> Any:
     return 1 / (1 + dr.exp(-u))
-
-
-def _softplus(u: Any) -> Any:
-    small = dr.exp(-dr.abs(u))
-    return dr.maximum(u, 0.0) + 2 * dr.atanh(small / (2 + small))  # log(1 + s), accurate for a small s, too
-
-
-def _inverse_softplus(x: Any) -> Any:
-    half = 0.5 * dr.minimum(x, 60.0)  # above this, the logarithm of exp(x) - 1 = 2 sinh(x/2) exp(x/2) is x
-    return x + dr.log(2 * dr.sinh(half)) - half
 
 
 class Smoother:

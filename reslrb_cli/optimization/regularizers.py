@@ -58,30 +58,24 @@ def make_cost(regularizer: Regularizer, spans: Spans) -> Cost:
     """Return the cost of a map (H, W, C): `weight` times the integral. Raises TypeError for a regularizer that does not
     apply to maps.
     """
-    if isinstance(regularizer, TotalVariation):
-        function = _variation(regularizer.epsilon, spans)
-    elif isinstance(regularizer, Thickness):
-        function = _thin(regularizer.least - regularizer.thickness, spans)
-    else:
+    if not isinstance(regularizer, Thickness | TotalVariation):
         raise TypeError(f"{regularizer.type} is not a cost of a map")
-    return _weighed(function, regularizer.weight)
 
-
-def _weighed(cost: Cost, weight: float) -> Cost:
-    def weighed(value: Array) -> tuple[float, Array]:
-        total, gradient = cost(np.asarray(value, np.float64))
-        return weight * total, weight * gradient
-
-    return weighed
-
-
-def _thin(lowest: float, spans: Spans) -> Cost:
-    def cost(h: Array) -> tuple[float, Array]:
-        area = _area(spans, h.shape, 0.5)
-        lacking = np.maximum(lowest - h, 0)
-        return float(np.sum(area * lacking**2)), -area * (2 * lacking)
+    def cost(value: Array) -> tuple[float, Array]:
+        h = np.asarray(value, np.float64)
+        if isinstance(regularizer, Thickness):
+            total, gradient = _thin(h, regularizer.least - regularizer.thickness, spans)
+        else:
+            total, gradient = _variation(h, regularizer.epsilon, spans)
+        return regularizer.weight * total, regularizer.weight * gradient
 
     return cost
+
+
+def _thin(h: Array, lowest: float, spans: Spans) -> tuple[float, Array]:
+    """Return the integral of max(0, lowest - h)², and its derivative."""
+    area, lacking = _area(spans, h.shape, 0.5), np.maximum(lowest - h, 0)
+    return float(np.sum(area * lacking**2)), -area * (2 * lacking)
 
 
 def _area(spans: Spans, shape: tuple[int, ...], first: float) -> Array:
@@ -92,29 +86,27 @@ def _area(spans: Spans, shape: tuple[int, ...], first: float) -> Array:
     return np.asarray(high[:, None, None] * wide[None, :, None])
 
 
-def _variation(epsilon: float, spans: Spans) -> Cost:
-    """Return the integral of sqrt(g² + epsilon²) - epsilon, where g is the gradient's norm over all channels."""
-
-    def cost(h: Array) -> tuple[float, Array]:
-        dx, dy = spans[0].pitch(h.shape[1]), spans[1].pitch(h.shape[0])
-        area, total, gradient = _area(spans, h.shape, 1.0) / 4, 0.0, np.zeros_like(h)
-        across, along = np.diff(h, axis=1) / dx, np.diff(h, axis=0) / dy
-        for row in (0, 1):
-            for column in (0, 1):
-                rows, columns = slice(row, row + len(along)), slice(column, column + across.shape[1])
-                gx, gy = across[rows], along[:, columns]
-                norm = np.sqrt(np.sum(gx**2 + gy**2, axis=2, keepdims=True))
-                root = np.sqrt(norm**2 + epsilon**2)
-                total += float(np.sum(area * (norm**2 / (root + epsilon))))
-                share = area * (norm / root) / np.maximum(norm, 1e-300)
-                back_x, back_y = share * gx / dx, share * gy / dy
-                gradient[rows, 1:] += back_x
-                gradient[rows, :-1] -= back_x
-                gradient[1:, columns] += back_y
-                gradient[:-1, columns] -= back_y
-        return total, gradient
-
-    return cost
+def _variation(h: Array, epsilon: float, spans: Spans) -> tuple[float, Array]:
+    """Return the integral of sqrt(g² + epsilon²) - epsilon, where g is the gradient's norm over all channels. Also
+    return its derivative.
+    """
+    dx, dy = spans[0].pitch(h.shape[1]), spans[1].pitch(h.shape[0])
+    area, total, gradient = _area(spans, h.shape, 1.0) / 4, 0.0, np.zeros_like(h)
+    across, along = np.diff(h, axis=1) / dx, np.diff(h, axis=0) / dy
+    for row in (0, 1):
+        for column in (0, 1):
+            rows, columns = slice(row, row + len(along)), slice(column, column + across.shape[1])
+            gx, gy = across[rows], along[:, columns]
+            norm = np.sqrt(np.sum(gx**2 + gy**2, axis=2, keepdims=True))
+            root = np.sqrt(norm**2 + epsilon**2)
+            total += float(np.sum(area * (norm**2 / (root + epsilon))))
+            share = area * (norm / root) / np.maximum(norm, 1e-300)
+            back_x, back_y = share * gx / dx, share * gy / dy
+            gradient[rows, 1:] += back_x
+            gradient[rows, :-1] -= back_x
+            gradient[1:, columns] += back_y
+            gradient[:-1, columns] -= back_y
+    return total, gradient
 
 
 def spans_of(positions: Array, texcoords: Array) -> Spans:

@@ -7,14 +7,12 @@ first step, for all entries of one parameter x. I(x) is the image at common rand
 
     D = I(x + h z) - I(x)
     change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
-    curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
 
-`change` is the relative change of the image per unit of the parameter. `curvature` is the Gauss-Newton curvature. D is
-scaled up so that single precision resolves the differences. `length` is the change of the parameter that would explain
-the image or the target. A least-squares fit over the pixels that the parameter affects gives the change. For a scene's
-only light, `length` is the light's intensity. For a wall, `length` is the albedo, regardless of the wall's share of the
-picture. h is chosen so that the image changes by about 3 %. With an image change of about 3 %, neither rounding nor
-curvature dominates the differences.
+`change` is the relative change of the image per unit of the parameter. `length` is the change of the parameter that
+would explain the image or the target. A least-squares fit over the pixels that the parameter affects gives the change.
+For a scene's only light, `length` is the light's intensity. For a wall, `length` is the albedo, regardless of the
+wall's share of the picture. h is chosen so that the image changes by about 3 %. With an image change of about 3 %,
+neither rounding nor curvature dominates the differences.
 
 `rescale` measures units so that all parameters can use one learning rate. Step lengths from `Sensitivity.length` make
 all parameters move equally fast. Gradients are divided by the root mean square of a gradient sample, so Adam's absolute
@@ -39,7 +37,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators.protocol import first_channels
@@ -101,7 +98,7 @@ TRIALS = 8
 #: Gradient samples of a run.
 SAMPLES = 4
 #: Quantities whose spread is measured.
-QUANTITIES = ("gradient", "change", "curvature", "length")
+QUANTITIES = ("gradient", "change", "length")
 
 
 @dataclass(frozen=True)
@@ -118,9 +115,6 @@ class Conditioning:
     def spread(self, quantity: str) -> float | None:
         """Return the ratio of the largest to the smallest value of `quantity`, which is one of QUANTITIES. Returns None
         for fewer than two positive values.
-
-        For `curvature`, the result is the condition number of the Gauss-Newton matrix's diagonal, with one entry per
-        parameter.
         """
         values = [getattr(row, quantity) for row in self.rows]
         positive = [value for value in values if value is not None and value > 0]
@@ -199,25 +193,12 @@ def _probe(
         row = replace(
             row,
             change=math.sqrt(squares) / (step * norm),
-            curvature=_second_difference(problem, base, difference, MOST / share) * (share / (MOST * step)) ** 2,
             length=min(step / share, high - low),
         )
         if LEAST <= share <= MOST or (share < LEAST and step == 0.5 * (high - low)):
             break
         step *= AIM / share
     return row
-
-
-def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
-    """Return L(I + D) - 2 L(I) + L(I - D), summed over the views. Each view is weighted by its share of the loss. D is
-    `factor` times the difference.
-    """
-    total = 0.0
-    for image, change, view in zip(base, difference, problem.trained, strict=True):
-        for side, times in ((1, 1), (0, -2), (-1, 1)):
-            at = mi.TensorXf((image + side * factor * change).astype(np.float32))
-            total += times * float(view.judge(at)[0]) * view.share
-    return total
 
 
 def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose: str = _PURPOSE) -> list[Array]:
@@ -366,6 +347,6 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
 def scale_line(row: Scaled) -> str:
     """Return a line for the user about the scale of one parameter."""
     if row.own_length is None:
-        lacks = "no effect on the image" if row.length is None and row.curvature is None else "no gradient"
+        lacks = "no effect on the image" if row.length is None else "no gradient"
         return f"{row.key} has {lacks} at its start; it is not scaled"
     return f"{row.key} moves by about {row.first_step or 0.0:.3g} at first"

@@ -136,7 +136,7 @@ class Sensitivity(Jsonable):
 
     `value`, `gradient` and `noise` are root mean squares over the entries. `gradient` is 0 if it cannot be
     distinguished from noise, and `noise` is the standard deviation of one step's gradient. `change` is relative, per
-    unit. `change`, `curvature` (loss per unit²) and `length` are None if the image did not change.
+    unit. `change` and `length` are None if the image did not change.
     """
 
     key: str
@@ -145,7 +145,6 @@ class Sensitivity(Jsonable):
     gradient: float
     noise: float
     change: float | None = None
-    curvature: float | None = None
     length: float | None = None
 
 
@@ -154,8 +153,10 @@ class Scaled(Sensitivity):
     """Sensitivity of a parameter, and the resulting scale.
 
     `own_length` is `length` in the optimiser's variable. `first_step` is how far one learning rate initially moves the
-    value, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled.
+    value, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled. `curvature` is
+    that of the loss in the optimiser's variable, for `scale: curvature`.
     """
 
     own_length: float | None = None
     first_step: float | None = None
+    curvature: float | None = None

@@ -191,13 +191,11 @@ TRANSFORMS = [
     ("sigmoid", (-2.0, 6.0), [-1.99, 0.1, 2.0, 5.5]),
     ("log", None, [1e-12, 1e-6, 0.5, 3.0, 1e7]),
     ("log", (0.01, 1e3), [0.011, 1.0, 900.0]),
-    ("softplus", None, [1e-12, 1e-3, 0.4, 7.0, 100.0, 1e6]),
 ]
 #: The same functions in double precision.
 REFERENCE = {
     "sigmoid": lambda u, low, high: low + (high - low) / (1 + np.exp(-u)),
     "log": lambda u, low, high: np.exp(u),
-    "softplus": lambda u, low, high: np.logaddexp(0, u),
 }
 
 
@@ -243,9 +241,7 @@ def test_without_a_transform_a_variable_is_a_unit(length):
     [
         ("sigmoid", (0.2, 0.9), 0.2, 0.9),
         ("log", (0.05, 2.0), 0.05, 2.0),
-        ("softplus", (0.05, 2.0), 0.05, 2.0),
         ("log", (-1.0, np.inf), 1e-36, 1e36),
-        ("softplus", None, 1e-36, 1e36),
     ],
 )
 def test_values_reach_the_bounds_and_return(name, bounds, low, high):
@@ -267,9 +263,8 @@ def adam_in_u(name, bounds, target, steps, rate):
     transform = {
         "sigmoid": lambda u: (1 / (1 + np.exp(-u)), np.exp(-u) / (1 + np.exp(-u)) ** 2),
         "log": lambda u: (np.exp(u), np.exp(u)),
-        "softplus": lambda u: (np.logaddexp(0, u), 1 / (1 + np.exp(-u))),
     }[name]
-    u = {"sigmoid": 0.0, "log": np.log(0.5), "softplus": np.log(np.expm1(0.5))}[name]
+    u = {"sigmoid": 0.0, "log": np.log(0.5)}[name]
     m = v = 0.0
     for t in range(1, steps + 1):
         x, slope = transform(u)
@@ -279,7 +274,7 @@ def adam_in_u(name, bounds, target, steps, rate):
     return transform(u)[0]
 
 
-@pytest.mark.parametrize("name", ["sigmoid", "log", "softplus"])
+@pytest.mark.parametrize("name", ["sigmoid", "log"])
 @pytest.mark.parametrize("kind", ["texture", "colour", "number"])
 def test_the_optimiser_moves_the_variable(name, kind):
     value = {
@@ -323,16 +318,16 @@ def test_a_skipped_transformed_parameter_keeps_value_and_state(type):
     np.testing.assert_array_equal(np.array(one["p"]), np.array(other["p"]))
 
 
-def test_an_overflowing_update_of_a_transformed_parameter_is_undone():
-    optimizer = Optimizer("sgd", 1e30, {}, {"p": numbers([1.0])}, {"p": None}, {"p": None},
-                          {"p": make_transform("softplus", None)})  # fmt: skip
+def test_an_overflowing_update_of_a_parameter_in_other_units_is_undone():
+    optimizer = Optimizer("sgd", 1e30, {}, {"p": numbers([1.0])}, {"p": None}, {"p": None})
+    optimizer.set_variable("p", Variable(None, None, length=2.0))
     dr.backward(dr.sum(optimizer["p"] * -3e30, axis=None))
     assert optimizer.step(1.0) == {"p": 1}
     np.testing.assert_array_equal(np.array(optimizer["p"]), [1.0])
     dr.backward(dr.sum(optimizer["p"] * 1e-30, axis=None))
     assert optimizer.step(1.0) == {}
-    # The start is v = log(e - 1) with T' = 1 - 1/e. Only the second gradient acts
-    np.testing.assert_allclose(np.array(optimizer["p"]), np.logaddexp(0, np.log(np.e - 1) - (1 - 1 / np.e)), rtol=1e-5)
+    # The start is v = 1/2, with dL/dv = 2e-30. Only the second gradient acts
+    np.testing.assert_allclose(np.array(optimizer["p"]), 2 * (0.5 - 2), rtol=1e-5)
 
 
 def test_the_state_holds_the_variable():

@@ -206,16 +206,13 @@ class Certainty:
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
     def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:
-        """Return the certainty with three additions: the distance moved, the possible distance, and the visible
-        share.
-        """
+        """Return the certainty with the distance moved, the possible distance, and the learning rate."""
         optimizer = self.problem.optimizer
         step = optimizer.first_step(key)
         reach = None if step is None else step * float(sum(own.rates))
         kept = own.touched & (True if own.seen is None else own.seen)
         moved = rms((own.value - self._initial[key])[kept]) if kept.any() else 0.0
-        seen = None if own.seen is None else float(own.seen.mean())
-        return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key), seen=seen)
+        return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key))
 
     def scale(self, key: str) -> float:
         """Return a parameter's scale, in the parameter's unit.

@@ -122,8 +122,7 @@ class ParameterCertainty:
 
     `moved` is the root mean square movement since the start, over the visible entries with a gradient. `reach` is the
     distance that all steps cover in one direction. `reach` is None if the step length depends on the gradient (`sgd`).
-    `rate` is the learning rate. `seen` is the share of a texture's texels that some view shows, or None for other
-    parameters.
+    `rate` is the learning rate.
     """
 
     verdict: str
@@ -135,7 +134,6 @@ class ParameterCertainty:
     moved: float | None = None
     reach: float | None = None
     rate: float | None = None
-    seen: float | None = None
 
 
 @dataclass(frozen=True)
