@@ -66,7 +66,8 @@ class Forecast:
     `iteration_s` is the time of one step, `start_s` the additional time of the first steps with cached kernels, and
     `compile_s` the current time for compiling. `peak` is the memory of the iterations in bytes, and `free` the free
     memory. The fields `before_s`, `measuring_s`, `target_s`, `images_s` and `verdicts_s` are seconds outside the
-    iterations. `kept` is true if a run finds the decisions in the cache. They took `measuring_s` now.
+    iterations. The decisions took `measuring_s` now, and a run finds them in the
+    cache.
     """
 
     iteration_s: float
@@ -77,7 +78,6 @@ class Forecast:
     iterations: int
     before_s: float
     measuring_s: float
-    kept: bool
     target_s: float
     images_s: float
     verdicts_s: float
@@ -90,8 +90,7 @@ class Forecast:
     @property
     def whole_s(self) -> float:
         """Seconds of the whole run, with the current caches of kernels and decisions."""
-        again = 0.0 if self.kept else self.measuring_s
-        return self.elapsed_s + self.before_s + again + self.target_s + self.images_s + self.verdicts_s
+        return self.elapsed_s + self.before_s + self.target_s + self.images_s + self.verdicts_s
 
 
 def make_forecast(
@@ -128,7 +127,6 @@ def make_forecast(
         iterations=iterations,
         before_s=before_s,
         measuring_s=problem.measured_s,
-        kept=cache is not None and cache.keeps,
         target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
         images_s=image_s * 2 * saved_spp(problem) * views,
         verdicts_s=VERDICTS * iteration_s if has_verdicts else 0.0,

@@ -40,7 +40,7 @@ import numpy as np
 import scipy.fft
 
 from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
-from reslrb_cli.statistics import Array
+from reslrb_cli.statistics import Array, rms
 
 Bounds = tuple[float, float] | None
 
@@ -162,6 +162,14 @@ class Variable:
         if self.transform is not None:
             result = result * self.transform.derivative(self._u(v))
         return result if self.smoother is None else self.smoother.smooth(result)
+
+    def reach(self, v: Any, rate: float) -> float:
+        """Return the root mean square change of x if v moves by `rate`. For each entry, the larger of the upward and
+        downward movements counts.
+        """
+        value = self.to_scene(v)
+        up, down = (dr.abs(self.to_scene(v + side * rate) - value) for side in (1, -1))
+        return rms(np.array(dr.maximum(up, down)))
 
     def _u(self, v: Any) -> Any:
         u = v * _opaque(v, self.length)
@@ -328,18 +336,13 @@ class Optimizer:
 
     def first_step(self, key: str) -> float | None:
         """Return the root mean square change of the scene's current value in one step at the parameter's learning rate.
-
-        For each entry, the larger of the upward and downward movements counts. Returns None if the step length depends
-        on the gradient.
+        Return None if the step length depends on the gradient.
         """
         if isinstance(self._own[key], dropt.SGD):
             return None
         if key not in self._variables:
             return self._rates[key]
-        variable, moved = self._variables[key], dr.detach(self._own[key][key])
-        value = variable.to_scene(moved)
-        ways = [np.array(variable.to_scene(moved + side * self._rates[key]) - value) for side in (1, -1)]
-        return float(np.sqrt(np.mean(np.square(np.maximum(*map(np.abs, ways)), dtype=np.float64))))
+        return self._variables[key].reach(dr.detach(self._own[key][key]), self._rates[key])
 
     def units(self) -> dict[str, tuple[float, float]]:
         """Return length and gain of each parameter that moves through a `Variable`."""

@@ -233,11 +233,8 @@ def rescale(problem: Problem) -> list[Scaled]:
         slope = np.array(unit.chain(unit.from_scene(value), type(value)(size)), dtype=np.float64)
         unit.gain = 1 / rms(slope)
         optimizer.set_variable(row.key, unit)
-        rate = problem.selection.specs[row.key].learning_rate or problem.config.optimizer.learning_rate
-        # One learning rate up or down, whichever moves farther.
-        at = unit.from_scene(value)
-        up, down = (dr.abs(unit.to_scene(at + side * rate) - value) for side in (1, -1))
-        measured[place] = replace(row, own_length=length, first_step=rms(np.array(dr.maximum(up, down))))
+        first_step = unit.reach(unit.from_scene(value), optimizer.rate(row.key))
+        measured[place] = replace(row, own_length=length, first_step=first_step)
     problem.apply()
     return measured
 
@@ -266,8 +263,7 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
         if found > 0:
             unit = replace(variable, gain=1 / (found * len(starts)))
             optimizer.set_variable(key, unit)
-            rate = problem.selection.specs[key].learning_rate or problem.config.optimizer.learning_rate
-            step = _like(v, gradient * (unit.gain * rate))
+            step = _like(v, gradient * (unit.gain * optimizer.rate(key)))
             first = rms(np.array(unit.to_scene(v - step)) - np.array(start))
             row = replace(row, curvature=found, own_length=1.0, first_step=first)
         measured.append(row)
