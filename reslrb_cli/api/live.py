@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm.auto import tqdm
 
-from reslrb_cli.optimization.errors import ErrorMeter
+from reslrb_cli.optimization.problem import ErrorMeter
 from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.run_summary import descriptions

@@ -229,7 +229,7 @@ def command(
 
     --conditioning measures how different the sensitivities of the parameters are at their initial values: for each
     parameter the root mean square of its values, its gradient and the noise of one step's gradient, the relative change
-    of the image and the curvature of the loss per unit, and the length by which it would have to change to explain the
+    of the image per unit, and the length by which it would have to change to explain the
     image. `optimizer.scale: auto` compensates for the parameters' different sensitivities.
     """
     subject = read_subject(path, overrides)

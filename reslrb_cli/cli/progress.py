@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from reslrb_cli.optimization.errors import ErrorMeter
+from reslrb_cli.optimization.problem import ErrorMeter
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.run_summary import descriptions
 

@@ -81,7 +81,7 @@ _NumberOrList = Annotated[
 
 _Bound = Annotated[float, Field(allow_inf_nan=True)]
 Bounds = Annotated[tuple[_Bound, _Bound], Field(strict=False)]
-TransformName = Literal["none", "sigmoid", "log", "softplus"]
+TransformName = Literal["none", "sigmoid", "log"]
 
 
 class MotionInitial(ByWord[_NumberOrList]):
@@ -247,16 +247,6 @@ class Regularizer(Choice):
     """Factor of the integral in the objective."""
 
 
-class Curvature(Regularizer, json_schema_extra={"required": ["type", "radius"]}):
-    """Hollows of a heightmap that are too narrow for a tool: integral of max(0, k - 1/radius)². Here k is the larger
-    principal curvature. The curvature k is positive in hollows, seen from outside.
-    """
-
-    type: Literal["curvature"] = "curvature"
-    """For a heightmap: integral of max(0, k - 1/radius)². k is the larger principal curvature, positive in hollows."""
-    radius: Positive = Field(description="Radius of the ball of the tool, in scene units.")
-
-
 class Thickness(Regularizer, json_schema_extra={"required": ["type", "thickness", "least"]}):
     """A plate that is too thin: integral of max(0, least - (thickness + h))², with the heightmap h. After each step,
     heights are clamped so that the plate keeps a tenth of `least`, and its faces never cross. The run records the
@@ -289,11 +279,11 @@ class TotalVariation(Regularizer, json_schema_extra=NEEDS_TYPE):
     epsilon: Positive = Field(default=1e-3, description="Gradients well below this value have a quadratic cost.")
 
 
-AnyRegularizer = Annotated[Curvature | Thickness | TotalVariation, ByType("")]
+AnyRegularizer = Annotated[Thickness | TotalVariation, ByType("")]
 
 #: The regularizers of each kind of parameter.
 REGULARIZERS = {
-    "heightmap": ("curvature", "thickness", "total_variation"),
+    "heightmap": ("thickness", "total_variation"),
     "bitmap": ("total_variation",),
     "mesh": (),
 }
@@ -338,18 +328,17 @@ class ParameterSpec(Section):
     leave a side open."""
     transform: _AnyTransform = "none"
     """Variable that the optimizer moves instead of the value x. `sigmoid`: the logit of x between its `bounds`, which x
-    never reaches. `log`: log(x), for positive values that are known to an order of magnitude at best. `softplus`:
-    log(exp(x) - 1), for positive values; acts like `log` well below 1, and like `none` well above. Learning rates are
-    in units of this variable."""
+    never reaches. `log`: log(x), for positive values that are known to an order of magnitude at best. Learning rates
+    are in units of this variable."""
     learning_rate: _AnyRate | None = None
     """Step size of this parameter, in the units of `optimizer.learning_rate`. null: `optimizer.learning_rate`."""
     resolution: Annotated[Size, few("texels")] | None = None
     """[width, height] in texels. The texture is resampled to this size before the start. null: it keeps its size."""
     precondition: Annotated[float, Field(gt=0, le=10)] | None = None
-    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021), for textures, heightmaps and mesh vertices: a
-    length l, as a fraction of the longer side. The optimizer moves v, and the parameter is (1 - l² Δ)⁻¹ v. Details
-    smaller than l move less in a step: with gradient descent, by the fourth power of their size divided by l. The
-    effect does not depend on the resolution. null: off."""
+    """Smooth steps ("large steps", Nicolet, Jacobson and Jakob 2021), for textures and heightmaps: a length l, as a
+    fraction of the longer side. The optimizer moves v, and the parameter is (1 - l² Δ)⁻¹ v. Details smaller than l move
+    less in a step: with gradient descent, by the fourth power of their size divided by l. The effect does not depend on
+    the resolution. null: off."""
     regularizers: list[AnyRegularizer] = Field(default=[], max_length=16)
     """Costs of the value itself. They are integrals over its surface, added to the loss once per step and recorded
     separately. Lengths are in scene units, and for a bitmap in units of its texture coordinates. The integrals hardly
@@ -467,7 +456,7 @@ class ParameterSpec(Section):
             if said.transform == "sigmoid" and not (math.isfinite(low) and math.isfinite(high)):
                 has = "has none" if said.bounds is None else f"has [{low:g}, {high:g}]"
                 raise located(at("transform"), f"sigmoid maps to finite `bounds`, [low, high]; this parameter {has}")
-            if said.transform in ("log", "softplus") and high <= 0:
+            if said.transform == "log" and high <= 0:
                 reason = f"exclude positive values, but transform: {said.transform} yields only these"
                 raise located(at("bounds"), reason)
             numbers = [said.initial] if isinstance(said.initial, float) else said.initial

@@ -42,7 +42,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.base import Pass, SurfacePoint, VertexHooks
-from reslrb_cli.estimators.stack import Ring, Stack, StackState, entry_bytes, walk_back
+from reslrb_cli.estimators.stack import Ring, Stack, StackState, walk_back
 from reslrb_cli.transport.bsdf import Hit, Scattering, evaluate, stays_behind
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
@@ -301,9 +301,6 @@ class AttachedStack(Stack):
 
     def kept(self, plan: Plan) -> Any:
         return []
-
-    def scratch_bytes(self, plan: Plan) -> int:
-        return sum(entry_bytes(AttachedFrame.blank(plan))) * (Ring.of(plan, self.stack_size).size + 1)
 
     def _differentiate(self, p: Pass) -> Adjoint:
         """Trace the paths, splat them if there is an image, and walk back. Returns the adjoint at the emitter."""

@@ -100,10 +100,6 @@ class Estimator(ABC):
     def kept(self, plan: Plan) -> Any:
         """Return a PyTree with the types of all data that are stored for a path at the same time."""
 
-    def scratch_bytes(self, plan: Plan) -> int:
-        """Return the thread-local bytes that each traced path uses. The allocator does not count these bytes."""
-        return 0
-
 
 def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]) -> None:
     """Add the derivative of E (C,), multiplied by `weight(E)`, if the plan differentiates emission."""

@@ -396,9 +396,6 @@ class Stack(Estimator):
     def kept(self, plan: Plan) -> Any:
         return [Visibility.none(vertices(plan)), mi.Spectrum(0)]  # `forward` keeps one of them
 
-    def scratch_bytes(self, plan: Plan) -> int:
-        return stack_bytes(plan, self.stack_size)
-
     def _sweep(self, p: Pass, visibility: Visibility | None) -> mi.Spectrum:
         ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
         active = True if visibility is None else visibility.last > 0
@@ -408,10 +405,3 @@ class Stack(Estimator):
             return again.walk(LightSweep(again, ring, end=end), end > 0)
 
         return walk_back(p, Frame.blank(p.plan), ring, state, state.since, before)
-
-
-def stack_bytes(plan: Plan, stack_size: int) -> int:
-    """Return the thread-local bytes of each traced path."""
-    if not plan.differentiate_bsdfs:
-        return 0
-    return sum(entry_bytes(Frame.blank(plan))) * (Ring.of(plan, stack_size).size + 1)

@@ -22,7 +22,6 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import Estimator, Pass, one_of
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
-from reslrb_cli.estimators.stack import stack_bytes
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
@@ -318,11 +317,6 @@ class Reslrb(LightTracer):
     def kept(self, plan: Plan) -> Any:
         """Return the types of all data stored for a light path, as in `Estimator.kept`. Camera paths store nothing."""
         return [] if plan.paths == "camera" else self.estimator.of(plan).kept(plan)
-
-    def scratch_bytes(self, plan: Plan) -> int:
-        """Return the thread-local bytes of each traced path, for both kinds of paths."""
-        light = 0 if plan.paths == "camera" else self.estimator.of(plan).scratch_bytes(plan)
-        return light if plan.paths == "light" else max(light, stack_bytes(plan, self.estimator.stack_size))
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         """Return the image. Adds the gradient that the image's own samples give for dL/dI = `derivative(image)`."""

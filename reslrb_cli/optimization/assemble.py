@@ -9,6 +9,7 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.loader import check_code
@@ -18,7 +19,6 @@ from reslrb_cli.integrators.baselines import Projective
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization.autotune.sampling import settle
-from reslrb_cli.optimization.errors import quantity
 from reslrb_cli.optimization.identifiability import check_exposures, find_reached
 from reslrb_cli.optimization.loading import (
     check_integrator,
@@ -30,7 +30,7 @@ from reslrb_cli.optimization.loading import (
     paths_of,
     samples_per_pass,
 )
-from reslrb_cli.optimization.memory import check_announced, check_described, check_films, check_step, plans
+from reslrb_cli.optimization.memory import check_described, check_films, check_step, plans
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
@@ -38,9 +38,38 @@ from reslrb_cli.optimization.views import expose, make_views
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.deformation import where_moved
-from reslrb_cli.scene.parameters import Selection, select_parameters
+from reslrb_cli.scene.parameters import select_parameters
 
 Array = np.ndarray[Any, Any]
+
+#: Parameters of emission; parameters of the same quantity have the same unit.
+_EMITTED = {
+    "AreaLight": "radiance",
+    "ConstantBackgroundEmitter": "radiance",
+    "DirectionalArea": "radiance",
+    "EnvironmentMapEmitter": "radiance",
+    "PointLight": "intensity",
+    "SpotLight": "intensity",
+    "DirectionalEmitter": "irradiance",
+    "Projector": "irradiance",
+}
+
+
+def quantity(params: Any, key: str) -> str:
+    """Return the quantity of a `mi.traverse` entry: `radiance`, `irradiance`, `intensity`, `length`, or "" without a
+    unit.
+
+    Parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`) have no unit.
+    """
+    if key.endswith((".vertex_positions", ".position")):
+        return "length"
+    node = own = params.properties[key][2]
+    while node is not None and not isinstance(node, mi.Emitter):
+        node = params.hierarchy[node][0]
+    is_factor = own is node and not key.endswith(".data") and key != "data"
+    if node is None or is_factor or ".texture." in f".{key}":
+        return ""
+    return _EMITTED.get(node.class_name(), "")
 
 
 def assemble(
@@ -135,10 +164,8 @@ def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
 def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:
     """Load and check the experiment of `config` without its targets.
 
-    `scene` replaces `scene.file`, and `values` replace the initial values of the parameters. Raises ValueError unless
-    `values` has one finite array of the right shape for each parameter.
+    `scene` replaces `scene.file`, and `values` replace the initial values of the parameters.
     """
-    check_announced(config)
     scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
     views = make_views(config, scene)
     check_films(config, scene, [view.sensor for view in views])
@@ -149,7 +176,6 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     paths = paths_of(config.integrator, scene, sensors, moves)
     expose(views, scene, selection)
     if values is not None:
-        _check_values(selection, values)
         selection.set_arrays(values)
     motions = selection.deformation.quantities
     problem = Problem(
@@ -204,15 +230,3 @@ def _check_moving(problem: Problem) -> None:
             reason = f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a "
             reason += "pixel; use a smooth filter, such as gaussian, for derivatives of moving light"
             raise ConfigError(config.source, "scene.file", reason)
-
-
-def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
-    foreign = sorted(set(values) ^ set(selection.keys))
-    if foreign:
-        raise ValueError(f"it {'has' if foreign[0] in values else 'lacks'} `{foreign[0]}`")
-    for key, value in values.items():
-        shape = selection.array(key).shape
-        if value.shape != shape or value.dtype.kind != "f":
-            raise ValueError(f"`{key}` is {value.dtype} of shape {value.shape}, not numbers of shape {shape}")
-        if not np.isfinite(value).all():
-            raise ValueError(f"`{key}` has a value that is not finite")

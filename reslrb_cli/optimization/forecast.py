@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.backend.doctor import resident_paths
 from reslrb_cli.backend.memory import free_bytes
 from reslrb_cli.config.schema import Config
-from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.race import lessons
 from reslrb_cli.optimization.loop import optimize
-from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem, progress_spp, saved_spp
-from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.decisions import DecisionCache
@@ -40,14 +34,12 @@ def measure_steps(problem: Problem) -> tuple[float, float, float, int]:
     Returns the seconds of one step, the additional seconds of the first steps with cached kernels, the current seconds
     for compiling, and the peak in bytes, which corresponds to `peak_mib` in `metrics.jsonl`.
     """
-    run, guiding = problem.config.run, guiding_of(problem)
+    run = problem.config.run
     enough = {"iterations": max(run.iterations, WARM_UP + MOST), "max_seconds": None}
     config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
     records: list[Record] = []
-    taught: list[int] = []  # number of table updates after each
     for record in optimize(replace(problem, config=config)):
         records.append(record)
-        taught.append(0 if guiding is None else guiding.lessons)
         timed = len(records) - WARM_UP
         if len(records) >= FEW and record.elapsed_s > LONG:
             break
@@ -56,27 +48,11 @@ def measure_steps(problem: Problem) -> tuple[float, float, float, int]:
     times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
     first = min(WARM_UP, len(records) - 1)
     steady = statistics.median(times[first:])
-    if guiding is not None:
-        learned = [b - a for a, b in pairwise(taught)]
-        steady = _with_learning(times[first:], learned[first - 1 :], lessons(problem))
     extra = sum(max(seconds - steady, 0.0) for seconds in times[:first])
     compiled = min(sum(record.codegen_ms for record in records[:first]) / 1e3, extra)
     # Kernels that run only when values change, for example to 0, do not count.
     peak = int(records[: run.iterations][-1].peak_mib * MIB)
     return steady, extra - compiled, compiled, peak
-
-
-def _with_learning(times: Sequence[float], learned: Sequence[int], mean: float) -> float:
-    """Return the duration in seconds of an iteration in which the tables learn `mean` times.
-
-    `times` are the durations of early iterations. `learned` is the number of table updates in each of the iterations.
-    This is more often than later.
-    """
-    plain = [seconds for seconds, count in zip(times, learned, strict=True) if count == 0]
-    if not plain or sum(learned) == 0:
-        return statistics.fmean(times)
-    without = statistics.median(plain)
-    return without + mean * max(sum(times) - len(times) * without, 0.0) / sum(learned)
 
 
 #: Number of steps, approximately, for the verdicts on the values after the last iteration.
@@ -88,23 +64,20 @@ class Forecast:
     """Forecast of a run.
 
     `iteration_s` is the time of one step, `start_s` the additional time of the first steps with cached kernels, and
-    `compile_s` the current time for compiling. `parts` has the bytes of each part. The parts sum to `peak`. `scratch`
-    is thread-local memory, and `free` the free memory. The fields `before_s`, `measuring_s`, `target_s`, `images_s` and
-    `verdicts_s` are seconds outside the iterations. `kept` is true if a run finds the decisions in the cache. They took
-    `measuring_s` now.
+    `compile_s` the current time for compiling. `peak` is the memory of the iterations in bytes, and `free` the free
+    memory. The fields `before_s`, `measuring_s`, `target_s`, `images_s` and `verdicts_s` are seconds outside the
+    iterations. The decisions took `measuring_s` now, and a run finds them in the
+    cache.
     """
 
     iteration_s: float
     start_s: float
     compile_s: float
     peak: int
-    parts: dict[str, int]
-    scratch: int
     free: int
     iterations: int
     before_s: float
     measuring_s: float
-    kept: bool
     target_s: float
     images_s: float
     verdicts_s: float
@@ -117,8 +90,7 @@ class Forecast:
     @property
     def whole_s(self) -> float:
         """Seconds of the whole run, with the current caches of kernels and decisions."""
-        again = 0.0 if self.kept else self.measuring_s
-        return self.elapsed_s + self.before_s + again + self.target_s + self.images_s + self.verdicts_s
+        return self.elapsed_s + self.before_s + self.target_s + self.images_s + self.verdicts_s
 
 
 def make_forecast(
@@ -140,30 +112,21 @@ def make_forecast(
     before_s = time.perf_counter() - begin
     say("measuring a few steps")
     iteration_s, start_s, compile_s, peak = measure_steps(problem)
-    scratch, integrator = 0, problem.integrator
-    if isinstance(integrator, Reslrb):  # of all paths traced at a time
-        scratch = max(integrator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
     run = config.run
     iterations = run.iterations
     if run.max_seconds is not None:
         left_s = run.max_seconds - problem.measured_s - start_s
         iterations = min(iterations, max(int(left_s / max(iteration_s, 1e-6)), 1))
-    parts = _parts(problem)
-    rest = max(peak - sum(parts.values()), 0)
-    parts["images of a step, gradients, stored paths (reservoir)"] = rest
     has_verdicts = run.certainty and config.by_pixel and run.iterations >= LEAST_ITERATIONS
     return Forecast(
         iteration_s=iteration_s,
         start_s=start_s,
         compile_s=compile_s,
-        peak=sum(parts.values()),
-        parts=parts,
-        scratch=scratch,
+        peak=peak,
         free=free_bytes(mi.variant()),
         iterations=iterations,
         before_s=before_s,
         measuring_s=problem.measured_s,
-        kept=cache is not None and cache.keeps,
         target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
         images_s=image_s * 2 * saved_spp(problem) * views,
         verdicts_s=VERDICTS * iteration_s if has_verdicts else 0.0,
@@ -188,30 +151,3 @@ def _image_seconds(problem: Problem) -> float:
     begin = time.perf_counter()
     problem.render(view.sensor, spp, 1, "forecast")
     return (time.perf_counter() - begin) / spp
-
-
-def _parts(problem: Problem) -> dict[str, int]:
-    """Return the bytes outside of a step: accessible values of the scene, targets, and the optimiser's state."""
-    geometry = values = 0
-    params = problem.selection.params
-    for key in params.properties:
-        value = params[key]
-        if not isinstance(value, dr.ArrayBase):
-            continue
-        if key.rpartition(".")[2].startswith(("vertex_", "faces", "to_world")):
-            geometry += _bytes(value)
-        else:
-            values += _bytes(value)
-    return {
-        "geometry": geometry,
-        "textures and other values of the scene": values,
-        "targets": sum(_bytes(view.target) for view in problem.views),
-        "optimiser's state": sum(
-            _bytes(value) for kept in problem.optimizer.moments().values() for value in kept.values()
-        ),
-    }
-
-
-def _bytes(value: dr.ArrayBase) -> int:
-    """Return the bytes of a Dr.Jit array."""
-    return int(dr.prod(dr.shape(value))) * int(dr.itemsize_v(value))

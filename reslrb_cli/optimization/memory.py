@@ -1,13 +1,12 @@
 """Limits of a run's memory: films, textures and steps that need more memory than is free are refused.
 
-Sizes in the configuration and the scene file are checked before anything is built (`check_announced`,
-`check_described`). Films and textures of a hundred million entries would take a minute to make. The memory estimates
+Sizes in the configuration and the scene file are checked before anything is built (`check_described`). Films and
+textures of a hundred million entries would take a minute to make. The memory estimates
 are lower bounds, so the checks refuse nothing that fits into the machine's memory.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 
 import drjit as dr
@@ -26,8 +25,6 @@ from reslrb_cli.scene.xml.check import film_sizes
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.transport.plan import Plan
 
-logger = logging.getLogger(__name__)
-
 #: Images of the film's size in memory during a step: block, image, parts of the loss, gradient, adjoint; also those of
 #: a batch.
 FILM_IMAGES = 12
@@ -41,9 +38,8 @@ ENTRY_BYTES = 4 * 4
 #: Minimum bytes per pixel: five images (block, image, dL/dI, its adjoint, target) of three floats.
 PIXEL_BYTES = 5 * 3 * 4
 
-#: Bytes that every machine has, and bytes of a step above which a message appears at once, because such a step takes a
-#: while.
-SMALL, MUCH = 2**28, 2**31
+#: Bytes that every machine has.
+SMALL = 2**28
 
 #: Minimum share of the estimated memory that a step takes, by `run.adjoint`: 0.93, 0.58 and 0.44 were measured.
 SURE = {"batched": 0.8, "independent": 0.5, "correlated": 0.4}
@@ -109,27 +105,16 @@ def allocated(size: int) -> int:
 # --- checks of memory -------------------------------------------------------------------------------------------------
 
 
-def check_announced(config: Config) -> None:
-    """Raise ConfigError if the configured film or a configured parameter needs more memory than is free."""
-    if config.scene.size is not None:
-        _check_film(config, "scene.size", config.scene.size)
-    for key, size in _textures(config).items():
-        _check_size(config, key, f"{size[0]}x{size[1]} texels", size, ENTRY_BYTES)
-
-
 def check_described(config: Config, description: Description) -> None:
-    """Raise ConfigError if the scene's film is too large for the sample count of a step. Also raise ConfigError if a
-    step needs more than the free memory.
+    """Raise ConfigError if the scene's film has too many samples for a step. Also raise ConfigError if a step needs
+    more than the free memory.
 
-    The check uses the scene's smallest film, because the sensors of the run are not known yet. Large steps that fit are
-    logged.
+    The check uses the scene's smallest film, because the sensors of the run are not known yet.
     """
     film = min(film_sizes(description), key=lambda size: size.cropped, default=None)
     if film is None or not film.cropped:
         return  # without a size in the file, Mitsuba's own film is used, which is small
     key = "scene.file" if config.scene.size is None else "scene.size"
-    is_whole = film.cropped == film.width * film.height
-    _check_film(config, key, (film.width, film.height) if is_whole else (film.cropped, 1))
     _check_samples(config, film.width * film.height)
     textures, pixels = _textures(config), film.cropped * PIXEL_BYTES
     texels = {name: width * height * ENTRY_BYTES for name, (width, height) in textures.items()}
@@ -147,9 +132,6 @@ def check_described(config: Config, description: Description) -> None:
         key = largest if texels.get(largest, 0) > pixels else key
         reason = f"{what}: a step takes at least {in_words(needed)}, and {in_words(free)} are free"
         raise ConfigError(config.source, key, f"{reason}; {COARSER}")
-    if needed > MUCH:
-        least = f"a step takes at least {in_words(needed)}, and {in_words(free)} are free"
-        logger.info(f"{what}: {least}; loading takes a while")
 
 
 def _textures(config: Config) -> dict[str, tuple[int, int]]:
@@ -165,29 +147,9 @@ def _textures(config: Config) -> dict[str, tuple[int, int]]:
 
 
 def check_films(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> None:
-    """Raise ConfigError if a film is too large, or has too many samples for a step."""
-    for index, pixels in zip(sensors, pixels_of(scene, sensors), strict=True):
-        width, height = (int(n) for n in scene.sensors()[index].film().crop_size())
-        _check_film(config, "scene.file", (width, height))
+    """Raise ConfigError if a film has too many samples for a step."""
+    for pixels in pixels_of(scene, sensors):
         _check_samples(config, pixels)
-
-
-def _check_film(config: Config, key: str, size: tuple[int, int]) -> None:
-    """Raise ConfigError at `key` if the images of a film of this (width, height) need more memory than is free."""
-    _check_size(config, key, f"a film of {size[0]}x{size[1]} pixels", size, PIXEL_BYTES)
-
-
-def _check_size(config: Config, key: str, what: str, size: tuple[int, int], each: int) -> None:
-    """Raise ConfigError at `key` if an array of (width, height) entries of `each` bytes needs more memory than is free.
-
-    The error names the largest size with the same aspect ratio that fits.
-    """
-    needed = size[0] * size[1] * each
-    free = free_for(needed)
-    if needed > free:
-        fits = "x".join(str(max(int(n * (free / needed) ** 0.5), 1)) for n in size)
-        reason = f"{what} takes at least {in_words(needed)}, and {in_words(free)} are free; use at most {fits}"
-        raise ConfigError(config.source, key, reason)
 
 
 def _check_samples(config: Config, pixels: int) -> None:

@@ -5,11 +5,18 @@ Transforms (`Transform`, `Variable`): the optimiser moves an unconstrained varia
     none      x = u
     sigmoid   x = low + (high - low) / (1 + exp(-u))     between the bounds, which it never reaches
     log       x = exp(u)                                 positive; a step is a relative change
-    softplus  x = log(1 + exp(u))                        positive; relative well below 1, absolute well above
 
 By the chain rule, dL/du = dL/dx T'(u). The factor T'(u) is applied to the accumulated gradient, so the kernels of a
-step do not depend on the factor. T is increasing in each entry. The smoother S (`precondition`) acts before the
-transform T: x = T(S v).
+step do not depend on the factor. T is increasing in each entry.
+
+Smooth steps (`precondition`, `Smoother`) move v instead of u: x = T(S v).
+
+    S = (1 - l^2 Δ)^-1,   dL/dv = S dL/du                Nicolet, Jacobson and Jakob 2021 ("large steps"), eq. 9 to 12
+
+S is symmetric, and a step of gradient descent is S^2 dL/du. A step therefore moves details finer than l by a smaller
+amount. The reduction factor is the fourth power of the ratio of the detail's size to l. Refracting surfaces need this.
+The light from refracting surfaces depends on the surface's second derivatives. The curvature of a loss therefore grows
+with the fourth power of the spatial frequency. Without S, the map's finest ripple limits the step.
 
 Updates (`Optimizer`): each parameter has its own optimiser. A parameter whose gradient is not finite can therefore keep
 its moments and its number of steps.
@@ -30,9 +37,10 @@ from typing import Any
 import drjit as dr
 import drjit.opt as dropt
 import numpy as np
+import scipy.fft
 
 from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
-from reslrb_cli.optimization.precondition import Smoother
+from reslrb_cli.statistics import Array, rms
 
 Bounds = tuple[float, float] | None
 
@@ -68,26 +76,44 @@ def make_transform(name: str, bounds: Bounds) -> Transform | None:
             low=-SIGMOID_END,
             high=SIGMOID_END,
         )
-    forward, inverse, derivative, end = {
-        "log": (dr.exp, dr.log, dr.exp, EXPONENT_END),
-        "softplus": (_softplus, _inverse_softplus, _logistic, math.inf),
-    }[name]
-    least = -EXPONENT_END if low <= 0 else max(float(inverse(low)), -EXPONENT_END)
-    return Transform(forward, inverse, derivative, least, end if math.isinf(high) else min(float(inverse(high)), end))
+    if name != "log":
+        raise KeyError(name)
+    least = -EXPONENT_END if low <= 0 else max(math.log(low), -EXPONENT_END)
+    return Transform(dr.exp, dr.log, dr.exp, least, min(math.log(high), EXPONENT_END))
 
 
 def _logistic(u: Any) -> Any:
     return 1 / (1 + dr.exp(-u))
 
 
-def _softplus(u: Any) -> Any:
-    small = dr.exp(-dr.abs(u))
-    return dr.maximum(u, 0.0) + 2 * dr.atanh(small / (2 + small))  # log(1 + s), accurate for a small s, too
+class Smoother:
+    """Smoothing operator S for textures and heightmaps of the shape (height, width, channels) with at least two texels.
 
+    `length` is l, as a fraction of the longer side, so the effect does not depend on the resolution. Δ is a sum of
+    differences of neighbours without flow through the edges, so the cosine transform diagonalises S. `gain` is the mean
+    of the diagonal of S^2, which is each entry's response to a gradient of the entry alone.
+    """
 
-def _inverse_softplus(x: Any) -> Any:
-    half = 0.5 * dr.minimum(x, 60.0)  # above this, the logarithm of exp(x) - 1 = 2 sinh(x/2) exp(x/2) is x
-    return x + dr.log(2 * dr.sinh(half)) - half
+    def __init__(self, shape: tuple[int, ...], length: float) -> None:
+        texels = length * max(shape[:2])  # l in texels, which are square
+        along = [2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in shape[:2]]
+        self._shape = shape
+        self._eigenvalues = 1 + texels**2 * (along[0][:, None] + along[1])[:, :, None]
+        self.gain = float(np.mean(self._eigenvalues**-2.0))
+
+    def smooth(self, value: Any) -> Any:
+        """Return S `value`, evaluated. S is symmetric, so S also turns the gradient by S v into the gradient by v."""
+        return self._scaled(value, 1 / self._eigenvalues)
+
+    def roughen(self, value: Any) -> Any:
+        """Return the inverse of `smooth`."""
+        return self._scaled(value, self._eigenvalues)
+
+    def _scaled(self, value: Any, factors: Array) -> Any:
+        array = np.array(dr.detach(value), dtype=np.float64)
+        spectrum = scipy.fft.dctn(array.reshape(self._shape), axes=(0, 1), norm="ortho")
+        result = np.asarray(scipy.fft.idctn(spectrum * factors, axes=(0, 1), norm="ortho"))
+        return type(value)(result.reshape(array.shape).astype(np.float32))
 
 
 @dataclass
@@ -135,7 +161,15 @@ class Variable:
         result = gradient * _opaque(v, self.length) * _opaque(v, self.gain)
         if self.transform is not None:
             result = result * self.transform.derivative(self._u(v))
-        return result if self.smoother is None else self.smoother.adjoint(result)
+        return result if self.smoother is None else self.smoother.smooth(result)
+
+    def reach(self, v: Any, rate: float) -> float:
+        """Return the root mean square change of x if v moves by `rate`. For each entry, the larger of the upward and
+        downward movements counts.
+        """
+        value = self.to_scene(v)
+        up, down = (dr.abs(self.to_scene(v + side * rate) - value) for side in (1, -1))
+        return rms(np.array(dr.maximum(up, down)))
 
     def _u(self, v: Any) -> Any:
         u = v * _opaque(v, self.length)
@@ -302,18 +336,13 @@ class Optimizer:
 
     def first_step(self, key: str) -> float | None:
         """Return the root mean square change of the scene's current value in one step at the parameter's learning rate.
-
-        For each entry, the larger of the upward and downward movements counts. Returns None if the step length depends
-        on the gradient.
+        Return None if the step length depends on the gradient.
         """
         if isinstance(self._own[key], dropt.SGD):
             return None
         if key not in self._variables:
             return self._rates[key]
-        variable, moved = self._variables[key], dr.detach(self._own[key][key])
-        value = variable.to_scene(moved)
-        ways = [np.array(variable.to_scene(moved + side * self._rates[key]) - value) for side in (1, -1)]
-        return float(np.sqrt(np.mean(np.square(np.maximum(*map(np.abs, ways)), dtype=np.float64))))
+        return self._variables[key].reach(dr.detach(self._own[key][key]), self._rates[key])
 
     def units(self) -> dict[str, tuple[float, float]]:
         """Return length and gain of each parameter that moves through a `Variable`."""

@@ -15,15 +15,14 @@ from reslrb_cli.config.parameters import Thickness
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
-from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
-from reslrb_cli.optimization.optimizers import Optimizer, make_transform
-from reslrb_cli.optimization.precondition import make_smoother
+from reslrb_cli.optimization.optimizers import Optimizer, Smoother, make_transform
 from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
+from reslrb_cli.statistics import Array, rms
 
 
 def saved_spp(problem: Problem) -> int:
@@ -40,16 +39,52 @@ def progress_spp(problem: Problem) -> int:
     return spp * -(-BETWEEN_SPP // spp)  # passes that divide a step divide this as well
 
 
-Array = np.ndarray[Any, Any]
+class ErrorMeter:
+    """Root mean square errors of parameters relative to true values, over the entries that light and sensor reach.
+
+    `truth`, `masks` and `quantities` are the fields of a `Problem`. Each error has the unit of its parameter. Only
+    errors with a common unit can be combined. Reflectance and roughness have no unit, but the intensity of a lamp is in
+    W/sr, and the radiance of an area light in W/(m² sr). If units differ, errors are divided by the true values.
+    """
+
+    def __init__(
+        self, truth: Mapping[str, Array], masks: Mapping[str, Array], quantities: Mapping[str, str] | None = None
+    ) -> None:
+        self._masks = {key: masks[key] for key in truth if masks[key].any()}
+        self._truth = {key: truth[key].astype(np.float64)[mask] for key, mask in self._masks.items()}
+        #: Root mean square of each truth over the same entries; a truth of zeros has none.
+        self.scales = {key: scale for key, true in self._truth.items() if (scale := rms(true)) > 0}
+        self.one_unit = len({(quantities or {}).get(key, "") for key in self._truth}) <= 1
+
+    def errors(self, value: Callable[[str], Array]) -> dict[str, float]:
+        """Return the root mean square error of each parameter with a true value. `value` returns a current value."""
+        return {key: rms(value(key).astype(np.float64)[self._masks[key]] - true) for key, true in self._truth.items()}
+
+    def total(self, errors: Mapping[str, float]) -> float | None:
+        """Return the root mean square error over the entries of all parameters. Return None if units differ or nothing
+        is known.
+
+        The argument `errors` is the result of the method `errors`.
+        """
+        count = sum(self._truth[key].size for key in errors)
+        if not count or not self.one_unit:
+            return None
+        return float(np.sqrt(sum(self._truth[key].size * error**2 for key, error in errors.items()) / count))
+
+    def relative(self, errors: Mapping[str, float]) -> dict[str, float]:
+        """Return each error divided by the root mean square of the true values. Parameters with true values of 0 are
+        left out.
+        """
+        return {key: error / self.scales[key] for key, error in errors.items() if key in self.scales}
 
 
 @dataclass(frozen=True)
 class Problem:
     """Complete problem for `optimize`, made by `assemble`.
 
-    `truth` has the known true values, with textures in the resolution of the scene file. For the parameters in `truth`,
-    `masks` has booleans. True entries are those that light and sensor reach. A mask is (H, W) for textures, and
-    otherwise has the parameter's shape. `quantities` has the physical quantity of each parameter (`errors.quantity`).
+    `truth` has the known true values, in the shapes of the parameters. For the parameters in `truth`, `masks` has
+    booleans. True entries are those that light and sensor reach. A mask is (H, W) for textures, and otherwise has the
+    parameter's shape. `quantities` has the physical quantity of each parameter (`assemble.quantity`).
     """
 
     config: Config
@@ -245,7 +280,7 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
         bounds={key: spec.bounds for key, spec in specs.items()},
         transforms={key: make_transform(spec.transform, spec.bounds) for key, spec in specs.items()},
         smoothers={
-            key: make_smoother(selection.array(key), selection.faces(key), spec.smoothing)
+            key: Smoother(selection.array(key).shape, spec.smoothing)
             for key, spec in specs.items()
             if spec.smoothing is not None
         },

@@ -22,7 +22,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.optimization.errors import nearest
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.trend import LEAST_ITERATIONS, find_trend, window
 from reslrb_cli.optimization.views import View
@@ -197,16 +196,11 @@ def summary(value: Array, mask: Array | None = None) -> dict[str, Any]:
     """Return a summary of a parameter. The summary has all numbers as `value`, or `mean`, `min` and `max` over the
     entries in `mask`.
 
-    The mean of a texture (H, W, C) has a number for each channel. A mask with another resolution is sampled at the
-    texel centres. An empty mask is ignored.
+    The mean of a texture (H, W, C) has a number for each channel. An empty mask is ignored.
     """
     if value.ndim < 3 and value.size <= MOST_NUMBERS:
         return {"value": value.tolist()}
-    chosen = value
-    if mask is not None and mask.any():
-        if value.ndim == 3 and mask.shape != value.shape[:2]:
-            mask = nearest(mask, (value.shape[0], value.shape[1]))
-        chosen = value[mask]
+    chosen = value if mask is None or not mask.any() else value[mask]
     channels = value.shape[2] if value.ndim == 3 else 1
     mean = chosen.reshape(-1, channels).mean(axis=0, dtype=np.float64)
     return {"mean": mean.tolist(), "min": float(chosen.min()), "max": float(chosen.max())}

@@ -7,14 +7,12 @@ first step, for all entries of one parameter x. I(x) is the image at common rand
 
     D = I(x + h z) - I(x)
     change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
-    curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
 
-`change` is the relative change of the image per unit of the parameter. `curvature` is the Gauss-Newton curvature. D is
-scaled up so that single precision resolves the differences. `length` is the change of the parameter that would explain
-the image or the target. A least-squares fit over the pixels that the parameter affects gives the change. For a scene's
-only light, `length` is the light's intensity. For a wall, `length` is the albedo, regardless of the wall's share of the
-picture. h is chosen so that the image changes by about 3 %. With an image change of about 3 %, neither rounding nor
-curvature dominates the differences.
+`change` is the relative change of the image per unit of the parameter. `length` is the change of the parameter that
+would explain the image or the target. A least-squares fit over the pixels that the parameter affects gives the change.
+For a scene's only light, `length` is the light's intensity. For a wall, `length` is the albedo, regardless of the
+wall's share of the picture. h is chosen so that the image changes by about 3 %. With an image change of about 3 %,
+neither rounding nor curvature dominates the differences.
 
 `rescale` measures units so that all parameters can use one learning rate. Step lengths from `Sensitivity.length` make
 all parameters move equally fast. Gradients are divided by the root mean square of a gradient sample, so Adam's absolute
@@ -39,7 +37,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators.protocol import first_channels
@@ -100,17 +97,8 @@ AIM, LEAST, MOST = 0.03, 0.003, 0.3
 TRIALS = 8
 #: Gradient samples of a run.
 SAMPLES = 4
-#: The optimiser's variable in place of a parameter x, by transform.
-_MOVED = {
-    "none": "",
-    "log": " in its logarithm",
-    "sigmoid": " in its logit between the bounds",
-    "softplus": " in log(exp(x) - 1)",
-}
-
-
 #: Quantities whose spread is measured.
-QUANTITIES = ("gradient", "change", "curvature", "length")
+QUANTITIES = ("gradient", "change", "length")
 
 
 @dataclass(frozen=True)
@@ -127,9 +115,6 @@ class Conditioning:
     def spread(self, quantity: str) -> float | None:
         """Return the ratio of the largest to the smallest value of `quantity`, which is one of QUANTITIES. Returns None
         for fewer than two positive values.
-
-        For `curvature`, the result is the condition number of the Gauss-Newton matrix's diagonal, with one entry per
-        parameter.
         """
         values = [getattr(row, quantity) for row in self.rows]
         positive = [value for value in values if value is not None and value > 0]
@@ -208,25 +193,12 @@ def _probe(
         row = replace(
             row,
             change=math.sqrt(squares) / (step * norm),
-            curvature=_second_difference(problem, base, difference, MOST / share) * (share / (MOST * step)) ** 2,
             length=min(step / share, high - low),
         )
         if LEAST <= share <= MOST or (share < LEAST and step == 0.5 * (high - low)):
             break
         step *= AIM / share
     return row
-
-
-def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
-    """Return L(I + D) - 2 L(I) + L(I - D), summed over the views. Each view is weighted by its share of the loss. D is
-    `factor` times the difference.
-    """
-    total = 0.0
-    for image, change, view in zip(base, difference, problem.trained, strict=True):
-        for side, times in ((1, 1), (0, -2), (-1, 1)):
-            at = mi.TensorXf((image + side * factor * change).astype(np.float32))
-            total += times * float(view.judge(at)[0]) * view.share
-    return total
 
 
 def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose: str = _PURPOSE) -> list[Array]:
@@ -261,11 +233,8 @@ def rescale(problem: Problem) -> list[Scaled]:
         slope = np.array(unit.chain(unit.from_scene(value), type(value)(size)), dtype=np.float64)
         unit.gain = 1 / rms(slope)
         optimizer.set_variable(row.key, unit)
-        rate = problem.selection.specs[row.key].learning_rate or problem.config.optimizer.learning_rate
-        # One learning rate up or down, whichever moves farther.
-        at = unit.from_scene(value)
-        up, down = (dr.abs(unit.to_scene(at + side * rate) - value) for side in (1, -1))
-        measured[place] = replace(row, own_length=length, first_step=rms(np.array(dr.maximum(up, down))))
+        first_step = unit.reach(unit.from_scene(value), optimizer.rate(row.key))
+        measured[place] = replace(row, own_length=length, first_step=first_step)
     problem.apply()
     return measured
 
@@ -294,8 +263,7 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
         if found > 0:
             unit = replace(variable, gain=1 / (found * len(starts)))
             optimizer.set_variable(key, unit)
-            rate = problem.selection.specs[key].learning_rate or problem.config.optimizer.learning_rate
-            step = _like(v, gradient * (unit.gain * rate))
+            step = _like(v, gradient * (unit.gain * optimizer.rate(key)))
             first = rms(np.array(unit.to_scene(v - step)) - np.array(start))
             row = replace(row, curvature=found, own_length=1.0, first_step=first)
         measured.append(row)
@@ -372,24 +340,9 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
     return float(distance.mean())
 
 
-def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
-    """Return a line for the user about one parameter. `transform` and `learning_rate` come from the parameter's
-    configuration.
-
-    A step is in units of the optimiser's variable. The line also has the parameter's movement in the first step.
-    """
+def scale_line(row: Scaled) -> str:
+    """Return a line for the user about the scale of one parameter."""
     if row.own_length is None:
         lacks = "no effect on the image" if row.length is None else "no gradient"
         return f"{row.key} has {lacks} at its start; it is not scaled"
-    first = f"about {row.first_step or 0.0:.3g}"
-    if transform == "log":
-        first = f"a factor of {math.exp(min(row.own_length * learning_rate, 700.0)):.3g}, up or down"
-    steps = f"{row.own_length:.3g} times the learning rate{_MOVED[transform]}"
-    return f"{row.key} moves in steps of {steps}, at first by {first}"
-
-
-def curvature_line(row: Scaled, learning_rate: float) -> str:
-    """Return a line for the user about one parameter with a scale from its curvature."""
-    if row.own_length is None:
-        return f"{row.key} has no effect on the image at its start; it is not scaled"
-    return f"{row.key} moves by {row.first_step or 0.0:.3g} at first, {learning_rate:g} of the largest stable step"
+    return f"{row.key} moves by about {row.first_step or 0.0:.3g} at first"

@@ -31,7 +31,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import NONE, Refused, derivative_of, given_step, gradient_step, render_image
@@ -104,18 +103,16 @@ def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[T
         Task(
             iteration,
             shard,
-            tuple(Part(view.sensor, scale, shard_seed(config, iteration, view.sensor, shard)) for view, scale in own),
+            tuple(
+                Part(view.sensor, scale, seed(config.run.seed, iteration, view.sensor, f"image, shard {shard}"))
+                for view, scale in own
+            ),
             config.share_spp,
             1 / shares,
             images or shares > 1,
         )
         for shard, own in enumerate(sets)
     ]
-
-
-def shard_seed(config: Config, iteration: int, sensor: int, shard: int) -> int:
-    """Return the seed of the samples of a view in a shard."""
-    return seed(config.run.seed, iteration, sensor, f"image, shard {shard}")
 
 
 def shard_image(problem: Problem, task: Task) -> Array:

@@ -15,7 +15,6 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.errors import comparison_grid
 from reslrb_cli.optimization.loading import (
     are_upright,
     check_integrator,
@@ -30,6 +29,7 @@ from reslrb_cli.records.images import luminance
 from reslrb_cli.scene.images import Photo, read_photo, turned_line
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
+from reslrb_cli.scene.values import resample
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
 
 #: The seed of rendered targets.
@@ -39,7 +39,6 @@ FEW_REMARKS = 2
 #: Descriptions of pixels of each kind.
 WORDS = {
     "specular": "show smooth glass or mirrors",
-    "mixed": "show coats, blends or thin panes",
     "border": "are at the film's border",
     "clipped": "are clipped",
     "beside": "are within the film's filter of clipped ones",
@@ -59,10 +58,7 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
     width, height = (int(n) for n in sensor.film().crop_size())
     if lacking:
         if "specular" in mask.kinds:
-            seen = sees_specular(scene, sensor)
-            found.left_out["specular"] = seen.alone
-            if (count := int(seen.mixed.sum())) > 0:
-                found.stay["mixed"] = count
+            found.left_out["specular"] = sees_specular(scene, sensor).alone
         if "border" in mask.kinds:
             found.left_out["border"] = ~interior((height, width), sensor)
     if photo is not None:
@@ -85,15 +81,14 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
 
 
 def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
-    """Return a line for the user about a view's mask. Return None if no pixel is excluded, weighted or counted."""
+    """Return a line for the user about a view's mask. Return None if no pixel is excluded or weighted."""
     counts = masked.counts()
-    stay = [f"{count} {WORDS[kind]} and are kept" for kind, count in masked.stay.items()]
-    if not counts and not stay and masked.weights is None:
+    if not counts and masked.weights is None:
         return None
     left, total = int((weights == 0).sum()), weights.size
     parts = [f"{count} {WORDS[kind]}" for kind, count in counts.items()]
     line = f"{name}: {left} of {total} pixels ({left / total:.1%}) are left out"
-    return "; ".join([line + (f": {', '.join(parts)}" if parts else ""), *stay])
+    return line + (f": {', '.join(parts)}" if parts else "")
 
 
 def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
@@ -190,7 +185,8 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
     config, render = problem.config, problem.config.target.render
     assert render is not None, "requires rendered targets"
     true_scene = load_configured(config, warn=False)
-    truth = _truth(problem, set_true_values(config, true_scene), say)
+    key = "target.render.parameters"
+    truth = _truth(problem, set_values(true_scene, config.parameters, render.parameters, config.source, key), say)
     chosen = render.integrator or config.integrator
     check_integrator(config, chosen, true_scene, problem.sensors, problem.moves)
     paths = paths_of(chosen, true_scene, problem.sensors, problem.moves)
@@ -209,24 +205,15 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
 
 
 def _truth(problem: Problem, true_values: Selection, say: Callable[[str], None]) -> dict[str, Array]:
-    """Return the parameters' true values."""
+    """Return the parameters' true values, with textures in the resolution of the parameters."""
     truth: dict[str, Array] = {}
     for key in problem.selection.keys:
+        shape = problem.selection.array(key).shape
         if key in problem.selection.factors:  # the target is an image of the scene itself
-            truth[key] = np.ones_like(problem.selection.array(key))
+            truth[key] = np.ones(shape, np.float32)
             continue
         truth[key] = true_values.array(key)
-        grid = comparison_grid(problem.selection.array(key).shape, truth[key].shape)
-        if grid is not None:
-            say(f"{key} and its true value have different resolutions: compared at {grid[1]}x{grid[0]}")
+        if len(shape) == 3 and truth[key].shape[:2] != shape[:2]:
+            say(f"the true value of {key} is resampled to its resolution, {shape[1]}x{shape[0]}")
+            truth[key] = resample(truth[key], (shape[1], shape[0]))
     return truth
-
-
-def set_true_values(config: Config, scene: mi.Scene) -> Selection:
-    """Set the values of `target.render.parameters` in `scene`, and return them as a selection.
-
-    They are checked like initial values. Errors are located in the target.
-    """
-    render = config.target.render
-    assert render is not None, "requires rendered targets"
-    return set_values(scene, config.parameters, render.parameters, config.source, "target.render.parameters")

@@ -110,12 +110,10 @@ class Masked:
     """Masked pixels of one view, as a boolean array (H, W) for each kind. `left_out` has the excluded pixels. A pixel
     may have several kinds.
 
-    `weights` (H, W) come from a weights file. Without such a file, `weights` is None. `stay` counts the pixels of kinds
-    that are reported but not excluded.
+    `weights` (H, W) come from a weights file. Without such a file, `weights` is None.
     """
 
     left_out: dict[str, Array] = field(default_factory=dict)
-    stay: dict[str, int] = field(default_factory=dict)
     weights: Array | None = None
 
     def total(self, shape: tuple[int, int]) -> Array:
@@ -254,7 +252,6 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
             "pixels": math.prod(view.target.shape[:2]),
             "left_out": 0 if view.weights is None else int((np.array(view.weights)[:, :, 0] == 0).sum()),
             "kinds": view.masked.counts(),
-            "counted": view.masked.stay,
         }
         for view in views
     ]

@@ -7,6 +7,7 @@ Sensitivity, Scaled     measured sensitivity of a parameter
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -90,12 +91,11 @@ def key_of(what: dict[str, Any]) -> str:
 class DecisionCache:
     """JSON file of decisions by key.
 
-    An unreadable file counts as empty. If writing fails, the file is unchanged and `keeps` becomes False.
+    An unreadable file counts as empty. If writing fails, the file is unchanged.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
         self._given = folder
-        self.keeps = True
 
     def get(self, key: str) -> Decision | None:
         """Return the decision of `key`, or None if there is none that this version can read."""
@@ -109,12 +109,10 @@ class DecisionCache:
         entries = {name: value for name, value in self._read().items() if name != key}
         entries = {**dict(list(entries.items())[1 - MOST :]), key: decision.to_json()}
         text = json.dumps(entries, indent=1)
-        try:
+        with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: no home folder
             path = self._path()
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, lambda file: file.write(text.encode() + b"\n"))
-        except (OSError, RuntimeError):  # RuntimeError: no home folder
-            self.keeps = False
 
     def _path(self) -> Path:
         return (self._given or cache_folder()) / CACHE_FILE
@@ -136,7 +134,7 @@ class Sensitivity(Jsonable):
 
     `value`, `gradient` and `noise` are root mean squares over the entries. `gradient` is 0 if it cannot be
     distinguished from noise, and `noise` is the standard deviation of one step's gradient. `change` is relative, per
-    unit. `change`, `curvature` (loss per unit²) and `length` are None if the image did not change.
+    unit. `change` and `length` are None if the image did not change.
     """
 
     key: str
@@ -145,7 +143,6 @@ class Sensitivity(Jsonable):
     gradient: float
     noise: float
     change: float | None = None
-    curvature: float | None = None
     length: float | None = None
 
 
@@ -154,8 +151,10 @@ class Scaled(Sensitivity):
     """Sensitivity of a parameter, and the resulting scale.
 
     `own_length` is `length` in the optimiser's variable. `first_step` is how far one learning rate initially moves the
-    value, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled.
+    value, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled. `curvature` is
+    that of the loss in the optimiser's variable, for `scale: curvature`.
     """
 
     own_length: float | None = None
     first_step: float | None = None
+    curvature: float | None = None

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from textwrap import wrap
 from typing import Any, NamedTuple
 
-from reslrb_cli.optimization.errors import ErrorMeter
+from reslrb_cli.optimization.problem import ErrorMeter
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.measurements import INCOMPLETE, incomplete_records
 from reslrb_cli.records.metrics import Record

@@ -59,14 +59,12 @@ def conditioning_lines(measured: Conditioning) -> list[str]:
     """Return one line per parameter, in the parameter's units, and a line with the spread between parameters. Unknown
     values are `-`.
     """
-    rows: list[tuple[str, ...]] = [
-        ("parameter", "entries", "value", "gradient", "noise", "image / unit", "curvature", "length")
-    ]
+    rows: list[tuple[str, ...]] = [("parameter", "entries", "value", "gradient", "noise", "image / unit", "length")]
     for row in measured.rows:
-        numbers = (row.value, row.gradient, row.noise, row.change, row.curvature, row.length)
+        numbers = (row.value, row.gradient, row.noise, row.change, row.length)
         rows.append((row.key, str(row.entries), *map(_number, numbers)))
-    gradient, change, curvature, length = (_number(measured.spread(quantity)) for quantity in QUANTITIES)
-    rows.append(("largest / smallest", "", "", gradient, "", change, curvature, length))
+    gradient, change, length = (_number(measured.spread(quantity)) for quantity in QUANTITIES)
+    rows.append(("largest / smallest", "", "", gradient, "", change, length))
     return table(rows, "<>")
 
 

@@ -279,7 +279,7 @@ class RunProgress:
         """
         met = SavedResults(
             self.results.images["initial"], self.certainty.noted, self.best.least,
-            self.best_values(), self.certainty.squares, self.certainty.last_steps(),
+            self.best_values(), self.certainty.squares, self.certainty.last,
         )  # fmt: skip
         return entries(self._settled, state.on_file(self.problem), met)
 
@@ -293,7 +293,7 @@ class RunProgress:
         squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
         wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
         kept = {key: each[0] for key, each in squares.items() if each is not None}
-        last = self.certainty.expects(met.certainty)
+        last = {key: None for key in met.certainty.last if key in problem.selection.keys}
         met = stored.fill(replace(met, best_values=wanted, squares=kept, last_steps=last))
         for record in records:
             self._take(record)

@@ -17,7 +17,7 @@ from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_faul
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
-from reslrb_cli.optimization.sensitivity import curvature_line, step_line
+from reslrb_cli.optimization.sensitivity import scale_line
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
@@ -174,12 +174,8 @@ class Recording:
         """Record the measurements for `scale` in the manifest, and log the resulting steps."""
         self.manifest.scaling = [row.to_json() for row in measured]
         for row in measured:
-            spec = self.problem.selection.specs[row.key]
-            rate = spec.learning_rate or self.problem.config.optimizer.learning_rate
             level = logging.WARNING if row.own_length is None else logging.INFO
-            scale = self.problem.config.optimizer.scale
-            line = curvature_line(row, rate) if scale == "curvature" else step_line(row, spec.transform, rate)
-            logger.log(level, f"scale {scale}: {line}")
+            logger.log(level, f"scale {self.problem.config.optimizer.scale}: {scale_line(row)}")
 
     def _on_nonfinite(self, found: Findings) -> None:
         """Save the state before the first step with a non-finite value, and explain how to inspect the state."""

@@ -134,13 +134,6 @@ class Selection:
         self.deformation.place()
         self.params.update()
 
-    def faces(self, key: str) -> np.ndarray[Any, Any] | None:
-        """Return the triangles (3 m indices) of the mesh whose vertex positions are `key`. For other keys,
-        return None.
-        """
-        mesh, _, name = key.rpartition(".")
-        return np.array(self.params[f"{mesh}.faces"]) if name == "vertex_positions" else None
-
     def slot(self, key: str) -> ParameterValue:
         """Return an object that reads and sets the value of `key`. Call `update` afterwards."""
         return ParameterValue(self._holder(key), key)
@@ -184,8 +177,9 @@ def select_parameters(
         check_transform(slot, value, settings, place)
         # The sides of an environment map meet.
         is_map = slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
-        if settings.smoothing is not None and not (is_map or selection.faces(key) is not None):
-            raise place.fail("precondition", f"smooths textures, heightmaps and vertices, but not `{key}`")
+        if settings.smoothing is not None and not is_map:
+            instead = "; recover a `heightmap` of the mesh instead" if key.endswith(".vertex_positions") else ""
+            raise place.fail("precondition", f"smooths textures and heightmaps, but not `{key}`{instead}")
         selection.check_regularizers(key, place)
         if values is not None or settings.initial != "scene" or settings.resolution is not None:
             slot.set(value)

@@ -41,9 +41,6 @@ def test_memory_matches_the_run(experiment: Path) -> None:
     assert sorted(os.listdir(experiment)) == before
     told = re.search(r"memory of the iterations: at most ([\d.]+) MiB", printed)
     assert told is not None, printed
-    sizes = re.findall(r"^ +([\d.]+) (MiB|KiB|B) ", printed, re.MULTILINE)[:-2]  # no thread-local or process memory
-    units = {"MiB": 1.0, "KiB": 2.0**-10, "B": 2.0**-20}
-    assert sum(float(size) * units[unit] for size, unit in sizes) == pytest.approx(float(told[1]), abs=0.2)
     assert "time of the iterations: " in printed
     assert "time of the whole run: about " in printed
     call("--quiet")
@@ -67,29 +64,19 @@ def test_few_long_steps_suffice(experiment: Path, monkeypatch: pytest.MonkeyPatc
     assert taken == [0, 1, 2]
 
 
-@pytest.mark.parametrize("keeps", [True, pytest.param(False, marks=pytest.mark.long)])
-def test_work_before_the_iterations_is_measured_once(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch, keeps: bool
-) -> None:
-    """A dry run measures the decisions and stores them for the run that follows. Without a cache, the run measures them
-    again.
-    """
-    cache = experiment / "cache"
-    monkeypatch.setenv("RESLRB_CACHE", str(cache))
-    if not keeps:
-        cache.write_text("no folder")
+def test_work_before_the_iterations_is_measured_once(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dry run measures the decisions and stores them for the run that follows."""
+    monkeypatch.setenv("RESLRB_CACHE", str(experiment / "cache"))
     auto = ["--set", "integrator={type: reslrb, max_depth: 3, paths: light}", "--set", "run.certainty=false"]
     auto += ["--set", "run.measuring=1000"]
     printed = call("--dry-run", *auto)
-    told = re.search(r"^ +([\d.]+ m?s)(, done now and stored)?  choosing the sampling$", printed, re.MULTILINE)
-    assert told is not None, printed
-    assert (told[2] is not None) == keeps
+    assert re.search(r"^ +[\d.]+ m?s, done now and stored  choosing the sampling$", printed, re.MULTILINE), printed
     call(*auto)
     manifest = read_manifest(experiment / "runs" / "tiny")
     assert manifest is not None
-    assert [each["cached"] for each in manifest["decisions"] if each["gain"] is not None] == [keeps]
+    assert [each["cached"] for each in manifest["decisions"] if each["gain"] is not None] == [True]
     printed = call("--dry-run", *auto)
-    assert ("none, or stored from before" in printed) == keeps
+    assert "none, or stored from before" in printed
 
 
 @pytest.mark.parametrize(

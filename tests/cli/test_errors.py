@@ -240,14 +240,15 @@ def little(monkeypatch: pytest.MonkeyPatch) -> int:
 
 @pytest.mark.usefixtures("llvm")
 def test_requirements_beyond_the_free_memory(experiment: Path, little: int) -> None:
+    advice = "and 1 GiB are free; use a smaller film or coarser textures"
     line = obstacle(experiment, "scene.size=[6000, 4000]")
-    said = "scene.size: a film of 6000x4000 pixels takes at least 1.3 GiB, and 1 GiB are free; use at most 5181x3454"
-    assert line.endswith(said)
+    assert line.endswith(advice)
+    assert "scene.size: a film of 6000x4000 pixels: a step takes at least " in line
     line = obstacle(experiment, "parameters[0].resolution=[10000, 10000]")
-    assert line.endswith("parameters[0].resolution: 10000x10000 texels takes at least 1.5 GiB, and 1 GiB are free; "
-                         "use at most 8192x8192")  # fmt: skip
+    assert line.endswith(advice)
+    assert "parameters[0].resolution: a film of 8x8 pixels and 10000x10000 texels: a step takes at least " in line
     (experiment / "scene.xml").write_text(SCENE.replace('value="8"', 'value="5000"'))
-    assert "scene.file: a film of 5000x5000 pixels takes at least 1.4 GiB" in obstacle(experiment)
+    assert "scene.file: a film of 5000x5000 pixels: a step takes at least " in obstacle(experiment)
 
 
 @pytest.mark.usefixtures("llvm")

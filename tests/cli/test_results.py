@@ -92,7 +92,7 @@ def test_a_truth_of_another_resolution_has_an_error():
     assert results["parameter_rmse"][KEY]["initial"] == pytest.approx(records[0]["parameter_errors"][KEY])
     assert results["parameters"][KEY]["shape"] == [8, 8, 3]
     assert "parameter RMSE" in last
-    assert read("runs/box/parameters/true/" + KEY + ".exr").shape == (4, 4, 3)
+    assert read("runs/box/parameters/true/" + KEY + ".exr").shape == (8, 8, 3)
 
 
 def test_a_worse_parameter_is_reported():

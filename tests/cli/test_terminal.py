@@ -24,7 +24,7 @@ from records.test_metrics import make_record
 
 from reslrb_cli.cli.progress import Progress, descriptions
 from reslrb_cli.cli.terminal import LogLines
-from reslrb_cli.optimization.errors import ErrorMeter
+from reslrb_cli.optimization.problem import ErrorMeter
 
 # Names from scenes, files and arguments reach the terminal and the log as text, never as commands.
 

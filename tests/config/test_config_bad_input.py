@@ -236,7 +236,7 @@ def test_removed_settings_are_refused_with_a_replacement(name: str, tmp_path: Pa
     place, _, value = name.partition(": ")
     lists = {
         "views.": "views[0].", "render.": "target.render.", "mask.": "target.mask.",
-        "regularizers.": "parameters[0].regularizers[0].",
+        "regularizers.": "parameters[0].regularizers[0].", "parameters.": "parameters[0].",
     }  # fmt: skip
     for short, whole in lists.items():
         place = whole + place.removeprefix(short) if place.startswith(short) else place

@@ -56,9 +56,11 @@ class World:
     entries: int = 200
     alone: bool = False
     calls: list[Any] = field(default_factory=list)
+    spent_s: float = 0.0
 
     def learn(self, round: int, spp: int) -> Step:
         self.calls.append(("learn", round, spp))
+        self.spent_s += 1e-3 * (self.walk * spp + self.python + 5.0)
         return Step(kernel_ms=self.walk * spp, wall_ms=self.walk * spp + self.python, compile_ms=5.0)
 
     def take(self, other: bool, round: int, spp: int) -> Step:
@@ -68,6 +70,7 @@ class World:
         picture = factor if self.image is None else (self.image if other else 1.0)
         kernel = spp * (self.time if other else 1.0)
         apart = spp * (self.image_time if other else 1.0) if self.alone else 0.0
+        self.spent_s += 1e-3 * (kernel + apart + self.overhead)
         return Step(
             {"a": self._noisy(random, factor / spp), "b": 1000 * self._noisy(random, factor / spp)},
             {"0": self._noisy(random, picture / spp)},
@@ -85,6 +88,11 @@ class World:
         sizes = replace(sizes, rounds=rounds, alone=self.alone)
         return Turns(self.take, sizes, limit_s, self.learn, guides).run()
 
+    @property
+    def rounds(self) -> int:
+        """The number of rounds of the race, after the step of the other kind that compiles kernels."""
+        return [call[0] for call in self.calls].count(True) - 1
+
 
 def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write the tiny experiment to `folder`, make it the working directory, and set a cache of its own."""
@@ -99,7 +107,7 @@ def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) ->
     """Fix the times of steps. A step and a walk for learning take 1 ms each. A step of the other kind takes the time
     that `other_ms` gives for the decided option.
     """
-    monkeypatch.setattr(race, "timed", lambda times, wall_ms=None: Step(kernel_ms=1.0, wall_ms=1.0))
+    monkeypatch.setattr(race, "timed", lambda times: Step(kernel_ms=1.0, wall_ms=1.0))
     take = StepTrial.take
 
     def timed(self: StepTrial, other: bool, round: int, spp: int) -> Step:

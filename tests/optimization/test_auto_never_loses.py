@@ -123,7 +123,7 @@ def test_losses_are_found(fault: str, tmp_path: Path, monkeypatch: pytest.Monkey
         run = Turns.run
 
         def forced(self: Turns) -> Finding:
-            return dataclasses.replace(run(self), other=True, images=True)
+            return dataclasses.replace(run(self), other=True)
 
         monkeypatch.setattr(Turns, "run", forced)
     else:

@@ -509,15 +509,13 @@ def test_the_border_is_excluded_unless_both_are_light_traced(masked_folder, make
 def test_pixels_invisible_to_light_tracing(masked_folder, bsdf, kind):
     scene = masked_folder / "scene.xml"
     scene.write_text(scene.read_text().replace("</scene>", GLASS.format(bsdf)))
-    problem, lines = make_masked(masked_folder, "target.file=photo.png")
+    problem, _ = make_masked(masked_folder, "target.file=photo.png")
     masked = problem.views[0].masked
     if kind == "specular":
         assert 0 < masked.counts()["specular"] < 40
         assert (3, 3) in left_out(problem)
         return
     assert masked.counts().keys() == {"clipped", "alpha"}
-    assert masked.stay["mixed"] > 0
-    assert "show coats, blends or thin panes and are kept" in lines[0]
 
 
 def test_an_empty_mask_is_refused(masked_folder):

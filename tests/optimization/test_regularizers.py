@@ -9,18 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reslrb_cli.config.parameters import (
-    Curvature,
-    ParameterSpec,
-    Thickness,
-    TotalVariation,
-)
+from reslrb_cli.config.parameters import ParameterSpec, Thickness, TotalVariation
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.regularizers import Span, make_cost, spans_of
 
 ALL = {
-    "curvature": Curvature(radius=50, weight=2),
-    "thickness": Thickness(thickness=0.3, least=0.4),
+    "thickness": Thickness(thickness=0.3, least=0.4, weight=2),
     "total_variation": TotalVariation(),
 }
 WIDE, HIGH = 10.0, 7.0
@@ -68,16 +62,10 @@ def test_refining_a_map_keeps_its_cost(name):
 
 
 def test_lengths_are_in_scene_units():
-    """A ball of radius 5, seen from below, is a hollow of curvature 1/5. A ramp of slope 2 varies by 2 per length."""
+    """A ramp of slope 2 varies by 2 per length."""
     n = 64
-    x, y = np.meshgrid(*[((np.arange(n) + 0.5) / n - 0.5) * 2] * 2)
-    bowl = (5 - np.sqrt(25 - x**2 - y**2))[:, :, None]
+    x, _ = np.meshgrid(*[((np.arange(n) + 0.5) / n - 0.5) * 2] * 2)
     spans = Span(2), Span(2)
-    limit = 1 / 10
-    value, _ = make_cost(Curvature(radius=10), spans)(bowl)
-    assert value == pytest.approx(4 * (1 / 5 - limit) ** 2, rel=1e-2)
-    assert make_cost(Curvature(radius=10), spans)(-bowl)[0] == 0  # a hill does not limit a tool
-    assert make_cost(Curvature(radius=4.9), spans)(bowl)[0] == 0
     ramp = 2 * x[:, :, None]
     assert make_cost(TotalVariation(), spans)(ramp)[0] == pytest.approx(8, rel=1e-3)
     assert make_cost(Thickness(thickness=1, least=1.5), spans)(0 * ramp)[0] == pytest.approx(4 * 0.25)
@@ -160,7 +148,7 @@ def test_a_bitmap_is_measured_in_its_texture_coordinates(tmp_path):
     slope = 3**0.5 * 0.8 / 7 * 8
     assert costs[0] == pytest.approx(slope, rel=2e-3)
     assert costs[1] == pytest.approx(slope, rel=0.15)  # resampling makes the rim flat
-    bad = ParameterSpec(key="*.reflectance.data", regularizers=[{"type": "curvature", "radius": 1.0}])
+    bad = ParameterSpec(key="*.reflectance.data", regularizers=[{"type": "thickness", "thickness": 1.0, "least": 0.5}])
     with pytest.raises(ConfigError, match="a bitmap; use total_variation"):
         select_parameters(load_scene(tmp_path / "s.xml"), [bad], "c.yaml")
 
@@ -189,7 +177,7 @@ REFUSED = {
     "a motion": ("motion: {of: face}", "[{type: total_variation}]", "has no surface"),
     "twice": (HEAD, "[{type: total_variation}, {type: total_variation}]", "regularizers[1].type: total_variation is"),
     "unknown": (HEAD, "[{type: smooth}]", "regularizers[0].type"),
-    "no radius": (HEAD, "[{type: curvature}]", "regularizers[0].radius: missing"),
+    "removed": (HEAD, "[{type: curvature, radius: 3}]", "was removed; take total_variation"),
     "through": (
         f"{HEAD}, initial: -3.0",
         "[{type: thickness, thickness: 2, least: 1}]",

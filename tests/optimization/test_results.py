@@ -15,10 +15,9 @@ from records.test_metrics import RECORD, make_record
 
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.optimization import loading, loop
-from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.errors import ErrorMeter, nearest, quantity
+from reslrb_cli.optimization.assemble import assemble_scene, quantity
+from reslrb_cli.optimization.problem import ErrorMeter
 from reslrb_cli.optimization.results import WINDOW, Best, Results, summary
-from reslrb_cli.scene.values import resample
 
 # Parameters summarised in a few numbers, and results that exist whenever a run ends.
 
@@ -35,8 +34,6 @@ def test_textures_are_reported_by_mean_and_range_of_reached_texels():
     mask = np.array([[True, True], [False, False]])
     assert summary(value, mask) == {"mean": [2.0, 3.0, 4.0], "min": 1.0, "max": 5.0}
     assert summary(value, np.zeros((2, 2), dtype=bool))["max"] == 100  # if nothing is reached, all entries count
-    finer = np.repeat(np.repeat(mask, 3, axis=0), 2, axis=1)
-    assert summary(value, finer) == summary(value, mask)
 
 
 def test_results_of_a_run(tmp_path, steps):
@@ -93,11 +90,7 @@ def test_an_image_of_each_sensor_is_requested(tmp_path):
     assert results.to_json()["image_loss"]["final"] == pytest.approx(0.04, rel=1e-4)
 
 
-# Errors of parameters: over the reached entries, in units that add up or do not, and at different resolutions.
-
-
-def texture(height, width, seed=0):
-    return np.random.default_rng(seed).uniform(0.1, 0.9, (height, width, 3)).astype(np.float32)
+# Errors of parameters: over the reached entries, in units that add up or do not.
 
 
 def everything(array):
@@ -154,33 +147,6 @@ def test_units_of_parameters_without_errors_do_not_matter():
 def test_a_black_truth_has_no_relative_error():
     meter = meter_of({"soot": np.zeros(3), "wall": np.ones(3)})
     assert meter.relative({"soot": 0.3, "wall": 0.5}) == {"wall": 0.5}
-
-
-@pytest.mark.parametrize(("own", "true"), [((4, 6), (8, 12)), ((16, 12), (8, 6)), ((4, 12), (8, 6)), ((5, 7), (8, 8))])
-def test_another_resolution_is_compared_on_the_finer_grid(own, true):
-    value, truth = texture(*own, seed=1), texture(*true, seed=2)
-    mask = np.ones(own, dtype=bool)
-    mask[: own[0] // 2] = False
-    grid = max(own[0], true[0]), max(own[1], true[1])
-    expected = (resample(value, grid[::-1]) - resample(truth, grid[::-1]))[nearest(mask, grid)]
-    error = ErrorMeter({"t": truth}, {"t": mask}).errors(lambda key: value)["t"]
-    assert error == pytest.approx(np.sqrt(np.mean(np.square(expected, dtype=np.float64))), rel=1e-5)
-    flat = ErrorMeter({"t": np.full_like(truth, 0.3)}, {"t": mask}).errors(lambda key: np.full_like(value, 0.5))
-    assert flat["t"] == pytest.approx(0.2, rel=1e-5)
-
-
-def test_the_truth_at_its_own_resolution_is_not_resampled():
-    value, truth = texture(4, 4, seed=1), texture(4, 4, seed=2)
-    error = meter_of({"t": truth}).errors(lambda key: value)["t"]
-    assert error == pytest.approx(np.sqrt(np.mean(np.square(value - truth, dtype=np.float64))), rel=1e-6)
-
-
-def test_a_mask_on_a_finer_grid():
-    mask = np.array([[True, False], [False, False]])
-    expected = np.zeros((4, 6), dtype=bool)
-    expected[:2, :3] = True
-    assert np.array_equal(nearest(mask, (4, 6)), expected)
-    assert np.array_equal(nearest(expected, (2, 2)), mask)
 
 
 IMAGE = {"type": "bitmap", "raw": True}

@@ -19,12 +19,11 @@ from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.optimizers import Optimizer, Variable, make_transform
 from reslrb_cli.optimization.sensitivity import (
-    curvature_line,
     measure_curvatures,
     measure_sensitivities,
     own_length,
     rescale,
-    step_line,
+    scale_line,
 )
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.records.decisions import Scaled
@@ -154,7 +153,7 @@ def test_a_stiff_problem_is_solved_with_one_learning_rate():
 
 @pytest.mark.parametrize(
     "transforms",
-    [("none", "none"), ("sigmoid", "log"), pytest.param(("softplus", "softplus"), marks=pytest.mark.long)],
+    [("none", "none"), ("sigmoid", "log")],
 )
 def test_the_optimiser_gets_gradients_of_order_one(transforms):
     sets = [f"parameters[{i}].transform={name}" for i, name in enumerate(transforms)]
@@ -168,7 +167,7 @@ def test_the_optimiser_gets_gradients_of_order_one(transforms):
         np.testing.assert_allclose(problem.selection.array(row.key), row.value, rtol=1e-6)
 
 
-@pytest.mark.parametrize("transform", a_few(["none", "sigmoid", "log", "softplus"], ["none", "log"]))
+@pytest.mark.parametrize("transform", a_few(["none", "sigmoid", "log"], ["none", "log"]))
 def test_the_first_step_matches_the_printed_line(transform):
     """Adam's first step is one learning rate in the variable that Adam moves."""
     sets = [f"parameters[1].transform={transform}", "parameters[1].bounds=[0, 1e8]", "run.iterations=1"]
@@ -178,31 +177,20 @@ def test_the_first_step_matches_the_printed_line(transform):
     state, _ = loop.step(problem, standing(problem))
     moved = problem.selection.array(LAMP) / before
     row = next(row for row in state.scaling if row.key == LAMP)
-    rate = problem.config.optimizer.learning_rate
-    line = step_line(row, transform, rate)
-    assert line.startswith(f"{LAMP} moves in steps of {row.own_length:.3g} times the learning rate")
-    if transform == "log":
-        factor = float(line.partition("by a factor of ")[2].partition(",")[0])
-        np.testing.assert_allclose(np.maximum(moved, 1 / moved), factor, rtol=0.01)
-        assert "in its logarithm" in line
-        return
-    step = float(line.rpartition("at first by about ")[2])
+    step = float(scale_line(row).partition("moves by about ")[2].removesuffix(" at first"))
     # The line reports the larger of the changes up and down
     assert np.all(np.abs(moved - 1) * before <= 1.01 * step)
     assert np.abs((moved - 1) * before).max() > 0.7 * step
-    assert ("logit between the bounds" in line) == (transform == "sigmoid")
-    assert ("log(exp(x) - 1)" in line) == (transform == "softplus")
     if transform == "none":
+        rate = problem.config.optimizer.learning_rate
         assert (row.own_length, step) == (row.length, pytest.approx(rate * row.length, rel=0.01))
 
 
 def test_the_line_of_an_unscaled_parameter_gives_the_reason():
     row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0)
-    assert (
-        step_line(row, "log", 0.1) == "lamp.intensity.value has no effect on the image at its start; it is not scaled"
-    )
-    row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0, change=1.0, curvature=1.0, length=1.0)
-    assert "no gradient" in step_line(row, "log", 0.1)
+    assert scale_line(row) == "lamp.intensity.value has no effect on the image at its start; it is not scaled"
+    row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0, change=1.0, length=1.0)
+    assert "no gradient" in scale_line(row)
 
 
 # --- units of curvature -----------------------------------------------------------------------------------------------
@@ -222,7 +210,7 @@ def test_the_curvature_of_a_lamp_matches_its_image():
     a = np.array(problem.render(0, 512, 0, "test"), dtype=np.float64) / x
     assert row.curvature == pytest.approx(2 * np.mean(a**2, axis=(0, 1)).max() / 3, rel=0.1)
     np.testing.assert_array_equal(np.array(problem.optimizer[LAMP]), before)
-    assert curvature_line(row, 0.5).startswith(f"{LAMP} moves by {row.first_step:.3g} at first")
+    assert scale_line(row) == f"{LAMP} moves by about {row.first_step:.3g} at first"
 
 
 @pytest.mark.parametrize(("rate", "ends"), [(1.0, "below"), (3.0, "above")])
@@ -242,5 +230,5 @@ def test_only_gradient_descent_uses_curvature():
 
 def test_parameters_that_cannot_be_smoothed_are_refused_with_a_location():
     config = load(CONFIG, [*TINY, "parameters=[{key: lamp.intensity.value, precondition: 0.1}]"])
-    with pytest.raises(ConfigError, match=r"parameters\[0\].precondition: smooths textures, heightmaps and vertices"):
+    with pytest.raises(ConfigError, match=r"parameters\[0\].precondition: smooths textures and heightmaps, but not"):
         assemble(config)

@@ -12,7 +12,7 @@ from reslrb_cli.optimization.results import got_worse
 from reslrb_cli.optimization.trend import Change, find_trend, window
 from reslrb_cli.optimization.uncertainty import posterior
 from reslrb_cli.optimization.uncertainty.curvature import ParameterDirection, smooth
-from reslrb_cli.optimization.uncertainty.posterior import Entries, LastSteps, Measured, Posterior, alone, joint
+from reslrb_cli.optimization.uncertainty.posterior import Entries, Measured, Posterior, alone, joint
 from reslrb_cli.optimization.uncertainty.verdicts import (
     ParameterVerdict,
     judge,
@@ -270,7 +270,7 @@ def recover(random, iterations, start=START, tails=3.0):
             rates=rates.tolist(),
             is_small=True,
             recent=np.mean(np.square(gradients[seen:]), axis=0)[at : at + 1],
-            last=LastSteps(*(np.array(each)[seen:, at : at + 1] + by for each, by in ((gradients, 0), (values, 0.6)))),
+            last=np.stack([np.array(gradients), np.array(values) + 0.6], axis=1)[seen:, :, at : at + 1],
             pace=np.array(responses)[:, at] / responses[-1][at],
         )
         for at, name in enumerate(("wall", "ceiling"))

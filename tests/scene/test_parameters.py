@@ -127,7 +127,7 @@ def test_bounds_hold_for_the_nearest_float(make_scene):
             "initial",
             "0 at entry 1; transform: log yields only pos",
         ),
-        ([{"key": LAMP, "initial": -2.0, "transform": "softplus"}], "initial", "starts at -2 at entry 0"),
+        ([{"key": LAMP, "initial": -2.0, "transform": "log"}], "initial", "starts at -2 at entry 0"),
         (
             [{"key": LAMP, "bounds": [0, 3], "transform": "sigmoid"}],
             "initial",

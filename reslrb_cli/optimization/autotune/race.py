@@ -21,20 +21,19 @@ from __future__ import annotations
 
 import math
 import statistics
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.integrators.step import render_image
+from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import finite, sample_gradient, take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
@@ -45,7 +44,7 @@ from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
 CONFIDENCE = 0.95
-#: Minimum relative efficiency of the image for a sampling method that serves both image and gradient.
+#: Minimum relative efficiency of the image.
 LEAST_IMAGE = 0.95
 #: Rounding error of a sum that should vanish, as a share of it.
 ROUNDING = 1e-12
@@ -54,9 +53,8 @@ MOST_VIEWS, MOST_VALUES = 4, 2**15
 #: Samples of the image at which dL/dI is fixed, as a share of a step's.
 IMAGE_SHARE = 0.25
 Gradients = dict[str, Array]
-#: A gain and the ends of its interval; None if unknown.
-Gain = tuple[float, float, float] | tuple[None, None, None]
-NOTHING: Gain = (None, None, None)
+#: A gain and the ends of its interval.
+Gain = tuple[float, float, float]
 
 
 # --- steps, and how they compare --------------------------------------------------------------------------------------
@@ -83,23 +81,20 @@ class Step:
         return max(self.wall_ms - self.kernel_ms - self.image_ms, 0.0)
 
 
-def timed(times: StepTimes, wall_ms: float | None = None) -> Step:
-    """Return a step with these times. If the process waited for other work, `wall_ms` replaces the clock's wall
-    time.
-    """
+def timed(times: StepTimes) -> Step:
+    """Return a step with these times."""
     # Kernels are compiled in parallel: their times can add up to more than the wait.
-    waited_ms = max((times.wall_ms if wall_ms is None else wall_ms) - times.codegen_ms, times.kernel_ms)
+    waited_ms = max(times.wall_ms - times.codegen_ms, times.kernel_ms)
     return Step(kernel_ms=times.kernel_ms, wall_ms=waited_ms, compile_ms=times.codegen_ms)
 
 
 def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Step:
     """Take one step of all views, with separate seeds. Leaves neither a gradient nor a change."""
-    start = time.perf_counter()
-    problem.apply()
     with clock.step() as times:
+        problem.apply()
         sample_gradient(problem, integrator, round, "pilot", spp)
-    gradients = take_gradient(problem)
-    return replace(timed(times, 1e3 * (time.perf_counter() - start)), gradients=gradients)
+        take_gradient(problem)
+    return timed(times)
 
 
 def compare(
@@ -108,47 +103,43 @@ def compare(
     other: Sequence[Gradients],
     other_ms: Sequence[float],
     confidence: float = CONFIDENCE,
-) -> Gain:
+) -> Gain | None:
     """Return the efficiency of `other` divided by the efficiency of `own`, with the confidence interval of the ratio.
 
     `own` and `other` have the gradients of at least three steps, by parameter. `own_ms` and `other_ms` have the times
-    of steps in any unit. Returns NOTHING if one way has no noise.
+    of steps in any unit. Returns None if one way has no noise.
     """
-    units = scales([*own, *other])
-    found = [_log_variances(gradients, units) for gradients in (own, other)] if units else [None]  # such as no light
-    known = [each for each in found if each is not None]
-    if len(known) < 2:
-        return NOTHING
+    squares = {key: float(np.mean([sum_of_squares(g[key]) for g in (*own, *other)])) for key in own[0]}
+    known = [_log_variances(gradients, {key: square for key, square in squares.items() if square > 0})
+             for gradients in (own, other)]  # fmt: skip
+    if known[0] is None or known[1] is None:
+        return None
     from scipy.special import stdtrit  # late: every run imports this module, and few need SciPy
 
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
     advantage = math.exp(known[0][0] - known[1][0]) * times
-    variance = sum(float(jackknife_variance(without)) for _, without in known)
+    variance = sum(float(jackknife_variance(each[1])) for each in known if each is not None)
     half = float(stdtrit(min(len(own), len(other)) - 1, (1 + confidence) / 2)) * math.sqrt(variance)
     factor = math.exp(min(half, 50.0)) * TIMING_NOISE
     return advantage, advantage / factor, advantage * factor
 
 
-def scales(gradients: Sequence[Gradients]) -> dict[str, float]:
-    """Return the mean square norm of each parameter's gradient, if it has a gradient."""
-    found = {key: float(np.mean([sum_of_squares(g[key]) for g in gradients])) for key in gradients[0]}
-    return {key: scale for key, scale in found.items() if scale > 0}
-
-
-def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
+def _log_variances(gradients: Sequence[Gradients], squares: dict[str, float]) -> tuple[float, Array] | None:
     """Return the logarithm of the total variance of all parameters. Also return the logarithms with each round left out
-    in turn.
+    in turn. Return None without noise. `squares` has the mean square norm of each parameter's gradient.
     """
+    if not squares:  # such as no light
+        return None
     rows = np.array([
-        np.concatenate([g[key].astype(np.float64) / math.sqrt(scale) for key, scale in scales.items()])
+        np.concatenate([g[key].astype(np.float64) / math.sqrt(square) for key, square in squares.items()])
         for g in gradients
     ])  # fmt: skip
     count = len(rows)
-    squares = np.square(rows - rows.mean(axis=0)).sum(axis=1) if rows.size else np.zeros(count)
-    whole = float(squares.sum())
+    distances = np.square(rows - rows.mean(axis=0)).sum(axis=1)
+    whole = float(distances.sum())
     # Leave-one-out: dropping a row lowers the sum of squares by its squared distance and that of the mean of the
     # others.
-    without = whole - squares * count / (count - 1)
+    without = whole - distances * count / (count - 1)
     if not without.min() > ROUNDING * whole:
         return None
     return math.log(whole / (count - 1)), np.log(without / (count - 2))
@@ -169,11 +160,6 @@ PLANNED = 3.4
 #: Samples of each walk for learning, as a share of a step's, and number of such walks before the trial if there is time
 #: for more than one.
 LEARNING_SHARE, LEARNINGS = 0.4, 2
-
-
-def sets_of(config: Config) -> int:
-    """Return the number of sets in which a step's samples are traced. Each set has one dL/dI."""
-    return (config.run.batches if config.adjoint == "batched" else 1) * config.shares
 
 
 def lessons(problem: Problem) -> float:
@@ -217,13 +203,13 @@ class Sizes:
 
 def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
     """Return the sample counts of the run's steps and of the planned measured steps."""
-    run, adjoint = problem.config.run, problem.config.adjoint
-    call = run.spp // sets_of(problem.config)
-    part = min(problem.samples_per_pass or call, call)
+    config = problem.config
+    spp, call = config.run.spp, config.set_spp
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
-    learned = lessons(problem) / (run.spp / call * len(problem.drawn(0)))
+    learned = lessons(problem) / (spp / call * len(problem.drawn(0)))
     rounds = ROUNDS_OF_FEW if entries < FEW_ENTRIES else ROUNDS
-    return Sizes(run.spp, call, part, adjoint == "independent", rounds, learned, longer, planned)
+    alone = config.adjoint == "independent"
+    return Sizes(spp, call, pass_spp(config), alone, rounds, learned, longer, planned)
 
 
 #: Take a plain step or one with the option, given a round and the samples per pixel, with the learned table, which
@@ -235,25 +221,20 @@ Learn = Callable[[int, int], Step]
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a race. `other` tells whether the other way is better. `images` tells whether samples that serve only
-    an image use the other way, too.
+    """Result of a race. `other` tells whether the other way is better.
 
-    `gain` is the gain of the other way. `note` gives a reason if the gain alone does not decide. The race took `rounds`
-    rounds and `spent_s` seconds.
+    `gain` is the gain of the other way. `note` gives a reason if the gain alone does not decide.
     """
 
     other: bool
-    images: bool
-    gain: Gain
+    gain: Gain | None
     note: str
-    rounds: int
-    spent_s: float
 
     def why(self) -> str:
         """Return the gain in words, or the reason why there is none."""
-        gain, low, high = self.gain
-        if gain is None:
+        if self.gain is None:
             return self.note
+        gain, low, high = self.gain
         found = f"{gain:.2g} times the efficiency here ({low:.2g} to {high:.2g})"
         return f"{found}; {self.note}" if self.note else found
 
@@ -261,27 +242,18 @@ class Finding:
 class Turns:
     """A race. `take` takes its steps. If a table must learn, `learn` provides the learning walks.
 
-    The race ends after `limit_s` seconds. With `sure`, it takes all planned rounds first, or as many as a step has
-    samples. Steps of milliseconds, whose time is that of Python code, are then measured, too. With `guides`, the other
-    way is guided. Its time then includes the learning of the run, and images with their own samples get their own
-    decision.
+    The race ends after `limit_s` seconds. With `guides`, the other way is guided, and its time includes the learning of
+    the run. Otherwise, the race takes all planned rounds first, or as many as a step has samples. Steps of
+    milliseconds, whose time is that of Python code, are then measured, too.
     """
 
     def __init__(
-        self,
-        take: Take,
-        sizes: Sizes,
-        limit_s: float,
-        learn: Learn | None = None,
-        guides: bool = False,
-        sure: bool = False,
+        self, take: Take, sizes: Sizes, limit_s: float, learn: Learn | None = None, guides: bool = False
     ) -> None:
         self._spent_ms = 0.0
         self._take, self._learn, self._sizes = take, learn, sizes
         self._limit_ms, self._guides = 1e3 * limit_s, guides
-        self._sure = max(min(sizes.rounds, sizes.step), LEAST_ROUNDS) if sure else 0
-        self._apart = guides and sizes.alone
-        self._plain: list[Step] = []  # all plain steps with valid times
+        self._sure = 0 if guides else max(min(sizes.rounds, sizes.step), LEAST_ROUNDS)
         self._steps: tuple[list[Step], list[Step]] = ([], [])  # of both kinds
         self._walk = Step()
 
@@ -290,16 +262,14 @@ class Turns:
         spp, take = self._sizes.trial, self._take
         self._spend(take(False, 0, spp))  # compiles kernels
         plain = self._spend(take(False, 0, spp))
-        self._plain.append(plain)
         # Python's time is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            return self._found(f"measuring it would take more than {self._limit_ms / 1e3:.2g} s")
+            return Finding(False, None, f"measuring it would take more than {self._limit_ms / 1e3:.2g} s")
         self._spend(take(True, 0, spp))
         for round in range(1, 1 + LOOKS * self._sizes.rounds):
             for other in (False, True):
                 self._steps[other].append(self._spend(take(other, round, spp)))
-            self._plain.append(self._steps[False][-1])
             if not self._affords(sum(steps[-1].wall_ms for steps in self._steps)):
                 break
             if round % self._sizes.rounds == 0 and self._is_clear():
@@ -310,23 +280,13 @@ class Turns:
         """Let the table learn if it must. Returns False if the time does not suffice for learning and for the minimum
         number of rounds of `round_ms` each.
         """
-        if self._learn is None:
-            return self._affords(LEAST_ROUNDS * round_ms)
-        self._walk = self._spend(self._learn(0, self._sizes.learning))
-        if not self._affords(LEAST_ROUNDS * round_ms):
-            return False
-        # One more walk gains little compared with the uncertainty of too few rounds.
         rounds = max(self._sizes.rounds // 2, LEAST_ROUNDS)
-        for number in range(1, LEARNINGS):
-            if self._affords(self._walk.wall_ms + rounds * round_ms):
-                self._walk = self._spend(self._learn(number, self._sizes.learning))
-        return True
-
-    @property
-    def _python_ms(self) -> float:
-        """Time outside of kernels for `trial` samples in a run. It occurs once for each `call`."""
-        beside = statistics.median(step.beside_ms for step in self._plain)
-        return beside * self._sizes.trial / self._sizes.call
+        for number in range(LEARNINGS if self._learn is not None else 0):
+            # One more walk gains little compared with the uncertainty of too few rounds.
+            if number and not self._affords(self._walk.wall_ms + rounds * round_ms):
+                break
+            self._walk = self._spend(self._learn(number, self._sizes.learning))  # type: ignore[misc]  # not None
+        return self._affords(LEAST_ROUNDS * round_ms)
 
     def _affords(self, more_ms: float) -> bool:
         return len(self._steps[True]) < self._sure or self._spent_ms + more_ms <= self._limit_ms
@@ -337,60 +297,43 @@ class Turns:
         kernel = self._walk.kernel_ms * sizes.part / sizes.learning
         return (kernel + self._walk.beside_ms) * sizes.lessons * sizes.trial / sizes.call
 
-    def _times(self, other: bool, images: bool) -> list[float]:
-        """Return the times of steps of one kind. `images` is True if images with their own samples use the option as
-        well.
-        """
-        beside = self._python_ms + (self._learning_ms() if other and self._guides else 0.0)
-        if self._sizes.alone:
-            beside += statistics.median(step.image_ms for step in self._steps[other and images])
-        return [step.kernel_ms + beside for step in self._steps[other]]
+    def _times(self, other: bool) -> list[float]:
+        """Return the times of steps of one kind. Time outside of kernels occurs once for each `call` of a run."""
+        steps, beside = self._steps[other], statistics.median(step.beside_ms for step in self._steps[False])
+        beside = beside * self._sizes.trial / self._sizes.call + statistics.median(step.image_ms for step in steps)
+        beside += self._learning_ms() if other and self._guides else 0.0
+        return [step.kernel_ms + beside for step in steps]
 
-    def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
-        """Return the gain of the gradient. `images` is True if images use the option as well."""
+    def _gain(self, confidence: float = CONFIDENCE) -> Gain | None:
+        """Return the gain in efficiency for the gradient."""
         own, other = ([step.gradients for step in steps] for steps in self._steps)
-        return compare(own, self._times(False, images), other, self._times(True, images), confidence)
+        return compare(own, self._times(False), other, self._times(True), confidence)
 
-    def _image_gain(self) -> Gain:
+    def _image_gain(self) -> Gain | None:
         """Return the gain in efficiency for the image. If images have their own samples, these samples give the gain.
         Without separate image samples, the gradient's samples also give the image.
         """
         own, other = ([step.images for step in steps] for steps in self._steps)
-        times = [self._times(each, False) for each in (False, True)]
+        times = [self._times(each) for each in (False, True)]
         if self._sizes.alone:  # time outside kernels counts once, with the gradient
             times = [[step.image_ms for step in steps] for steps in self._steps]
         return compare(own, times[0], other, times[1])
 
     def _is_clear(self) -> bool:
         """True if no more steps are needed. The alternative is then clearly better, or clearly not better."""
-        _, low, high = self._gain(not self._apart or self._images(self._image_gain()), CLEAR)
-        return low is None or high is None or low > 1 or high < 1
-
-    def _images(self, gain: Gain) -> bool:
-        """True if images also use the alternative. If images have no separate decision, True if the alternative does
-        not harm images.
-        """
-        if self._apart:
-            return gain[1] is not None and gain[1] > 1
-        return gain[2] is None or gain[2] >= LEAST_IMAGE
+        gain = self._gain(CLEAR)
+        return gain is None or gain[1] > 1 or gain[2] < 1
 
     def _decided(self) -> Finding:
-        if len(self._steps[False]) < LEAST_ROUNDS:
-            return self._found(f"{len(self._steps[False])} steps of both are too few to decide")
-        picture = self._image_gain()
-        images = self._images(picture)
-        gain = self._gain(images or not self._apart)
-        if gain[1] is None:
-            return self._found("gradients have no noise")
-        note = ""
-        if gain[1] > 1 and not (images or self._apart):
+        if (count := len(self._steps[False])) < LEAST_ROUNDS:
+            return Finding(False, None, f"{count} steps of both are too few to decide")
+        gain, image = self._gain(), self._image_gain()
+        if gain is None:
+            return Finding(False, None, "gradients have no noise")
+        if gain[1] > 1 and image is not None and image[2] < LEAST_IMAGE:
             whose = "images have" if self._sizes.alone else "the image, of the same samples, has"
-            note = f"{whose} {picture[0]:.2g} times the efficiency"
-        on = gain[1] > 1 and not note
-        return self._found(note, gain, on, on and images)
-
-    def _found(self, note: str, gain: Gain = NOTHING, other: bool = False, images: bool = False) -> Finding:
-        return Finding(other, images, gain, note, len(self._steps[True]), self._spent_ms / 1e3)
+            return Finding(False, gain, f"{whose} {image[0]:.2g} times the efficiency")
+        return Finding(gain[1] > 1, gain, "")
 
     def _spend(self, step: Step) -> Step:
         """Add the time of a step."""
@@ -426,10 +369,9 @@ class StepTrial:
         self._slopes = [self._slope(view) for view in self.views]
         take_gradient(problem)  # recovered exposures have some of these entries
 
-    def race(self, sizes: Sizes, limit_s: float, guides: bool = False, sure: bool = False) -> Finding:
+    def race(self, sizes: Sizes, limit_s: float, guides: bool = False) -> Finding:
         """Return the result of alternating steps (`Turns`)."""
-        learn = None if self.table is None else self.learn
-        return Turns(self.take, sizes, limit_s, learn, guides, sure).run()
+        return Turns(self.take, sizes, limit_s, None if self.table is None else self.learn, guides).run()
 
     def _slope(self, view: View) -> mi.TensorXf:
         """Return the fixed dL/dI. Non-finite values become 0."""

@@ -38,7 +38,7 @@ from reslrb_cli.guiding.pixels import noted_part
 from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, PlanRow, with_reason
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sets_of, sizes
+from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sizes
 from reslrb_cli.optimization.losses import QUADRATIC
 from reslrb_cli.optimization.memory import pixels_of
 from reslrb_cli.optimization.problem import Problem
@@ -102,8 +102,9 @@ class Tuner:
         key = ""
         if self._cache is not None:
             key = key_of({"setting": otherwise.setting, "of": of, **situation(self.problem)})
-            if (kept := self._cache.get(key)) is not None:
-                return replace(kept, cached=True)
+            kept = self._cache.get(key)
+            if kept is not None and kept.value in OPTIONS[otherwise.setting].values:
+                return replace(kept, setting=otherwise.setting, cached=True)
         share = self.problem.config.run.measuring
         if not share or (left_s := self._left_s(kernels)) is None:
             return replace(otherwise, why=f"not measured (over {100 * share:.3g} % of this run); {otherwise.why}")
@@ -131,11 +132,12 @@ class Tuner:
         few samples determine them. The run would take these steps as well, so they do not count as spent.
         """
         if self._times is None:
-            problem, unit, clock = self.problem, sets_of(self.problem.config), StepClock()
+            problem, config, clock = self.problem, self.problem.config, StepClock()
+            unit = config.run.spp // config.set_spp  # a sample for each set
             own = problem.integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
             first, second = (measured_step(problem, own, clock, 0, unit) for _ in range(2))
             compile_ms = max(first.wall_ms + first.compile_ms - second.wall_ms, 0.0)
-            iteration_ms = second.beside_ms + second.kernel_ms * problem.config.run.spp / unit
+            iteration_ms = second.beside_ms + second.kernel_ms * config.run.spp / unit
             self._times = compile_ms / 1e3, iteration_ms / 1e3
         return self._times
 
@@ -199,7 +201,7 @@ def _paths(tuner: Tuner) -> None:
 
     def measure(limit_s: float) -> Decision:
         trial = StepTrial(problem, "paths", problem.integrator.afresh(), problem.integrator.afresh(light_share=0.0))
-        found = trial.race(sizes(problem, PATHS_LONGER, PATHS_PLANNED), limit_s, sure=True)
+        found = trial.race(sizes(problem, PATHS_LONGER, PATHS_PLANNED), limit_s)
         return _found(both, found, "camera" if found.other else "both", "camera paths have ")
 
     tuner.take(tuner.race(both, None, PATHS_KERNELS, measure))
@@ -207,9 +209,10 @@ def _paths(tuner: Tuner) -> None:
 
 def _found(otherwise: Decision, found: Finding, value: str, whose: str = "") -> Decision:
     """Return the decision that follows from a race. `whose` names the other way, if there is a gain."""
+    if found.gain is None:
+        return replace(otherwise, value=value, why=found.why())
     gain, low, high = found.gain
-    why = found.why() if gain is None else whose + found.why()
-    return replace(otherwise, value=value, why=why, gain=gain, low=low, high=high)
+    return replace(otherwise, value=value, why=whose + found.why(), gain=gain, low=low, high=high)
 
 
 # --- pixels -----------------------------------------------------------------------------------------------------------
@@ -271,9 +274,7 @@ def _guiding(tuner: Tuner) -> None:
         plain, share = problem.integrator.afresh(), 1.0 if alone else None
         guided = problem.integrator.afresh(guided=True, light_share=share, **independent)
         found = StepTrial(problem, "guiding", plain, guided).race(plan, limit_s, guides=True)
-        if alone and found.other and not found.images and plan.alone:
-            found = replace(found, other=False, note="images would have less")
-        return _found(off, found, ("on" if found.images else "on for gradients") if found.other else "off")
+        return _found(off, found, "on" if found.other else "off")
 
     # Learning is a larger part of a short run, because tables learn most often at the start.
     of = [plan.lessons, problem.integrator.paths, problem.integrator.light_share]
@@ -334,9 +335,7 @@ OPTIONS = {
         ("camera", "both"), PIXELS, _measure_pixels,
     ),
     "guiding": Option(
-        _guiding, ("off", "on", "on for gradients"),
-        lambda tracer, value: tracer.afresh(guided=value != "off", images=value == "on"),
-        ("light", "both"), GUIDED,
+        _guiding, ("off", "on"), lambda tracer, value: tracer.afresh(guided=value == "on"), ("light", "both"), GUIDED,
     ),
 }  # fmt: skip
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -22,10 +22,10 @@ from reslrb_cli.optimization.uncertainty.curvature import (
     plan_changes,
     row_of,
 )
-from reslrb_cli.optimization.uncertainty.posterior import LastSteps, Measured
+from reslrb_cli.optimization.uncertainty.posterior import Measured
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
 from reslrb_cli.records.clock import StepClock
-from reslrb_cli.records.tree import expected, to_array
+from reslrb_cli.records.tree import to_array
 from reslrb_cli.statistics import Array, rms
 
 _PURPOSE = "certainty"
@@ -54,13 +54,13 @@ class Noted:
     """Iterations at which data were recorded.
 
     `seen` is the iteration at which squared gradients were recorded, or 0 before the recording. `keys` are the
-    parameters with recorded squares. `steps` is the number of later steps recorded for each small parameter. `paces`
-    has each parameter's movement per unit of gradient, recorded after some iterations.
+    parameters with recorded squares, and `last` those with recorded later steps. `paces` has each parameter's movement
+    per unit of gradient, recorded after some iterations.
     """
 
     seen: int
     keys: list[str]
-    steps: dict[str, int] = field(default_factory=dict)
+    last: list[str] = field(default_factory=list)
     paces: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
 
 
@@ -74,8 +74,8 @@ class Certainty:
         self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
         #: The optimiser's squares (`Optimizer.squares`) at that time, by key.
         self._seen, self.squares = 0, dict[str, Any]()
-        #: Since then, by key of a small parameter: gradients of steps, and the values at which they were taken.
-        self.last: dict[str, LastSteps] = {}
+        #: Since then, by key of a small parameter: `Measured.last`.
+        self.last: dict[str, Array] = {}
         self._paces: dict[str, list[tuple[int, float]]] = {key: [] for key in problem.selection.keys}
         #: Texels (H, W) of each texture that are visible in some view and lit, once computed.
         self.shown: dict[str, Array] = {}
@@ -85,26 +85,12 @@ class Certainty:
     @property
     def noted(self) -> Noted:
         """Recorded data without arrays."""
-        return Noted(self._seen, list(self.squares), {key: len(each) for key, each in self.last.items()}, self._paces)
+        return Noted(self._seen, list(self.squares), list(self.last), self._paces)
 
-    def last_steps(self) -> dict[str, dict[str, Array]]:
-        """Return the arrays of `last`, by name and key."""
-        names = [each.name for each in fields(LastSteps)]
-        return {name: {key: getattr(each, name) for key, each in self.last.items()} for name in names}
-
-    def restore(self, noted: Noted, squares: dict[str, Any], last: Mapping[str, Mapping[str, Array]]) -> None:
-        """Continue from recorded data. `last` has the arrays of `LastSteps`, by name and key."""
-        self._seen, self.squares = noted.seen, squares
-        names = [each.name for each in fields(LastSteps)]
-        known = [key for key in noted.steps if key in self._initial]
-        self.last = {key: LastSteps(*(last[name][key] for name in names)) for key in known}
+    def restore(self, noted: Noted, squares: dict[str, Any], last: dict[str, Array]) -> None:
+        """Continue from recorded data: `noted`, `squares` and `last`."""
+        self._seen, self.squares, self.last = noted.seen, squares, last
         self._paces |= {key: looks for key, looks in noted.paces.items() if key in self._initial}
-
-    def expects(self, noted: Noted) -> dict[str, dict[str, Array]]:
-        """Return placeholders, with the right shapes, for the argument `last` of `restore`."""
-        sizes = {key: (rows, self._initial[key].size) for key, rows in noted.steps.items() if key in self._initial}
-        shapes = {key: expected(size) for key, size in sizes.items()}
-        return {each.name: shapes for each in fields(LastSteps)}
 
     def see(self, before: State, state: State) -> None:
         """Record data of the iteration that leads from `before` to `state`. This costs almost nothing."""
@@ -128,10 +114,8 @@ class Certainty:
         gradient, value = (to_array(each[key]).astype(np.float64).ravel() for each in (state.gradients, before.values))
         if not np.isfinite(gradient).all():
             return
-        own = self.last.get(key) or LastSteps(*(np.zeros((0, gradient.size)) for _ in range(2)))
-        self.last[key] = LastSteps(
-            np.vstack([own.gradients, gradient])[-MOST_LAST:], np.vstack([own.values, value])[-MOST_LAST:]
-        )
+        earlier = self.last.get(key, np.zeros((0, 2, gradient.size)))
+        self.last[key] = np.concatenate([earlier, [[gradient, value]]])[-MOST_LAST:]
 
     def _pace(self, key: str) -> float:
         """Return how far a step currently moves a parameter, per unit of gradient. The parameter's steepest entries
@@ -222,16 +206,13 @@ class Certainty:
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
     def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:
-        """Return the certainty with three additions: the distance moved, the possible distance, and the visible
-        share.
-        """
+        """Return the certainty with the distance moved, the possible distance, and the learning rate."""
         optimizer = self.problem.optimizer
         step = optimizer.first_step(key)
         reach = None if step is None else step * float(sum(own.rates))
         kept = own.touched & (True if own.seen is None else own.seen)
         moved = rms((own.value - self._initial[key])[kept]) if kept.any() else 0.0
-        seen = None if own.seen is None else float(own.seen.mean())
-        return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key), seen=seen)
+        return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key))
 
     def scale(self, key: str) -> float:
         """Return a parameter's scale, in the parameter's unit.

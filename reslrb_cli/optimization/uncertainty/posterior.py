@@ -20,7 +20,7 @@ steps, the mean g of K gradients at the final values measures H d. The measureme
 
     gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
 
-The last iterations measure H d as well (`LastSteps`). The noise of the last iterations is part of C, but the total
+The last iterations measure H d as well (`Measured.last`). The noise of the last iterations is part of C, but the total
 movement m of the last iterations is known. C is then the covariance of the values before the last iterations. The
 offset d has the mean m in place of 0. The gradient of a step is H (d + y) plus noise. Here y is the offset of the
 step's values from the final values. After subtracting H y, a step's gradient counts as one more gradient at the end.
@@ -70,19 +70,6 @@ STEPS_OFF = 3.0
 
 
 @dataclass(frozen=True)
-class LastSteps:
-    """Last n iterations of a parameter with N entries. The gradients, and the values at which the gradients were
-    computed, are both (n, N).
-    """
-
-    gradients: Array
-    values: Array
-
-    def __len__(self) -> int:
-        return len(self.gradients)
-
-
-@dataclass(frozen=True)
 class Measured:
     """Parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
@@ -90,7 +77,8 @@ class Measured:
         schedule's factor for each iteration.
     - `pace` is the step length of each iteration divided by the step length at the end. `pace` is None if all step
         lengths are equal.
-    - `last` has the last iterations, if known. `recent` (N,) is the mean square of the gradients in the last
+    - `last` (n, 2, N) has the last n iterations, if known: the gradients, and the values at which the gradients were
+        computed. `recent` (N,) is the mean square of the gradients in the last
         iterations, if the optimiser stores this mean.
     - `seen` (N,) marks the entries of a texture that some view shows. `seen` is None for other parameters.
     - `start` (N,) are the values before the first iteration.
@@ -106,7 +94,7 @@ class Measured:
     is_small: bool
     recent: Array | None = None
     seen: Array | None = None
-    last: LastSteps | None = None
+    last: Array | None = None
     pace: Array | None = None
     start: Array | None = None
     mean: Array = field(init=False)

@@ -122,8 +122,7 @@ class ParameterCertainty:
 
     `moved` is the root mean square movement since the start, over the visible entries with a gradient. `reach` is the
     distance that all steps cover in one direction. `reach` is None if the step length depends on the gradient (`sgd`).
-    `rate` is the learning rate. `seen` is the share of a texture's texels that some view shows, or None for other
-    parameters.
+    `rate` is the learning rate.
     """
 
     verdict: str
@@ -135,7 +134,6 @@ class ParameterCertainty:
     moved: float | None = None
     reach: float | None = None
     rate: float | None = None
-    seen: float | None = None
 
 
 @dataclass(frozen=True)
@@ -203,8 +201,8 @@ def judge_together(
         if direction.entry is not None:
             noise[place] = own.noise[direction.entry]
             free[place] = not own.at_bound[direction.entry]
-            if own.last:
-                gradients, values = (each[:, direction.entry] for each in (own.last.gradients, own.last.values))
+            if own.last is not None:
+                gradients, values = own.last[:, 0, direction.entry], own.last[:, 1, direction.entry]
                 steps[place], pull[place] = len(own.last), gradients.mean()
                 mean[place], came[place] = own.value[direction.entry] - (values.mean(), values[0])
         free[place] = free[place] and np.any(along)

@@ -98,7 +98,7 @@ def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, 
 
     The result is empty for a single view with default settings. All pixels of such a view have equal weights.
     """
-    special = [view for view in views or () if view["left_out"] or view["kinds"] or view["counted"]]
+    special = [view for view in views or () if view["left_out"] or view["kinds"]]
     if not views or (len(views) == 1 and not special and views[0]["exposure"] == 1):
         return Markup()
     exposures = {view["exposure"]: _recovered(view["exposure"], results) for view in views}
