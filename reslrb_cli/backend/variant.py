@@ -98,7 +98,7 @@ def missing_cuda(variant: str = "cuda_ad_rgb") -> str:
         ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
     except OSError:
         return "no NVIDIA driver (libcuda.so.1) found"
-    return probe(variant).failure
+    return probe(variant)
 
 
 def package_version(name: str) -> str | None:

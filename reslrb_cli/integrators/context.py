@@ -23,7 +23,6 @@ from reslrb_cli.guiding.collect import bsdf_groups
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.differentiated import Differentiated, Motion, attach, bounces, with_shading_normals
 from reslrb_cli.integrators.freezing import Recordings
-from reslrb_cli.scene.catalog import entry_value
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
@@ -32,7 +31,7 @@ from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import PixelShares
 from reslrb_cli.transport.plan import Plan, make_plan
-from reslrb_cli.transport.samples import Samples, passes
+from reslrb_cli.transport.samples import Samples, passes, tracked_values
 from reslrb_cli.transport.sobol import make_coordinates
 
 
@@ -307,9 +306,7 @@ class Preparation:
         The owner of a parameter never changes. A parameter may start or stop tracking derivatives, and may become zero
         or nonzero.
         """
-        with dr.resume_grad():  # with suspended gradients, nothing shows that it tracks them
-            values = {key: entry_value(params, key) for key in params.properties}
-            enabled = {key: value for key, value in values.items() if dr.grad_enabled(value)}
+        enabled = tracked_values(params)
         these = tuple((key, params.properties[key][2]) for key in enabled)
         known = self._found.parameters
         if these not in known:

@@ -11,8 +11,7 @@ from itertools import pairwise
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.backend.doctor import resident_paths
-from reslrb_cli.backend.memory import free_bytes
+from reslrb_cli.backend.doctor import free_bytes, resident_paths
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.assemble import assemble

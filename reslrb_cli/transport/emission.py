@@ -27,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.graph import Lamp, sensor_rays
+from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.connection import connect, forward_derivatives, passage
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.lamps import environment_ray, lamp_point, lamp_ray
@@ -259,8 +259,8 @@ def primary_ray(samples: Samples) -> PrimaryRay:
     time = sample_time(plan, sensor, sampler)
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + sampler.next_2d()
     aperture = sampler.next_2d() if plan.needs.thin_lens else mi.Point2f(0.5)
-    ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture)
-    return PrimaryRay(ray, u, weight * dr.rcp(dr.maximum(per_pixel, 1)), per_pixel > 0)
+    ray, weight = sensor.sample_ray_differential(time, 0.5, u / mi.Vector2f(size), aperture, True)
+    return PrimaryRay(mi.Ray3f(ray), u, weight * dr.rcp(dr.maximum(per_pixel, 1)), per_pixel > 0)
 
 
 @dataclass
