@@ -67,7 +67,6 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
             path.write_text(behaviour)
             paths.append(path)
         monkeypatch.setattr(llvm, "_folders", lambda: iter([tmp_path / "lib"]))
-        monkeypatch.setattr(llvm, "_loader_cache", list)
         monkeypatch.setattr(llvm.shared_library, "__file__", str(trial))
         return paths
 

@@ -16,24 +16,20 @@ prefix. A path stores only one of the two selected events, so the two selections
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config.files import CAPACITY
 from reslrb_cli.estimators.base import (
-    Estimator,
     Pass,
     VertexHooks,
     adjoint_of_factor,
-    at_least_one,
     contribution,
     differentiate_emission,
-    one_of,
 )
 from reslrb_cli.estimators.selection import (
     Event,
+    Selecting,
     at_least_share,
     differentiate_event,
     is_taken,
@@ -131,18 +127,8 @@ class EventSelection(VertexHooks):
         return EventState(Q, W, prefix, slots)
 
 
-class EventEstimator(Estimator):
-    """Estimator with `capacity` independent pairs of a connection and an event.
-
-    The selection weight is `luminance` or `adjoint`.
-    """
-
-    OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}
-
-    def __init__(self, capacity: int = 1, weight: str = "luminance") -> None:
-        at_least_one("capacity", capacity, CAPACITY)
-        one_of("weight", weight, ("luminance", "adjoint"))
-        self.capacity, self.weight = capacity, weight
+class EventEstimator(Selecting):
+    """The estimator `event`: `capacity` independent pairs of a connection and an event."""
 
     def forward(self, p: Pass) -> KeptEvents:
         state: EventState = p.walk(EventSelection(p, self.capacity, self.weight))

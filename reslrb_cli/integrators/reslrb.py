@@ -19,17 +19,16 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
-from reslrb_cli.estimators.base import Estimator, Pass, one_of
+from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.estimators.stack import stack_bytes
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.context import Preparation, SamplingOptions, sensor_number
-from reslrb_cli.integrators.differentiated import Motion
+from reslrb_cli.integrators.context import Preparation, sensor_number
 from reslrb_cli.integrators.forward import splat_tangents
+from reslrb_cli.integrators.plans import Motion, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
@@ -241,75 +240,11 @@ class LightTracer(StepIntegrator):
 
 
 class Reslrb(LightTracer):
-    """Light tracer that differentiates by replaying each path. Options that are not in OPTIONS belong to the
-    estimator.
-    """
-
-    OPTIONS: ClassVar[Mapping[str, Any]] = {
-        **LightTracer.OPTIONS,
-        "estimator": "reservoir",
-        "freeze": False,
-        "attached": "auto",
-        "filter_normalization": "attached",
-        "attached_sampling": "auto",
-        "guiding": "off",
-        "sequence": "independent",
-        "paths": "light",
-        "light_share": 0.5,
-        "pixels": "even",
-    }
+    """Light tracer that differentiates the paths of its image by an estimator."""
 
     def __init__(self, estimator: Estimator, **common: Any) -> None:
         super().__init__(**common)
         self.estimator = estimator
-
-    @classmethod
-    def of(cls, **given: Any) -> Reslrb:
-        """Make the tracer from its options (OPTIONS, and those of the estimator). Raises ValueError if one is wrong."""
-        options = {**cls.OPTIONS, **given}
-        if options["paths"] == "camera" and not given.get("estimator"):
-            options["estimator"] = "stack"
-        estimator = options.pop("estimator") or cls.OPTIONS["estimator"]
-        if estimator == "auto":
-            raise ValueError(
-                '"estimator" auto needs an experiment to measure on (`reslrb optimize`); for the plugin, name one of '
-                + ", ".join(ESTIMATORS)
-            )
-        if estimator not in ESTIMATORS:
-            raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
-        if options["paths"] == "camera" and estimator != "stack":
-            raise ValueError(
-                f'"estimator" {estimator} needs the connections of light paths, and paths: camera has none; remove it, '
-                "or use stack"
-            )
-        obstacle = None
-        if estimator not in ATTACHED:
-            obstacle = (
-                f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
-                f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
-            )
-        motion = Motion(
-            options.pop("attached"), options.pop("filter_normalization"), obstacle, options.pop("attached_sampling")
-        )
-        for name, values in (
-            ("guiding", ("on", "off")),
-            ("sequence", ("independent", "low_discrepancy")),
-            ("pixels", ("even", "measured")),
-        ):
-            if options[name] == "auto":
-                raise ValueError(
-                    f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); use {" or ".join(values)}'
-                )
-            one_of(name, options[name], values)
-        sampling = SamplingOptions(
-            guided=options.pop("guiding") == "on",
-            low_discrepancy=options.pop("sequence") == "low_discrepancy",
-            paths=options.pop("paths"),
-            light_share=options.pop("light_share"),
-            shares_out=options.pop("pixels") == "measured",
-        )
-        own = {name: options.pop(name) for name in options_of(estimator) if name in options}
-        return cls(make_estimator(estimator, own), motion=motion, sampling=sampling, **options)
 
     def share_of_light(self, plan: Plan) -> float:
         """Return the share of the samples that are light paths."""

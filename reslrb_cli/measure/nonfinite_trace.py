@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.guiding.tables import Purpose
+from reslrb_cli.integrators.plugin import make_reslrb
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import (
@@ -464,7 +465,7 @@ def _sets_of_others(problem: Problem, view: View, sets: list[tuple[str, mi.UInt3
     """Return the samples of light tracers other than `reslrb`, which trace the same paths as `reslrb`."""
     given = problem.config.integrator.options()
     shared = {name: given[name] for name in ("max_depth", "rr_depth", "hide_emitters") if name in given}
-    tracer = Reslrb.of(estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
+    tracer = make_reslrb(estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
     # For moving light, only contributions are checked: `gather` has no derivatives of them.
     params = None if problem.moves else problem.selection.params
     scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]

@@ -193,7 +193,7 @@ def test_rows_explain_needed_features() -> None:
     case, ours = Case(through_a_lens(), (FLOOR,)), integrator("reslrb", 5, estimator="stack")
     with tracking(case.params, case.keys):
         rows = plan_rows(ours.plan(case.scene, case.scene.sensors()[0], case.params))
-    assert {row.feature for row in rows if row.needed} == {"visible emitters", "lens sampling", "derivatives of BSDFs"}
+    assert {row.feature for row in rows if row.needed} == {"visible emitters", "derivatives of BSDFs"}
     assert all(row.reason for row in rows)
 
 

@@ -16,8 +16,8 @@ from pydantic import TypeAdapter
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.gather import Gathering, Taking
+from reslrb_cli.integrators.plugin import make_reslrb
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
@@ -161,7 +161,7 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
     import mitsuba as mi
 
     leaves = setup.leaves()
-    tracer = Reslrb.of(**{"rr_depth": 1000, **case.options, **case.ours, "estimator": "gather"})
+    tracer = make_reslrb(**{"rr_depth": 1000, **case.options, **case.ours, "estimator": "gather"})
     with dr.suspend_grad(), dr.isolate_grad():
         [samples] = tracer.passes(Job(setup.scene, setup.scene.sensors()[0], mi.UInt32(seed), case.spp, setup.params))
         p = Pass(samples, None, samples.film.adjoint(setup.weights))
