@@ -8,7 +8,6 @@ tracer therefore gives the results of a new tracer. `Renewal` updates plans afte
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from numbers import Integral
 from typing import Any
@@ -139,8 +138,8 @@ class AboutScene:
     #: The densities of emitters, by their sources.
     emitters: dict[tuple[Any, ...], EmitterDensities] = field(default_factory=dict)
     recordings: Recordings = field(default_factory=Recordings)
-    #: By sensor, number of paths, and their density.
-    shares: dict[tuple[int, int, int], PixelShares | None] = field(default_factory=dict)
+    #: By density and number of paths.
+    shares: dict[tuple[int, int], PixelShares | None] = field(default_factory=dict)
     #: Samples per pixel for which the cells of guided emission are made.
     met: int = 0
 
@@ -215,24 +214,12 @@ class Preparation:
         """
         return self._look_through(params).noted
 
-    def shares(
-        self, number: int, known: NDArray[np.float32], size: tuple[int, int]
-    ) -> Callable[[int], PixelShares | None]:
-        """Return a function that takes a number of camera paths and returns their distribution over the pixels.
-
-        The distribution is proportional to the `known` density (H, W). `size` is the (width, height) of the sensor's
-        crop window.
-        """
-        made = self._found.shares
-
-        def shares(paths: int) -> PixelShares | None:
-            key = number, paths, id(known)  # held by `SamplingOptions.given` or `AboutParameters`
-            if key not in made:
-                rows, columns = (np.arange(n) * m // n for n, m in zip(size[::-1], known.shape, strict=True))
-                made[key] = PixelShares.of(known[np.ix_(rows, columns)].ravel(), paths)
-            return made[key]
-
-        return shares
+    def shares(self, known: NDArray[np.float32], paths: int) -> PixelShares | None:
+        """Return the distribution of camera paths over the pixels, in proportion to the `known` density (H, W)."""
+        made, key = self._found.shares, (id(known), paths)  # held by `SamplingOptions.given` or `AboutParameters`
+        if key not in made:
+            made[key] = PixelShares.of(known.ravel(), paths)
+        return made[key]
 
     def entries(self, plan: Plan, params: mi.SceneParameters) -> list[int]:
         """Return the number of differentiated entries of each group of BSDFs (`bsdf_groups`) and of emission."""

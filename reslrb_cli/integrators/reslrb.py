@@ -161,13 +161,13 @@ class LightTracer(StepIntegrator):
         preparation = self.preparation
         if plan.paths == "light" or not preparation.sampling.shares_out:
             return None
-        number, size = sensor_number(job.scene, job.sensor), job.sensor.film().crop_size()
+        number = sensor_number(job.scene, job.sensor)
         known = preparation.sampling.given
         if job.params is not None and number not in known:
             known = preparation.noted(job.params)
             if number not in known:
                 known[number] = self.note_pixels(job)
-        return preparation.shares(number, known[number], (int(size[0]), int(size[1]))) if number in known else None
+        return partial(preparation.shares, known[number]) if number in known else None
 
     def note_pixels(self, job: Job, curvature: NDArray[np.floating] | None = None) -> NDArray[np.float32]:
         """Return the density (H, W) of camera paths over the pixels of a job's sensor, for the current scene. The mean
