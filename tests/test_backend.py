@@ -20,10 +20,9 @@ from compilation import search_path
 from conformance.operations import even_table
 
 from reslrb_cli.backend import doctor, llvm, variant
-from reslrb_cli.backend import probe as probe_module
 from reslrb_cli.backend.memory import own_memory
-from reslrb_cli.backend.probe import probe
 from reslrb_cli.backend.shared_library import missing_library
+from reslrb_cli.backend.variant import probe
 from reslrb_cli.errors import BackendError, ExitCode
 from reslrb_cli.guiding.tables import make_grid
 from reslrb_cli.optimization.views import to_tensor
@@ -277,7 +276,7 @@ def test_the_trial_compiles_and_traces(llvm: str) -> None:
     ],
 )
 def test_a_failed_trial_is_one_line(monkeypatch: pytest.MonkeyPatch, script: str, failure: str) -> None:
-    monkeypatch.setattr(probe_module, "_SCRIPT", script)
+    monkeypatch.setattr(variant, "_SCRIPT", script)
     assert failure in probe.__wrapped__("llvm_ad_rgb")
 
 

@@ -18,8 +18,7 @@ from importlib import metadata
 from pathlib import Path
 
 from reslrb_cli.backend import llvm
-from reslrb_cli.backend.probe import probe
-from reslrb_cli.backend.variant import missing_cuda, package_version
+from reslrb_cli.backend.variant import missing_cuda, package_version, probe
 from reslrb_cli.errors import BackendError
 
 #: Lanes of a vector on the CPU, at most (AVX-512); resident threads of a large GPU, where the driver does not tell.

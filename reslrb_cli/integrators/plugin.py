@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import mitsuba as mi
 
@@ -98,15 +98,10 @@ def make_reslrb(**given: Any) -> Reslrb:
 
 
 def _on_variant(old: str | None, new: str) -> None:
-    plugin = _plugin_class() if works_under(new) else _refuse
+    # `check_variant` raises: Mitsuba's own message, "no such plugin", would not help.
+    plugin = _plugin_class() if works_under(new) else lambda name, props: check_variant(mi.variant())
     for name in TRACERS:
         mi.register_integrator(name, lambda props, name=name: plugin(name, props))
-
-
-def _refuse(type: str, props: mi.Properties) -> NoReturn:
-    """Raise an error under a variant without the plugin. Mitsuba's own message, "no such plugin", would not help."""
-    check_variant(mi.variant())
-    raise AssertionError("requires such a variant")
 
 
 def _plugin_class() -> type[mi.CppADIntegrator]:

@@ -165,24 +165,23 @@ def gradient_step(
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
     if adjoint == "batched":
         return _batched(work, job, objective, batches, on_samples)
-    losses: list[mi.Float | mi.TensorXf] = []
-    gradients: list[mi.TensorXf] = []
     refused = Refused()
+    if adjoint == "independent":
+        image = work.image(job)
+        loss, gradient = derivative_of(objective, image, refused)
+        _differentiate(work, replace(job, seed=second_seed(job.seed)), gradient, on_samples)
+        return StepResult(image, loss, refused)
+    found: list[tuple[mi.Float | mi.TensorXf, mi.TensorXf]] = []
 
     def derivative(image: mi.TensorXf) -> mi.TensorXf:
-        loss, gradient = derivative_of(objective, image, refused)
-        losses.append(loss)
-        gradients.append(gradient)
-        return gradient
+        found.append(derivative_of(objective, image, refused))
+        return found[0][1]
 
-    if adjoint == "correlated":
-        image = work.correlated(job, derivative)
-        if on_samples is not None:
-            on_samples(image, gradients[0])
-    else:
-        image = work.image(job)
-        _differentiate(work, replace(job, seed=second_seed(job.seed)), derivative(image), on_samples)
-    return StepResult(image, losses[0], refused)
+    image = work.correlated(job, derivative)
+    [(loss, gradient)] = found
+    if on_samples is not None:
+        on_samples(image, gradient)
+    return StepResult(image, loss, refused)
 
 
 def known_step(
