@@ -91,4 +91,4 @@ def test_versions_match_pyproject() -> None:
     for name, (first, end) in installation._WANTED.items():
         found = re.search(rf'"{name}>=([\d.]+),<([\d.]+)"', text)
         assert found is not None
-        assert found.groups() == (".".join(map(str, first)), ".".join(map(str, end)))
+        assert found.groups() == (first, end)

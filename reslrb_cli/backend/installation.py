@@ -142,7 +142,7 @@ def python_command(code: str) -> list[str]:
 MISSING_LIBRARY = "run scripts/setup, or install the package that contains it"
 
 #: The versions that pyproject.toml allows: the first one, and the first that is too new.
-_WANTED = {"drjit": ((1, 5), (1, 6)), "mitsuba": ((3, 9), (3, 10))}
+_WANTED = {"drjit": ("1.5", "1.6"), "mitsuba": ("3.9", "3.10")}
 
 
 def load_packages() -> tuple[ModuleType, ModuleType]:
@@ -155,7 +155,7 @@ def load_packages() -> tuple[ModuleType, ModuleType]:
 
 def _load(name: str) -> ModuleType:
     first, end = _WANTED[name]
-    mend = f"install it with `pip install '{name}>={_dotted(first)},<{_dotted(end)}'`"
+    mend = f"install it with `pip install '{name}>={first},<{end}'`"
     try:
         package = importlib.import_module(name)
     except (Exception, SystemExit) as error:  # the import may run any code
@@ -166,8 +166,8 @@ def _load(name: str) -> ModuleType:
         reason = f"{type(cause).__name__}: {cause}"
         raise BackendError(f"Mitsuba cannot be loaded: {name}, found at {_place(name)}: {reason}; {mend}") from error
     version = str(getattr(package, "__version__", "without a version"))
-    if not first <= _numbers(version) < end:
-        raise BackendError(f"found {name} {version} at {_place(name)}, but {_dotted(first)} is needed: {mend}")
+    if not _numbers(first) <= _numbers(version) < _numbers(end):
+        raise BackendError(f"found {name} {version} at {_place(name)}, but {first} is needed: {mend}")
     return package
 
 
@@ -184,7 +184,3 @@ def _numbers(version: str) -> tuple[int, ...]:
     """Return the first two numbers of a version."""
     parts = version.split(".")[:2]
     return tuple(int(part) if part.isdecimal() else -1 for part in parts)
-
-
-def _dotted(version: tuple[int, ...]) -> str:
-    return ".".join(map(str, version))

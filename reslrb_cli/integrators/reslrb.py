@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.estimators.stack import stack_bytes
@@ -27,7 +26,7 @@ from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.context import Preparation, sensor_number
-from reslrb_cli.integrators.forward import splat_tangents
+from reslrb_cli.integrators.forward import tangent_of
 from reslrb_cli.integrators.plans import Motion, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
@@ -214,13 +213,7 @@ class LightTracer(StepIntegrator):
     def tangent(self, job: Job) -> mi.TensorXf:
         """Return the derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
         with dr.suspend_grad():
-            parts = self.passes(job)
-            if parts[0].plan.moving_emission:
-                raise UnsupportedScene("forward mode has no derivatives of moving emitters; use reverse mode")
-            film = parts[0].film
-            block = film.block()
-            in_passes(parts, splat_tangents, block)
-            return film.develop(block, tangent=True)
+            return tangent_of(self.passes(job))
 
     def launch(
         self, kind: str, parts: list[Samples], work: Callable[..., Any], *inputs: Any,

@@ -254,7 +254,7 @@ FAULTS = [
     Fault("slots_counted_twice", "cornell_capacity_2", "estimators.selection:inverse_probability",
           "W / (capacity * slot.w)", "W / slot.w", by("reservoir(capacity=2)", *GRADIENT, "ptracer")),
     Fault("weight_of_prefix", "cornell_event", "estimators.event:EventSelection.vertex",
-          "return EventState(Q, W", "return EventState(state.Q, W", by("event", *GRADIENT, "ptracer")),
+          "return EventState([Q], W", "return EventState(state.Q, W", by("event", *GRADIENT, "ptracer")),
     Fault("one_visibility_bit_late", "cornell", "estimators.gather:Visibility.seen",
           "index = depth - 1", "index = depth", by("gather stack", *GRADIENT)),
     Fault("beyond_visibility_bits_all_seen", "deep", "transport.connection:passage",
