@@ -1,4 +1,7 @@
-"""Light tracers as Mitsuba plugins: `mi.load_dict({"type": "reslrb", ...})` after `reslrb_cli.register()`."""
+"""Integrators from a name and options, and light tracers as Mitsuba plugins.
+
+`mi.load_dict({"type": "reslrb", ...})` makes a plugin after `reslrb_cli.register()`.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,11 @@ from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import Trajectory, WalkAd
 from reslrb_cli.integrators.context import resolve_sensor
+from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.plans import Motion, SamplingOptions
-from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
+from reslrb_cli.integrators.step import interface_of
 
 #: Our integrators by the names of their plugins.
 TRACERS = ("reslrb", "walk_ad", "trajectory")
@@ -49,6 +54,29 @@ def register() -> None:
     if mi.variant() is not None:
         _on_variant(None, mi.variant())
         check_variant(mi.variant())
+
+
+def make_integrator(type: str, **options: Any) -> StepIntegrator:
+    """Make an integrator from its plugin's name and options.
+
+    The name is `reslrb`, `walk_ad`, `trajectory`, a stock integrator such as `ptracer` and `prb`, or `custom` for a
+    user's own integrator (`OwnIntegrator`). Options that are None are left out, because Mitsuba would crash. Raises
+    ValueError for an unknown option.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    if type in TRACERS:
+        return make_tracer(type, given)
+    if type == "custom":
+        return OwnIntegrator(**given)
+    properties = mi.Properties(type)
+    for name, value in given.items():
+        properties[name] = value
+    # `mi.load_dict` would search for a library `plugins/prb.so` and run one from the working folder: it does not know
+    # plugins written in Python.
+    integrator = mi.PluginManager.instance().create_object(properties)
+    if properties.unqueried():
+        raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
+    return interface_of(integrator)
 
 
 def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Trajectory:

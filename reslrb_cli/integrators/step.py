@@ -27,8 +27,6 @@ from reslrb_cli.config.files import PASS_SAMPLES, PASSES
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import NaiveAD, Projective, Replayed
 from reslrb_cli.integrators.context import resolve_sensor
-from reslrb_cli.integrators.own import OwnIntegrator
-from reslrb_cli.integrators.plugin import TRACERS, make_tracer
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
 
 Adjoint = Literal["correlated", "independent", "batched"]
@@ -86,29 +84,6 @@ class StepResult:
     image: mi.TensorXf
     loss: mi.Float | mi.TensorXf
     refused: Refused = field(default_factory=Refused)
-
-
-def make_integrator(type: str, **options: Any) -> StepIntegrator:
-    """Make an integrator from its plugin's name and options.
-
-    The name is `reslrb`, `walk_ad`, `trajectory`, a stock integrator such as `ptracer` and `prb`, or `custom` for a
-    user's own integrator (`OwnIntegrator`). Options that are None are left out, because Mitsuba would crash. Raises
-    ValueError for an unknown option.
-    """
-    given = {name: value for name, value in options.items() if value is not None}
-    if type in TRACERS:
-        return make_tracer(type, given)
-    if type == "custom":
-        return OwnIntegrator(**given)
-    properties = mi.Properties(type)
-    for name, value in given.items():
-        properties[name] = value
-    # `mi.load_dict` would search for a library `plugins/prb.so` and run one from the working folder: it does not know
-    # plugins written in Python.
-    integrator = mi.PluginManager.instance().create_object(properties)
-    if properties.unqueried():
-        raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
-    return interface_of(integrator)
 
 
 def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:

@@ -16,7 +16,8 @@ from turns import taking_turns
 from reslrb_cli.estimators import gather, reservoir, stack
 from reslrb_cli.integrators.context import Preparation
 from reslrb_cli.integrators.plan_report import plan_rows
-from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator
+from reslrb_cli.integrators.plugin import make_integrator
+from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, texture, transform
 

@@ -16,9 +16,9 @@ from conformance.path_densities import CameraNotes, Densities, Emission, LightNo
 from measure.faults import Fault, plant, planted
 from turns import a_few
 
-from reslrb_cli.integrators.plugin import make_reslrb
+from reslrb_cli.integrators.plugin import make_integrator, make_reslrb
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.integrators.step import gradient_step, make_integrator
+from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.transport.camera import camera_walk
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import walk

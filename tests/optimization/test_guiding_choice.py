@@ -16,7 +16,7 @@ from runs.going_on import begin_alone, differences, left_over, optimize, run_and
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.guiding.tables import Guiding, Purpose
-from reslrb_cli.integrators.step import make_integrator
+from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization import assemble as assembling
 from reslrb_cli.optimization import loop
