@@ -292,7 +292,7 @@ FAULTS = [
     Fault("factor_detached", "wavy_glass", BACK,
           "this.scattering.weight * B", "dr.detach(this.scattering.weight) * B", by("stack", "walk_ad")),
     Fault("adjoints_of_origin_and_direction_exchanged", "wavy_glass", BACK,
-          "dr.grad(ray.o), dr.grad(ray.d), B)", "dr.grad(ray.d), mi.Vector3f(dr.grad(ray.o)), B)",
+          "(mi.Vector3f(dr.grad(ray.o)), dr.grad(ray.d), B)", "(dr.grad(ray.d), mi.Vector3f(dr.grad(ray.o)), B)",
           by("stack", *MOVED)),
     Fault("last_vertex_of_the_attached_stack", "wavy_glass", "estimators.stack:StackState.pushed",
           "dr.select(contributes, count, self.needed)", "dr.select(contributes, self.count, self.needed)",
