@@ -1,13 +1,15 @@
-"""Examination for `reslrb doctor`: versions, libraries, device, and a trial of each backend.
+"""This machine: backends and packages for `reslrb doctor`, and the device's name, memory, and number of resident paths.
 
-The module also reports a device's name, its memory, and the number of paths that the device traces at once.
+Forecasts of memory use `free_bytes`, `resident_bytes`, `local_bytes` and `resident_paths` as limits.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -16,12 +18,20 @@ from importlib import metadata
 from pathlib import Path
 
 from reslrb_cli.backend import llvm
-from reslrb_cli.backend.probe import Probe, probe
-from reslrb_cli.backend.variant import missing_cuda, package_version
+from reslrb_cli.backend.variant import missing_cuda, package_version, probe
 from reslrb_cli.errors import BackendError
 
 #: Lanes of a vector on the CPU, at most (AVX-512); resident threads of a large GPU, where the driver does not tell.
 LLVM_LANES, LARGE_GPU = 16, 132 * 2048
+
+#: Stack size of a thread if the system sets no limit: glibc's default.
+_UNLIMITED_STACK = 2 * 2**20
+
+#: Part of the stack that is in use when a kernel starts.
+_IN_USE = 2**20
+
+#: Lanes of a vector by processor feature, the widest first; the backend uses the widest.
+_LANES = (("avx512vl", 16), ("avx", 8))
 
 #: Seconds for `nvidia-smi`, which hangs if the driver does.
 PATIENCE = 20.0
@@ -79,6 +89,44 @@ def memory_bytes(variant: str) -> int:
         return total
 
 
+def free_bytes(variant: str) -> int:
+    """Return the number of bytes that a process of `variant` can still allocate on the GPU or the machine.
+
+    Memory of this process counts as used. If the free memory is unknown, returns all memory (`memory_bytes`).
+    """
+    if variant.startswith("cuda"):
+        return gpu_bytes("memory.free", memory_bytes(variant))
+    known = [memory_bytes(variant)]
+    if available := of_system("/proc/meminfo", "MemAvailable"):
+        known.append(int(available.removesuffix(" kB")) * 1024)
+    with contextlib.suppress(OSError, ValueError):
+        group = Path("/sys/fs/cgroup")
+        limit, used = ((group / name).read_text() for name in ("memory.max", "memory.current"))
+        known.append(int(limit) - int(used))
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if most != resource.RLIM_INFINITY:
+        with contextlib.suppress(OSError, ValueError):
+            known.append(most - int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize())
+    return max(min(known), 0)
+
+
+def resident_bytes() -> int:
+    """Return the maximum memory of this process so far, in bytes."""
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024
+
+
+def local_bytes() -> int:
+    """Return the thread-local bytes that a path can use on the CPU. Each path uses its share of a thread's stack.
+
+    A kernel that needs more thread-local memory than this share overwrites other memory or crashes the process.
+    """
+    stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
+    stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
+    flags = (of_system("/proc/cpuinfo", "flags") or "").split()
+    return max(stack - _IN_USE, 0) // next((lanes for name, lanes in _LANES if name in flags), 4)
+
+
 def resident_paths() -> int:
     """Return the number of lanes that the current device runs simultaneously. Each lane has its own thread-local
     memory.
@@ -102,47 +150,30 @@ def resident_paths() -> int:
     return count[0] * count[1]
 
 
-_WITHOUT_METADATA = ["mitsuba", "drjit", "numpy"]
-
-
 @dataclass(frozen=True)
 class Backend:
-    """Backend of Dr.Jit.
-
-    `missing` is one line that explains why the backend does not work. `missing` is empty if the backend works. `trial`
-    holds the measured times of one kernel and one ray.
-    """
+    """Backend of Dr.Jit. `missing` is one line that explains why the backend does not work, or "" if it works."""
 
     variant: str
     missing: str
     device: str
-    library: str
-    trial: Probe
+    library: str = ""
 
 
-@dataclass(frozen=True)
-class Report:
-    """Result of the examination. `variant` is the variant that `auto` selects, or None if no backend works."""
+def backends() -> list[Backend]:
+    """Test both backends, which takes a few seconds. `auto` selects the first one that works."""
+    missing, device = missing_cuda(), device_name("llvm_ad_rgb")
+    cuda = Backend("cuda_ad_rgb", missing, "" if missing else device_name("cuda_ad_rgb"))
+    try:
+        library = llvm.require()
+    except BackendError as error:
+        return [cuda, Backend("llvm_ad_rgb", str(error), device)]
+    return [cuda, Backend("llvm_ad_rgb", probe("llvm_ad_rgb"), device, f"libLLVM {library.version}, {library.path}")]
 
-    variant: str | None
-    python: str
-    platform: str
-    packages: dict[str, str | None]
-    backends: tuple[Backend, ...]
 
-
-def examine() -> Report:
-    """Examine this machine; takes a few seconds, and never raises for missing parts."""
-    missing = missing_cuda()
-    device, trial = ("", Probe(missing)) if missing else (device_name("cuda_ad_rgb"), probe("cuda_ad_rgb"))
-    backends = (Backend("cuda_ad_rgb", missing, device, "", trial), _llvm())
-    return Report(
-        variant=next((backend.variant for backend in backends if not backend.missing), None),
-        python=f"{platform.python_version()} ({sys.executable})",
-        platform=platform.platform(),
-        packages={name: package_version(name) for name in ["reslrb", *_required()]},
-        backends=backends,
-    )
+def packages() -> dict[str, str | None]:
+    """Return the versions of `reslrb` and the packages that it needs. The version of a missing package is None."""
+    return {name: package_version(name) for name in ["reslrb", *_required()]}
 
 
 def _required() -> list[str]:
@@ -150,16 +181,6 @@ def _required() -> list[str]:
     try:
         needs = metadata.requires("reslrb") or []
     except metadata.PackageNotFoundError:
-        return _WITHOUT_METADATA
+        return ["mitsuba", "drjit", "numpy"]
     names = (re.match(r"[\w.-]+", need) for need in needs if "extra ==" not in need)
     return [name[0] for name in names if name]
-
-
-def _llvm() -> Backend:
-    device = device_name("llvm_ad_rgb")
-    try:
-        library = llvm.require()
-    except BackendError as error:
-        return Backend("llvm_ad_rgb", str(error), device, "", Probe(str(error)))
-    trial = probe("llvm_ad_rgb")
-    return Backend("llvm_ad_rgb", trial.failure, device, f"libLLVM {library.version}, {library.path}", trial)

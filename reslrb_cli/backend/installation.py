@@ -141,12 +141,8 @@ def python_command(code: str) -> list[str]:
 
 MISSING_LIBRARY = "run scripts/setup, or install the package that contains it"
 
-#: For each package: the versions that pyproject.toml allows (the first one, and the first that is too new), and
-#: functions that tell it from another package of the same name.
-_WANTED = {
-    "drjit": ((1, 5), (1, 6), ("has_backend", "eval")),
-    "mitsuba": ((3, 9), (3, 10), ("set_variant", "variants")),
-}
+#: The versions that pyproject.toml allows: the first one, and the first that is too new.
+_WANTED = {"drjit": ("1.5", "1.6"), "mitsuba": ("3.9", "3.10")}
 
 
 def load_packages() -> tuple[ModuleType, ModuleType]:
@@ -158,8 +154,8 @@ def load_packages() -> tuple[ModuleType, ModuleType]:
 
 
 def _load(name: str) -> ModuleType:
-    first, end, functions = _WANTED[name]
-    mend = f"install it with `pip install '{name}>={_dotted(first)},<{_dotted(end)}'`"
+    first, end = _WANTED[name]
+    mend = f"install it with `pip install '{name}>={first},<{end}'`"
     try:
         package = importlib.import_module(name)
     except (Exception, SystemExit) as error:  # the import may run any code
@@ -169,14 +165,9 @@ def _load(name: str) -> ModuleType:
         mend = MISSING_LIBRARY if missing_library(str(cause)) else mend
         reason = f"{type(cause).__name__}: {cause}"
         raise BackendError(f"Mitsuba cannot be loaded: {name}, found at {_place(name)}: {reason}; {mend}") from error
-    version = getattr(package, "__version__", None)
-    if not all(callable(getattr(package, function, None)) for function in functions):
-        raise BackendError(
-            f"the package {name} at {_place(name)} is another one of that name (it has no {functions[0]}); remove it "
-            f"from the path (PYTHONPATH, or the folder in which Python was started), or {mend}"
-        )
-    if not isinstance(version, str) or not first <= _numbers(version) < end:
-        raise BackendError(f"found {name} {version} at {_place(name)}, but {_dotted(first)} is needed: {mend}")
+    version = str(getattr(package, "__version__", "without a version"))
+    if not _numbers(first) <= _numbers(version) < _numbers(end):
+        raise BackendError(f"found {name} {version} at {_place(name)}, but {first} is needed: {mend}")
     return package
 
 
@@ -193,7 +184,3 @@ def _numbers(version: str) -> tuple[int, ...]:
     """Return the first two numbers of a version."""
     parts = version.split(".")[:2]
     return tuple(int(part) if part.isdecimal() else -1 for part in parts)
-
-
-def _dotted(version: tuple[int, ...]) -> str:
-    return ".".join(map(str, version))

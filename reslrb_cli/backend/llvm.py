@@ -92,12 +92,10 @@ def choose() -> tuple[Library | None, list[Library]]:
 
 
 def candidates() -> list[Path]:
-    """Return every libLLVM in the known folders and in the dynamic loader's cache. Each file appears once, files in the
-    nearest folder first.
-    """
+    """Return every libLLVM in the known folders. Each file appears once, files in the nearest folder first."""
     found = [path for folder in _folders() for path in sorted(folder.glob("libLLVM*")) if _NAME.fullmatch(path.name)]
     unique: dict[Path, Path] = {}
-    for path in [*found, *_loader_cache()]:
+    for path in found:
         with suppress(OSError, RuntimeError):  # a broken or circular link
             unique.setdefault(path.resolve(strict=True), path)
     return list(unique)
@@ -152,22 +150,9 @@ def _folders() -> Iterator[Path]:
     for pattern in (
         f"usr/lib/{platform.machine()}-linux-gnu*", "usr/lib64", "usr/lib64/llvm*/lib*", "usr/lib/llvm*/lib*",
         "usr/lib", "usr/local/lib", "usr/local/lib64", "opt/homebrew/opt/llvm*/lib", "usr/local/opt/llvm*/lib",
-        "home/linuxbrew/.linuxbrew/opt/llvm*/lib",
+        "home/linuxbrew/.linuxbrew/opt/llvm*/lib", "usr/lib/llvm/*/lib*",
     ):  # fmt: skip
         yield from sorted(Path("/").glob(pattern))
-
-
-def _loader_cache() -> list[Path]:
-    """Return the libLLVMs in the cache of the dynamic loader. `ldconfig` is not on an ordinary user's PATH."""
-    ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
-    if ldconfig is None or sys.platform != "linux":
-        return []
-    try:
-        printed = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, timeout=20, check=False).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return []
-    paths = [Path(line.rpartition("=> ")[2]) for line in printed.splitlines() if "libLLVM" in line and "=> " in line]
-    return [path for path in paths if _NAME.fullmatch(path.name)]
 
 
 def _what_to_install() -> str:

@@ -36,7 +36,7 @@ def show_forecast(config: Config) -> None:
     A variant must be set. The function writes only the caches of kernels and decisions. A later run reuses these
     caches.
     """
-    from reslrb_cli.backend.memory import resident_bytes
+    from reslrb_cli.backend.doctor import resident_bytes
     from reslrb_cli.measure.missing import check_missing
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.decisions import DecisionCache

@@ -145,7 +145,7 @@ def _started(workers: int, folder: Path) -> Iterator[tuple[object, object]]:
     """Start a scheduler in this process, and `workers` worker processes. Yields address and security."""
     from distributed import LocalCluster
 
-    from reslrb_cli.backend.memory import free_bytes
+    from reslrb_cli.backend.doctor import free_bytes
 
     try:
         cluster = LocalCluster(

@@ -159,17 +159,6 @@ class Adjoint:
     direction: mi.Vector3f
     B: mi.Spectrum
 
-    @staticmethod
-    def where(mask: mi.Bool, origin: mi.Point3f, direction: mi.Vector3f, B: mi.Spectrum) -> Adjoint:
-        """Return the given values in the lanes of the mask, and zero in all other lanes."""
-        values = mi.Vector3f(origin), direction, B
-        return Adjoint(*(dr.select(mask, value, 0) for value in values))
-
-    @staticmethod
-    def zero() -> Adjoint:
-        """Return the adjoint behind the last vertex."""
-        return Adjoint(mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0))
-
 
 @dataclass
 class AttachedFrame:
@@ -219,7 +208,8 @@ class AttachedFrame:
             dr.backward_from(dr.dot(P, reached * (own + later)) + dr.select(scattered, moved, 0))
             # A lane without light may compute NaN, which must not reach earlier vertices.
             B = dr.detach(own + later) * self.roulette
-            return Adjoint.where(connected | scattered, dr.grad(ray.o), dr.grad(ray.d), B)
+            values, here = (mi.Vector3f(dr.grad(ray.o)), dr.grad(ray.d), B), connected | scattered
+            return Adjoint(*(dr.select(here, value, 0) for value in values))
 
 
 @dataclass
@@ -310,7 +300,8 @@ class AttachedStack(Stack):
         def before(end: mi.UInt32) -> StackState:
             return again.walk(AttachedSweep(again, ring, end), end > 0).stack
 
-        return walk_back(p, AttachedFrame.blank(p.plan), ring, state.stack, Adjoint.zero(), before)
+        behind = Adjoint(mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0))
+        return walk_back(p, AttachedFrame.blank(p.plan), ring, state.stack, behind, before)
 
 
 def begins(plan: Plan, vertex: Vertex) -> mi.Bool:

@@ -48,9 +48,9 @@ from reslrb_cli.estimators.attached import (
     reach,
     segment_again,
 )
-from reslrb_cli.estimators.base import Estimator, Pass, PathAdjoint, VertexHooks, adjoint_of_factor, contribution
-from reslrb_cli.estimators.reservoir import Reservoir
+from reslrb_cli.estimators.base import Pass, PathAdjoint, VertexHooks, adjoint_of_factor, contribution
 from reslrb_cli.estimators.selection import (
+    Selecting,
     SlotReplay,
     at_least_share,
     chosen_by,
@@ -338,17 +338,16 @@ class ChainReplay(SlotReplay):
             dr.backward_from(own_part + later)
 
 
-class AttachedReservoir(Estimator):
+class AttachedReservoir(Selecting):
     """The estimator `reservoir` with attached derivatives."""
 
-    OPTIONS: ClassVar[dict[str, Any]] = Reservoir.OPTIONS | {"jacobian_damping": JACOBIAN_DAMPING}
+    OPTIONS: ClassVar[dict[str, Any]] = Selecting.OPTIONS | {"jacobian_damping": JACOBIAN_DAMPING}
 
     def __init__(self, jacobian_damping: float = JACOBIAN_DAMPING, **options: Any) -> None:
-        """Make the estimator. `options` are the options of `Reservoir`."""
+        super().__init__(**options)
         if not jacobian_damping > 0:
             raise ValueError(f'"jacobian_damping" must be positive, not {jacobian_damping}')
-        checked = Reservoir(**options)
-        self.capacity, self.weight, self.damping = checked.capacity, checked.weight, jacobian_damping
+        self.damping = jacobian_damping
 
     def forward(self, p: Pass) -> ChainState:
         return p.walk(ChainSelection(p, self.capacity, self.weight, self.damping)).stored()

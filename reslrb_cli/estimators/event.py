@@ -16,24 +16,20 @@ prefix. A path stores only one of the two selected events, so the two selections
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config.files import CAPACITY
 from reslrb_cli.estimators.base import (
-    Estimator,
     Pass,
     VertexHooks,
     adjoint_of_factor,
-    at_least_one,
     contribution,
     differentiate_emission,
-    one_of,
 )
 from reslrb_cli.estimators.selection import (
     Event,
+    Selecting,
     at_least_share,
     differentiate_event,
     is_taken,
@@ -64,21 +60,13 @@ class EventSlot:
 
 @dataclass
 class EventState:
-    """Loop state: Q and W. For each slot, the state also holds the event selected from the path prefix and the selected
-    pair of connection and event.
+    """Stored data of a path: W, and the selected pair of each slot. During the walk, the state also holds Q and, for
+    each slot, the event selected from the path prefix.
     """
 
-    Q: mi.Float
+    Q: list[mi.Float]
     W: mi.Float
     prefix: list[Event]
-    slots: list[EventSlot]
-
-
-@dataclass
-class KeptEvents:
-    """Stored data of a path."""
-
-    W: mi.Float
     slots: list[EventSlot]
 
 
@@ -94,10 +82,10 @@ class EventSelection(VertexHooks):
         slots = [EventSlot.empty(plan) for _ in range(self.capacity)]
         prefix = [Event.emission(plan) for _ in slots]
         Q = mi.Float(1 if plan.differentiate_emission else 0)
-        return EventState(Q, mi.Float(0), prefix, slots)
+        return EventState([Q], mi.Float(0), prefix, slots)
 
     def concerned(self, state: EventState) -> mi.Bool:
-        return state.Q > 0
+        return state.Q[0] > 0
 
     def vertex(
         self, state: EventState, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
@@ -109,7 +97,7 @@ class EventSelection(VertexHooks):
         q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
         if plan.differentiate_null:
             q = mi.Float(1)  # masks between vertex and sensor may have differentiated parameters
-        Q = state.Q + q
+        Q = state.Q[0] + q
         w = at_least_share(w, state.W / dr.maximum(Q, 1))  # 1 is the smallest positive Q
         W = dr.fma(w, Q, state.W)
         this = Event.of_connection(plan, vertex, connection)
@@ -123,35 +111,24 @@ class EventSelection(VertexHooks):
         if not plan.differentiate_bsdfs:
             return replace(state, W=W, slots=slots)
         q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
-        Q = state.Q + q
+        Q = state.Q[0] + q
         this = Event.of_scattering(plan, vertex, scattering)
         prefix = [
             dr.select(number * Q < q, this, event) for number, event in zip(numbers[::2], state.prefix, strict=True)
         ]
-        return EventState(Q, W, prefix, slots)
+        return EventState([Q], W, prefix, slots)
 
 
-class EventEstimator(Estimator):
-    """Estimator with `capacity` independent pairs of a connection and an event.
+class EventEstimator(Selecting):
+    """The estimator `event`: `capacity` independent pairs of a connection and an event."""
 
-    The selection weight is `luminance` or `adjoint`.
-    """
+    def forward(self, p: Pass) -> EventState:
+        return replace(p.walk(EventSelection(p, self.capacity, self.weight)), Q=[], prefix=[])
 
-    OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}
+    def kept(self, plan: Plan) -> EventState:
+        return EventState([], mi.Float(0), [], [EventSlot.empty(plan) for _ in range(self.capacity)])
 
-    def __init__(self, capacity: int = 1, weight: str = "luminance") -> None:
-        at_least_one("capacity", capacity, CAPACITY)
-        one_of("weight", weight, ("luminance", "adjoint"))
-        self.capacity, self.weight = capacity, weight
-
-    def forward(self, p: Pass) -> KeptEvents:
-        state: EventState = p.walk(EventSelection(p, self.capacity, self.weight))
-        return KeptEvents(state.W, state.slots)
-
-    def kept(self, plan: Plan) -> KeptEvents:
-        return KeptEvents(mi.Float(0), [EventSlot.empty(plan) for _ in range(self.capacity)])
-
-    def backward(self, p: Pass, state: KeptEvents) -> None:
+    def backward(self, p: Pass, state: EventState) -> None:
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
         def emission_weight(E: mi.Spectrum) -> mi.Spectrum:

@@ -18,25 +18,22 @@ candidate.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config.files import CAPACITY
 from reslrb_cli.estimators.base import (
-    Estimator,
     Pass,
     PathAdjoint,
     VertexHooks,
     adjoint_of_factor,
-    at_least_one,
     contribution,
     differentiate_emission,
-    one_of,
 )
 from reslrb_cli.estimators.selection import (
     Event,
+    Selecting,
     SlotReplay,
     at_least_share,
     chosen_by,
@@ -137,15 +134,8 @@ class ReservoirReplay(SlotReplay):
         return state
 
 
-class Reservoir(Estimator):
-    """Reservoir of `capacity` slots with selection weight `luminance` or `adjoint`."""
-
-    OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}
-
-    def __init__(self, capacity: int = 1, weight: str = "luminance") -> None:
-        one_of("weight", weight, ("luminance", "adjoint"))
-        at_least_one("capacity", capacity, CAPACITY)
-        self.capacity, self.weight = capacity, weight
+class Reservoir(Selecting):
+    """The estimator `reservoir`: `capacity` connections of each path."""
 
     def forward(self, p: Pass) -> ReservoirState:
         return replace(p.walk(ReservoirSelection(p, self.capacity, self.weight)), latest=[])

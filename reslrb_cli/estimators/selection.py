@@ -8,20 +8,24 @@ An `Event` stores a single factor of a path. Its derivative needs no replay.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.config.files import CAPACITY
 from reslrb_cli.estimators.base import (
+    Estimator,
     Pass,
     PathAdjoint,
     SurfacePoint,
     VertexHooks,
     adjoint_of_factor,
+    at_least_one,
     differentiate_passage,
     event,
     lobe,
+    one_of,
 )
 from reslrb_cli.transport.bsdf import Scattering, tracked_factor
 from reslrb_cli.transport.connection import Connection, connect, stand_in
@@ -31,6 +35,17 @@ from reslrb_cli.transport.walk import Vertex
 
 S = TypeVar("S")
 SHARE = 0.01  # minimum share of a candidate in the weights up to it
+
+
+class Selecting(Estimator):
+    """Estimator that keeps `capacity` slots of each path, with selection weight `luminance` or `adjoint`."""
+
+    OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}
+
+    def __init__(self, capacity: int = 1, weight: str = "luminance") -> None:
+        one_of("weight", weight, ("luminance", "adjoint"))
+        at_least_one("capacity", capacity, CAPACITY)
+        self.capacity, self.weight = capacity, weight
 
 
 class Chosen(Protocol):

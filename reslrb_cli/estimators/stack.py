@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -108,15 +108,6 @@ def read(stack: list[dr.Local], form: T, place: mi.UInt32) -> T:
 
 
 # ---- The stack ----
-
-
-class Differentiable(Protocol[A]):
-    """Vertex on the stack: a PyTree of arrays."""
-
-    def differentiate(self, p: Pass, adjoint: A) -> A:
-        """Add the derivatives of the vertex. `adjoint` is the adjoint behind the vertex. Returns the adjoint
-        before it.
-        """
 
 
 @dataclass(frozen=True)
@@ -202,6 +193,9 @@ def walk_back(
 ) -> A:
     """Differentiate all vertices, from the last to the first. Returns the adjoint before the first vertex.
 
+    `form` is a frame, such as `Frame.blank`. A frame's `differentiate(p, adjoint)` adds the derivatives of a vertex. It
+    takes the adjoint behind the vertex, and returns the adjoint before it.
+
     `adjoint` is the adjoint behind the last contribution. `again(end)` traces the paths again, and pushes the vertices
     before number `end`. `again` is called only if paths may be longer than the stack.
     """
@@ -230,8 +224,7 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
     """Differentiate the vertices from number top - 1 down to bottom. Traces no ray."""
 
     def body(number: mi.UInt32, adjoint: A, stack: list[dr.Local]) -> tuple[mi.UInt32, A, list[dr.Local]]:
-        frame: Differentiable[A] = read(stack, form, ring.place(number - 1))
-        return number - 1, frame.differentiate(p, adjoint), stack
+        return number - 1, read(stack, form, ring.place(number - 1)).differentiate(p, adjoint), stack
 
     _, adjoint, _ = dr.while_loop(
         state=(mi.UInt32(top), adjoint, state.stack),

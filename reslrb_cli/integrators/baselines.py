@@ -16,8 +16,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.camera import splat_camera_paths
-from reslrb_cli.integrators.context import SamplingOptions
-from reslrb_cli.integrators.differentiated import Motion
+from reslrb_cli.integrators.plans import Motion, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.scene.deformation import Surroundings
@@ -107,6 +106,10 @@ class Projective(Replayed):
         return None
 
 
+#: A differentiated parameter may receive no light.
+_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+
+
 class NaiveAD(Replayed):
     """Integrator, such as `ptracer`, that is differentiated through the whole computation graph of its image.
 
@@ -122,25 +125,8 @@ class NaiveAD(Replayed):
             with _no_word_of_signals():
                 image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
             # If none of a few paths hits anything, evaluated loops end before the image depends on a parameter.
-            flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
-            dr.backward_from(image * derivative(dr.detach(image)), flags=flags)
+            dr.backward_from(image * derivative(dr.detach(image)), flags=_MAY_LACK)
         return dr.detach(image)
-
-
-#: A differentiated parameter may receive no light.
-_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
-
-
-class TrackedSplat(Splat):
-    """Hooks that splat every connection with tracked derivatives of its factors. If `attached`, rays and film positions
-    have derivatives, too.
-    """
-
-    tracked = True
-
-    def __init__(self, samples: Samples, block: mi.ImageBlock, attached: bool) -> None:
-        super().__init__(samples, block)
-        self.attached = attached
 
 
 def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
@@ -154,7 +140,9 @@ def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
             if side.plan.camera:
                 splat_camera_paths(side, block, tracked=True)
             else:
-                walk(side, TrackedSplat(side, block, side.plan.attached))
+                hooks = Splat(side, block)
+                hooks.tracked, hooks.attached = True, side.plan.attached
+                walk(side, hooks)
 
 
 class WalkAd(LightTracer):
@@ -186,14 +174,13 @@ class WalkAd(LightTracer):
         return film.develop(block)
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        with dr.isolate_grad():
+        with dr.resume_grad(), dr.isolate_grad():
             image = self.graph(job)
             dr.backward_from(image * derivative(dr.detach(image)), flags=_MAY_LACK)
         return dr.detach(image)
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        with dr.resume_grad(), dr.isolate_grad():
-            dr.backward_from(self.graph(job) * gradient, flags=_MAY_LACK)
+        self.correlated(job, lambda image: gradient)
 
     def tangent(self, job: Job) -> mi.TensorXf:
         with dr.resume_grad():

@@ -8,7 +8,6 @@ tracer therefore gives the results of a new tracer. `Renewal` updates plans afte
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from numbers import Integral
 from typing import Any
@@ -18,21 +17,27 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from reslrb_cli.estimators.base import one_of
 from reslrb_cli.guiding.collect import bsdf_groups
 from reslrb_cli.guiding.tables import Guiding
-from reslrb_cli.integrators.differentiated import Differentiated, Motion, attach, bounces, with_shading_normals
 from reslrb_cli.integrators.freezing import Recordings
-from reslrb_cli.scene.catalog import entry_value
+from reslrb_cli.integrators.plans import (
+    Differentiated,
+    Motion,
+    SamplingOptions,
+    attach,
+    bounces,
+    settle,
+    with_shading_normals,
+)
 from reslrb_cli.scene.deformation import Surroundings
-from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
+from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import PixelShares
 from reslrb_cli.transport.plan import Plan, make_plan
-from reslrb_cli.transport.samples import Samples, passes
+from reslrb_cli.transport.samples import Samples, passes, tracked_values
 from reslrb_cli.transport.sobol import make_coordinates
 
 
@@ -133,49 +138,10 @@ class AboutScene:
     #: The densities of emitters, by their sources.
     emitters: dict[tuple[Any, ...], EmitterDensities] = field(default_factory=dict)
     recordings: Recordings = field(default_factory=Recordings)
-    #: By sensor, number of paths, and their density.
-    shares: dict[tuple[int, int, int], PixelShares | None] = field(default_factory=dict)
+    #: By density and number of paths.
+    shares: dict[tuple[int, int], PixelShares | None] = field(default_factory=dict)
     #: Samples per pixel for which the cells of guided emission are made.
     met: int = 0
-
-
-@dataclass(frozen=True)
-class SamplingOptions:
-    """Options of a light tracer for its choice of paths. Raises ValueError, which names the option, for a wrong value.
-
-    - `guided` tells whether emission is guided (`tables.py`). `images` tells whether samples that serve only an image
-        are guided, too. Camera paths alone are never guided.
-    - `low_discrepancy` tells whether the first numbers of a path are low-discrepancy numbers (`sobol.py`).
-    - `paths` are light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
-        only one kind of paths remains.
-    - If `whole` is true, images of light paths alone have the same film border as images with camera paths.
-    - `shares_out` tells whether camera paths are distributed over the pixels by need. The distribution by sensor,
-        (H, W), may be `given` for all scenes with the same sensors. Otherwise it is stored for each scene and its
-        parameters.
-    - `expected` is the sample count of the passes that tables learn from. If it is None, each pass uses its own count.
-    """
-
-    guided: bool = False
-    images: bool = True
-    low_discrepancy: bool = False
-    paths: str = "light"
-    light_share: float = 0.5
-    whole: bool = False
-    shares_out: bool = False
-    given: dict[int, NDArray[np.float32]] = field(default_factory=dict)
-    expected: int | None = None
-
-    def __post_init__(self) -> None:
-        one_of("paths", self.paths, ("light", "camera", "both"))
-        if not 0 <= self.light_share <= 1:
-            raise ValueError(f'"light_share" must lie in [0, 1], not {self.light_share}')
-        paths = self.paths
-        if paths == "both" and self.light_share in (0, 1):
-            paths = "light" if self.light_share else "camera"
-        guided = self.guided and paths != "camera"  # no camera path starts from a table
-        settled = {"paths": paths, "whole": self.whole or paths != "light", "guided": guided}
-        for name, value in {**settled, "images": self.images or not guided}.items():
-            object.__setattr__(self, name, value)
 
 
 class Preparation:
@@ -248,24 +214,12 @@ class Preparation:
         """
         return self._look_through(params).noted
 
-    def shares(
-        self, number: int, known: NDArray[np.float32], size: tuple[int, int]
-    ) -> Callable[[int], PixelShares | None]:
-        """Return a function that takes a number of camera paths and returns their distribution over the pixels.
-
-        The distribution is proportional to the `known` density (H, W). `size` is the (width, height) of the sensor's
-        crop window.
-        """
-        made = self._found.shares
-
-        def shares(paths: int) -> PixelShares | None:
-            key = number, paths, id(known)  # held by `SamplingOptions.given` or `AboutParameters`
-            if key not in made:
-                rows, columns = (np.arange(n) * m // n for n, m in zip(size[::-1], known.shape, strict=True))
-                made[key] = PixelShares.of(known[np.ix_(rows, columns)].ravel(), paths)
-            return made[key]
-
-        return shares
+    def shares(self, known: NDArray[np.float32], paths: int) -> PixelShares | None:
+        """Return the distribution of camera paths over the pixels, in proportion to the `known` density (H, W)."""
+        made, key = self._found.shares, (id(known), paths)  # held by `SamplingOptions.given` or `AboutParameters`
+        if key not in made:
+            made[key] = PixelShares.of(known.ravel(), paths)
+        return made[key]
 
     def entries(self, plan: Plan, params: mi.SceneParameters) -> list[int]:
         """Return the number of differentiated entries of each group of BSDFs (`bsdf_groups`) and of emission."""
@@ -307,9 +261,7 @@ class Preparation:
         The owner of a parameter never changes. A parameter may start or stop tracking derivatives, and may become zero
         or nonzero.
         """
-        with dr.resume_grad():  # with suspended gradients, nothing shows that it tracks them
-            values = {key: entry_value(params, key) for key in params.properties}
-            enabled = {key: value for key, value in values.items() if dr.grad_enabled(value)}
+        enabled = tracked_values(params)
         these = tuple((key, params.properties[key][2]) for key in enabled)
         known = self._found.parameters
         if these not in known:
@@ -368,17 +320,3 @@ class Preparation:
             owners[None] = graph.surface_bsdfs()
         used = {bsdf: None for node in nodes for bsdf in owners[node]}
         return () if all(bsdf in used for bsdf in owners.get(None, [])) else tuple(used)
-
-
-def settle(scene: mi.Scene) -> None:
-    """Make textures and emitters set up their data (padded storage, distributions) now instead of at their first use.
-
-    Data set-up during tracing would split the kernels of the first step. The second step would then compile new
-    kernels. Raises UnsupportedScene for an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
-    """
-    with dr.suspend_grad():
-        for texture in SceneGraph.of(scene).of_type(mi.Texture):
-            if texture.class_name().startswith("BitmapTexture"):
-                texture.eval(dr.zeros(mi.SurfaceInteraction3f))
-        _, weight = emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
-        dr.eval(weight)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.attached import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
@@ -18,7 +19,7 @@ from reslrb_cli.transport.connection import Connection, before_lamps, forward_de
 from reslrb_cli.transport.emission import primary_ray, sample_emission, visible_tangent
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.lamp_light import small_splat
-from reslrb_cli.transport.samples import Numbers, Samples
+from reslrb_cli.transport.samples import Numbers, Samples, in_passes
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 
@@ -176,6 +177,16 @@ def tangent_of_passage(
 def tangent_of_scattering(scattering: Scattering, df: mi.Spectrum) -> mi.Spectrum:
     """Return the derivative (C,) of an event's factor. `df` is the derivative of the event's f."""
     return dr.select(scattering.active, df * (scattering.correction / scattering.pdf), 0)
+
+
+def tangent_of(parts: list[Samples]) -> mi.TensorXf:
+    """Return the derivative (H, W, C) of the image of all passes. Raises UnsupportedScene if emitters move."""
+    if parts[0].plan.moving_emission:
+        raise UnsupportedScene("forward mode has no derivatives of moving emitters; use reverse mode")
+    film = parts[0].film
+    block = film.block()
+    in_passes(parts, splat_tangents, block)
+    return film.develop(block, tangent=True)
 
 
 def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:

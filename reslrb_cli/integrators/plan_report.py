@@ -27,30 +27,15 @@ class PlanRow:
 
 
 def plan_rows(plan: Plan) -> list[PlanRow]:
-    """List all features, including those that the plan leaves out."""
-    needs, camera_alone = plan.needs, plan.paths == "camera"
+    """List all features, including those that the plan leaves out. The scene's own needs are not in the list."""
+    camera_alone = plan.paths == "camera"
     no_start = "no path starts at a light" if camera_alone else None
     rows = (
         ("visible emitters", plan.visible_emission, "an emitter may be directly visible",
          "hidden, or only points and directions"),
-        ("several emitters", len(needs.emitters) > 1, "each path chooses one", "the only one is sampled"),
+        ("several emitters", len(plan.needs.emitters) > 1, "each path chooses one", "the only one is sampled"),
         ("environment map", plan.environment_map, "the walk places its rays", "none emits"),
         ("roulette", plan.roulette, "rr_depth is below max_depth", "max_depth ends paths earlier"),
-        ("shading-normal correction", needs.has_shading_normals, "shapes have interpolated normals",
-         "all normals are geometric"),
-        ("bump and normal maps", needs.has_perturbed_normals, "smooth lobes are evaluated with exchanged directions",
-         "no BSDF perturbs normals"),
-        ("delta lobes", needs.has_delta_lobes, "mirrors or clear glass", "no BSDF has any"),
-        ("null surfaces", needs.has_null, "shadow rays pass through masks", "every surface stops a shadow ray"),
-        ("instances", needs.has_instances, "shapes are instanced", "no shape is instanced"),
-        ("lens sampling", needs.thin_lens, "the aperture has a size", "the sensor is a pinhole"),
-        ("time sampling", needs.moving_shutter, "the shutter is open for some time",
-         "the shutter opens for an instant"),
-        ("shifted principal point", needs.principal_point, "the film is off the axis", "the film is on the axis"),
-        ("near clip plane", needs.near_clip, "shadow rays end there: something may be in front of it",
-         "nothing is in front of it"),
-        ("clip planes of a thin lens", needs.lens_clip, "something may be outside of them, or it focuses there",
-         "the scene is between them, or no sensor is a lens"),
         ("derivatives of emission", plan.differentiate_emission, "parameters of emitters",
          "no parameter of an emitter"),
         ("derivatives of BSDFs", plan.differentiate_bsdfs, "parameters of BSDFs",
@@ -88,8 +73,6 @@ def plan_rows(plan: Plan) -> list[PlanRow]:
          "as in finite differences", "nothing moves, or it is detached"),
         ("zero-factor bookkeeping", plan.track_zeros, "a parameter is zero or nearly zero somewhere",
          "no parameter is nearly zero"),
-        ("geometry read by BSDFs", needs.bsdfs_read_geometry, "stored vertices are found again on their surface",
-         "texture coordinates and directions suffice"),
     )  # fmt: skip
     return [PlanRow(name, needed, present if needed else absent) for name, needed, present, absent in rows]
 

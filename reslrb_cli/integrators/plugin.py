@@ -1,22 +1,44 @@
-"""Light tracers as Mitsuba plugins: `mi.load_dict({"type": "reslrb", ...})` after `reslrb_cli.register()`."""
+"""Integrators from a name and options, and light tracers as Mitsuba plugins.
+
+`mi.load_dict({"type": "reslrb", ...})` makes a plugin after `reslrb_cli.register()`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import mitsuba as mi
 
 from reslrb_cli.backend.variant import check_variant, works_under
-from reslrb_cli.estimators import ESTIMATORS, options_of
+from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
+from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import Trajectory, WalkAd
 from reslrb_cli.integrators.context import resolve_sensor
-from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.integrators.own import OwnIntegrator
+from reslrb_cli.integrators.plans import Motion, SamplingOptions
+from reslrb_cli.integrators.protocol import Job, StepIntegrator
+from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
+from reslrb_cli.integrators.step import interface_of
 
 #: Our integrators by the names of their plugins.
 TRACERS = ("reslrb", "walk_ad", "trajectory")
 _registered_with_callback = False
+
+#: Options of `reslrb` and their defaults. The estimator has more (`options_of`).
+OPTIONS: dict[str, Any] = {
+    **LightTracer.OPTIONS,
+    "estimator": "reservoir",
+    "freeze": False,
+    "attached": "auto",
+    "filter_normalization": "attached",
+    "attached_sampling": "auto",
+    "guiding": "off",
+    "sequence": "independent",
+    "paths": "light",
+    "light_share": 0.5,
+    "pixels": "even",
+}
 
 
 def register() -> None:
@@ -34,26 +56,80 @@ def register() -> None:
         check_variant(mi.variant())
 
 
+def make_integrator(type: str, **options: Any) -> StepIntegrator:
+    """Make an integrator from its plugin's name and options.
+
+    The name is `reslrb`, `walk_ad`, `trajectory`, a stock integrator such as `ptracer` and `prb`, or `custom` for a
+    user's own integrator (`OwnIntegrator`). Options that are None are left out, because Mitsuba would crash. Raises
+    ValueError for an unknown option.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    if type in TRACERS:
+        return make_tracer(type, given)
+    if type == "custom":
+        return OwnIntegrator(**given)
+    properties = mi.Properties(type)
+    for name, value in given.items():
+        properties[name] = value
+    # `mi.load_dict` would search for a library `plugins/prb.so` and run one from the working folder: it does not know
+    # plugins written in Python.
+    integrator = mi.PluginManager.instance().create_object(properties)
+    if properties.unqueried():
+        raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
+    return interface_of(integrator)
+
+
 def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Trajectory:
     """Make one of the light tracers. Raises ValueError if an option is wrong."""
     unknown = [name for name in options if name not in _option_names(type, options.get("estimator"))]
     if unknown:
         raise ValueError(f"{type} has no option {', '.join(unknown)}")
     if type == "reslrb":
-        return Reslrb.of(**options)
+        return make_reslrb(**options)
     return WalkAd(**options) if type == "walk_ad" else Trajectory(**options)
 
 
+def make_reslrb(**given: Any) -> Reslrb:
+    """Make `reslrb` from its options, including those of the estimator. Raises ValueError if one is wrong."""
+    options = {**OPTIONS, **given}
+    if options["paths"] == "camera" and "estimator" not in given:
+        options["estimator"] = "stack"
+    estimator, choices = options.pop("estimator"), {}
+    one_of("estimator", estimator, tuple(ESTIMATORS))
+    if options["paths"] == "camera" and estimator != "stack":
+        raise ValueError(
+            f'"estimator" {estimator} needs the connections of light paths, and paths: camera has none; remove it, '
+            "or use stack"
+        )
+    obstacle = None
+    if estimator not in ATTACHED:
+        obstacle = (
+            f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
+            f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
+        )
+    for name, other in (("guiding", "on"), ("sequence", "low_discrepancy"), ("pixels", "measured")):
+        value = options.pop(name)
+        one_of(name, value, (OPTIONS[name], other))
+        choices[name] = value == other
+    motion = Motion(
+        options.pop("attached"), options.pop("filter_normalization"), obstacle, options.pop("attached_sampling")
+    )
+    sampling = SamplingOptions(
+        guided=choices["guiding"],
+        low_discrepancy=choices["sequence"],
+        paths=options.pop("paths"),
+        light_share=options.pop("light_share"),
+        shares_out=choices["pixels"],
+    )
+    own = {name: options.pop(name) for name in options_of(estimator) if name in options}
+    return Reslrb(make_estimator(estimator, own), motion=motion, sampling=sampling, **options)
+
+
 def _on_variant(old: str | None, new: str) -> None:
-    plugin = _plugin_class() if works_under(new) else _refuse
+    # `check_variant` raises: Mitsuba's own message, "no such plugin", would not help.
+    plugin = _plugin_class() if works_under(new) else lambda name, props: check_variant(mi.variant())
     for name in TRACERS:
         mi.register_integrator(name, lambda props, name=name: plugin(name, props))
-
-
-def _refuse(type: str, props: mi.Properties) -> NoReturn:
-    """Raise an error under a variant without the plugin. Mitsuba's own message, "no such plugin", would not help."""
-    check_variant(mi.variant())
-    raise AssertionError("requires such a variant")
 
 
 def _plugin_class() -> type[mi.CppADIntegrator]:
@@ -104,8 +180,8 @@ def _option_names(type: str, estimator: str | None) -> list[str]:
     """Return the names of an integrator's options, including those of its estimator."""
     if type != "reslrb":
         return list(WalkAd.OPTIONS if type == "walk_ad" else Trajectory.OPTIONS)
-    name = Reslrb.OPTIONS["estimator"] if estimator is None else estimator
-    return [*Reslrb.OPTIONS, *(options_of(name) if name in ESTIMATORS else ())]
+    name = OPTIONS["estimator"] if estimator is None else estimator
+    return [*OPTIONS, *(options_of(name) if name in ESTIMATORS else ())]
 
 
 def _job(scene: mi.Scene, params: Any, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int) -> Job:

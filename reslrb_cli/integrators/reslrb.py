@@ -18,17 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
-from reslrb_cli.estimators.base import Estimator, Pass, one_of
+from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.context import Preparation, SamplingOptions, sensor_number
-from reslrb_cli.integrators.differentiated import Motion
-from reslrb_cli.integrators.forward import splat_tangents
+from reslrb_cli.integrators.context import Preparation, sensor_number
+from reslrb_cli.integrators.forward import tangent_of
+from reslrb_cli.integrators.plans import Motion, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
@@ -161,13 +159,13 @@ class LightTracer(StepIntegrator):
         preparation = self.preparation
         if plan.paths == "light" or not preparation.sampling.shares_out:
             return None
-        number, size = sensor_number(job.scene, job.sensor), job.sensor.film().crop_size()
+        number = sensor_number(job.scene, job.sensor)
         known = preparation.sampling.given
         if job.params is not None and number not in known:
             known = preparation.noted(job.params)
             if number not in known:
                 known[number] = self.note_pixels(job)
-        return preparation.shares(number, known[number], (int(size[0]), int(size[1]))) if number in known else None
+        return partial(preparation.shares, known[number]) if number in known else None
 
     def note_pixels(self, job: Job, curvature: NDArray[np.floating] | None = None) -> NDArray[np.float32]:
         """Return the density (H, W) of camera paths over the pixels of a job's sensor, for the current scene. The mean
@@ -214,13 +212,7 @@ class LightTracer(StepIntegrator):
     def tangent(self, job: Job) -> mi.TensorXf:
         """Return the derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
         with dr.suspend_grad():
-            parts = self.passes(job)
-            if parts[0].plan.moving_emission:
-                raise UnsupportedScene("forward mode has no derivatives of moving emitters; use reverse mode")
-            film = parts[0].film
-            block = film.block()
-            in_passes(parts, splat_tangents, block)
-            return film.develop(block, tangent=True)
+            return tangent_of(self.passes(job))
 
     def launch(
         self, kind: str, parts: list[Samples], work: Callable[..., Any], *inputs: Any,
@@ -240,75 +232,11 @@ class LightTracer(StepIntegrator):
 
 
 class Reslrb(LightTracer):
-    """Light tracer that differentiates by replaying each path. Options that are not in OPTIONS belong to the
-    estimator.
-    """
-
-    OPTIONS: ClassVar[Mapping[str, Any]] = {
-        **LightTracer.OPTIONS,
-        "estimator": "reservoir",
-        "freeze": False,
-        "attached": "auto",
-        "filter_normalization": "attached",
-        "attached_sampling": "auto",
-        "guiding": "off",
-        "sequence": "independent",
-        "paths": "light",
-        "light_share": 0.5,
-        "pixels": "even",
-    }
+    """Light tracer that differentiates the paths of its image by an estimator."""
 
     def __init__(self, estimator: Estimator, **common: Any) -> None:
         super().__init__(**common)
         self.estimator = estimator
-
-    @classmethod
-    def of(cls, **given: Any) -> Reslrb:
-        """Make the tracer from its options (OPTIONS, and those of the estimator). Raises ValueError if one is wrong."""
-        options = {**cls.OPTIONS, **given}
-        if options["paths"] == "camera" and not given.get("estimator"):
-            options["estimator"] = "stack"
-        estimator = options.pop("estimator") or cls.OPTIONS["estimator"]
-        if estimator == "auto":
-            raise ValueError(
-                '"estimator" auto needs an experiment to measure on (`reslrb optimize`); for the plugin, name one of '
-                + ", ".join(ESTIMATORS)
-            )
-        if estimator not in ESTIMATORS:
-            raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
-        if options["paths"] == "camera" and estimator != "stack":
-            raise ValueError(
-                f'"estimator" {estimator} needs the connections of light paths, and paths: camera has none; remove it, '
-                "or use stack"
-            )
-        obstacle = None
-        if estimator not in ATTACHED:
-            obstacle = (
-                f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
-                f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
-            )
-        motion = Motion(
-            options.pop("attached"), options.pop("filter_normalization"), obstacle, options.pop("attached_sampling")
-        )
-        for name, values in (
-            ("guiding", ("on", "off")),
-            ("sequence", ("independent", "low_discrepancy")),
-            ("pixels", ("even", "measured")),
-        ):
-            if options[name] == "auto":
-                raise ValueError(
-                    f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); use {" or ".join(values)}'
-                )
-            one_of(name, options[name], values)
-        sampling = SamplingOptions(
-            guided=options.pop("guiding") == "on",
-            low_discrepancy=options.pop("sequence") == "low_discrepancy",
-            paths=options.pop("paths"),
-            light_share=options.pop("light_share"),
-            shares_out=options.pop("pixels") == "measured",
-        )
-        own = {name: options.pop(name) for name in options_of(estimator) if name in options}
-        return cls(make_estimator(estimator, own), motion=motion, sampling=sampling, **options)
 
     def share_of_light(self, plan: Plan) -> float:
         """Return the share of the samples that are light paths."""

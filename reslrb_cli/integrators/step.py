@@ -27,8 +27,6 @@ from reslrb_cli.config.files import PASS_SAMPLES, PASSES
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import NaiveAD, Projective, Replayed
 from reslrb_cli.integrators.context import resolve_sensor
-from reslrb_cli.integrators.own import OwnIntegrator
-from reslrb_cli.integrators.plugin import TRACERS, make_tracer
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
 
 Adjoint = Literal["correlated", "independent", "batched"]
@@ -88,29 +86,6 @@ class StepResult:
     refused: Refused = field(default_factory=Refused)
 
 
-def make_integrator(type: str, **options: Any) -> StepIntegrator:
-    """Make an integrator from its plugin's name and options.
-
-    The name is `reslrb`, `walk_ad`, `trajectory`, a stock integrator such as `ptracer` and `prb`, or `custom` for a
-    user's own integrator (`OwnIntegrator`). Options that are None are left out, because Mitsuba would crash. Raises
-    ValueError for an unknown option.
-    """
-    given = {name: value for name, value in options.items() if value is not None}
-    if type in TRACERS:
-        return make_tracer(type, given)
-    if type == "custom":
-        return OwnIntegrator(**given)
-    properties = mi.Properties(type)
-    for name, value in given.items():
-        properties[name] = value
-    # `mi.load_dict` would search for a library `plugins/prb.so` and run one from the working folder: it does not know
-    # plugins written in Python.
-    integrator = mi.PluginManager.instance().create_object(properties)
-    if properties.unqueried():
-        raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
-    return interface_of(integrator)
-
-
 def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
     """Return the step interface of a plugin. An object that already is a step interface is returned unchanged."""
     if not isinstance(integrator, mi.Integrator):
@@ -165,24 +140,23 @@ def gradient_step(
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
     if adjoint == "batched":
         return _batched(work, job, objective, batches, on_samples)
-    losses: list[mi.Float | mi.TensorXf] = []
-    gradients: list[mi.TensorXf] = []
     refused = Refused()
+    if adjoint == "independent":
+        image = work.image(job)
+        loss, gradient = derivative_of(objective, image, refused)
+        _differentiate(work, replace(job, seed=second_seed(job.seed)), gradient, on_samples)
+        return StepResult(image, loss, refused)
+    found: list[tuple[mi.Float | mi.TensorXf, mi.TensorXf]] = []
 
     def derivative(image: mi.TensorXf) -> mi.TensorXf:
-        loss, gradient = derivative_of(objective, image, refused)
-        losses.append(loss)
-        gradients.append(gradient)
-        return gradient
+        found.append(derivative_of(objective, image, refused))
+        return found[0][1]
 
-    if adjoint == "correlated":
-        image = work.correlated(job, derivative)
-        if on_samples is not None:
-            on_samples(image, gradients[0])
-    else:
-        image = work.image(job)
-        _differentiate(work, replace(job, seed=second_seed(job.seed)), derivative(image), on_samples)
-    return StepResult(image, losses[0], refused)
+    image = work.correlated(job, derivative)
+    [(loss, gradient)] = found
+    if on_samples is not None:
+        on_samples(image, gradient)
+    return StepResult(image, loss, refused)
 
 
 def known_step(

@@ -27,8 +27,9 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job, first_channels
-from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator, render_image
+from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import Deformation

@@ -29,8 +29,8 @@ import numpy as np
 from reslrb_cli.config.parameters import HEIGHTMAP
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.reslrb import LightTracer
-from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import (
     REACH,
     STEPS,

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
-from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.gradients import Case, seeds
 from reslrb_cli.measure.methods import NEVER

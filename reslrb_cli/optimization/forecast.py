@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import mitsuba as mi
 
-from reslrb_cli.backend.memory import free_bytes
+from reslrb_cli.backend.doctor import free_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import optimize

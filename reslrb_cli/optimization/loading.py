@@ -19,9 +19,10 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.context import sensors_in_words
 from reslrb_cli.integrators.freezing import MOST_PATHS_APART
+from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.integrators.step import make_integrator, render_image
+from reslrb_cli.integrators.step import render_image
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.load import load_scene, make_grid, warn_once
 from reslrb_cli.scene.needs import (

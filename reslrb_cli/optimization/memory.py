@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.backend.memory import free_bytes, local_bytes
+from reslrb_cli.backend.doctor import free_bytes, local_bytes
 from reslrb_cli.config.files import in_words
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.schema import Config

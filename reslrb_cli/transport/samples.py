@@ -58,13 +58,26 @@ def in_passes(
         sums.put()
 
 
+def tracked_values(params: mi.SceneParameters) -> dict[str, Any]:
+    """Return the values of all parameters that track derivatives, by name.
+
+    `params[key]` is not used, because it fails for missing values such as an optional texture.
+    """
+    found = {}
+    with dr.resume_grad():  # with suspended gradients, nothing shows that it tracks them
+        for key, (value, kind, node, _) in params.properties.items():
+            value = value if kind is None else params.get_property(value, kind, node)
+            if dr.grad_enabled(value):
+                found[key] = value
+    return found
+
+
 class GradientSum:
     """Sum of the parameters' gradients over passes, separate from the gradients of the current pass."""
 
     def __init__(self, params: mi.SceneParameters) -> None:
-        with dr.resume_grad():  # with suspended gradients, nothing shows that it tracks them
-            enabled = [value for _, value in params.items() if dr.grad_enabled(value)]
-            self.values = [array for value in enabled for array in _arrays(value)]
+        with dr.resume_grad():
+            self.values = [array for value in tracked_values(params).values() for array in _arrays(value)]
         self.totals: list[dr.ArrayBase] = []
 
     def take(self) -> None:

@@ -357,7 +357,8 @@ import reslrb_cli
 
 RENDERS = """
 import reslrb_cli, mitsuba as mi
-from reslrb_cli.integrators.step import make_integrator, render_image
+from reslrb_cli.integrators.plugin import make_integrator
+from reslrb_cli.integrators.step import render_image
 
 mi.set_variant("llvm_ad_rgb")
 scene, integrator = mi.load_dict(mi.cornell_box()), make_integrator("ptracer", max_depth=2)

@@ -174,7 +174,7 @@ BACK = "estimators.attached:AttachedFrame.differentiate"
 FAULTS = [
     # ---- The walk back: naive AD of our walk is right ----
     Fault("sign_of_adjoint_of_origin", "slab", BACK,
-                  "scattered, dr.grad(ray.o),", "scattered, -dr.grad(ray.o),", quick=True),
+                  "(mi.Vector3f(dr.grad(ray.o)),", "(-mi.Vector3f(dr.grad(ray.o)),", quick=True),
     Fault("direction_has_no_adjoint", "slab", BACK, " + dr.dot(following.d, adjoint.direction)", ""),
     Fault("prefix_missing", "bounces", BACK, "dr.dot(P, reached * (own + later))",
                   "dr.sum(reached * (own + later))"),

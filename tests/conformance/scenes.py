@@ -15,7 +15,8 @@ import numpy as np
 from agreement import Agreement, compare
 
 import reslrb_cli
-from reslrb_cli.integrators.step import make_integrator, render_image
+from reslrb_cli.integrators.plugin import make_integrator
+from reslrb_cli.integrators.step import render_image
 
 #: Largest allowed relative difference between images from the same random numbers.
 SAME = 3e-4

@@ -17,7 +17,7 @@ from measure.faults import Fault, plant, planted
 from measure.moving_light import SCENES, moved, point, room, shelf, wall
 
 from reslrb_cli.estimators import chain
-from reslrb_cli.integrators.differentiated import stays
+from reslrb_cli.integrators.plans import stays
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds

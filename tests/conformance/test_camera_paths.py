@@ -34,8 +34,9 @@ from turns import a_few, taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.guiding.pixels import MOST, NOTED_SPP, density_of
+from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.integrators.step import interface_of, make_integrator, render_image
+from reslrb_cli.integrators.step import interface_of, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.transport.film import EVEN, MOST_SLOTS, PixelShares

@@ -36,7 +36,7 @@ from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.guiding import tables
-from reslrb_cli.integrators.step import make_integrator
+from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.transport import aim, walk
 from reslrb_cli.transport.aim import Aim, Blocks, Pending

@@ -27,7 +27,8 @@ from conformance.scenes import plugin
 from turns import a_few, taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator, render_image, sample_sets
+from reslrb_cli.integrators.plugin import make_integrator
+from reslrb_cli.integrators.step import gradient_step, known_step, render_image, sample_sets
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room, texture, transform
 

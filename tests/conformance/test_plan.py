@@ -16,7 +16,8 @@ from turns import taking_turns
 from reslrb_cli.estimators import gather, reservoir, stack
 from reslrb_cli.integrators.context import Preparation
 from reslrb_cli.integrators.plan_report import plan_rows
-from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator
+from reslrb_cli.integrators.plugin import make_integrator
+from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, texture, transform
 
@@ -193,7 +194,7 @@ def test_rows_explain_needed_features() -> None:
     case, ours = Case(through_a_lens(), (FLOOR,)), integrator("reslrb", 5, estimator="stack")
     with tracking(case.params, case.keys):
         rows = plan_rows(ours.plan(case.scene, case.scene.sensors()[0], case.params))
-    assert {row.feature for row in rows if row.needed} == {"visible emitters", "lens sampling", "derivatives of BSDFs"}
+    assert {row.feature for row in rows if row.needed} == {"visible emitters", "derivatives of BSDFs"}
     assert all(row.reason for row in rows)
 
 

@@ -20,7 +20,8 @@ from turns import a_few
 
 from reslrb_cli import step
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.integrators.step import gradient_step, make_integrator, render_image
+from reslrb_cli.integrators.plugin import make_integrator
+from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import camera, lamp, rgb, room, transform
 

@@ -16,9 +16,9 @@ from conformance.path_densities import CameraNotes, Densities, Emission, LightNo
 from measure.faults import Fault, plant, planted
 from turns import a_few
 
+from reslrb_cli.integrators.plugin import make_integrator, make_reslrb
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.integrators.step import gradient_step, make_integrator
+from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.transport.camera import camera_walk
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import walk
@@ -226,7 +226,7 @@ def prepared(case: Case) -> Any:
     names = ("paths", "max_depth", "light_share", "rr_depth", "hide_emitters")
     options = {name: getattr(case, name) for name in names} | {"estimator": "stack"}
     scene, params = case.scene(), None
-    tracer = Reslrb.of(**options, guiding="on" if case.guided else "off")
+    tracer = make_reslrb(**options, guiding="on" if case.guided else "off")
     if case.shared:
         size = scene.sensors()[0].film().crop_size()
         density = np.random.default_rng(2).exponential(size=(size[1], size[0])).astype(np.float32)

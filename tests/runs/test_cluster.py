@@ -312,7 +312,7 @@ def test_failing_workers_are_restarted(
     """One worker fails in the middle of a run. The run ends with the same result, and no iteration takes longer than a
     minute.
     """
-    monkeypatch.setattr("reslrb_cli.backend.memory.free_bytes", lambda variant: workers * 2 * 2**30)
+    monkeypatch.setattr("reslrb_cli.backend.doctor.free_bytes", lambda variant: workers * 2 * 2**30)
     longest, before = 0.0, time.monotonic()
 
     with beside(experiment, workers, 8) as (course, client):

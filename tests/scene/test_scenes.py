@@ -11,7 +11,8 @@ import pytest
 from turns import a_few
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.integrators.step import make_integrator, render_image
+from reslrb_cli.integrators.plugin import make_integrator
+from reslrb_cli.integrators.step import render_image
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.needs import check_paths, look, scene_needs
 from reslrb_cli.scene.parameters import select_parameters, set_values

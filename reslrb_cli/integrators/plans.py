@@ -1,6 +1,7 @@
-"""Differentiated parameters, and the features of a walk that their derivatives need, mainly for moving light.
+"""Options of a light tracer, differentiated parameters, and the features of a plan that both need.
 
-`Motion` has the options of attached derivatives, and `attach` adds them to a plan. The values `follow` and `stay` of
+`SamplingOptions` has the choice of paths. `Motion` has the options of attached derivatives, and `attach` adds them to a
+plan. The values `follow` and `stay` of
 `attached_sampling` (`estimators/attached.py`) differ in only one case. The case occurs when a nonspecular surface
 scatters moving light to another visible surface. `bounces` tests whether moving light reaches a visible surface after
 nonspecular scattering. In a caustic of few segments, moving light does not bounce, because paths end where light first
@@ -11,15 +12,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.estimators.base import one_of
 from reslrb_cli.scene.catalog import entry_value, parameter_kind
 from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
-from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
+from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_emission
@@ -109,10 +113,61 @@ class Motion:
     def __post_init__(self) -> None:
         if self.attached not in (True, False, "auto"):
             raise ValueError('"attached" must be auto, true or false')
-        if self.filter_normalization not in ("attached", "detached"):
-            raise ValueError('"filter_normalization" must be attached or detached')
-        if self.sampling not in ("auto", "follow", "stay"):
-            raise ValueError('"attached_sampling" must be auto, follow or stay')
+        one_of("filter_normalization", self.filter_normalization, ("attached", "detached"))
+        one_of("attached_sampling", self.sampling, ("auto", "follow", "stay"))
+
+
+@dataclass(frozen=True)
+class SamplingOptions:
+    """Options of a light tracer for its choice of paths. Raises ValueError, which names the option, for a wrong value.
+
+    - `guided` tells whether emission is guided (`tables.py`). `images` tells whether samples that serve only an image
+        are guided, too. Camera paths alone are never guided.
+    - `low_discrepancy` tells whether the first numbers of a path are low-discrepancy numbers (`sobol.py`).
+    - `paths` are light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
+        only one kind of paths remains.
+    - If `whole` is true, images of light paths alone have the same film border as images with camera paths.
+    - `shares_out` tells whether camera paths are distributed over the pixels by need. The distribution by sensor,
+        (H, W), may be `given` for all scenes with the same sensors. Otherwise it is stored for each scene and its
+        parameters.
+    - `expected` is the sample count of the passes that tables learn from. If it is None, each pass uses its own count.
+    """
+
+    guided: bool = False
+    images: bool = True
+    low_discrepancy: bool = False
+    paths: str = "light"
+    light_share: float = 0.5
+    whole: bool = False
+    shares_out: bool = False
+    given: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+    expected: int | None = None
+
+    def __post_init__(self) -> None:
+        one_of("paths", self.paths, ("light", "camera", "both"))
+        if not 0 <= self.light_share <= 1:
+            raise ValueError(f'"light_share" must lie in [0, 1], not {self.light_share}')
+        paths = self.paths
+        if paths == "both" and self.light_share in (0, 1):
+            paths = "light" if self.light_share else "camera"
+        guided = self.guided and paths != "camera"  # no camera path starts from a table
+        settled = {"paths": paths, "whole": self.whole or paths != "light", "guided": guided}
+        for name, value in {**settled, "images": self.images or not guided}.items():
+            object.__setattr__(self, name, value)
+
+
+def settle(scene: mi.Scene) -> None:
+    """Make textures and emitters set up their data (padded storage, distributions) now instead of at their first use.
+
+    Data set-up during tracing would split the kernels of the first step. The second step would then compile new
+    kernels. Raises UnsupportedScene for an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
+    """
+    with dr.suspend_grad():
+        for texture in SceneGraph.of(scene).of_type(mi.Texture):
+            if texture.class_name().startswith("BitmapTexture"):
+                texture.eval(dr.zeros(mi.SurfaceInteraction3f))
+        _, weight = emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
+        dr.eval(weight)
 
 
 def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bool]:
