@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import drjit as dr
@@ -13,8 +14,19 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene.extent import clipped
-from reslrb_cli.scene.graph import Lamp, SceneGraph, bent_faces, emitted_rays, failure, grid, sensor_rays, small_lamps
+from reslrb_cli.scene.graph import (
+    Lamp,
+    SceneGraph,
+    bent_faces,
+    bounds,
+    emitted_rays,
+    face_normals,
+    failure,
+    grid,
+    sensor_rays,
+    small_lamps,
+    triangles,
+)
 
 #: Sensors to which light paths can connect: they have `sample_direction`, with the density of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
@@ -114,7 +126,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` includes it
     lamps = graph.find_lamps(scene)
     is_projective = sensor.class_name() in SENSORS
-    near, far = clipped(scene, sensor) if is_projective else (False, False)
+    near, far = _clipped(scene, sensor) if is_projective else (False, False)
     thin_lens = bool(sensor.needs_aperture_sample())
     params = mi.traverse(sensor)
     others = [bsdf for bsdf in graph.of_type(mi.BSDF) if bsdf.class_name() not in _FOLLOWED_BSDFS]
@@ -442,6 +454,53 @@ def _read_geometry(graph: SceneGraph) -> bool:
     textures = [texture.class_name() for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
     is_plain = all(bsdf.class_name() in _PLAIN_BSDFS for bsdf in graph.of_type(mi.BSDF))
     return not is_plain or not all(map(_PLAIN_TEXTURES.fullmatch, textures))
+
+
+def _clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
+    """Return whether objects may lie between a sensor and its near clip plane, and whether objects may lie beyond its
+    far clip plane.
+
+    The sensor is perspective or thin-lens. Between the sensor and its near plane, only objects in the sensor's view
+    count. The test uses bounding boxes, and triangles near the sensor. A result of false is certain, and a result of
+    true may be wrong.
+    """
+    params = mi.traverse(sensor)
+    near, far, radius, focus = (
+        float(np.ravel(params[key])[0]) if key in params else default
+        for key, default in (("near_clip", 0), ("far_clip", np.inf), ("aperture_radius", 0), ("focus_distance", np.inf))
+    )
+    to_world = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+    axes, eye = to_world[:3, :3], to_world[:3, 3]
+    corners = np.array(list(product(*zip(*bounds(scene), strict=True))))
+    beyond = bool(((corners - eye) @ axes[:, 2]).max() > far)
+
+    # The box, in sensor coordinates, that contains everything between the aperture and the near plane.
+    width, height = (int(n) for n in sensor.film().size())
+    shift = max((float(np.abs(value).max()) for key, value in params if key.startswith("principal_point")), default=0.0)
+    tangent = np.tan(np.deg2rad(float(params["x_fov"][0])) / 2) * max(1, height / width) * (1 + 2 * shift)
+    side = near * tangent + radius * (1 + near / focus if focus > 0 else 1)
+    half, middle = np.array([side, side, near / 2]), np.array([0, 0, near / 2])
+    return any(_touches(shape, axes, eye, middle, half) for shape in scene.shapes()), beyond
+
+
+def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, half: np.ndarray) -> bool:
+    """Whether a shape may touch a box. `middle` and `half` are the box's centre and half sizes in the coordinates of
+    `axes` (columns) and `eye`.
+    """
+    low, high = bounds(shape)
+    centre, extent = (low + high) / 2, (high - low) / 2
+    apart = centre - (eye + axes @ middle)
+    beside = (np.abs(apart) > extent + np.abs(axes) @ half) | (np.abs(apart @ axes) > half + extent @ np.abs(axes))
+    if beside.any():
+        return False
+    if shape.class_name() == "Sphere":  # a sensor may be inside it
+        return bool(np.linalg.norm(apart) + np.linalg.norm(half) > extent.min() * 0.999)
+    if not shape.is_mesh():
+        return True
+    corners = (triangles(shape) - eye) @ axes - middle
+    corners = corners[((corners.min(1) <= half) & (corners.max(1) >= -half)).all(1)]
+    normals = face_normals(corners)
+    return bool((np.abs((normals * corners[:, 0]).sum(1)) <= np.abs(normals) @ half).any())
 
 
 def _focuses_outside(params: mi.SceneParameters) -> bool:

@@ -17,7 +17,7 @@ import reslrb_cli
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.catalog import list_parameters
-from reslrb_cli.scene.load import load_scene, warn_once
+from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -260,66 +260,6 @@ def test_nothing_is_rebuilt_without_selected_8_bit_textures(walls):
     assert types == ["TensorXu8"] * 3 + ["TensorXf"]
     with pytest.raises(ConfigError, match=r"`ball\.bsdf\.reflectance\.data` is stored with 8 bits"):
         select_parameters(load_scene(walls), [ParameterSpec(key="ball.bsdf.reflectance.data")], "c.yaml")
-
-
-TRIANGLE = "v -2 -2 0\nv 2 -2 0\nv 0 2 0\n"
-ONE, OTHER, TWICE = "f 1 2 3\n", "f 3 2 1\n", "f 1 2 3\nf 2 3 1\n"
-WHITE = '<bsdf type="diffuse" id="white"/>'
-BOTH_SIDES = '<bsdf type="twosided" id="white"><bsdf type="diffuse"/></bsdf>'
-REF = '<ref id="white"/>'
-
-
-def rectangle(name: str, more: str = REF) -> str:
-    return f'<shape type="rectangle" id="{name}">{more}</shape>'
-
-
-def obj(name: str, file: str, more: str = REF) -> str:
-    return f'<shape type="obj" id="{name}"><string name="filename" value="{file}.obj"/>{more}</shape>'
-
-
-FLIPPED = '<boolean name="flip_normals" value="true"/>'
-FLAT = REF + '<boolean name="face_normals" value="true"/>'
-
-
-def moved(z: float, scale: float = 1) -> str:
-    return f'<transform name="to_world"><scale value="{scale}"/><translate z="{z}"/></transform>'
-
-
-@pytest.mark.parametrize(
-    ("bsdf", "shapes", "names"),
-    [
-        (WHITE, rectangle("a") + rectangle("b", '<bsdf type="diffuse"/>'), "`a` and `b`"),
-        (WHITE, rectangle("a") + rectangle("b"), None),
-        (WHITE, rectangle("a") + rectangle("b", REF + FLIPPED), "`a` and `b`"),
-        (BOTH_SIDES, rectangle("a") + rectangle("b", REF + FLIPPED), None),
-        (WHITE, rectangle("a") + rectangle("b", REF + '<emitter type="area"/>'), "`a` and `b`"),
-        (WHITE, rectangle("a") + rectangle("b", '<bsdf type="diffuse"/>' + moved(z=-0.1)), None),
-        (WHITE, obj("a", "both", FLAT), "`a`"),
-        (BOTH_SIDES, obj("a", "both", FLAT), None),
-        (BOTH_SIDES, obj("a", "both"), "`a`"),  # each corner normal is the mean of both faces' normals, 0
-        (WHITE, obj("a", "twice"), None),
-        (WHITE, obj("a", "one") + obj("b", "one"), None),
-        (WHITE, obj("a", "one") + obj("b", "other"), "`a` and `b`"),
-        (BOTH_SIDES, obj("a", "one") + obj("b", "other"), None),
-        (BOTH_SIDES, obj("a", "one") + obj("b", "one", '<bsdf type="diffuse"/>'), "`a` and `b`"),
-        # No ray reaches the inside of a box.
-        (WHITE, obj("a", "one") + obj("b", "other") + f'<shape type="cube">{moved(z=0, scale=3)}</shape>', None),
-    ],
-)
-def test_coincident_faces_give_a_warning(tmp_path, caplog, bsdf, shapes, names):
-    for name, faces in (("one", ONE), ("other", OTHER), ("twice", TWICE), ("both", ONE + OTHER)):
-        (tmp_path / f"{name}.obj").write_text(TRIANGLE + faces)
-    view = '<transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/></transform>'
-    warn_once.cache_clear()
-    load(tmp_path, f'<scene version="3.0.0"><sensor type="perspective">{view}</sensor><emitter type="constant"/>{bsdf}'
-                   f"{shapes}</scene>")  # fmt: skip
-    lines = [record.getMessage() for record in caplog.records]
-    if names is None:
-        assert lines == []
-        return
-    [line] = lines
-    assert f"faces of {names} coincide and differ" in line
-    assert "remove one of each" in line
 
 
 # Lasting names: an object without an id is named by its kind and its number in the file. The name is the same in every
