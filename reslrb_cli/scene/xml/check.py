@@ -15,7 +15,6 @@ import mitsuba as mi
 from reslrb_cli.backend.installation import is_known, nearest_plugin, plugin_type
 from reslrb_cli.config.files import PIXELS
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene.images import DamagedImage, image_size
 from reslrb_cli.scene.xml.read import Description, Element, quoted
 
 #: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, with substitutes.
@@ -168,14 +167,6 @@ def _wrong_file(name: str, description: Description) -> str | None:
         return f"{quoted(name)}: no such file{looked}"
     if not stat.S_ISREG(path.stat().st_mode):
         return f"{path} is not a regular file"
-    try:
-        width, height = image_size(path)
-    except DamagedImage as error:
-        return str(error)
-    except ConfigError:
-        return None  # not an image, or of an unknown format
-    if width * height > PIXELS:
-        return f"{path} is {width}x{height} pixels; the limit is {PIXELS} pixels"
     return None
 
 
