@@ -21,8 +21,7 @@ from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.graph import bounds
 from reslrb_cli.scene.values import Place
-from reslrb_cli.scene.xml.build import Owners, build
-from reslrb_cli.scene.xml.check import check, check_files, resize_films
+from reslrb_cli.scene.xml.build import Owners, build, resize_films
 from reslrb_cli.scene.xml.mend import mend, warnings
 from reslrb_cli.scene.xml.read import Description, quoted, read_description
 
@@ -60,13 +59,11 @@ def load_scene(
     """
     file = Path(file)
     description = read_description(file, options or {})
-    root = description.root
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
     found = mend(description)
     if size is not None:
-        resize_films(root, size)
-    check(description)
+        resize_films(description.root, size)
     if look is not None:
         look(description)
     scene, unused = build(description)
@@ -81,10 +78,10 @@ def load_scene(
             raise ConfigError(file, "", wrong)
     _check_meshes(file, scene)
     lost = {note.element for note in unused}  # other notes on lost elements do not matter
-    for line in warnings([*(note for note in found if note.element not in lost), *unused], root):
+    for line in warnings([*(note for note in found if note.element not in lost), *unused]):
         warn_once(line)
-    if (lost := _lost_light(scene)) is not None:
-        warn_once(f"{file}: {lost}")
+    if (problem := _lost_light(scene)) is not None:
+        warn_once(f"{file}: {problem}")
     for note in unused:
         if note.owner is not None:
             note.owner.children.remove(note.element)
@@ -177,8 +174,6 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
             owner.drop("format")
             owner.children.append(owner.new("string", name="format", value="variant"))
             changed = True
-    if changed:
-        check_files(description)
     return changed
 
 

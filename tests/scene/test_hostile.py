@@ -63,8 +63,6 @@ OPENED = {
     "volume": f'<medium type="heterogeneous"><volume type="gridvolume" name="albedo">{NAMED}</volume></medium>',
     "spectrum": '<bsdf type="diffuse"><spectrum name="reflectance" filename="pipe"/></bsdf>',
     "lamp": '<emitter type="point"><spectrum name="intensity" filename="pipe"/></emitter>',
-    "material": '<bsdf type="conductor"><string name="material" value="mine"/></bsdf>',
-    "rough material": '<bsdf type="roughconductor"><string name="material" value="Cu"/></bsdf>',
     "nested": '<include filename="part.xml"/>',
     "include": '<include filename="pipe"/>',
     "folder": '<path value="pipe"/>',
@@ -73,12 +71,10 @@ OPENED = {
 
 @pytest.mark.parametrize("kind", OPENED)
 def test_no_pipe_is_opened(kind: str, tmp_path: Path) -> None:
-    (tmp_path / "data" / "ior").mkdir(parents=True)
-    pipes = [tmp_path / "pipe", *(tmp_path / "data" / "ior" / f"{name}.spd" for name in ("mine.eta", "Cu.k"))]
-    for pipe in pipes:
-        os.mkfifo(pipe)
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
     write(tmp_path, f'<scene version="3.0.0">{OPENED["spectrum"]}</scene>', "part.xml")
-    opened = "".join(f": <> {pipe}; " for pipe in pipes)  # frees blocked readers, so that the test fails, not hangs
+    opened = f": <> {pipe}"  # frees blocked readers, so that the test fails, not hangs
     with subprocess.Popen(["sh", "-c", f"sleep 30; {opened}"]) as freeing:
         start = time.monotonic()
         with pytest.raises(ConfigError, match=r"no regular file|not a regular file|folder `pipe` not found"):
@@ -94,18 +90,11 @@ def test_no_pipe_is_opened(kind: str, tmp_path: Path) -> None:
             '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"/></bsdf>',
             "bitmap needs a parameter `filename`",
         ),
-        ('<bsdf type="normalmap"><bsdf type="diffuse"/></bsdf>', "normalmap needs a parameter `normalmap`"),
-        ('<bsdf type="blendbsdf"><bsdf type="diffuse"/></bsdf>', "blendbsdf needs two BSDFs"),
         ('<bsdf type="diffuse"><texture type="blendbsdf" name="reflectance"/></bsdf>', "`blendbsdf` is no texture"),
         ('<shape type="perspective"/>', "`perspective` is no shape"),
-        ('<shape type="sphere"><point name="center" value="1, 2"/></shape>', "<point> needs one or three numbers"),
-        (
-            '<shape type="sphere"><transform name="to_world"><scale value="2" x="1"/></transform></shape>',
-            "<scale> can have `value` or x, y and z, not both",
-        ),
     ],
 )
-def test_input_that_crashes_mitsuba_or_lacks_a_location(tmp_path, objects, said):
+def test_input_that_crashes_mitsuba(tmp_path, objects, said):
     file = write(tmp_path, HEAD + objects + "</scene>")
     with pytest.raises(ConfigError) as error:
         load_scene(file)

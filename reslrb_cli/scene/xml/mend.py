@@ -3,20 +3,14 @@
 Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives an object
 without an id a new id. The new id consists of the object's kind and its number among all objects of this kind. `mend`
 returns notes on the parts that were mended or left out.
-
-The plugins `regular`, `irregular` and `blackbody` need wavelengths, which RGB variants lack. `mend` replaces `regular`,
-`irregular` and `blackbody` plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba converts a
-`<spectrum>` element to a colour with the CIE matching functions. For emitters, the result is the colour of light.
-Otherwise, the result is the colour of a surface under D65.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,9 +18,6 @@ import numpy as np
 from reslrb_cli.backend.installation import is_known
 from reslrb_cli.scene.images import decode_srgb
 from reslrb_cli.scene.xml.read import Description, Element, quoted
-
-#: Maximum number of lines that one warning names, and of warnings per scene.
-_LINES, _WARNINGS = 5, 30
 
 
 @dataclass(frozen=True)
@@ -43,30 +34,15 @@ class Note:
     owner: Element | None = None
 
 
-def _in_order(notes: Iterable[Note], root: Element) -> list[Note]:
-    """Sort notes by file and line, with the file of `root` first."""
-
-    def place(note: Note) -> tuple[bool, str, int]:
-        source = note.element.source
-        return source != root.source, str(source.file), note.element.line
-
-    return sorted(notes, key=place)
-
-
-def warnings(notes: Sequence[Note], root: Element) -> list[str]:
+def warnings(notes: Iterable[Note]) -> list[str]:
     """Return one line per kind of note. Each line names the first occurrence of its kind."""
     kinds: dict[tuple[str, str, object], list[Element]] = {}
-    for note in _in_order(notes, root):
+    for note in notes:
         kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
-    lines = []
-    for (wrong, done, _), elements in kinds.items():
-        others = list(dict.fromkeys(str(element.line) for element in elements[1:]))
-        more = ", ".join(others[:_LINES]) + f" and {len(others) - _LINES} more" * (len(others) > _LINES)
-        lines.append(f"{elements[0].place}: {wrong}: {done}" + f" (also in line {more})" * bool(others))
-    if len(lines) > _WARNINGS:
-        rest = f"{len(lines) - _WARNINGS} more kinds of elements were mended or left out"
-        lines[_WARNINGS:] = [f"{root.source.file}: {rest}"]
-    return lines
+    return [
+        f"{elements[0].place}: {wrong}: {done}" + f" (also {len(elements) - 1} more)" * (len(elements) > 1)
+        for (wrong, done, _), elements in kinds.items()
+    ]
 
 
 #: Elements with another name in Mitsuba 3.
@@ -131,14 +107,6 @@ def snake_case(name: str) -> str:
     return re.sub(r"(?<=[a-z])[A-Z]+", lambda capitals: "_" + capitals[0].lower(), name)
 
 
-#: Plugins of spectra by wavelength.
-SPECTRA = ("regular", "irregular", "blackbody")
-#: Mitsuba's visible range in nm; for black bodies, the step in nm and the maximum number of steps.
-_VISIBLE, _STEP, _MOST = (360.0, 830.0), 5.0, 2**14
-#: Planck's law: 2 h c^2 (W m^2) and h c / k_B (m K), with Mitsuba's constants.
-_FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792458e8 / 1.38064852e-23
-
-
 def _floats(text: str) -> list[float]:
     """Parse a list of numbers. Returns an empty list if any word of the text is not a number."""
     try:
@@ -164,70 +132,6 @@ def linear(element: Element) -> str:
     return " ".join(f"{value:.9g}" for value in decode_srgb(np.array(encoded)))
 
 
-def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
-    """Return the attributes of a <spectrum> element, a parameter of `owner`. The element is equivalent to `spectrum`, a
-    plugin of `SPECTRA`.
-
-    Raises ConfigError if the plugin is not a valid spectrum, or is a black body outside of an emitter.
-    """
-    inner = spectrum.find("value")
-    if spectrum.type == "blackbody":
-        if owner.tag != "emitter":
-            raise spectrum.fail("", f"only emitters can have a blackbody; a {owner.tag} can have <rgb>")
-        wavelengths, values = _black_body(spectrum)
-    elif inner is not None and inner.tag == "spectrum":
-        return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
-    elif spectrum.type == "regular":
-        values = _numbers(spectrum, "values")
-        wavelengths = np.linspace(*_range(spectrum, ()), len(values))
-    else:
-        wavelengths, values = _numbers(spectrum, "wavelengths"), _numbers(spectrum, "values")
-        if len(wavelengths) != len(values):
-            raise spectrum.fail("", f"irregular has {len(wavelengths)} wavelengths and {len(values)} values")
-    if len(wavelengths) < 2 or (np.diff(wavelengths) <= 0).any():
-        raise spectrum.fail("", f"{spectrum.type} needs two wavelengths or more, in ascending order")
-    pairs = zip(wavelengths, values, strict=True)
-    return {"value": ", ".join(f"{wavelength:.9g}:{value:.9g}" for wavelength, value in pairs)}
-
-
-def _black_body(spectrum: Element) -> tuple[np.ndarray, np.ndarray]:
-    """Return wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
-    temperature = _numbers(spectrum, "temperature")
-    if len(temperature) > 1 or temperature[0] <= 0:
-        raise spectrum.fail("temperature", "must be a positive number of kelvin")
-    first, last = _range(spectrum, _VISIBLE)
-    nm = np.linspace(first, last, min(math.ceil((last - first) / _STEP), _MOST) + 1)
-    exponent = _SECOND / (1e-9 * nm * temperature[0])
-    # Above 700 the radiance is 0 in single precision, and expm1 overflows.
-    return nm, 1e-9 * _FIRST / ((1e-9 * nm) ** 5 * np.expm1(np.minimum(exponent, 700)))
-
-
-def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
-    """Return the range of wavelengths in nm. A missing `wavelength_min` or `wavelength_max` comes from `default`,
-    unless `default` is empty.
-    """
-    names = ("wavelength_min", "wavelength_max")
-    low, high = (
-        default[place] if default and spectrum.find(name) is None else _numbers(spectrum, name)[0]
-        for place, name in enumerate(names)
-    )
-    if not 0 < low < high:
-        raise spectrum.fail("", f"{spectrum.type}: wavelength_max must be above wavelength_min, and both above 0")
-    return low, high
-
-
-def _numbers(spectrum: Element, name: str) -> np.ndarray:
-    """Return the numbers of a parameter. Raises ConfigError if the parameter has no numbers, or if any number is
-    negative or not finite.
-    """
-    if (parameter := spectrum.find(name)) is None:
-        raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
-    numbers = np.array(_floats(parameter.value))
-    if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
-        raise spectrum.fail(name, f"must be numbers of at least 0, not {quoted(parameter.value)}")
-    return numbers
-
-
 def transform_coordinates(texture: Element) -> Element | None:
     """Replace a texture's `uoffset`, `voffset`, `uscale` and `vscale` by a `to_uv` transform. Return the first of them,
     or None.
@@ -250,16 +154,14 @@ def transform_coordinates(texture: Element) -> Element | None:
 _GROUPS = ("shapegroup", "batch")
 #: Prefix of the ids that Mitsuba writes for objects without an id. It ignores them when it reads a scene.
 _UNNAMED = "_unnamed_"
-#: Maximum length of an id: keys become file names.
-_LONGEST = 120
 
 
-def _name_objects(root: Element) -> list[Note]:
-    """Give every object below `root` an id that is the same at every load. Return notes on changed ids.
+def _name_objects(root: Element) -> None:
+    """Give every object below `root` an id that is the same at every load.
 
-    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Some ids cannot be used
-    in a key and are replaced. Ids to be replaced are empty, very long or unprintable, or start with `_unnamed_`.
-    References are updated. Raises ConfigError if two objects have one id, which Mitsuba refuses as well.
+    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Ids that are empty or
+    start with `_unnamed_` are replaced, and references to them are updated. Raises ConfigError if two objects have one
+    id, which Mitsuba refuses as well.
     """
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
@@ -267,7 +169,6 @@ def _name_objects(root: Element) -> list[Note]:
     taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
     owners: dict[str, Element] = {}
     renamed: dict[str, str] = {}
-    notes: list[Note] = []
     numbers: Counter[str] = Counter()
     for element in objects:
         kind = element.type[:1].upper() + element.type[1:]
@@ -275,7 +176,7 @@ def _name_objects(root: Element) -> list[Note]:
         own = element.id
         if own in owners:
             raise element.fail("", f"id {quoted(own)} is also that of {owners[own].place}; rename one of them")
-        if own.strip() and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED):
+        if own.strip() and not own.startswith(_UNNAMED):
             owners[own] = element
             continue
         if element in grouped and not own:
@@ -287,14 +188,11 @@ def _name_objects(root: Element) -> list[Note]:
             name = f"{first}_{number}"
         taken.add(name)
         element.attributes["id"] = name
-        if own.strip() and own not in renamed:
-            renamed[own] = name
-            if not own.startswith(_UNNAMED):
-                notes.append(Note(element, f"id {quoted(own)} cannot be part of a key", f"named {name}"))
+        if own.strip():
+            renamed.setdefault(own, name)
     for element in root.walk("ref", "alias"):
         if element.id in renamed:
             element.attributes["id"] = renamed[element.id]
-    return notes
 
 
 CURRENT_VERSION = "3.0.0"
@@ -309,7 +207,7 @@ def mend(description: Description) -> list[Note]:
     them. Unused parameters are found only when the scene is built.
     """
     mender, root = _Mender(description), description.root
-    mender.notes += _name_objects(root)
+    _name_objects(root)
     given = root.attributes.pop("version", None)
     if root.source.version is None:
         wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
@@ -317,7 +215,6 @@ def mend(description: Description) -> list[Note]:
     if root.is_object:
         mender.mend_element(root)
     mender.mend_below(root)
-    mender.mend_spectra(root)
     # Remove references to objects that were left out.
     for element in root.walk() if mender.gone else ():
         element.children[:] = [child for child in element.children if child.tag != "ref" or child.id not in mender.gone]
@@ -455,20 +352,3 @@ class _Mender:
                 dropped.add(earlier)
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]
-
-    def mend_spectra(self, root: Element) -> None:
-        """Replace spectrum plugins by <spectrum> parameters, since RGB variants cannot evaluate these plugins."""
-        named = {id: item for id, item in root.by_id().items() if item.type in SPECTRA}
-        for owner in [element for element in root.objects() if element.type != "specfilm"]:
-            kept = []
-            for child in owner.children:
-                meant = named.get(child.id)
-                if meant is None:
-                    kept.append(child)
-                elif owner is not root:
-                    name = child.name or meant.name
-                    if not name:
-                        raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name, that of a parameter")
-                    kept.append(child.new("spectrum", name=name, **by_wavelength(meant, owner)))
-                    self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as its colour")
-            owner.children[:] = kept

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -150,9 +149,6 @@ class Element:
 
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-#: An ampersand that does not start an XML reference. Mitsuba's parser reads it literally.
-_BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[0-9a-fA-F]+);)")
-_DECLARED_ENCODING = re.compile(rb"""^\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)["']""")
 
 
 def read_document(file: Path) -> Element:
@@ -160,17 +156,15 @@ def read_document(file: Path) -> Element:
     XML.
     """
     text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), _decode(read_file(file)))
-    return _parse(file, _BARE_AMPERSAND.sub("&amp;", text))
+    return _parse(file, text)
 
 
 def _decode(data: bytes) -> str:
     """Decode the text of a file. Never fails, since Mitsuba's parser also accepts bytes of a wrong encoding."""
-    declared = _DECLARED_ENCODING.match(data)
-    encodings = ["utf-8-sig", *([declared[1].decode("ascii")] if declared else [])]
-    for encoding in ["utf-16"] if data.startswith((b"\xff\xfe", b"\xfe\xff")) else encodings:
-        with suppress(LookupError, UnicodeError):
-            return data.decode(encoding)
-    return data.decode("latin-1")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeError:
+        return data.decode("latin-1")
 
 
 def _parse(file: Path, text: str) -> Element:
@@ -224,17 +218,10 @@ class Description:
         return _find(name, self.folders)
 
     def named_files(self) -> Iterator[tuple[Element, str]]:
-        """Yield the element and the file name for each file that Mitsuba opens for the scene.
-
-        The `material` of a metal names two of Mitsuba's own tables. The two tables of a metal's `material` are included
-        if files in `folders` replace Mitsuba's own tables.
-        """
+        """Yield the element and the file name for each file that an element names."""
         for element in self.root.walk():
             if element.file_attribute:
                 yield element, element.attributes[element.file_attribute]
-            elif element.tag == "string" and element.name == "material":
-                tables = (f"data/ior/{element.value}.{table}.spd" for table in ("eta", "k"))
-                yield from ((element, name) for name in tables if self.find_file(name) is not None)
 
 
 def read_description(file: Path, options: Mapping[str, Any]) -> Description:
