@@ -253,16 +253,6 @@ def test_the_scenes_own_integrator_is_not_loaded(tmp_path, caplog):
     assert not caplog.records
 
 
-def test_references_to_omitted_objects_are_omitted(tmp_path, caplog):
-    points, own = (
-        '<sampler type="halton" id="points"/>',
-        '<integrator type="x"><sampler type="stratified" id="own"/></integrator>',
-    )
-    load_scene(write(tmp_path, integrator=points + own, sampler='<ref id="points"/>'))
-    load_scene(write(tmp_path, integrator=own, sampler='<ref id="own"/>'))
-    assert len(caplog.records) == 1
-
-
 def test_objects_with_one_name_are_all_kept(tmp_path):
     # Mitsuba drops the first object, because it takes a name for that of a parameter
     shape = PARTS["shape"].replace("<shape", '<shape name="mesh"')

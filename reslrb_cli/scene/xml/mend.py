@@ -215,9 +215,6 @@ def mend(description: Description) -> list[Note]:
     if root.is_object:
         mender.mend_element(root)
     mender.mend_below(root)
-    # Remove references to objects that were left out.
-    for element in root.walk() if mender.gone else ():
-        element.children[:] = [child for child in element.children if child.tag != "ref" or child.id not in mender.gone]
     root.attributes["version"] = CURRENT_VERSION
     return mender.notes
 
@@ -226,7 +223,6 @@ class _Mender:
     def __init__(self, description: Description) -> None:
         self.find_file = description.find_file
         self.notes: list[Note] = []
-        self.gone: set[str] = set()
 
     def note(self, element: Element, wrong: str, done: str) -> None:
         self.notes.append(Note(element, wrong, done))
@@ -237,10 +233,11 @@ class _Mender:
         names = {child.name for child in element.children}
         for child in element.children:
             # The experiment's integrator replaces that of the scene.
-            is_kept = child.tag != "integrator" and self.mend_element(child)
-            if not is_kept or (child.is_object and not self._plugin(child)):
-                self.gone.update(other.id for other in child.objects())
-            elif not element.is_object or self._parameter(child, element, names):
+            if child.tag == "integrator" or not self.mend_element(child):
+                continue
+            if child.is_object and not self._plugin(child):
+                continue
+            if not element.is_object or self._parameter(child, element, names):
                 kept.append(child)
         element.children[:] = kept
         if element.is_object:
