@@ -54,7 +54,7 @@ class ParameterInfo:
     - `obstacle` is the reason why the parameter cannot be recovered, or None if the parameter can be recovered.
     - `value` is None if the value is not a number.
     - `bits` is the number of bits per texel if Mitsuba's precision is too low for gradients. Otherwise, `bits` is None.
-        A texture with too low precision must be read as floating point (`load.read_as_floats`).
+        A texture with too low precision must be read as floating point (`keys` of `load_scene`).
     """
 
     key: str

@@ -188,7 +188,7 @@ class Replacing:
         A file in the folder of the scene keeps its relative path. Other files go to a separate folder.
         """
         own = {name.casefold() for name in (SCENE, *self.writers)}
-        home = self.description.root.source.file.absolute().parent.resolve()
+        home = self.description.root.file.absolute().parent.resolve()
         copies: dict[Path, str] = {}
         for element in self.description.root.walk("string", "spectrum"):
             attribute = element.file_attribute

@@ -50,8 +50,8 @@ def load_scene(
 
     Shapes are not merged, so all parameters keep their names. An object without an id is named by its kind and a
     number, such as `Sphere_3`. The number counts the file's objects of this kind. Elements of other versions or
-    exporters that Mitsuba's parser would refuse are repaired or left out. The log gets a warning. Mitsuba must use
-    every remaining element. The function does not load the scene's integrator, because an experiment has its own
+    exporters that Mitsuba's parser would refuse are converted, or left out with a warning. Mitsuba must use every
+    remaining element. The function does not load the scene's integrator, because an experiment has its own
     integrator. Plugins are loaded only from Mitsuba's own folder.
 
     Raises a ConfigError that names the scene file if the file is missing or wrong. Raises ConfigError also for a scene
@@ -76,8 +76,7 @@ def load_scene(
     ):
         if len(objects) == 0:
             raise ConfigError(file, "", wrong)
-    lost = {note.element for note in unused}  # other notes on lost elements do not matter
-    for line in warnings([*(note for note in found if note.element not in lost), *unused]):
+    for line in warnings([*found, *unused]):
         warn_once(line)
     if (problem := _lost_light(scene)) is not None:
         warn_once(f"{file}: {problem}")
@@ -142,16 +141,6 @@ def _grid_file(width: int, height: int) -> Path:
 @functools.cache
 def _grid_folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="reslrb-")
-
-
-def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
-    """Return the scene. The 8-bit and 16-bit bitmaps that `keys` name are read as floating point. `keys` may contain
-    globs.
-
-    If `keys` name no 8-bit or 16-bit bitmaps, the result is `scene` itself. Otherwise the scene is built again from
-    `description`, which is modified.
-    """
-    return build(description)[0] if _mark_floats(scene, description, keys) else scene
 
 
 def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:

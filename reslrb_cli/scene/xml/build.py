@@ -226,7 +226,7 @@ class _Text:
             text = _PREAMBLE.sub("", text).strip()
         text = _NO_FACES.sub("the mesh has no faces", text)
         text = _PLACE.sub(lambda other: f"({self._elements[int(other[1]) - 1].place})", text)
-        return ConfigError(element.place if element else self._root.source.file, "", text)
+        return ConfigError(element.place if element else self._root.file, "", text)
 
 
 def _unused(props: mi.Properties, element: Element) -> list[Note]:
@@ -243,7 +243,7 @@ def _unused(props: mi.Properties, element: Element) -> list[Note]:
             hint = f" (did you mean `{near[0]}`?)" if near else ""
             child = element.find(name) or element
             wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3{hint}"
-        notes.append(Note(child, wrong, "left out", None if child is element else element))
+        notes.append(Note(child, wrong, None if child is element else element))
     return notes
 
 

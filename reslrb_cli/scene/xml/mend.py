@@ -1,8 +1,8 @@
 """Conversion of scene files from other Mitsuba versions and exporters to Mitsuba 3. Assignment of stable ids.
 
 Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives an object
-without an id a new id. The new id consists of the object's kind and its number among all objects of this kind. `mend`
-returns notes on the parts that were mended or left out.
+without an id a new id. The new id consists of the object's kind and its number among all objects of this kind.
+Conversions keep the meaning, and are silent. `mend` returns notes on the parts that are left out.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -22,26 +23,24 @@ from reslrb_cli.scene.xml.read import Description, Element, quoted
 
 @dataclass(frozen=True)
 class Note:
-    """A part of a scene's files that Mitsuba would refuse. `wrong` describes the problem, and `done` describes the
-    repair.
+    """A part of a scene's files that is left out, with the reason.
 
     If a plugin does not use an element, `owner` is the parent of the element. For other notes, it is None.
     """
 
     element: Element
     wrong: str
-    done: str
     owner: Element | None = None
 
 
 def warnings(notes: Iterable[Note]) -> list[str]:
     """Return one line per kind of note. Each line names the first occurrence of its kind."""
-    kinds: dict[tuple[str, str, object], list[Element]] = {}
+    kinds: dict[tuple[str, Path], list[Element]] = {}
     for note in notes:
-        kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
+        kinds.setdefault((note.wrong, note.element.file), []).append(note.element)
     return [
-        f"{elements[0].place}: {wrong}: {done}" + f" (also {len(elements) - 1} more)" * (len(elements) > 1)
-        for (wrong, done, _), elements in kinds.items()
+        f"{elements[0].place}: {wrong}: left out" + f" (also {len(elements) - 1} more)" * (len(elements) > 1)
+        for (wrong, _), elements in kinds.items()
     ]
 
 
@@ -78,12 +77,6 @@ PLUGINS = {
     **{("film", name): "hdrfilm" for name in ("exrfilm", "pngfilm", "ldrfilm", "tiledhdrfilm", "mfilm")},
 }
 
-#: Objects that do not affect the light on the film, and what replaces them.
-REPLACEABLE = {
-    "sampler": "replaced by an `independent` one",
-    "rfilter": "replaced by the film's default",
-}
-
 #: Renamed values of text parameters, by plugin and parameter.
 VALUES = {
     ("bitmap", "filter_type"): {"trilinear": "bilinear", "ewa": "bilinear"},
@@ -93,12 +86,6 @@ VALUES = {
         "luminanceAlpha": "luminance_alpha",
         "xyzAlpha": "xyza",
     },
-}
-
-#: File formats that `hdrfilm` knows. Others can be left out, since films write no files here.
-FORMATS = {
-    "file_format": frozenset({"openexr", "exr", "rgbe", "pfm"}),
-    "component_format": frozenset({"float16", "float32", "uint32"}),
 }
 
 
@@ -132,22 +119,18 @@ def linear(element: Element) -> str:
     return " ".join(f"{value:.9g}" for value in decode_srgb(np.array(encoded)))
 
 
-def transform_coordinates(texture: Element) -> Element | None:
-    """Replace a texture's `uoffset`, `voffset`, `uscale` and `vscale` by a `to_uv` transform. Return the first of them,
-    or None.
-    """
+def transform_coordinates(texture: Element) -> None:
+    """Replace a texture's `uoffset`, `voffset`, `uscale` and `vscale` by a `to_uv` transform."""
     names = ("uoffset", "voffset", "uscale", "vscale")
     given = {child.name: child for child in texture.children if child.tag == "float" and child.name in names}
     if not given:
-        return None
-    first = next(iter(given.values()))
+        return
     steps = []
     for tag, word in (("translate", "offset"), ("scale", "scale")):  # the order of the steps matters
         axes = {axis: given[u + word].value for axis, u in (("x", "u"), ("y", "v")) if u + word in given}
-        steps += [first.new(tag, **axes)] if axes else []
+        steps += [texture.new(tag, **axes)] if axes else []
     texture.drop(*given)
-    texture.children.append(first.new("transform", *steps, name="to_uv"))
-    return first
+    texture.children.append(texture.new("transform", *steps, name="to_uv"))
 
 
 #: Plugins that name their children by position, which is the same at every load.
@@ -195,27 +178,19 @@ def _name_objects(root: Element) -> None:
             element.attributes["id"] = renamed[element.id]
 
 
-CURRENT_VERSION = "3.0.0"
-
-
 def mend(description: Description) -> list[Note]:
-    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts of the scene that Mitsuba 3's
-    parser would refuse.
+    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts that are left out.
 
-    Notes omit the conversions that Mitsuba itself makes for files from before version 2. Materials, lights and shapes
-    keep their meaning. Materials, lights and shapes that Mitsuba 3 lacks stay unchanged, and a later check refuses
-    them. Unused parameters are found only when the scene is built.
+    Materials, lights and shapes keep their meaning. Materials, lights and shapes that Mitsuba 3 lacks stay unchanged,
+    and a later check refuses them. Unused parameters are found only when the scene is built.
     """
     mender, root = _Mender(description), description.root
     _name_objects(root)
-    given = root.attributes.pop("version", None)
-    if root.source.version is None:
-        wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
-        mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
+    root.attributes.pop("version", None)
     if root.is_object:
         mender.mend_element(root)
     mender.mend_below(root)
-    root.attributes["version"] = CURRENT_VERSION
+    root.attributes["version"] = "3.0.0"
     return mender.notes
 
 
@@ -224,71 +199,45 @@ class _Mender:
         self.find_file = description.find_file
         self.notes: list[Note] = []
 
-    def note(self, element: Element, wrong: str, done: str) -> None:
-        self.notes.append(Note(element, wrong, done))
-
     def mend_below(self, element: Element) -> None:
         """Mend all elements below `element`. `element` itself must be mended already."""
-        kept = []
         names = {child.name for child in element.children}
-        for child in element.children:
-            # The experiment's integrator replaces that of the scene.
-            if child.tag == "integrator" or not self.mend_element(child):
-                continue
-            if child.is_object and not self._plugin(child):
-                continue
-            if not element.is_object or self._parameter(child, element, names):
-                kept.append(child)
+        # The experiment's integrator replaces that of the scene.
+        kept = [child for child in element.children if child.tag != "integrator" and self.mend_element(child)]
+        if element.is_object:
+            kept = [child for child in kept if self._parameter(child, element, names)]
         element.children[:] = kept
         if element.is_object:
             self._repetitions(element)
         if element.tag == "texture":
-            replaced = transform_coordinates(element)
-            if replaced is not None and not element.source.is_old:
-                self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
+            transform_coordinates(element)
         for child in element.children:
             self.mend_below(child)
 
-    # --- elements and plugins -----------------------------------------------------------------------------------------
-
     def mend_element(self, element: Element) -> bool:
-        """Mend tag and attributes. Return False if the element must be left out."""
+        """Mend the tag, the attributes and the plugin. Return False if the element must be left out."""
         tag = element.tag
         if tag == "srgb":
             element.attributes["value"] = linear(element)
-        if tag in ELEMENTS:
-            element.tag = ELEMENTS[tag]
-            self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", f"read as <{element.tag}>")
+        element.tag = ELEMENTS.get(tag, tag)
         known = OBJECT_ATTRIBUTES if element.is_object else ATTRIBUTES.get(element.tag)
         if known is None:
             if tag in LOST_ELEMENTS:
                 raise element.fail("", f"<{tag}> is {LOST_ELEMENTS[tag]}")
-            self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", "left out")
+            self.notes.append(Note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3"))
             return False
         for attribute in [name for name in element.attributes if name not in known]:
-            self.note(element, f"<{tag}> has no attribute {quoted(attribute)} in Mitsuba 3", "left out")
+            self.notes.append(Note(element, f"<{tag}> has no attribute {quoted(attribute)} in Mitsuba 3"))
             del element.attributes[attribute]
-        return True
-
-    def _plugin(self, element: Element) -> bool:
-        """Mend the name of an object's plugin. Return False if the object must be left out."""
         type = element.type
-        wrong = f"there is no {element.tag} {quoted(type)} in Mitsuba 3"
-        other = PLUGINS.get((element.tag, type), type.lower())
-        if is_known(type):
-            if element.tag == "sampler" and type != "independent":
-                # Other samplers round the sample count, which the experiment sets, and fail if it is split differently.
-                element.attributes["type"] = "independent"
-                element.children[:] = [child for child in element.children if child.name == "sample_count"]
-        elif is_known(other):
-            self.note(element, wrong, f"read as `{other}`")
-            element.attributes["type"] = other
-        elif element.tag in REPLACEABLE:
-            self.note(element, wrong, f"left out ({REPLACEABLE[element.tag]})")
-            return False
+        if tag == "sampler" and type != "independent":
+            # Other samplers round the sample count, which the experiment sets, and fail if it is split differently.
+            element.attributes["type"] = "independent"
+            element.children[:] = [child for child in element.children if child.name == "sample_count"]
+        elif element.is_object and not is_known(type):
+            other = PLUGINS.get((tag, type), type.lower())
+            element.attributes["type"] = other if is_known(other) else type
         return True
-
-    # --- parameters ---------------------------------------------------------------------------------------------------
 
     def _parameter(self, element: Element, owner: Element, names: set[str]) -> bool:
         """Mend the name and the value of a parameter of `owner`. `names` are the names of all parameters of `owner`.
@@ -300,14 +249,21 @@ class _Mender:
             element.attributes.pop("name", None)
             return True
         self._name(element, owner, names)
-        value = element.value
+        name, value = element.name, element.value
         if element.tag == "spectrum" and "type" not in element.attributes and len(_floats(value)) == 3:
-            self.note(element, "a <spectrum> of three numbers is unknown to Mitsuba 3", "read as <rgb>")
             element.tag = "rgb"
         elif element.tag == "rgb" and value.startswith("#"):
             element.attributes["value"] = hexadecimal(element)
-            self.note(element, f"a colour cannot be written as {quoted(value)} in Mitsuba 3", "read as three numbers")
-        return element.tag != "string" or self._text(element, owner, value)
+        if element.tag != "string":
+            return True
+        if owner.type == "hdrfilm" and name == "pixel_format":
+            value = value.partition(",")[0].strip()  # a list has one format per image; keep the first
+        if name == "filename" and "\\" in value and self.find_file(value) is None:
+            slashed = value.replace("\\", "/")
+            value = slashed if self.find_file(slashed) is not None else value
+        element.attributes["value"] = VALUES.get((owner.type, name), {}).get(value, value)
+        # Films write no files here, and Mitsuba 3 does not have all formats of earlier versions.
+        return owner.type != "hdrfilm" or name not in ("file_format", "component_format")
 
     def _name(self, element: Element, owner: Element, names: set[str]) -> None:
         old, name = element.name, snake_case(element.name)
@@ -315,28 +271,8 @@ class _Mender:
             name = "reflectance"
         # Users choose the names of mesh attributes.
         is_attribute = owner.tag == "shape" and old.startswith(("vertex_", "face_"))
-        if name == old or is_attribute or name in names:
-            return
-        element.attributes["name"], element.written = name, old
-        if not element.source.is_old:
-            self.note(element, f"{quoted(old)} has the spelling before Mitsuba 2", f"read as {quoted(name)}")
-
-    def _text(self, element: Element, owner: Element, value: str) -> bool:
-        wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
-        if owner.type == "hdrfilm" and value.lower() not in FORMATS.get(element.name, (value.lower(),)):
-            self.note(element, wrong, "left out")  # the film writes no files here
-            return False
-        other = VALUES.get((owner.type, element.name), {}).get(value)
-        if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
-            other = value.partition(",")[0].strip()  # a list has one format per image; keep the first
-        if element.name == "filename" and "\\" in value and self.find_file(value) is None:
-            slashed = value.replace("\\", "/")
-            if self.find_file(slashed) is not None:
-                other, wrong = slashed, f"there is no file {quoted(value)}"
-        if other is not None:
-            element.attributes["value"] = other
-            self.note(element, wrong, f"read as {quoted(other)}")
-        return True
+        if name != old and not is_attribute and name not in names:
+            element.attributes["name"], element.written = name, old
 
     def _repetitions(self, owner: Element) -> None:
         """If a parameter is given more than once, keep only the last one, as in Mitsuba 0.6."""
@@ -345,7 +281,7 @@ class _Mender:
         for child in owner.children:
             earlier = last.get(child.name) if child.name else None
             if earlier is not None and (earlier.is_value or child.is_value):
-                self.note(earlier, f"{quoted(child.name)} is given again in line {child.line}", "left out")
+                self.notes.append(Note(earlier, f"{quoted(child.name)} is given again in line {child.line}"))
                 dropped.add(earlier)
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]

@@ -37,19 +37,6 @@ def quoted(text: str, mark: str = "`") -> str:
     return f"{mark}{text if text.isprintable() else repr(text)[1:-1]}{mark}"
 
 
-@dataclass(frozen=True)
-class Source:
-    """One file of a scene. `version` is the Mitsuba version that the file declares, or None."""
-
-    file: Path
-    version: tuple[int, ...] | None
-
-    @property
-    def is_old(self) -> bool:
-        """Whether the file is for a Mitsuba before version 2, which spelled parameters differently."""
-        return self.version is not None and self.version < (2,)
-
-
 @dataclass(slots=True, eq=False)
 class Element:
     """An XML element with its attributes and children in their order.
@@ -59,7 +46,7 @@ class Element:
 
     tag: str
     attributes: dict[str, str]
-    source: Source
+    file: Path
     line: int
     children: list[Element] = field(default_factory=list)
     written: str = ""
@@ -67,7 +54,7 @@ class Element:
     @property
     def place(self) -> str:
         """File and line, for errors."""
-        return f"{self.source.file}:{self.line}"
+        return f"{self.file}:{self.line}"
 
     @property
     def is_object(self) -> bool:
@@ -145,7 +132,7 @@ class Element:
 
     def new(self, tag: str, /, *children: Element, **attributes: str) -> Element:
         """Return a new element with the location of this one. It is not added to the children."""
-        return Element(tag, attributes, self.source, self.line, list(children))
+        return Element(tag, attributes, self.file, self.line, list(children))
 
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
@@ -173,8 +160,7 @@ def _parse(file: Path, text: str) -> Element:
     roots: list[Element] = []
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        source = stack[0].source if stack else Source(file, _version(attributes.get("version", "")))
-        element = Element(tag, attributes, source, parser.CurrentLineNumber)
+        element = Element(tag, attributes, file, parser.CurrentLineNumber)
         (stack[-1].children if stack else roots).append(element)
         stack.append(element)
 
@@ -185,11 +171,6 @@ def _parse(file: Path, text: str) -> Element:
     except expat.ExpatError as error:
         raise ConfigError(f"{file}:{error.lineno}", "", f"not valid XML: {expat.ErrorString(error.code)}") from None
     return roots[0]
-
-
-def _version(text: str) -> tuple[int, ...] | None:
-    """Parse a version. Return None unless the text consists of three numbers, as Mitsuba requires."""
-    return tuple(map(int, text.split("."))) if re.fullmatch(r"\d+\.\d+\.\d+", text) else None
 
 
 #: An unescaped `$`, and the text after it that may be the name of a variable, at most 256 characters.
@@ -321,7 +302,7 @@ class _Reader:
         """Return the elements that replace `include`. A scene file gives its objects, and any other file gives its
         single object.
         """
-        here = [include.source.file.absolute().parent, *folders]
+        here = [include.file.absolute().parent, *folders]
         if (file := _find(_required(include, "filename"), here)) is None:
             raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
         root = self.read(file, here, include)
@@ -348,7 +329,7 @@ def _find(name: str, folders: Sequence[Path]) -> Path | None:
 
 def _folder(element: Element, folders: list[Path]) -> Path:
     name = _required(element, "value")
-    folder = _find(name, [element.source.file.absolute().parent, *folders])
+    folder = _find(name, [element.file.absolute().parent, *folders])
     if folder is None or not folder.is_dir():
         raise element.fail("", f"<path>: folder {quoted(name)} not found")
     return folder.absolute()
