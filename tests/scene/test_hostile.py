@@ -63,6 +63,7 @@ OPENED = {
     "volume": f'<medium type="heterogeneous"><volume type="gridvolume" name="albedo">{NAMED}</volume></medium>',
     "spectrum": '<bsdf type="diffuse"><spectrum name="reflectance" filename="pipe"/></bsdf>',
     "lamp": '<emitter type="point"><spectrum name="intensity" filename="pipe"/></emitter>',
+    "material": '<bsdf type="conductor"><string name="material" value="mine"/></bsdf>',
     "nested": '<include filename="part.xml"/>',
     "include": '<include filename="pipe"/>',
     "folder": '<path value="pipe"/>',
@@ -71,10 +72,12 @@ OPENED = {
 
 @pytest.mark.parametrize("kind", OPENED)
 def test_no_pipe_is_opened(kind: str, tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
+    (tmp_path / "data" / "ior").mkdir(parents=True)
+    pipes = [tmp_path / "pipe", tmp_path / "data" / "ior" / "mine.eta.spd"]
+    for pipe in pipes:
+        os.mkfifo(pipe)
     write(tmp_path, f'<scene version="3.0.0">{OPENED["spectrum"]}</scene>', "part.xml")
-    opened = f": <> {pipe}"  # frees blocked readers, so that the test fails, not hangs
+    opened = "".join(f": <> {pipe}; " for pipe in pipes)  # frees blocked readers, so that the test fails, not hangs
     with subprocess.Popen(["sh", "-c", f"sleep 30; {opened}"]) as freeing:
         start = time.monotonic()
         with pytest.raises(ConfigError, match=r"no regular file|not a regular file|folder `pipe` not found"):

@@ -199,10 +199,16 @@ class Description:
         return _find(name, self.folders)
 
     def named_files(self) -> Iterator[tuple[Element, str]]:
-        """Yield the element and the file name for each file that an element names."""
+        """Yield the element and the file name for each file that Mitsuba opens for the scene.
+
+        The two tables of a metal's `material` are included if `folders` contain them.
+        """
         for element in self.root.walk():
             if element.file_attribute:
                 yield element, element.attributes[element.file_attribute]
+            elif element.tag == "string" and element.name == "material":
+                tables = (f"data/ior/{element.value}.{table}.spd" for table in ("eta", "k"))
+                yield from ((element, name) for name in tables if self.find_file(name) is not None)
 
 
 def read_description(file: Path, options: Mapping[str, Any]) -> Description:
