@@ -95,7 +95,7 @@ def _photograph(path: Path) -> Iterator[ImageFile | None]:
         warnings.simplefilter("ignore")  # damaged EXIF data rotates nothing
         try:
             found = Image.open(file, formats=("JPEG", "PNG"))
-        except (OSError, Image.DecompressionBombError):
+        except (OSError, ValueError, Image.DecompressionBombError):
             found = None
         yield found
 
