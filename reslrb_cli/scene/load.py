@@ -23,7 +23,7 @@ from reslrb_cli.scene.graph import bounds
 from reslrb_cli.scene.values import Place
 from reslrb_cli.scene.xml.build import Owners, build, resize_films
 from reslrb_cli.scene.xml.mend import mend, warnings
-from reslrb_cli.scene.xml.read import Description, read_description
+from reslrb_cli.scene.xml.read import Description, quoted, read_description
 
 logger = logging.getLogger(__name__)
 #: Largest ray offset, as a fraction of the scene's size, without visible loss of light: that of a room of size 3 at
@@ -76,6 +76,7 @@ def load_scene(
     ):
         if len(objects) == 0:
             raise ConfigError(file, "", wrong)
+    _check_meshes(file, scene)
     for line in warnings([*found, *unused]):
         warn_once(line)
     if (problem := _lost_light(scene)) is not None:
@@ -163,6 +164,18 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
             owner.children.append(owner.new("string", name="format", value="variant"))
             changed = True
     return changed
+
+
+def _check_meshes(file: Path, scene: mi.Scene) -> None:
+    """Raise ConfigError for a mesh whose faces refer to missing vertices. Mitsuba would read out of bounds for such a
+    mesh.
+    """
+    for shape in scene.shapes():
+        if shape.is_mesh() and shape.face_count() and shape.vertex_count():
+            last = int(np.array(shape.faces_buffer()).max())
+            if last >= shape.vertex_count():
+                has = f"has a face with vertex {last}, but only {shape.vertex_count()} vertices"
+                raise ConfigError(file, "", f"the mesh {quoted(shape.id())} {has}; write it again")
 
 
 def _lost_light(scene: Any) -> str | None:

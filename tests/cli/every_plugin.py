@@ -54,7 +54,7 @@ class Row:
         default.
     - `light` is the reason why light paths, for example of `reslrb` and `ptracer`, refuse the scene. `camera` is the
         reason why `prb` refuses the scene. Both are parts of the printed message.
-    - `loading` is the error of loading the scene.
+    - `loading` is the error of loading the scene, and `mended` is the warning.
     - `note` and `without` are used only for the page. `without` names the part that light paths leave out.
     """
 
@@ -65,6 +65,7 @@ class Row:
     light: str = ""
     camera: str = ""
     loading: str = ""
+    mended: str = ""
     note: str = ""
     without: str = ""
 
@@ -187,7 +188,7 @@ PHASES = {
 }  # fmt: skip
 INTEGRATORS = ("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "prb",
                "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic", "direct_projective")  # fmt: skip
-INLINE = 'write `<spectrum value="400:0.1, 700:0.9"/>` instead'
+MENDED = "RGB variants have no spectrum `{}`: read as its colour"
 SPECTRAL = "needs wavelengths, which RGB variants lack"
 
 ROWS: tuple[Row, ...] = (
@@ -251,9 +252,17 @@ ROWS: tuple[Row, ...] = (
         f'{ATTRIBUTE.format("reflectance")}</bsdf>')),
     Row("texture", "volume", scene=painted(SOLID)),
     Row("texture", "volume", "on a lamp", lit(EVEN), light=NO_RAYS),
-    *(Row("texture", name, scene=painted(xml), loading=SPECTRAL, note=note)
-      for name, xml, note in (("regular", REGULAR, INLINE), ("irregular", IRREGULAR, INLINE),
-                              ("blackbody", BLACK_BODY, "use `rgb` instead"))),
+    *(Row("texture", name, form, place(xml), mended=MENDED.format(name), note=note)
+      for name, xml in (("regular", REGULAR), ("irregular", IRREGULAR))
+      for form, place, note in (("on a lamp", lit, ""), ("in a material", painted, "its colour under D65"))),
+    Row("texture", "irregular", "by reference", IRREGULAR.replace('name="{}"', 'id="s"')
+        + painted('<ref id="s" name="{}"/>'), mended=MENDED.format("irregular")),
+    Row("texture", "irregular", "with lists of different lengths", painted(IRREGULAR.replace("0.1, ", "")),
+        loading="irregular has 3 wavelengths and 2 values"),
+    Row("texture", "blackbody", "on a lamp", lit(BLACK_BODY), mended=MENDED.format("blackbody"),
+        note="in W/(m² sr), so its values are in the thousands"),
+    Row("texture", "blackbody", "in a material", painted(BLACK_BODY),
+        loading="only emitters can have a blackbody; a bsdf can have <rgb>"),
     Row("texture", "d65", "on a lamp", lit('<spectrum type="d65" name="{}"/>')),
     Row("texture", "d65", "in a material",
         painted('<spectrum type="d65" name="{}"><float name="scale" value="0.5"/></spectrum>')),
@@ -303,7 +312,7 @@ ROWS: tuple[Row, ...] = (
     Row("sensor", "flat_sensor", scene=sensor("flat_sensor", ""), loading="belongs to Mitsuba's own RayDataLoader"),
     Row("film", "hdrfilm", scene=sensor(on=film('<string name="pixel_format" value="luminance"/>'))),
     Row("film", "specfilm", scene=sensor(on=film(REGULAR.format("band1"), "specfilm")),
-        loading=SPECTRAL, note="use `hdrfilm` instead"),
+        loading=SPECTRAL),
     *(Row("rfilter", name, scene=sensor(on=film(f'<rfilter type="{name}"/>'))) for name in FILTERS),
     *(Row("sampler", name, scene=sensor(inner=f'<float name="fov" value="50"/><sampler type="{name}"/>'),
           note="" if name == "independent" else "replaced by `independent` with `run.spp` samples")
@@ -316,7 +325,8 @@ ROWS: tuple[Row, ...] = (
 FEW = (
     "diffuse",
     "hair",
-    "irregular",
+    "irregular in a material",
+    "blackbody on a lamp",
     "rawconstant",
     "orthogonal",
     "irradiancemeter",
@@ -404,7 +414,9 @@ REASONS = {
     "can only render a specific wavelength specified by the `wavelength` parameter": "it needs `wavelength`",
     "reads the memory of a running Blender": "it reads the memory of a running Blender",
     "belongs to Mitsuba's own RayDataLoader": "it belongs to Mitsuba's own RayDataLoader",
-    SPECTRAL: "it needs a spectral variant of Mitsuba",
+    "irregular has 3 wavelengths and 2 values": "both lists must have the same length",
+    "only emitters can have a blackbody; a bsdf can have <rgb>": "only emitters can have it; use `rgb` instead",
+    SPECTRAL: "it needs a spectral variant of Mitsuba; use `hdrfilm` instead",
 }
 
 HEAD = """# Mitsuba's plugins
@@ -417,6 +429,7 @@ through `inspect`, `init`, three iterations of `optimize`, and `export`.
 - **works**: supported, with the restriction in brackets. `reslrb inspect` lists the parameters that can be recovered.
 - **refused**: every command prints the reason in one line and ends with exit code 2. If both columns refuse a plugin,
     or loading refuses it, change the scene file.
+- **converted**: read as an RGB colour, with a warning, because RGB variants of Mitsuba do not have this spectrum.
 
 `python tests/cli/every_plugin.py` writes this page. `pytest -m long tests/cli/test_every_plugin.py` runs all rows;
 without `-m long` it runs the refused plugins and a few others.
@@ -432,7 +445,9 @@ def page() -> str:
             note = f" ({row.note})" if row.note else ""
             name = f"`{row.plugin}`{f' {row.where}' if row.where else ''}"
             if row.loading:
-                parts.append(f"| {name} | refused on loading: {REASONS[row.loading]}{note} | the same |\n")
+                parts.append(f"| {name} | refused on loading: {REASONS[row.loading]} | the same |\n")
+            elif row.mended:
+                parts.append(f"| {name} | converted{note} | the same |\n")
             elif row.light and row.light == row.camera:
                 parts.append(f"| {name} | refused: {REASONS[row.light]} | the same |\n")
             else:

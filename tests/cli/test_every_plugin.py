@@ -74,7 +74,7 @@ def check(row: Row, folder: Path, to_the_end: bool) -> None:
             assert row.loading in said(command, "scene.xml", code=2)
         return
     inspected = said("inspect", "scene.xml")
-    assert "scene.xml" in inspected
+    assert (row.mended or "scene.xml") in inspected
     if row.refused:
         assert "cannot be rendered: " in inspected
         assert row.light in inspected

@@ -1,7 +1,8 @@
-"""Scenes of other versions and exporters: repairs and refusals."""
+"""Scenes of other versions and exporters, and their spectra: repairs, conversions to colours, and refusals."""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -262,11 +263,6 @@ def test_encodings(tmp_path, encoding):
         ("shape", '<shape type="spere"/>', "there is no shape `spere` in Mitsuba 3; did you mean `sphere`?"),
         ("shape", '<shape type="blender"/>', "shape `blender` reads the memory of a running Blender"),
         ("shape", "<shape/>", "<shape> has no type"),
-        (
-            "light",
-            '<emitter type="constant"><spectrum type="blackbody" name="radiance"/></emitter>',
-            "spectrum `blackbody` needs wavelengths, which RGB variants lack; give its colour as <rgb>",
-        ),
         ("paint", PARTS["paint"].replace("0.5, 0.25, 1", "#12345"), "must be a colour such as #80ff00, not `#12345`"),
         ("light", '<include filename="none.xml"/>', "included file `none.xml` not found"),
         ("light", '<path value="none"/>', "<path>: folder `none` not found"),
@@ -278,6 +274,127 @@ def test_irreparable_scenes_are_refused(tmp_path, part, text, said):
         load_scene(file)
     assert str(error.value).startswith(f"{file}:{LINES[part]}: ")
     assert said in str(error.value)
+
+
+# Spectra by wavelength, which RGB variants cannot evaluate: converted to their colours, or refused.
+
+SCENE = """<scene version="3.0.0">
+<sensor type="perspective"/>
+<shape type="sphere" id="thing"><bsdf type="diffuse" id="paint">{paint}</bsdf></shape>
+<emitter type="constant" id="sky">{light}</emitter>
+{more}
+</scene>"""
+IRREGULAR = """<spectrum type="irregular" {}><string name="wavelengths" value="400, 500 700"/>
+<string name="values" value="0.1, 0.5 0.8"/></spectrum>"""
+REGULAR = """<spectrum type="regular" {}><integer name="wavelength_min" value="420"/>
+<float name="wavelength_max" value="680"/><string name="values" value="0.1, 0.5, 0.8"/></spectrum>"""
+#: Constants of Planck's law, from CODATA.
+PLANCK, LIGHT, BOLTZMANN = 6.62607015e-34, 299792458.0, 1.380649e-23
+
+
+def write_spectrum(folder: Path, paint: str = "", light: str = "", more: str = "") -> Path:
+    (folder / "scene.xml").write_text(SCENE.format(paint=paint, light=light, more=more))
+    return folder / "scene.xml"
+
+
+def value(scene: mi.Scene, key: str) -> np.ndarray:
+    return np.array(mi.traverse(scene)[key], dtype=np.float64).ravel()
+
+
+def colour(wavelengths: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the colour of light with the given spectrum, as Mitsuba's spectral variants compute the colour."""
+    fine = np.linspace(wavelengths[0], wavelengths[-1], 20001)
+    matching = np.array(mi.cie1931_xyz(mi.Float(fine.astype(np.float32))), dtype=np.float64)
+    heights = matching * np.interp(fine, wavelengths, values)
+    area = (heights[:, 1:] + heights[:, :-1]).sum(axis=1) / 2 * (fine[1] - fine[0])
+    return np.array(mi.xyz_to_srgb(mi.Color3f((area * mi.MI_CIE_Y_NORMALIZATION).tolist()))).ravel()
+
+
+def black_body(temperature: float, low: float = 360, high: float = 830) -> tuple[np.ndarray, np.ndarray]:
+    """Return wavelengths in nm and the radiance in W/(m^2 sr nm)."""
+    nm = np.linspace(low, high, 5001)
+    metres = 1e-9 * nm
+    exponent = PLANCK * LIGHT / (metres * BOLTZMANN * temperature)
+    return nm, 1e-9 * 2 * PLANCK * LIGHT**2 / metres**5 / np.expm1(exponent)
+
+
+@pytest.mark.parametrize("temperature", [2200, 3000, 6500, 12000])
+def test_a_black_body_has_its_colour(tmp_path: Path, temperature: int) -> None:
+    light = f'<spectrum type="blackbody" name="radiance"><float name="temperature" value="{temperature}"/></spectrum>'
+    found = value(load_scene(write_spectrum(tmp_path, light=light)), "sky.radiance.value")
+    np.testing.assert_allclose(found, colour(*black_body(temperature)), rtol=3e-3)
+
+
+def test_a_black_body_within_a_range(tmp_path: Path) -> None:
+    light = """<spectrum type="blackbody" name="radiance"><float name="temperature" value="4000"/>
+    <float name="wavelength_min" value="400"/><float name="wavelength_max" value="650"/></spectrum>"""
+    found = value(load_scene(write_spectrum(tmp_path, light=light)), "sky.radiance.value")
+    np.testing.assert_allclose(found, colour(*black_body(4000, 400, 650)), rtol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("xml", "wavelengths"), [(IRREGULAR, (400, 500, 700)), (REGULAR, (420, 550, 680))], ids=["irregular", "regular"]
+)
+def test_light_by_wavelength_has_its_colour(tmp_path: Path, xml: str, wavelengths: tuple[float, ...]) -> None:
+    found = value(load_scene(write_spectrum(tmp_path, light=xml.format('name="radiance"'))), "sky.radiance.value")
+    np.testing.assert_allclose(found, colour(np.array(wavelengths), np.array([0.1, 0.5, 0.8])), rtol=3e-3)
+
+
+INLINE = '<spectrum name="{}" value="400:0.1, 500:0.5, 700:0.8"/>'
+
+
+@pytest.mark.parametrize(
+    ("paint", "more"),
+    [
+        (IRREGULAR.format('name="reflectance"'), ""),
+        (IRREGULAR.format('name="reflectance"').replace("spectrum", "texture"), ""),
+        ('<ref id="s" name="reflectance"/>', IRREGULAR.format('id="s"')),
+        ('<ref id="t" name="reflectance"/>', IRREGULAR.format('id="s"') + '<alias id="s" as="t"/>'),
+        (f'<spectrum type="irregular" name="reflectance">{INLINE.format("value")}</spectrum>', ""),
+    ],
+    ids=["spectrum", "texture", "referred to", "by an alias", "value"],
+)  # fmt: skip
+def test_a_material_has_the_colour_of_the_same_spectrum_written_inline(tmp_path: Path, paint: str, more: str) -> None:
+    found = value(load_scene(write_spectrum(tmp_path, paint, more=more)), "thing.bsdf.reflectance.value")
+    inline = value(load_scene(write_spectrum(tmp_path, INLINE.format("reflectance"))), "thing.bsdf.reflectance.value")
+    assert len(set(inline)) == 3
+    np.testing.assert_array_equal(found, inline)
+
+
+def test_a_repaired_spectrum_is_named_with_its_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file = write_spectrum(tmp_path, IRREGULAR.format('name="reflectance"'))
+    with caplog.at_level(logging.WARNING):
+        load_scene(file)
+    line = f"{file}:3: RGB variants have no spectrum `irregular`: read as its colour"
+    assert [record.getMessage() for record in caplog.records] == [line]
+
+
+@pytest.mark.parametrize(
+    ("xml", "reason"),
+    [
+        (IRREGULAR.replace("500 ", ""), "scene.xml:3: irregular has 2 wavelengths and 3 values"),
+        (IRREGULAR.replace("400, 500", "500, 400"), "irregular needs two wavelengths or more, in ascending order"),
+        (REGULAR.replace("0.1, 0.5, 0.8", "0.1"), "regular needs two wavelengths or more"),
+        (REGULAR.replace("680", "420"), "regular: wavelength_max must be above wavelength_min"),
+        (REGULAR.replace("wavelength_min", "lambda_min"), "regular needs a parameter `wavelength_min`"),
+        (IRREGULAR.replace('"0.1, ', '"-0.1, '), r"values: must be numbers of at least 0, not `-0\.1, 0\.5 0\.8`"),
+        (IRREGULAR.replace('"0.1, ', '"x, '), "values: must be numbers of at least 0"),
+        (IRREGULAR.replace('name="wavelengths"', 'name="lambdas"'), "irregular needs a parameter `wavelengths`"),
+        (IRREGULAR.replace("{}", ""), "<spectrum> `irregular` needs a name, that of a parameter"),
+        ('<spectrum type="blackbody" {}><float name="temperature" value="3000"/></spectrum>',
+         "only emitters can have a blackbody; a bsdf can have <rgb>"),
+    ],
+)  # fmt: skip
+def test_an_invalid_spectrum_is_one_located_line(tmp_path: Path, xml: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        load_scene(write_spectrum(tmp_path, xml.format('name="reflectance"')))
+
+
+@pytest.mark.parametrize("temperature", ["0", "-3", "warm", "3000 4000"])
+def test_a_missing_temperature_is_one_located_line(tmp_path: Path, temperature: str) -> None:
+    light = f'<spectrum type="blackbody" name="radiance"><float name="temperature" value="{temperature}"/></spectrum>'
+    with pytest.raises(ConfigError, match=r"scene\.xml:4: temperature: must be"):
+        load_scene(write_spectrum(tmp_path, light=light))
 
 
 def test_constants_of_spectra_are_no_parameters() -> None:

@@ -104,6 +104,43 @@ def test_input_that_crashes_mitsuba(tmp_path, objects, said):
     assert str(error.value).startswith(f"{file}:2: {said}")
 
 
+PLY = """ply
+format ascii 1.0
+element vertex {vertices}
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_index
+end_header
+0 0 0
+1 0 0
+0 1 0
+3 0 1 {last}
+"""
+
+
+@pytest.mark.parametrize(
+    ("vertices", "last", "said"),
+    [
+        (3, 3, "has a face with vertex 3, but only 3 vertices; write it again"),
+        (3, 2, ""),
+    ],
+)
+def test_a_mesh_with_faces_of_missing_vertices_is_refused(tmp_path, vertices, last, said):
+    (tmp_path / "mesh.ply").write_text(PLY.format(vertices=vertices, last=last))
+    lamp = '<emitter type="point"/><sensor type="perspective"/>'
+    mesh = '<shape type="ply" id="mesh"><string name="filename" value="mesh.ply"/></shape>'
+    file = write(tmp_path, f"{HEAD}{lamp}{mesh}</scene>")
+    if not said:
+        assert any(shape.is_mesh() for shape in load_scene(file).shapes())
+        return
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value).startswith(str(file))
+    assert said in str(error.value)
+
+
 def test_a_damaged_texture_is_refused_with_a_location(tmp_path):
     (tmp_path / "a.hdr").write_bytes(b"#?RGBE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n\2\2\0\x08")
     file = write(tmp_path, f"{HEAD}{TEXTURE.format('a.hdr')}</scene>")

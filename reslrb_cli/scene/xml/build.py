@@ -71,7 +71,6 @@ class Owners:
 
 
 _OLD = "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have"
-_SPECTRAL = "needs wavelengths, which RGB variants lack"
 #: Plugins that scene files cannot use here, with reasons and substitutes.
 REFUSED_PLUGINS = {
     ("bsdf", "coating"): f"{_OLD}; use `principled` with a clearcoat",
@@ -94,17 +93,8 @@ REFUSED_PLUGINS = {
     ("texture", "curvature"): f"{_OLD}; use `mesh_attribute`",
     ("texture", "vertexcolors"): f"{_OLD}; use `mesh_attribute`",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
-    ("film", "specfilm"): f"{_SPECTRAL}; use `hdrfilm`",
+    ("film", "specfilm"): "needs wavelengths, which RGB variants lack; use `hdrfilm`",
     ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; use a `perspective` one",
-    **{
-        (tag, type): f"{_SPECTRAL}; {instead}"
-        for tag in ("spectrum", "texture")
-        for type, instead in (
-            ("regular", 'write <spectrum value="400:0.1, 700:0.9"/>'),
-            ("irregular", 'write <spectrum value="400:0.1, 700:0.9"/>'),
-            ("blackbody", "give its colour as <rgb>"),
-        )
-    },
 }
 
 

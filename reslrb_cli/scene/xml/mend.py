@@ -2,7 +2,8 @@
 
 Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives an object
 without an id a new id. The new id consists of the object's kind and its number among all objects of this kind.
-Conversions keep the meaning, and are silent. `mend` returns notes on the parts that are left out.
+Conversions keep the meaning, and are silent. `mend` returns notes on the parts that are left out, and on spectra that
+become colours.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ import numpy as np
 
 from reslrb_cli.backend.installation import is_known
 from reslrb_cli.scene.images import decode_srgb
-from reslrb_cli.scene.xml.read import Description, Element, quoted
+from reslrb_cli.scene.xml.read import Description, Element, floats, quoted
+from reslrb_cli.scene.xml.spectra import convert_spectra
 
 
 @dataclass(frozen=True)
 class Note:
-    """A part of a scene's files that is left out, with the reason.
+    """A part of a scene's files that is left out or simplified. `wrong` is the reason, and `done` is the result.
 
     If a plugin does not use an element, `owner` is the parent of the element. For other notes, it is None.
     """
@@ -31,16 +33,17 @@ class Note:
     element: Element
     wrong: str
     owner: Element | None = None
+    done: str = "left out"
 
 
 def warnings(notes: Iterable[Note]) -> list[str]:
     """Return one line per kind of note. Each line names the first occurrence of its kind."""
     kinds: dict[tuple[str, Path], list[Element]] = {}
     for note in notes:
-        kinds.setdefault((note.wrong, note.element.file), []).append(note.element)
+        kinds.setdefault((f"{note.wrong}: {note.done}", note.element.file), []).append(note.element)
     return [
-        f"{elements[0].place}: {wrong}: left out" + f" (also {len(elements) - 1} more)" * (len(elements) > 1)
-        for (wrong, _), elements in kinds.items()
+        f"{elements[0].place}: {text}" + f" (also {len(elements) - 1} more)" * (len(elements) > 1)
+        for (text, _), elements in kinds.items()
     ]
 
 
@@ -94,14 +97,6 @@ def snake_case(name: str) -> str:
     return re.sub(r"(?<=[a-z])[A-Z]+", lambda capitals: "_" + capitals[0].lower(), name)
 
 
-def _floats(text: str) -> list[float]:
-    """Parse a list of numbers. Returns an empty list if any word of the text is not a number."""
-    try:
-        return [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        return []
-
-
 def hexadecimal(element: Element) -> str:
     """Return the three numbers of `#rrggbb`, each divided by 255. Raises ConfigError if the format differs."""
     text = element.value.strip()
@@ -113,7 +108,7 @@ def hexadecimal(element: Element) -> str:
 def linear(element: Element) -> str:
     """Convert an <srgb> element (one or three numbers, or `#rrggbb`) to linear Rec. 709. Raises ConfigError."""
     text = element.value
-    encoded = _floats(hexadecimal(element) if text.strip().startswith("#") else text)
+    encoded = floats(hexadecimal(element) if text.strip().startswith("#") else text)
     if len(encoded) not in (1, 3):
         raise element.fail(element.name, f"must be one or three numbers or #rrggbb, not {quoted(text)}")
     return " ".join(f"{value:.9g}" for value in decode_srgb(np.array(encoded)))
@@ -179,7 +174,8 @@ def _name_objects(root: Element) -> None:
 
 
 def mend(description: Description) -> list[Note]:
-    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts that are left out.
+    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts that are left out and on
+    spectra that become colours.
 
     Materials, lights and shapes keep their meaning. Materials, lights and shapes that Mitsuba 3 lacks stay unchanged,
     and a later check refuses them. Unused parameters are found only when the scene is built.
@@ -190,6 +186,9 @@ def mend(description: Description) -> list[Note]:
     if root.is_object:
         mender.mend_element(root)
     mender.mend_below(root)
+    for spectrum in convert_spectra(root):
+        wrong = f"RGB variants have no spectrum `{spectrum.type}`"
+        mender.notes.append(Note(spectrum, wrong, done="read as its colour"))
     root.attributes["version"] = "3.0.0"
     return mender.notes
 
@@ -250,7 +249,7 @@ class _Mender:
             return True
         self._name(element, owner, names)
         name, value = element.name, element.value
-        if element.tag == "spectrum" and "type" not in element.attributes and len(_floats(value)) == 3:
+        if element.tag == "spectrum" and "type" not in element.attributes and len(floats(value)) == 3:
             element.tag = "rgb"
         elif element.tag == "rgb" and value.startswith("#"):
             element.attributes["value"] = hexadecimal(element)

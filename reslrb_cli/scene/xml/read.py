@@ -37,6 +37,14 @@ def quoted(text: str, mark: str = "`") -> str:
     return f"{mark}{text if text.isprintable() else repr(text)[1:-1]}{mark}"
 
 
+def floats(text: str) -> list[float]:
+    """Parse a list of numbers. Returns an empty list if any word of the text is not a number."""
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        return []
+
+
 @dataclass(slots=True, eq=False)
 class Element:
     """An XML element with its attributes and children in their order.
