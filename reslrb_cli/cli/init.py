@@ -199,7 +199,7 @@ def command(
     set_variant("auto")
 
     from reslrb_cli.scene.images import turned_line
-    from reslrb_cli.scene.load import load_scene, read_as_floats
+    from reslrb_cli.scene.load import load_scene
     from reslrb_cli.scene.parameters import select_parameters
     from reslrb_cli.scene.proposal import open_photograph, write_smaller
     from reslrb_cli.scene.visibility import find_depth
@@ -230,7 +230,7 @@ def command(
         hides_emitters=description.hides_emitters, depth=depth, missing=missing,
     )  # fmt: skip
     specs = loads(text, path).parameters
-    scene = read_as_floats(scene, description, [key for spec in specs for key in spec.keys])
+    scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # raises errors before anything is written
     with writing("--output", path):
         if copied and photo is not None and image is not None:

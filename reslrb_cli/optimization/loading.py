@@ -95,13 +95,11 @@ def load_configured(
     config: Config,
     look: Callable[[Description], object] | None = None,
     selects: bool = True,
-    warn: bool = True,
 ) -> mi.Scene:
     """Load the scene of `config`. `look` is called with the scene's description before the scene is built. Raises
     ConfigError.
 
-    With `selects`, the 8-bit and 16-bit textures that parameters select are read as floating point. With `warn`,
-    doubtful parts of the scene cause warnings.
+    With `selects`, the 8-bit and 16-bit textures that parameters select are read as floating point.
     """
     scene = config.scene
     keys = selected_keys(config) if selects else []
@@ -115,7 +113,7 @@ def load_configured(
         if look is not None:
             look(description)
 
-    return load_scene(scene.file, scene.options, scene.size, scene.cameras, see, keys, warn)
+    return load_scene(scene.file, scene.options, scene.size, scene.cameras, see, keys)
 
 
 def selected_keys(config: Config) -> list[str]:

@@ -21,7 +21,7 @@ from reslrb_cli.estimators.stack import entry_bytes
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.scene.xml.check import film_sizes
+from reslrb_cli.scene.xml.build import film_sizes
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.transport.plan import Plan
 

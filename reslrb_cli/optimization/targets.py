@@ -116,7 +116,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
         problem = replace(problem, truth=_render_targets(problem, say))
         gc.collect()  # a second scene takes part in all tracing until it is freed
     elif problem.config.target.truth:
-        true_scene = load_configured(config, warn=False)
+        true_scene = load_configured(config)
         problem = replace(
             problem, truth=_truth(problem, set_values(true_scene, config.parameters, {}, config.source, ""), say)
         )
@@ -184,7 +184,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
     """Render the targets of views without a file. Returns the parameters' true values."""
     config, render = problem.config, problem.config.target.render
     assert render is not None, "requires rendered targets"
-    true_scene = load_configured(config, warn=False)
+    true_scene = load_configured(config)
     key = "target.render.parameters"
     truth = _truth(problem, set_values(true_scene, config.parameters, render.parameters, config.source, key), say)
     chosen = render.integrator or config.integrator

@@ -18,21 +18,14 @@ import numpy as np
 
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene.images import FORMATS, image_size
+from reslrb_cli.scene.images import image_size
 from reslrb_cli.scene.xml.read import Description, Element
 
 #: Maximum relative difference between the focal lengths of rows and columns.
 SQUARE = 1e-3
 
-#: COLMAP's models without fisheyes, and the names of their parameters; `f` is both focal lengths.
-MODELS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-}
+#: COLMAP's models without distortion, and the names of their parameters; `f` is both focal lengths.
+MODELS = {"SIMPLE_PINHOLE": ("f", "cx", "cy"), "PINHOLE": ("fx", "fy", "cx", "cy")}
 
 _DISTORTION = re.compile(r"[kp]\d")
 #: From a camera's axes to the sensor's: NeRF (x right, y up, view along -z) and COLMAP (y down, view along +z).
@@ -127,7 +120,10 @@ def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
         raise ConfigError(file, f"{key}.file_path", "must name the camera's image")
     if "FISHEYE" in str(frame.get("camera_model", "")).upper() or frame.get("is_fisheye"):
         raise ConfigError(file, f"{key}.camera_model", "is a fisheye, which Mitsuba lacks; undistort the images")
-    _check_distortion(file, key, frame)
+    for name, value in frame.items():
+        if _DISTORTION.fullmatch(name) and value != 0:
+            what = f"has distortion ({name} = {value}), which Mitsuba's sensors lack"
+            raise ConfigError(file, key, f"{what}; undistort the images")
     try:
         matrix = np.array(frame["transform_matrix"], dtype=np.float64)
     except (KeyError, ValueError, TypeError):
@@ -135,7 +131,9 @@ def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise ConfigError(file, f"{key}.transform_matrix", "must be four rows of four numbers, from camera to world")
     to_world = np.vstack([matrix[:3], [0, 0, 0, 1]]) @ _NERF
-    image = _image(file.parent / frame["file_path"])
+    image = file.parent / frame["file_path"]
+    if not image.suffix and not image.exists():  # Blender's files omit the suffix
+        image = image.with_suffix(".png")
     names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
     w, h, fx, fy, cx, cy, angle = (_number(file, f"{key}.{name}", frame.get(name)) for name in names)
     width, height = (int(w), int(h)) if w and h else image_size(image)
@@ -146,27 +144,12 @@ def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
     return Camera(image.stem, image, (width, height), focal, (cx or width / 2, cy or height / 2), to_world)
 
 
-def _image(path: Path) -> Path:
-    """Return the path of an image. Blender's files omit the suffix of the path."""
-    if path.suffix or path.exists():
-        return path
-    names = [path.with_suffix(f".{name.strip().lower()}") for name in re.split(r",| or ", FORMATS)]
-    return next((found for found in names if found.exists()), path.with_suffix(".png"))
-
-
 def _number(file: Path, key: str, value: Any) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
         raise ConfigError(file, key, "must be a positive number")
     return float(value)
-
-
-def _check_distortion(source: object, key: str, parameters: Mapping[str, Any]) -> None:
-    for name, value in parameters.items():
-        if _DISTORTION.fullmatch(name) and value != 0:
-            what = f"has distortion ({name} = {value}), which Mitsuba's sensors lack"
-            raise ConfigError(source, key, f"{what}; undistort the images")
 
 
 def _check_square(source: object, key: str, fx: float, fy: float) -> None:
@@ -218,7 +201,6 @@ def _models(file: Path) -> Iterator[tuple[int, tuple[tuple[int, int], float, tup
             found = dict(zip(MODELS[model], map(float, words[4:]), strict=True))
         except (ValueError, IndexError):
             raise ConfigError(place, "", f"is not a camera: CAMERA_ID, {model}, WIDTH, HEIGHT, parameters") from None
-        _check_distortion(place, "", found)
         focal = found.get("f", found.get("fx", 0.0))
         _check_square(place, "", focal, found.get("fy", focal))
         if not (focal > 0 and math.isfinite(focal) and width > 0 and height > 0):

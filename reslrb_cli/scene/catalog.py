@@ -54,7 +54,7 @@ class ParameterInfo:
     - `obstacle` is the reason why the parameter cannot be recovered, or None if the parameter can be recovered.
     - `value` is None if the value is not a number.
     - `bits` is the number of bits per texel if Mitsuba's precision is too low for gradients. Otherwise, `bits` is None.
-        A texture with too low precision must be read as floating point (`load.read_as_floats`).
+        A texture with too low precision must be read as floating point (`keys` of `load_scene`).
     """
 
     key: str
@@ -132,7 +132,10 @@ def _current_value(params: Any, key: str) -> Value | None:
     if array is None or array.size == 0:
         return None
     if array.dtype == np.uint8 and coarse_bits(params, key) is not None:
-        return _encoded_value(array, params.properties[key][2])
+        # Lookups divide an 8-bit texture by 255, and decode it from sRGB unless it is raw.
+        levels = mi.Float(np.arange(256, dtype=np.float32) / 255)
+        is_raw = re.search(r"^ *raw = 1,$", str(params.properties[key][2]), re.MULTILINE)
+        array = np.array(levels if is_raw else dr.srgb_to_linear(levels))[array]
     columns = halo(params.properties[key][2], value)
     array = array[:, columns : array.shape[1] - columns] if columns else array
     numbers = [float(number) for number in array.ravel()] if array.size <= _FEW else None
@@ -146,20 +149,6 @@ def as_numbers(value: Any) -> np.ndarray | None:
     except (RuntimeError, TypeError):
         return None
     return array if array.dtype.kind in "buif" else None
-
-
-def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
-    """Return the value of an 8-bit texture as lookups return it: divided by 255, and decoded from sRGB unless it is
-    raw.
-    """
-    table = np.arange(256, dtype=np.float32) / 255
-    if not re.search(r"^ *raw = 1,$", str(texture), re.MULTILINE):
-        table = np.array(dr.srgb_to_linear(mi.Float(table)))
-    # By rows, because bincount converts to integers of 8 bytes.
-    counts = np.sum([np.bincount(row.ravel(), minlength=256) for row in array], axis=0)
-    there = table[counts > 0]
-    numbers = [float(table[level]) for level in array.ravel()] if array.size <= _FEW else None
-    return Value(numbers, float(table.astype(np.float64) @ counts / array.size), float(there.min()), float(there.max()))
 
 
 def entry_value(params: Any, key: str) -> Any:

@@ -189,7 +189,7 @@ class Replacing:
         metal's `material` keep their names, by which Mitsuba finds them.
         """
         own = {name.casefold() for name in (SCENE, *self.writers)}
-        home = self.description.root.source.file.absolute().parent.resolve()
+        home = self.description.root.file.absolute().parent.resolve()
         copies: dict[Path, str] = {}
         for element, name in list(self.description.named_files()):
             path = self.description.find_file(name)

@@ -1,36 +1,34 @@
-"""Image files: checked before they are decoded, and read as images to compare with or as textures.
+"""Image files, read as images to compare with or as textures.
 
-The checks cover the stated size, the orientation, and missing data. A file of some kilobytes can claim to be an image
-of gigabytes, and Mitsuba's reader fills missing data of a JPEG with grey. For compressed formats, the checks also
-detect files that were truncated and padded. The checks do not detect damage in the last lines of an EXR file, because
-EXR has no checksums. Cameras and phones store pixels in the sensor's orientation. JPEG and PNG files store the rotation
-to an upright image as EXIF metadata. Mitsuba's reader ignores this metadata.
+Cameras and phones store pixels in the sensor's orientation. JPEG and PNG files store the rotation to an upright image
+as EXIF metadata. Mitsuba's reader ignores this metadata.
 """
 
 from __future__ import annotations
 
 import logging
-import os
-import re
 import struct
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.files import PIXELS, open_file
+from reslrb_cli.config.files import open_file
 from reslrb_cli.errors import ConfigError, is_out_of_memory
+
+if TYPE_CHECKING:
+    from PIL.ImageFile import ImageFile
 
 logger = logging.getLogger(__name__)
 FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
-_NO_IMAGE = f"is not a readable image ({FORMATS})"
-#: Bytes that contain the size of an image; a preview may come first.
-_HEAD = 2**20
+_NO_IMAGE = f"is not a readable image ({FORMATS}): damaged, truncated, or in another format, such as CMYK"
+#: EXIF's tag of the camera's orientation.
+_ORIENTATION = 0x0112
 Size = tuple[int, int]
 
 #: Operations that turn the pixels upright, by EXIF's orientation number; 1 is upright.
@@ -45,60 +43,34 @@ TURNS = {
 }
 
 
-class DamagedImage(ConfigError):
-    """Image for which Mitsuba's reader, or another user of the image, would access memory out of bounds."""
-
-
-@dataclass(frozen=True)
-class _Header:
-    """Header of an image, with the (width, height) of the stored pixels and the EXIF orientation."""
-
-    size: Size
-    orientation: int = 1
-    is_jpeg: bool = False
-
-
 def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> mi.Bitmap:
     """Decode the image file `path`. `size` is the required (width, height), or None for any.
 
     Pixels are as stored. If `upright`, pixels and size are rotated or mirrored by EXIF (`TURNS`). Raises a ConfigError
-    that names the file if the file is unreadable, no image, too large, of another size, damaged or truncated. The
-    header is checked first.
+    that names the file if the file is unreadable, no image, of another size, damaged or truncated.
     """
-    header = _examine(path)
-    orientation = header.orientation if upright else 1
-    width, height = header.size[::-1] if orientation >= 5 else header.size
+    orientation = orientation_of(path) if upright else 1
+    with _photograph(path) as photograph:
+        try:
+            if photograph is not None and photograph.format != "PNG":
+                photograph.load()  # Mitsuba's reader would fill missing data of a JPEG with grey
+            bitmap = mi.Bitmap(str(path))
+        except Exception as error:
+            if is_out_of_memory(error):
+                raise
+            raise ConfigError(path, "", _NO_IMAGE) from None
+    if orientation > 1:
+        turned_bitmap = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
+        turned_bitmap.set_srgb_gamma(bitmap.srgb_gamma())
+        turned_bitmap.set_premultiplied_alpha(bitmap.premultiplied_alpha())
+        bitmap = turned_bitmap
+    width, height = (int(n) for n in bitmap.size())
     if min(width, height) < 1:
         raise ConfigError(path, "", _NO_IMAGE)
     if size is not None and (width, height) != size:
         turned = f", {TURNS[orientation]} as its EXIF orientation says" if orientation > 1 else ""
         raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
-    if width * height > PIXELS:
-        raise ConfigError(path, "", f"is {width}x{height} pixels; the limit is {PIXELS} pixels")
-    complaints: list[str] = []
-    try:
-        with _heard(complaints) if header.is_jpeg else nullcontext():
-            bitmap = mi.Bitmap(str(path))
-    except Exception as error:
-        if is_out_of_memory(error):
-            raise
-        raise ConfigError(
-            path,
-            "",
-            ("is damaged or truncated, or has a format that Mitsuba does not decode, such as CMYK; save it as RGB"),
-        ) from None
-    for line in complaints:
-        if line.startswith(("Corrupt JPEG data", "Premature end")):
-            raise ConfigError(path, "", f"is damaged or truncated ({line}); copy or save it again")
-        logger.warning("%s: %s", path, line)
-    if (int(bitmap.width()), int(bitmap.height())) != header.size:
-        raise ConfigError(path, "", f"claims {header.size[0]}x{header.size[1]} pixels, but has another size")
-    if orientation == 1:
-        return bitmap
-    turned_bitmap = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
-    turned_bitmap.set_srgb_gamma(bitmap.srgb_gamma())
-    turned_bitmap.set_premultiplied_alpha(bitmap.premultiplied_alpha())
-    return turned_bitmap
+    return bitmap
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -112,164 +84,44 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return pixels
 
 
-def orientation_of(path: Path) -> int:
-    """Return the EXIF orientation (1 to 8) of an image file, or 1 if the file has none. Raises ConfigError if it is no
-    image.
+@contextmanager
+def _photograph(path: Path) -> Iterator[ImageFile | None]:
+    """Open a PNG or JPEG file by Pillow, which reads the head only. Yields None for a file of another format. Raises
+    ConfigError if the file cannot be read.
     """
-    return _examine(path).orientation
+    from PIL import Image  # late, because few commands read such files
+
+    with open_file(path) as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # damaged EXIF data rotates nothing
+        try:
+            found = Image.open(file, formats=("JPEG", "PNG"))
+        except (OSError, ValueError, Image.DecompressionBombError):
+            found = None
+        yield found
+
+
+def orientation_of(path: Path) -> int:
+    """Return the EXIF orientation (1 to 8) of an image file, or 1 if the file has none. Raises ConfigError if the file
+    cannot be read.
+    """
+    from PIL.Image import Exif
+
+    exif, orientation = Exif(), None
+    with _photograph(path) as photograph:
+        if photograph is not None:
+            with suppress(SyntaxError, ValueError, struct.error):
+                exif.load(photograph.info.get("exif", b""))
+                orientation = exif.get(_ORIENTATION)
+    return orientation if orientation in TURNS else 1
 
 
 def image_size(path: Path) -> Size:
     """Return the stored (width, height) of an image. Raises a ConfigError that names the file if the file is not an
     image.
     """
-    width, height = _examine(path).size
-    if min(width, height) < 1:
-        raise DamagedImage(path, "", f"claims {width}x{height} pixels; save it again")
-    return width, height
-
-
-def _examine(path: Path) -> _Header:
-    """Return the header of an image. Raises a ConfigError that names the file if the file is not an image."""
-    header: _Header | None = None
-    with open_file(path) as file:
-        try:
-            head = file.read(_HEAD) or b""
-            reader = next((reader for magic, reader in _READERS.items() if head.startswith(magic)), None)
-            with suppress(struct.error, ValueError):  # a truncated header does not count
-                header = None if reader is None else reader(path, head, file)
-        except OSError as error:
-            raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
-    if header is None:
-        raise ConfigError(path, "", _NO_IMAGE)
-    return header
-
-
-# --- formats ----------------------------------------------------------------------------------------------------------
-
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-#: EXIF's tag of the camera's orientation.
-_ORIENTATION = 0x0112
-
-
-def _photograph(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
-    """Return the header of a PNG or JPEG file."""
-    from PIL.Image import Exif  # late, because few commands read such files
-    from PIL.JpegImagePlugin import JpegImageFile
-    from PIL.PngImagePlugin import PngImageFile
-
-    is_jpeg, exif, orientation = head.startswith(_JPEG), Exif(), None
-    file.seek(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # damaged EXIF data rotates nothing
-        try:
-            image = JpegImageFile(file) if is_jpeg else PngImageFile(file)
-        except (SyntaxError, OSError):
-            return None
-        with suppress(SyntaxError, ValueError, struct.error):
-            exif.load(image.info.get("exif", b""))
-            orientation = exif.get(_ORIENTATION)
-    return _Header(image.size, orientation if orientation in TURNS else 1, is_jpeg)
-
-
-def _exr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
-    position = 8
-    while True:  # attributes: a name and a type that end with a zero, the number of bytes, and the bytes
-        name, _, rest = head[position : position + 600].partition(b"\0")
-        kind, _, _ = rest.partition(b"\0")
-        position += len(name) + len(kind) + 2
-        [length] = struct.unpack_from("<i", head, position)
-        if not name or length < 0:
-            return None
-        if name == b"dataWindow":
-            left, top, right, bottom = struct.unpack_from("<4i", head, position + 4)
-            return _Header((right - left + 1, bottom - top + 1))
-        position += 4 + length
-
-
-def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
-    found = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", head)
-    if found is None:
-        return None
-    width, height = int(found[2]), int(found[1])
-    if width * height <= PIXELS:  # larger images are refused anyway
-        file.seek(found.end())
-        if not _are_whole(file.read(), width, height):
-            raise DamagedImage(path, "", "is damaged or truncated; copy or save it again")
-    return _Header((width, height))
-
-
-def _are_whole(data: bytes, width: int, height: int) -> bool:
-    """True if the lines of a Radiance image fit the image's header.
-
-    Runs must fill each of a line's four parts exactly. Either all lines consist of runs, or no line does. Mitsuba's
-    reader does not check the lines, and would write out of bounds.
-    """
-    start = bytes((2, 2, width >> 8, width & 255)) if 8 <= width <= 0x7FFF else b""
-    if not start or data[:2] != start[:2] or data[2:3] >= b"\x80":
-        return len(data) >= 4 * width * height
-    position, end = 0, len(data)
-    for _ in range(height):
-        if data[position : position + 4] != start:
-            return False
-        position += 4
-        for _ in range(4):
-            left = width
-            while left > 0 and position < end and data[position]:
-                code = data[position]
-                length = code - 128 if code > 128 else code
-                left, position = left - length, position + (2 if code > 128 else length + 1)
-            if left or position > end:
-                return False
-    return True
-
-
-def _netpbm(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
-    found = re.match(rb"..(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", head)
-    return _Header((int(found[1]), int(found[2]))) if found else None
-
-
-def _bmp(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
-    width, height = struct.unpack_from("<ii", head, 18)
-    return _Header((width, abs(height)))
-
-
-_READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Header | None]] = {
-    b"\x76\x2f\x31\x01": _exr,
-    **dict.fromkeys((_PNG, _JPEG), _photograph),
-    b"#?": _hdr,
-    **dict.fromkeys((b"PF", b"Pf", b"P5", b"P6"), _netpbm),
-    b"BM": _bmp,
-}
-
-
-# --- messages of C libraries ------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _heard(lines: list[str]) -> Iterator[None]:
-    """Append the process's standard error to `lines` instead of printing it.
-
-    If a file looks complete, libjpeg (inside Mitsuba) reports missing data only on standard error.
-    """
-    try:
-        before = os.dup(2)
-    except OSError:  # closed: no messages
-        yield
-        return
-    listening, speaking = os.pipe()
-    for end in (listening, speaking):  # messages beyond the buffer are dropped; neither end waits for the other
-        os.set_blocking(end, False)
-    os.dup2(speaking, 2)
-    os.close(speaking)
-    try:
-        yield
-    finally:
-        os.dup2(before, 2)
-        os.close(before)
-        with suppress(BlockingIOError):
-            lines += os.read(listening, 2**16).decode(errors="replace").splitlines()
-        os.close(listening)
+    with _photograph(path) as photograph:
+        width, height = read_bitmap(path).size() if photograph is None else photograph.size
+    return int(width), int(height)
 
 
 Image = np.ndarray[Any, Any]

@@ -19,14 +19,16 @@ from reslrb_cli.config.files import as_path
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
-from reslrb_cli.scene.extent import doubts
+from reslrb_cli.scene.graph import bounds
 from reslrb_cli.scene.values import Place
-from reslrb_cli.scene.xml.build import Owners, build
-from reslrb_cli.scene.xml.check import check, check_files, resize_films
+from reslrb_cli.scene.xml.build import Owners, build, resize_films
 from reslrb_cli.scene.xml.mend import mend, warnings
 from reslrb_cli.scene.xml.read import Description, quoted, read_description
 
 logger = logging.getLogger(__name__)
+#: Largest ray offset, as a fraction of the scene's size, without visible loss of light: that of a room of size 3 at
+#: about 150 from the origin, or of a room a fiftieth in size.
+_LARGEST_OFFSET = 5e-3
 
 
 def load_scene(
@@ -36,7 +38,6 @@ def load_scene(
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
     keys: Iterable[str] = (),
-    warn: bool = True,
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3). A variant must be set.
 
@@ -46,27 +47,23 @@ def load_scene(
     - `look` is called with the description before anything is built, and may raise exceptions.
     - `keys` are keys or globs of parameters that need derivatives. If a bitmap of these parameters has 8 or 16 bits,
         the bitmap is read as floating point.
-    - Without `warn`, the scene is not checked for doubtful parts.
 
     Shapes are not merged, so all parameters keep their names. An object without an id is named by its kind and a
     number, such as `Sphere_3`. The number counts the file's objects of this kind. Elements of other versions or
-    exporters that Mitsuba's parser would refuse are repaired or left out. The log gets a warning. Mitsuba must use
-    every remaining element. The function does not load the scene's integrator, because an experiment has its own
+    exporters that Mitsuba's parser would refuse are converted, or left out with a warning. Mitsuba must use every
+    remaining element. The function does not load the scene's integrator, because an experiment has its own
     integrator. Plugins are loaded only from Mitsuba's own folder.
 
     Raises a ConfigError that names the scene file if the file is missing or wrong. Raises ConfigError also for a scene
-    without shapes or light. Warns of a scene that is too far from the origin or too small, of glass that is too thin,
-    and of coincident faces.
+    without shapes or light. Warns of a scene that is too far from the origin or too small.
     """
     file = Path(file)
     description = read_description(file, options or {})
-    root = description.root
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
     found = mend(description)
     if size is not None:
-        resize_films(root, size)
-    check(description)
+        resize_films(description.root, size)
     if look is not None:
         look(description)
     scene, unused = build(description)
@@ -80,11 +77,10 @@ def load_scene(
         if len(objects) == 0:
             raise ConfigError(file, "", wrong)
     _check_meshes(file, scene)
-    lost = {note.element for note in unused}  # other notes on lost elements do not matter
-    for line in warnings([*(note for note in found if note.element not in lost), *unused], root):
+    for line in warnings([*found, *unused]):
         warn_once(line)
-    for doubt in doubts(scene) if warn else ():
-        warn_once(f"{file}: {doubt}")
+    if (problem := _lost_light(scene)) is not None:
+        warn_once(f"{file}: {problem}")
     for note in unused:
         if note.owner is not None:
             note.owner.children.remove(note.element)
@@ -148,16 +144,6 @@ def _grid_folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="reslrb-")
 
 
-def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
-    """Return the scene. The 8-bit and 16-bit bitmaps that `keys` name are read as floating point. `keys` may contain
-    globs.
-
-    If `keys` name no 8-bit or 16-bit bitmaps, the result is `scene` itself. Otherwise the scene is built again from
-    `description`, which is modified.
-    """
-    return build(description)[0] if _mark_floats(scene, description, keys) else scene
-
-
 def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
     """Mark the 8-bit and 16-bit bitmaps that `keys` name as floats in the description. Returns whether there are any.
 
@@ -177,8 +163,6 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
             owner.drop("format")
             owner.children.append(owner.new("string", name="format", value="variant"))
             changed = True
-    if changed:
-        check_files(description)
     return changed
 
 
@@ -192,6 +176,26 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
             if last >= shape.vertex_count():
                 has = f"has a face with vertex {last}, but only {shape.vertex_count()} vertices"
                 raise ConfigError(file, "", f"the mesh {quoted(shape.id())} {has}; write it again")
+
+
+def _lost_light(scene: Any) -> str | None:
+    """Return the problem of a scene that is far from the origin or tiny, with a remedy, or None.
+
+    Mitsuba offsets the origins of rays from their surface by RayEpsilon (1 + max |p|), in the scene's units. Rays skip
+    surfaces that are closer together than the offset. Light is then lost in corners, in all integrators.
+    """
+    low, high = bounds(scene)
+    size = float(np.linalg.norm(high - low))
+    reach = float(np.maximum(np.abs(low), np.abs(high)).max())
+    offset = mi.math.RayEpsilon * (1 + reach)
+    if not np.isfinite(size) or offset <= _LARGEST_OFFSET * size:
+        return None
+    centre = float(np.linalg.norm((low + high) / 2))
+    if centre > size:
+        place, advice = f"is {centre:.3g} from the origin and {size:.3g} wide", "move it to the origin"
+    else:
+        place, advice = f"measures {size:.3g} across", "scale it to about 1"
+    return f"the scene {place}: Mitsuba starts rays {offset:.2g} away from surfaces there, and light is lost; {advice}"
 
 
 @functools.cache

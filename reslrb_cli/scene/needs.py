@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import drjit as dr
@@ -13,8 +14,19 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene.extent import clipped
-from reslrb_cli.scene.graph import Lamp, SceneGraph, bent_faces, emitted_rays, failure, grid, sensor_rays, small_lamps
+from reslrb_cli.scene.graph import (
+    Lamp,
+    SceneGraph,
+    bent_faces,
+    bounds,
+    emitted_rays,
+    face_normals,
+    failure,
+    grid,
+    sensor_rays,
+    small_lamps,
+    triangles,
+)
 
 #: Sensors to which light paths can connect: they have `sample_direction`, with the density of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
@@ -64,8 +76,7 @@ class SceneNeeds:
 
     `emitters` holds class names in the order of `scene.emitters()`. `environment` is the index of the surrounding
     emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
-    is true if a thin lens may see objects outside of its clip planes. `lens_clip` is also true if Mitsuba sees nothing
-    because of the lens's focus.
+    tells whether a thin lens may see objects outside of its clip planes, or nothing because of its focus.
     """
 
     emitters: tuple[str, ...]
@@ -114,8 +125,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` includes it
     lamps = graph.find_lamps(scene)
     is_projective = sensor.class_name() in SENSORS
-    near, far = clipped(scene, sensor) if is_projective else (False, False)
-    thin_lens = bool(sensor.needs_aperture_sample())
+    near_clip, lens_clip = _clip_planes(scene, sensor) if is_projective else (False, False)
     params = mi.traverse(sensor)
     others = [bsdf for bsdf in graph.of_type(mi.BSDF) if bsdf.class_name() not in _FOLLOWED_BSDFS]
     unfollowed = {owner for bsdf in others for owner in graph.owning_bsdfs(bsdf)}
@@ -133,12 +143,12 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
-        thin_lens=thin_lens,
+        thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=any(
             key.startswith("principal_point_offset") and np.any(np.array(value) != 0) for key, value in params
         ),
-        near_clip=near,
-        lens_clip=thin_lens and (near or far or (is_projective and _focuses_outside(params))),
+        near_clip=near_clip,
+        lens_clip=lens_clip,
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in unfollowed),
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
@@ -197,9 +207,8 @@ def scaled_emitter(scene: Any) -> str | None:
     """Return the reason, as text, why light paths and camera paths render different light, or None if they render the
     same light.
 
-    A `directional` or `projector` emitter may have a scale in `to_world`. With a scale in `to_world`, the directions of
-    a `directional` or `projector` emitter do not have length 1. Mitsuba's `sample_ray` and `sample_direction` treat
-    such directions differently.
+    With a scale in `to_world`, the directions of a `directional` or `projector` emitter do not have length 1. Mitsuba's
+    `sample_ray` and `sample_direction` treat such directions differently.
     """
     plugins = {"DirectionalEmitter": "directional", "Projector": "projector"}
     for emitter in scene.emitters():
@@ -212,10 +221,6 @@ def scaled_emitter(scene: Any) -> str | None:
     return None
 
 
-#: Length of the longest path with light directly from an emitter to a visible surface.
-DIRECT = 2
-
-
 def camera_finds_all(scene: Any, max_depth: int) -> bool:
     """True if camera paths of up to `max_depth` segments find all light with good probability. A `max_depth` of -1
     means any number.
@@ -225,7 +230,7 @@ def camera_finds_all(scene: Any, max_depth: int) -> bool:
     """
     if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
         return False
-    if 0 <= max_depth <= DIRECT:
+    if 0 <= max_depth <= 2:  # light goes straight from an emitter to a visible surface
         return True
     bundled = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Glossy)
     return not any(int(bsdf.flags()) & bundled for bsdf in SceneGraph.of(scene).surface_bsdfs())
@@ -444,12 +449,51 @@ def _read_geometry(graph: SceneGraph) -> bool:
     return not is_plain or not all(map(_PLAIN_TEXTURES.fullmatch, textures))
 
 
-def _focuses_outside(params: mi.SceneParameters) -> bool:
-    """True if a thin lens with these `params` may see nothing in Mitsuba because of the lens's focus.
+def _clip_planes(scene: Any, sensor: Any) -> tuple[bool, bool]:
+    """Return `near_clip` and `lens_clip` of `SceneNeeds` for a perspective or thin-lens sensor.
 
-    The focus may be so far away that `sample_direction`, in single precision, considers it outside of the clip planes.
-    By default, the lens focuses on the far plane.
+    Between the sensor and its near plane, only objects in the sensor's view count. The test uses bounding boxes, and
+    triangles near the sensor. A result of false is certain, and a result of true may be wrong.
     """
-    near, far, focus = (float(np.ravel(params[key])[0]) for key in ("near_clip", "far_clip", "focus_distance"))
+    params = mi.traverse(sensor)
+    names = ("near_clip", "far_clip", "aperture_radius", "focus_distance")
+    near, far, radius, focus = (float(np.ravel(params[name])[0]) if name in params else 0.0 for name in names)
+    to_world = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+    axes, eye = to_world[:3, :3], to_world[:3, 3]
+
+    # The box, in sensor coordinates, that contains everything between the aperture and the near plane.
+    width, height = (int(n) for n in sensor.film().size())
+    shift = max((float(np.abs(value).max()) for key, value in params if key.startswith("principal_point")), default=0.0)
+    tangent = np.tan(np.deg2rad(float(params["x_fov"][0])) / 2) * max(1, height / width) * (1 + 2 * shift)
+    side = near * tangent + radius * (1 + near / focus if focus > 0 else 1)
+    half, middle = np.array([side, side, near / 2]), np.array([0, 0, near / 2])
+    is_before = any(_touches(shape, axes, eye, middle, half) for shape in scene.shapes())
+    if not sensor.needs_aperture_sample():
+        return is_before, False
+
+    corners = np.array(list(product(*zip(*bounds(scene), strict=True))))
+    is_beyond = bool(((corners - eye) @ axes[:, 2]).max() > far)
+    # Mitsuba sees nothing if `sample_direction`, in single precision, considers the focus outside of the clip planes.
+    # By default, the lens focuses on the far plane.
     depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # projected depth: 0 at near, 1 at far
-    return not _DEPTH_ROUNDING < depth < 1 - _DEPTH_ROUNDING
+    return is_before, is_before or is_beyond or not _DEPTH_ROUNDING < depth < 1 - _DEPTH_ROUNDING
+
+
+def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, half: np.ndarray) -> bool:
+    """Whether a shape may touch a box. `middle` and `half` are the box's centre and half sizes in the coordinates of
+    `axes` (columns) and `eye`.
+    """
+    low, high = bounds(shape)
+    centre, extent = (low + high) / 2, (high - low) / 2
+    apart = centre - (eye + axes @ middle)
+    beside = (np.abs(apart) > extent + np.abs(axes) @ half) | (np.abs(apart @ axes) > half + extent @ np.abs(axes))
+    if beside.any():
+        return False
+    if shape.class_name() == "Sphere":  # a sensor may be inside it
+        return bool(np.linalg.norm(apart) + np.linalg.norm(half) > extent.min() * 0.999)
+    if not shape.is_mesh():
+        return True
+    corners = (triangles(shape) - eye) @ axes - middle
+    corners = corners[((corners.min(1) <= half) & (corners.max(1) >= -half)).all(1)]
+    normals = face_normals(corners)
+    return bool((np.abs((normals * corners[:, 0]).sum(1)) <= np.abs(normals) @ half).any())

@@ -20,7 +20,6 @@ import numpy as np
 from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings, Thickness
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
-from reslrb_cli.scene.load import warn_once
 from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
 
 
@@ -231,7 +230,6 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
                 deformation.add_motion(items, spec.motion.pivot, spec.motion.free)
             elif spec.heightmap is not None:
                 deformation.add_heightmap(items, spec.heightmap.resolution)
-                _warn_of_finer(items, spec.heightmap.resolution)
             for name, word in zip(spec.names, spec.motion.free if spec.motion is not None else ("",), strict=True):
                 chosen[name], origin[name] = spec.settings(word), index
             continue
@@ -247,17 +245,6 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
             tied[keys[0]], keys = keys[1:], keys[:1]
         chosen |= dict.fromkeys(keys, spec.settings())
     return Selection(params, chosen, tied, deformation), origin
-
-
-def _warn_of_finer(items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
-    """Warn once about a heightmap with more texels than its meshes have vertices. Texels between vertices have no
-    effect.
-    """
-    vertices, (width, height) = sum(item.node.vertex_count() for item in items), resolution
-    if width * height > vertices:
-        ids = " and ".join(f"`{item.id}`" for item in items)
-        warn_once(f"the heightmap of {ids}, {width}x{height}, is finer than the mesh with {vertices} vertices: texels "
-                  "between vertices have no effect")  # fmt: skip
 
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]

@@ -189,6 +189,7 @@ PHASES = {
 INTEGRATORS = ("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "prb",
                "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic", "direct_projective")  # fmt: skip
 MENDED = "RGB variants have no spectrum `{}`: read as its colour"
+SPECTRAL = "needs wavelengths, which RGB variants lack"
 
 ROWS: tuple[Row, ...] = (
     *(Row("bsdf", name, scene=thing(xml), note=SAID_OF.get(name, ""), without=SMOOTH.get(name, ""))
@@ -311,7 +312,7 @@ ROWS: tuple[Row, ...] = (
     Row("sensor", "flat_sensor", scene=sensor("flat_sensor", ""), loading="belongs to Mitsuba's own RayDataLoader"),
     Row("film", "hdrfilm", scene=sensor(on=film('<string name="pixel_format" value="luminance"/>'))),
     Row("film", "specfilm", scene=sensor(on=film(REGULAR.format("band1"), "specfilm")),
-        loading="can only be used in Mitsuba variants that perform a spectral simulation"),
+        loading=SPECTRAL),
     *(Row("rfilter", name, scene=sensor(on=film(f'<rfilter type="{name}"/>'))) for name in FILTERS),
     *(Row("sampler", name, scene=sensor(inner=f'<float name="fov" value="50"/><sampler type="{name}"/>'),
           note="" if name == "independent" else "replaced by `independent` with `run.spp` samples")
@@ -412,10 +413,10 @@ REASONS = {
     "`none.bsdf`: no such file": "the file does not exist",
     "can only render a specific wavelength specified by the `wavelength` parameter": "it needs `wavelength`",
     "reads the memory of a running Blender": "it reads the memory of a running Blender",
+    "belongs to Mitsuba's own RayDataLoader": "it belongs to Mitsuba's own RayDataLoader",
     "irregular has 3 wavelengths and 2 values": "both lists must have the same length",
     "only emitters can have a blackbody; a bsdf can have <rgb>": "only emitters can have it; use `rgb` instead",
-    "belongs to Mitsuba's own RayDataLoader": "it belongs to Mitsuba's own RayDataLoader",
-    "can only be used in Mitsuba variants that perform a spectral simulation": "it needs a spectral variant of Mitsuba",
+    SPECTRAL: "it needs a spectral variant of Mitsuba; use `hdrfilm` instead",
 }
 
 HEAD = """# Mitsuba's plugins

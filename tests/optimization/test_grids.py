@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -92,20 +91,6 @@ def test_other_shapes_are_refused_and_missing_grids_reported(tmp_path, with_quad
         assemble_scene(configured(tmp_path, "mesh: back, resolution: [4, 4]"))
     with pytest.raises(ConfigError, match=r"heightmap.grid: must be at least 2"):
         configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 1")
-
-
-def test_a_map_finer_than_its_mesh_gives_one_warning(tmp_path, caplog, with_quad):
-    from reslrb_cli.optimization.assemble import assemble_scene
-
-    with caplog.at_level(logging.WARNING):
-        for _ in range(2):
-            assemble_scene(configured(tmp_path, "mesh: back, resolution: [6, 5], grid: [5, 5]"))
-        assemble_scene(configured(tmp_path, "mesh: back, resolution: [5, 5], grid: [5, 5]"))
-        assemble_scene(configured(tmp_path, "mesh: back, resolution: [7, 5]", with_quad))
-    found = [line for line in caplog.messages if "finer than the mesh" in line]
-    assert len(found) == 2
-    assert "25 vertices" in found[0]
-    assert "4 vertices" in found[1]
 
 
 def test_a_run_on_a_grid_is_exported_and_continued(tmp_path, monkeypatch):

@@ -15,7 +15,6 @@ from agreement import compare
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene import export as replacing
-from reslrb_cli.scene import load
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import Selection, select_parameters
@@ -107,14 +106,6 @@ KINDS: dict[str, tuple[dict[str, object], float]] = {
 }
 #: The entries of `KINDS` that can be recovered together.
 TOGETHER = [name for name in KINDS if name not in ("finer texture", "colour", "heightmap", "rectangle in motion")]
-
-
-@pytest.fixture(autouse=True)
-def _without_checks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Skip the measurements that loading makes of a scene. A scene with so many kinds of objects takes long to
-    compile.
-    """
-    monkeypatch.setattr(load, "doubts", lambda scene: [])
 
 
 @pytest.fixture(scope="module")

@@ -129,107 +129,81 @@ def test_any_name_is_a_variable(tmp_path, name):
     assert values(load_scene(file, {name: 3}))["Sphere_1.to_world"][0, 0, 0] == 3
 
 
+# Part of the scene and its replacement, which means the same
+CONVERTED = [
+    ("head", "<scene>"),
+    ("head", '<scene version="3">'),
+    ("pose", PARTS["pose"].replace("lookat", "lookAt")),
+    ("pose", PARTS["pose"].replace("to_w", "toW")),
+    ("film", PARTS["film"].replace("hdr", "ldr")),
+    ("format", PARTS["format"] + '<string name="file_format" value="png"/>'),
+    ("format", PARTS["format"] + '<string name="pixel_format" value="rgb, luminance"/>'),
+    ("sampler", '<sampler type="sobol"/>'),
+    ("shape", PARTS["shape"].replace("sphere", "Sphere")),
+    ("light", PARTS["light"].replace("<rgb", "<spectrum")),
+    ("paint", PARTS["paint"].replace("reflectance", "diffuseReflectance")),
+    ("paint", PARTS["paint"].replace("<rgb", "<srgb").replace("0.5, 0.25, 1", "0.735356983, 0.537098729, 1")),
+]
 # Part of the scene, its replacement, and the message after file and line
-MENDED = [
-    ("head", "<scene>", "the version is missing: taken for 3.0.0"),
-    ("head", '<scene version="3">', "version `3` is not three numbers: taken for 3.0.0"),
-    ("head", '<scene version="3.0.0" xmlns="x">', "<scene> has no attribute `xmlns` in Mitsuba 3: left out"),
+LEFT_OUT = [
+    ("head", '<scene version="3.0.0" xmlns="x">', "<scene> has no attribute `xmlns` in Mitsuba 3"),
     (
         "light",
         PARTS["light"].replace("<emitter", '<emitter version="3.0.0"'),
-        "<emitter> has no attribute `version` in Mitsuba 3: left out",
+        "<emitter> has no attribute `version` in Mitsuba 3",
     ),
-    ("pose", PARTS["pose"].replace("lookat", "lookAt"), "`<lookAt>` is unknown to Mitsuba 3: read as <lookat>"),
-    ("pose", PARTS["pose"].replace("to_w", "toW"), "`toWorld` has the spelling before Mitsuba 2: read as `to_world`"),
-    ("film", PARTS["film"].replace("hdr", "ldr"), "there is no film `ldrfilm` in Mitsuba 3: read as `hdrfilm`"),
     (
         "film",
         PARTS["film"] + '<float name="exposure" value="2"/>',
-        "hdrfilm has no parameter `exposure` in Mitsuba 3: left out",
+        "hdrfilm has no parameter `exposure` in Mitsuba 3",
     ),
     (
-        "format",
-        PARTS["format"] + '<string name="file_format" value="png"/>',
-        "hdrfilm has no file_format `png` in Mitsuba 3: left out",
+        "film",
+        PARTS["film"] + '<boolean name="highQualityEdges" value="true"/>',
+        "hdrfilm has no parameter `highQualityEdges` in Mitsuba 3",  # as in the file
     ),
-    (
-        "format",
-        PARTS["format"] + '<string name="pixel_format" value="rgb, luminance"/>',
-        "hdrfilm has no pixel_format `rgb, luminance` in Mitsuba 3: read as `rgb`",
-    ),
-    (
-        "format",
-        '<integer name="width" value="99"/>' + PARTS["format"],
-        "`width` is given again in line 7: left out",
-    ),
-    (
-        "sampler",
-        '<sampler type="sobol"/>',
-        "there is no sampler `sobol` in Mitsuba 3: left out (replaced by an `independent` one)",
-    ),
-    ("shape", PARTS["shape"].replace("sphere", "Sphere"), "there is no shape `Sphere` in Mitsuba 3: read as `sphere`"),
+    ("format", '<integer name="width" value="99"/>' + PARTS["format"], "`width` is given again in line 7"),
     (
         "shape",
         PARTS["shape"].replace("<ref", '<float name="radios" value="3"/><ref'),
-        "sphere has no parameter `radios` in Mitsuba 3 (did you mean `radius`?): left out",
+        "sphere has no parameter `radios` in Mitsuba 3 (did you mean `radius`?)",
     ),
     (
         "shape",
         PARTS["shape"].replace("<ref", '<sampler type="independent"/><ref'),
-        "sphere does not use a <sampler> in Mitsuba 3: left out",
+        "sphere does not use a <sampler> in Mitsuba 3",
     ),
-    ("shape", PARTS["shape"] + "<comment>mine</comment>", "`<comment>` is unknown to Mitsuba 3: left out"),
+    ("shape", PARTS["shape"] + "<comment>mine</comment>", "`<comment>` is unknown to Mitsuba 3"),
     (
         "light",
         PARTS["light"].replace('value="0.5', 'intent="illuminant" value="0.5'),
-        "<rgb> has no attribute `intent` in Mitsuba 3: left out",
-    ),
-    (
-        "light",
-        PARTS["light"].replace("<rgb", "<spectrum"),
-        "a <spectrum> of three numbers is unknown to Mitsuba 3: read as <rgb>",
-    ),
-    (
-        "paint",
-        PARTS["paint"].replace("reflectance", "diffuseReflectance"),
-        "`diffuseReflectance` has the spelling before Mitsuba 2: read as `reflectance`",
-    ),
-    (
-        "paint",
-        PARTS["paint"].replace("<rgb", "<srgb").replace("0.5, 0.25, 1", "0.735356983, 0.537098729, 1"),
-        "`<srgb>` is unknown to Mitsuba 3: read as <rgb>",
+        "<rgb> has no attribute `intent` in Mitsuba 3",
     ),
 ]
 
 
-@pytest.mark.parametrize(("part", "text", "said"), MENDED, ids=[said.partition(":")[0][:40] for _, _, said in MENDED])
-def test_repairs_are_reported_with_their_line(tmp_path, caplog, part, text, said):
+@pytest.mark.parametrize(("part", "text", "said"), [*((*each, None) for each in CONVERTED), *LEFT_OUT])
+def test_conversions_are_silent_and_omissions_are_reported_with_their_line(tmp_path, caplog, part, text, said):
     expected = values(load_scene(write(tmp_path)))
     assert not caplog.records
     file = write(tmp_path, **{part: text})
     before = file.read_bytes()
     found = values(load_scene(file))
-    assert [record.getMessage() for record in caplog.records] == [f"{file}:{LINES[part]}: {said}"]
+    lines = [] if said is None else [f"{file}:{LINES[part]}: {said}: left out"]
+    assert [record.getMessage() for record in caplog.records] == lines
     assert list(found) == list(expected)
     for key, value in expected.items():
         np.testing.assert_allclose(found[key], value, atol=1e-6, err_msg=key)
     assert file.read_bytes() == before
 
 
-def test_omissions_are_named_as_in_the_file(tmp_path, caplog):
-    file = write(tmp_path, film=PARTS["film"] + '<boolean name="highQualityEdges" value="true"/>')
-    load_scene(file)
-    [record] = caplog.records
-    assert record.getMessage() == f"{file}:6: hdrfilm has no parameter `highQualityEdges` in Mitsuba 3: left out"
-
-
-def test_similar_repairs_are_one_line(tmp_path, caplog):
+def test_similar_omissions_are_one_line(tmp_path, caplog):
     shape = PARTS["shape"].replace("<ref", '<float name="weight" value="3"/><ref')
     file = write(tmp_path, shape="\n".join([shape] * 9))
     load_scene(file)
     load_scene(file)  # as for a rendered target
     [record] = caplog.records
-    said = "sphere has no parameter `weight` in Mitsuba 3: left out (also in line 12, 13, 14, 15, 16 and 3 more)"
+    said = "sphere has no parameter `weight` in Mitsuba 3: left out (also 8 more)"
     assert record.getMessage() == f"{file}:11: {said}"
 
 
@@ -237,8 +211,7 @@ def test_scaled_texture_coordinates(tmp_path, caplog):
     texture = '<texture type="checkerboard" name="reflectance"><float name="uscale" value="3"/></texture>'
     file = write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>')
     assert values(load_scene(file))["paint.reflectance.to_uv"].ravel()[[0, 4]].tolist() == [3, 1]
-    [record] = caplog.records
-    assert record.getMessage() == f"{file}:10: `uscale` is unknown to Mitsuba 3: read as `to_uv`"
+    assert not caplog.records
 
 
 def test_colours_in_hexadecimal(tmp_path):
@@ -254,38 +227,28 @@ def test_the_scenes_own_integrator_is_not_loaded(tmp_path, caplog):
     assert not caplog.records
 
 
-def test_references_to_omitted_objects_are_omitted(tmp_path, caplog):
-    points, own = (
-        '<sampler type="halton" id="points"/>',
-        '<integrator type="x"><sampler type="stratified" id="own"/></integrator>',
-    )
-    load_scene(write(tmp_path, integrator=points + own, sampler='<ref id="points"/>'))
-    load_scene(write(tmp_path, integrator=own, sampler='<ref id="own"/>'))
-    assert len(caplog.records) == 1
-
-
 def test_objects_with_one_name_are_all_kept(tmp_path):
     # Mitsuba drops the first object, because it takes a name for that of a parameter
     shape = PARTS["shape"].replace("<shape", '<shape name="mesh"')
     assert len(load_scene(write(tmp_path, shape=shape + shape)).shapes()) == 2
 
 
-def test_paths_with_backslashes_are_found(tmp_path, caplog):
+def test_paths_with_backslashes_are_found(tmp_path):
     (tmp_path / "textures").mkdir()
     mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "textures" / "t.exr"))
     texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="textures\\t.exr"/></texture>'
-    load_scene(write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>'))
-    assert "read as `textures/t.exr`" in caplog.text
+    scene = load_scene(write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>'))
+    assert values(scene)["paint.reflectance.data"].shape == (2, 2, 3)
 
 
-@pytest.mark.parametrize("text", ["<!-- - -- what a -- rule -->", "<!-- \n -->", "Tom & Jerry", "<!DOCTYPE scene>"])
+@pytest.mark.parametrize("text", ["<!-- - -- what a -- rule -->", "<!-- \n -->", "<!DOCTYPE scene>"])
 def test_input_tolerated_by_the_parser_of_mitsuba(tmp_path, text, caplog):
     head = text + PARTS["head"] if "DOCTYPE" in text else PARTS["head"] + text
     load_scene(write(tmp_path, head=head))
     assert not caplog.records
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "latin-1"])
 def test_encodings(tmp_path, encoding):
     file = tmp_path / "scene.xml"
     file.write_bytes("\n".join((PARTS | {"shape": PARTS["shape"] + "<!-- Ä -->"}).values()).encode(encoding))

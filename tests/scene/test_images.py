@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import images
 from reslrb_cli.scene.images import decode_srgb, orientation_of, read_bitmap, read_image
 from reslrb_cli.scene.proposal import open_photograph, write_smaller
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-# Files that are not whole images: truncated, padded, damaged, larger than possible, or no files at all.  Also whole
-# images whose EXIF data gives their orientation.
+# Files that are not whole images: truncated, damaged, or no files at all. Also whole images whose EXIF data gives their
+# orientation.
 
 
 def picture():
@@ -68,35 +67,8 @@ def test_a_complete_file_is_read(image, capfd):
 def test_a_truncated_file_is_refused(image, share, capfd):
     data = image.read_bytes()
     image.write_bytes(data[: int(share * len(data))])
-    assert refused(image).startswith(("is damaged or truncated", "is not a readable image"))
+    assert refused(image).startswith("is not a readable image")
     assert capfd.readouterr() == ("", "")  # libjpeg's messages do not reach the terminal
-
-
-#: In the last three formats, zeros are black pixels. Zeros also occur in the last lines of an EXR file, which have no
-#: checksum.
-PADDED = [(name, share) for name in NAMES[:-3] for share in (0.25, 0.5, 0.9) if (name, share) != ("a.exr", 0.9)]
-
-
-@pytest.mark.parametrize(("image", "share"), PADDED, indirect=["image"])
-@pytest.mark.parametrize("padding", ["zeros", "the end"])
-def test_a_truncated_and_padded_file_is_refused(image, share, padding, capfd):
-    data = image.read_bytes()
-    begin, end = data[: int(share * len(data))], data[-12:] if padding == "the end" else b""
-    if image.suffix == ".jpg":
-        end = b"\xff\xd9"
-    zeros = b"\0" * (len(data) - len(begin) - len(end)) if padding == "zeros" else b""
-    image.write_bytes(begin + zeros + end)
-    assert "is damaged or truncated" in refused(image) or image.suffix == ".png"
-    assert capfd.readouterr() == ("", "")
-
-
-def test_a_hole_within_a_jpeg_is_refused(tmp_path):
-    path = tmp_path / "a.jpg"
-    mi.Bitmap((255 * picture()).astype(np.uint8)).write(str(path))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 512] = b"\0" * 512
-    path.write_bytes(data)
-    assert "is damaged or truncated (Corrupt JPEG data" in refused(path)
 
 
 def png(width, height, data=b""):
@@ -117,26 +89,6 @@ def exr(right, bottom):
 
     window = struct.pack("<4i", 0, 0, right, bottom)
     return b"\x76\x2f\x31\x01\x02\0\0\0" + attribute(b"dataWindow", b"box2i", window) + b"\0"
-
-
-@pytest.mark.parametrize(
-    ("name", "data"),
-    [
-        ("a.png", png(60_000, 60_000, bytes(20_000_000))),
-        ("a.exr", exr(59_999, 59_999)),
-        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n" + bytes(20_000)),
-        ("a.pfm", b"PF\n60000 60000\n-1.0\n" + bytes(20_000)),
-        ("a.ppm", b"P6\n# a comment\n60000 60000\n255\n" + bytes(20_000)),
-        ("a.jpg", b"\xff\xd8\xff\xc0\0\x11\x08\xea\x60\xea\x60\x03\x01\x22\0\x02\x11\x01\x03\x11\x01\xff\xd9"),
-        ("a.bmp", b"BM" + bytes(16) + struct.pack("<ii", 60_000, -60_000) + bytes(100)),
-    ],
-)
-def test_a_file_with_a_huge_size_is_not_decoded(tmp_path, monkeypatch, name, data):
-    path = tmp_path / name
-    path.write_bytes(data)
-    monkeypatch.setattr(images, "mi", None)  # so that nothing can be decoded
-    assert refused(path) == "is 60000x60000 pixels; the limit is 134217728 pixels"
-    assert refused(path, size=(6, 4)) == "is 60000x60000 pixels; it must be 6x4"
 
 
 @pytest.mark.parametrize(
@@ -173,30 +125,6 @@ def test_only_regular_files_are_read(tmp_path, kind):
     assert refused(path).startswith(
         "is not a readable image" if kind == "sparse" else "is a pipe, a socket or a device, not a regular"
     )
-
-
-@pytest.mark.parametrize("width", [7, 8, 40, 300])
-def test_lines_of_a_radiance_image_are_checked_before_decoding(width, tmp_path):
-    """If the first lines are run-length encoded and a later line is not, Mitsuba writes past its memory."""
-    path = tmp_path / "a.hdr"
-    array = np.random.default_rng(5).uniform(0, 2, (9, width, 3)).astype(np.float32)
-    array[2:5] = 0.5  # includes long runs
-    mi.Bitmap(array).write(str(path))
-    assert np.allclose(read_image(path), array, atol=0.01)
-    if width < 8:
-        return
-    data = path.read_bytes()
-    start = bytes((2, 2, width >> 8, width & 255))
-    lines = [place for place in range(len(data)) if data[place : place + 4] == start]
-    for place, there in (
-        (lines[3], b"\xff"),
-        (lines[1] + 3, b"\x07"),
-        (lines[2] + 4, b"\x00"),
-    ):
-        path.write_bytes(data[:place] + there + data[place + 1 :])
-        assert refused(path).startswith("is damaged or truncated")
-        with pytest.raises(images.DamagedImage):
-            images.image_size(path)
 
 
 def with_orientation(path, orientation, channels=3):

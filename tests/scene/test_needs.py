@@ -1,11 +1,9 @@
-"""The requirements of a scene, the depth of its paths, the pixels of a sensor, and glass that rays jump over."""
+"""The requirements of a scene, the depth of its paths, and the pixels of a sensor."""
 
 from __future__ import annotations
 
 import gc
-import logging
 from collections.abc import Iterator
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -13,7 +11,6 @@ import pytest
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import summarise
-from reslrb_cli.scene.load import load_scene, warn_once
 from reslrb_cli.scene.needs import (
     CROSSINGS,
     check_paths,
@@ -511,52 +508,3 @@ def test_pixels_that_see_lamps(size: int, sensor: dict) -> None:
     far = ((y < 3 / 8 - 2 * near) | (y > 5 / 8 + 2 * near))[:, None] | ((x < 1 / 2 - near) | (x > 3 / 4 + near))
     assert not found[far].any()
     assert found.sum() > (1.5 if sensor else 0.9) * inside.sum()
-
-
-# Loading a scene gives a warning about glass that rays jump over.
-
-OFFSET = 8.94e-5 * (1 + 3)  # ray offset at the slab
-
-SCENE = """\
-<scene version="3.0.0">
-  <sensor type="perspective"/>
-  <emitter type="point"><point name="position" value="0, 6, 0"/></emitter>
-  <bsdf type="dielectric" id="glass"/>
-  <shape type="rectangle" id="floor">
-    <transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/></transform></shape>
-  <shape type="rectangle" id="top"><ref id="glass"/>
-    <transform name="to_world"><scale value="2"/><rotate x="1" angle="-90"/><translate y="3"/></transform></shape>
-  <shape type="rectangle" id="bottom"><ref id="glass"/>
-    <transform name="to_world"><scale value="2"/><rotate x="1" angle="90"/><translate y="{bottom}"/></transform></shape>
-  {more}
-</scene>
-"""
-
-
-def warnings(tmp_path: Path, caplog: pytest.LogCaptureFixture, thickness: float, more: str = "") -> list[str]:
-    file = tmp_path / "scene.xml"
-    file.write_text(SCENE.format(bottom=3 - thickness, more=more))
-    warn_once.cache_clear()
-    caplog.clear()
-    with caplog.at_level(logging.WARNING):
-        load_scene(file)
-    return [record.getMessage() for record in caplog.records]
-
-
-@pytest.mark.parametrize("offsets", [0.5, 3, 8])
-def test_thin(offsets: float, tmp_path: Path, caplog: pytest.LogCaptureFixture, llvm: str) -> None:
-    [line] = warnings(tmp_path, caplog, offsets * OFFSET)
-    assert "light passes through surfaces" in line
-    assert "make the glass thicker" in line
-    measured = float(line.partition(" that are ")[2].split()[0])
-    assert 0.8 * offsets < measured < 1.4 * offsets  # the slab is thicker at an angle
-
-
-@pytest.mark.parametrize("thickness", [15 * OFFSET, 0.2])
-def test_thick(thickness: float, tmp_path: Path, caplog: pytest.LogCaptureFixture, llvm: str) -> None:
-    assert warnings(tmp_path, caplog, thickness) == []
-
-
-def test_a_ball_is_thin_only_at_its_rim(tmp_path: Path, caplog: pytest.LogCaptureFixture, llvm: str) -> None:
-    place = '<float name="radius" value="0.5"/><point name="center" value="0, 1, 0"/>'
-    assert warnings(tmp_path, caplog, 0.3, f'<shape type="sphere">{place}<ref id="glass"/></shape>') == []

@@ -100,6 +100,7 @@ def test_the_trap_works(trap):
         '<texture type="evil"/>',
         '<spectrum type="evil" name="x"/>',
         '<film type="evil"/>',
+        '<rfilter type="evil"/>',
         '<volume type="evil"/>',
         '<shape type="EVIL"/>',
         '<shape type="evil.so"/>',
@@ -121,7 +122,6 @@ def test_the_plugin_of_mitsuba_wins_over_one_of_the_scene(trap):
     kinds = [
         '<shape type="ellipsoids"/>',
         '<sampler type="evil"/>',
-        '<rfilter type="evil"/>',
         '<integrator type="evil"/>',
     ]
     for objects in ('<shape type="disk"><bsdf type="principledthin"/></shape>', '<emitter type="spot"/>', *kinds[1:]):

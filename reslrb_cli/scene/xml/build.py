@@ -1,15 +1,20 @@
-"""Building of Mitsuba's objects from elements with Mitsuba's own parser, and the map from parameters to elements."""
+"""Building of Mitsuba's objects from elements with Mitsuba's own parser, and the map from parameters to elements.
+
+Before Mitsuba parses a description, plugins that are not Mitsuba's own are refused, and files that never end.
+"""
 
 from __future__ import annotations
 
 import bisect
 import difflib
+import os
 import re
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
 
-from reslrb_cli.backend.installation import likely_parameters, looking_in
+from reslrb_cli.backend.installation import is_known, likely_parameters, looking_in, nearest_plugin, plugin_type
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.xml.mend import Note
 from reslrb_cli.scene.xml.read import Description, Element, quoted, tag_lines
@@ -65,6 +70,71 @@ class Owners:
         return unnamed[place] if place < len(unnamed) else None
 
 
+_OLD = "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have"
+#: Plugins that scene files cannot use here, with reasons and substitutes.
+REFUSED_PLUGINS = {
+    ("bsdf", "coating"): f"{_OLD}; use `principled` with a clearcoat",
+    ("bsdf", "roughcoating"): f"{_OLD}; use `principled` with a clearcoat",
+    ("bsdf", "mixturebsdf"): f"{_OLD}; use nested `blendbsdf`",
+    ("bsdf", "phong"): f"{_OLD}; use `roughplastic`",
+    ("bsdf", "ward"): f"{_OLD}; use `roughconductor` or `roughplastic`",
+    ("bsdf", "roughdiffuse"): f"{_OLD}; use `diffuse`",
+    ("bsdf", "difftrans"): f"{_OLD}; use `principledthin`",
+    ("bsdf", "hk"): f"{_OLD}; use a medium",
+    ("bsdf", "irawan"): f"{_OLD}; use a texture",
+    ("emitter", "sky"): f"{_OLD}; use `sunsky`, with z instead of y as its up axis",
+    ("emitter", "sun"): f"{_OLD}; use `sunsky`, with z instead of y as its up axis",
+    ("emitter", "collimated"): f"{_OLD}; use `directionalarea`",
+    ("shape", "heightfield"): f"{_OLD}; write it as a mesh",
+    ("shape", "hair"): f"{_OLD}; `bsplinecurve` draws strands",
+    ("texture", "scale"): f"{_OLD}; multiply the texture itself",
+    ("texture", "gridtexture"): f"{_OLD}; use `bitmap` or `checkerboard`",
+    ("texture", "wireframe"): f"{_OLD}; use `bitmap`",
+    ("texture", "curvature"): f"{_OLD}; use `mesh_attribute`",
+    ("texture", "vertexcolors"): f"{_OLD}; use `mesh_attribute`",
+    ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
+    ("film", "specfilm"): "needs wavelengths, which RGB variants lack; use `hdrfilm`",
+    ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; use a `perspective` one",
+}
+
+
+def _check(description: Description) -> None:
+    """Raise ConfigError with file and line for a plugin that is not Mitsuba's own, and for a file that is missing or
+    never ends.
+    """
+    for element in description.root.walk():
+        if element.is_object:
+            _check_plugin(element)
+    for element, name in description.named_files():
+        path = description.find_file(name)
+        if path is None:
+            looked = "" if os.path.isabs(name) else f"; searched in {', '.join(map(str, description.folders))}"
+            raise element.fail("filename", f"{quoted(name)}: no such file{looked}")
+        if not path.is_file():
+            raise element.fail("filename", f"{path} is not a regular file")
+
+
+def _check_plugin(element: Element) -> None:
+    """Refuse an object whose plugin is not Mitsuba's own, or belongs to another tag. Mitsuba would load the plugin from
+    the scene's folder, or read memory out of bounds.
+    """
+    tag, type = element.tag, element.type
+    if not type:
+        raise element.fail("", f"<{tag}> has no type")
+    if (refused := REFUSED_PLUGINS.get((tag, type))) is not None:
+        raise element.fail("", f"{tag} `{type}` {refused}")
+    others = {"bsdf": "BSDF", "phase": "PhaseFunction", "rfilter": "ReconstructionFilter", "spectrum": "Texture"}
+    wanted = getattr(mi.ObjectType, others.get(tag, tag.capitalize()))
+    if not is_known(type):
+        near = nearest_plugin(type, wanted)
+        hint = f"; did you mean `{near}`?" if near else "; only Mitsuba's own plugins are loaded"
+        raise element.fail("", f"there is no {tag} {quoted(type)} in Mitsuba 3{hint}")
+    if plugin_type(type) not in (mi.ObjectType.Unknown, wanted):
+        raise element.fail("", f"{quoted(type)} is no {tag}")
+    if type == "bitmap" and element.find("filename") is None:
+        raise element.fail("", "bitmap needs a parameter `filename`")
+
+
 #: "[parser.cpp:482] " and "[PluginManager] ": where in Mitsuba's sources a message comes from.
 _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
 #: "At string (line 3, col 7): " and the like, before the message proper.
@@ -99,9 +169,10 @@ def _place_textures(root: Element) -> None:
 def build(description: Description) -> tuple[Any, list[Note]]:
     """Build the Mitsuba object of a description. Return the object, and notes on parameters that no plugin uses.
 
-    Nothing is merged, so all parameters keep their names. Raises ConfigError with a location if Mitsuba refuses the
-    scene.
+    Nothing is merged, so all parameters keep their names. Raises ConfigError with a location if a plugin is not
+    Mitsuba's own, a file is missing, or Mitsuba refuses the scene.
     """
+    _check(description)
     _place_textures(description.root)
     text = _Text(description.root)
     config = mi.parser.ParserConfig(mi.variant())
@@ -145,7 +216,7 @@ class _Text:
             text = _PREAMBLE.sub("", text).strip()
         text = _NO_FACES.sub("the mesh has no faces", text)
         text = _PLACE.sub(lambda other: f"({self._elements[int(other[1]) - 1].place})", text)
-        return ConfigError(element.place if element else self._root.source.file, "", text)
+        return ConfigError(element.place if element else self._root.file, "", text)
 
 
 def _unused(props: mi.Properties, element: Element) -> list[Note]:
@@ -162,5 +233,50 @@ def _unused(props: mi.Properties, element: Element) -> list[Note]:
             hint = f" (did you mean `{near[0]}`?)" if near else ""
             child = element.find(name) or element
             wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3{hint}"
-        notes.append(Note(child, wrong, "left out", None if child is element else element))
+        notes.append(Note(child, wrong, None if child is element else element))
     return notes
+
+
+@dataclass(frozen=True)
+class FilmSize:
+    """Width and height of a film in pixels, pixels in its crop window, and channels per pixel.
+
+    Sizes are 0 if the file does not give them.
+    """
+
+    width: int
+    height: int
+    cropped: int
+    channels: int
+
+
+def film_sizes(description: Description) -> list[FilmSize]:
+    """Return the sizes of the scene's films."""
+    return [_size_of(film) for film in description.root.walk("film")]
+
+
+def _size_of(film: Element) -> FilmSize:
+    """Return the size of a film. Ignores values that are not numbers, because Mitsuba refuses such values."""
+    values = {child.name: child.value.strip() for child in film.children}
+    numbers = {name: int(value[:20]) for name, value in values.items() if value.isdecimal()}
+    width, height = numbers.get("width", 0), numbers.get("height", 0)
+    cropped = numbers.get("crop_width", width) * numbers.get("crop_height", height)
+    channels = 1 if values.get("pixel_format", "rgb").lower().startswith("luminance") else 3
+    return FilmSize(width, height, cropped, channels)
+
+
+#: Parameters of a film that set its size.
+_SIZES = ("width", "height", "crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+
+
+def resize_films(root: Element, size: tuple[int, int]) -> None:
+    """Set the films of all sensors below `root` to `size` (width, height) in pixels, and remove crop windows."""
+    for sensor in root.walk("sensor"):
+        films = [child for child in sensor.children if child.tag == "film"]
+        if not films:
+            films = [sensor.new("film", type="hdrfilm")]
+            sensor.children += films
+        for film in films:
+            film.drop(*_SIZES)
+            for name, value in zip(("width", "height"), size, strict=True):
+                film.children.append(film.new("integer", name=name, value=str(value)))

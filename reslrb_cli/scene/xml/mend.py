@@ -1,72 +1,50 @@
 """Conversion of scene files from other Mitsuba versions and exporters to Mitsuba 3. Assignment of stable ids.
 
 Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives an object
-without an id a new id. The new id consists of the object's kind and its number among all objects of this kind. `mend`
-returns notes on the parts that were mended or left out.
-
-The plugins `regular`, `irregular` and `blackbody` need wavelengths, which RGB variants lack. `mend` replaces `regular`,
-`irregular` and `blackbody` plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba converts a
-`<spectrum>` element to a colour with the CIE matching functions. For emitters, the result is the colour of light.
-Otherwise, the result is the colour of a surface under D65.
+without an id a new id. The new id consists of the object's kind and its number among all objects of this kind.
+Conversions keep the meaning, and are silent. `mend` returns notes on the parts that are left out, and on spectra that
+become colours.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from reslrb_cli.backend.installation import is_known
 from reslrb_cli.scene.images import decode_srgb
-from reslrb_cli.scene.xml.read import Description, Element, quoted
-
-#: Maximum number of lines that one warning names, and of warnings per scene.
-_LINES, _WARNINGS = 5, 30
+from reslrb_cli.scene.xml.read import Description, Element, floats, quoted
+from reslrb_cli.scene.xml.spectra import convert_spectra
 
 
 @dataclass(frozen=True)
 class Note:
-    """A part of a scene's files that Mitsuba would refuse. `wrong` describes the problem, and `done` describes the
-    repair.
+    """A part of a scene's files that is left out or simplified. `wrong` is the reason, and `done` is the result.
 
     If a plugin does not use an element, `owner` is the parent of the element. For other notes, it is None.
     """
 
     element: Element
     wrong: str
-    done: str
     owner: Element | None = None
+    done: str = "left out"
 
 
-def _in_order(notes: Iterable[Note], root: Element) -> list[Note]:
-    """Sort notes by file and line, with the file of `root` first."""
-
-    def place(note: Note) -> tuple[bool, str, int]:
-        source = note.element.source
-        return source != root.source, str(source.file), note.element.line
-
-    return sorted(notes, key=place)
-
-
-def warnings(notes: Sequence[Note], root: Element) -> list[str]:
+def warnings(notes: Iterable[Note]) -> list[str]:
     """Return one line per kind of note. Each line names the first occurrence of its kind."""
-    kinds: dict[tuple[str, str, object], list[Element]] = {}
-    for note in _in_order(notes, root):
-        kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
-    lines = []
-    for (wrong, done, _), elements in kinds.items():
-        others = list(dict.fromkeys(str(element.line) for element in elements[1:]))
-        more = ", ".join(others[:_LINES]) + f" and {len(others) - _LINES} more" * (len(others) > _LINES)
-        lines.append(f"{elements[0].place}: {wrong}: {done}" + f" (also in line {more})" * bool(others))
-    if len(lines) > _WARNINGS:
-        rest = f"{len(lines) - _WARNINGS} more kinds of elements were mended or left out"
-        lines[_WARNINGS:] = [f"{root.source.file}: {rest}"]
-    return lines
+    kinds: dict[tuple[str, Path], list[Element]] = {}
+    for note in notes:
+        kinds.setdefault((f"{note.wrong}: {note.done}", note.element.file), []).append(note.element)
+    return [
+        f"{elements[0].place}: {text}" + f" (also {len(elements) - 1} more)" * (len(elements) > 1)
+        for (text, _), elements in kinds.items()
+    ]
 
 
 #: Elements with another name in Mitsuba 3.
@@ -102,12 +80,6 @@ PLUGINS = {
     **{("film", name): "hdrfilm" for name in ("exrfilm", "pngfilm", "ldrfilm", "tiledhdrfilm", "mfilm")},
 }
 
-#: Objects that do not affect the light on the film, and what replaces them.
-REPLACEABLE = {
-    "sampler": "replaced by an `independent` one",
-    "rfilter": "replaced by the film's default",
-}
-
 #: Renamed values of text parameters, by plugin and parameter.
 VALUES = {
     ("bitmap", "filter_type"): {"trilinear": "bilinear", "ewa": "bilinear"},
@@ -119,32 +91,10 @@ VALUES = {
     },
 }
 
-#: File formats that `hdrfilm` knows. Others can be left out, since films write no files here.
-FORMATS = {
-    "file_format": frozenset({"openexr", "exr", "rgbe", "pfm"}),
-    "component_format": frozenset({"float16", "float32", "uint32"}),
-}
-
 
 def snake_case(name: str) -> str:
     """Convert a parameter's name to the spelling since Mitsuba 2: `toWorld` to `to_world`, `intIOR` to `int_ior`."""
     return re.sub(r"(?<=[a-z])[A-Z]+", lambda capitals: "_" + capitals[0].lower(), name)
-
-
-#: Plugins of spectra by wavelength.
-SPECTRA = ("regular", "irregular", "blackbody")
-#: Mitsuba's visible range in nm; for black bodies, the step in nm and the maximum number of steps.
-_VISIBLE, _STEP, _MOST = (360.0, 830.0), 5.0, 2**14
-#: Planck's law: 2 h c^2 (W m^2) and h c / k_B (m K), with Mitsuba's constants.
-_FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792458e8 / 1.38064852e-23
-
-
-def _floats(text: str) -> list[float]:
-    """Parse a list of numbers. Returns an empty list if any word of the text is not a number."""
-    try:
-        return [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        return []
 
 
 def hexadecimal(element: Element) -> str:
@@ -158,108 +108,38 @@ def hexadecimal(element: Element) -> str:
 def linear(element: Element) -> str:
     """Convert an <srgb> element (one or three numbers, or `#rrggbb`) to linear Rec. 709. Raises ConfigError."""
     text = element.value
-    encoded = _floats(hexadecimal(element) if text.strip().startswith("#") else text)
+    encoded = floats(hexadecimal(element) if text.strip().startswith("#") else text)
     if len(encoded) not in (1, 3):
         raise element.fail(element.name, f"must be one or three numbers or #rrggbb, not {quoted(text)}")
     return " ".join(f"{value:.9g}" for value in decode_srgb(np.array(encoded)))
 
 
-def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
-    """Return the attributes of a <spectrum> element, a parameter of `owner`. The element is equivalent to `spectrum`, a
-    plugin of `SPECTRA`.
-
-    Raises ConfigError if the plugin is not a valid spectrum, or is a black body outside of an emitter.
-    """
-    inner = spectrum.find("value")
-    if spectrum.type == "blackbody":
-        if owner.tag != "emitter":
-            raise spectrum.fail("", f"only emitters can have a blackbody; a {owner.tag} can have <rgb>")
-        wavelengths, values = _black_body(spectrum)
-    elif inner is not None and inner.tag == "spectrum":
-        return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
-    elif spectrum.type == "regular":
-        values = _numbers(spectrum, "values")
-        wavelengths = np.linspace(*_range(spectrum, ()), len(values))
-    else:
-        wavelengths, values = _numbers(spectrum, "wavelengths"), _numbers(spectrum, "values")
-        if len(wavelengths) != len(values):
-            raise spectrum.fail("", f"irregular has {len(wavelengths)} wavelengths and {len(values)} values")
-    if len(wavelengths) < 2 or (np.diff(wavelengths) <= 0).any():
-        raise spectrum.fail("", f"{spectrum.type} needs two wavelengths or more, in ascending order")
-    pairs = zip(wavelengths, values, strict=True)
-    return {"value": ", ".join(f"{wavelength:.9g}:{value:.9g}" for wavelength, value in pairs)}
-
-
-def _black_body(spectrum: Element) -> tuple[np.ndarray, np.ndarray]:
-    """Return wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
-    temperature = _numbers(spectrum, "temperature")
-    if len(temperature) > 1 or temperature[0] <= 0:
-        raise spectrum.fail("temperature", "must be a positive number of kelvin")
-    first, last = _range(spectrum, _VISIBLE)
-    nm = np.linspace(first, last, min(math.ceil((last - first) / _STEP), _MOST) + 1)
-    exponent = _SECOND / (1e-9 * nm * temperature[0])
-    # Above 700 the radiance is 0 in single precision, and expm1 overflows.
-    return nm, 1e-9 * _FIRST / ((1e-9 * nm) ** 5 * np.expm1(np.minimum(exponent, 700)))
-
-
-def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
-    """Return the range of wavelengths in nm. A missing `wavelength_min` or `wavelength_max` comes from `default`,
-    unless `default` is empty.
-    """
-    names = ("wavelength_min", "wavelength_max")
-    low, high = (
-        default[place] if default and spectrum.find(name) is None else _numbers(spectrum, name)[0]
-        for place, name in enumerate(names)
-    )
-    if not 0 < low < high:
-        raise spectrum.fail("", f"{spectrum.type}: wavelength_max must be above wavelength_min, and both above 0")
-    return low, high
-
-
-def _numbers(spectrum: Element, name: str) -> np.ndarray:
-    """Return the numbers of a parameter. Raises ConfigError if the parameter has no numbers, or if any number is
-    negative or not finite.
-    """
-    if (parameter := spectrum.find(name)) is None:
-        raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
-    numbers = np.array(_floats(parameter.value))
-    if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
-        raise spectrum.fail(name, f"must be numbers of at least 0, not {quoted(parameter.value)}")
-    return numbers
-
-
-def transform_coordinates(texture: Element) -> Element | None:
-    """Replace a texture's `uoffset`, `voffset`, `uscale` and `vscale` by a `to_uv` transform. Return the first of them,
-    or None.
-    """
+def transform_coordinates(texture: Element) -> None:
+    """Replace a texture's `uoffset`, `voffset`, `uscale` and `vscale` by a `to_uv` transform."""
     names = ("uoffset", "voffset", "uscale", "vscale")
     given = {child.name: child for child in texture.children if child.tag == "float" and child.name in names}
     if not given:
-        return None
-    first = next(iter(given.values()))
+        return
     steps = []
     for tag, word in (("translate", "offset"), ("scale", "scale")):  # the order of the steps matters
         axes = {axis: given[u + word].value for axis, u in (("x", "u"), ("y", "v")) if u + word in given}
-        steps += [first.new(tag, **axes)] if axes else []
+        steps += [texture.new(tag, **axes)] if axes else []
     texture.drop(*given)
-    texture.children.append(first.new("transform", *steps, name="to_uv"))
-    return first
+    texture.children.append(texture.new("transform", *steps, name="to_uv"))
 
 
 #: Plugins that name their children by position, which is the same at every load.
 _GROUPS = ("shapegroup", "batch")
 #: Prefix of the ids that Mitsuba writes for objects without an id. It ignores them when it reads a scene.
 _UNNAMED = "_unnamed_"
-#: Maximum length of an id: keys become file names.
-_LONGEST = 120
 
 
-def _name_objects(root: Element) -> list[Note]:
-    """Give every object below `root` an id that is the same at every load. Return notes on changed ids.
+def _name_objects(root: Element) -> None:
+    """Give every object below `root` an id that is the same at every load.
 
-    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Some ids cannot be used
-    in a key and are replaced. Ids to be replaced are empty, very long or unprintable, or start with `_unnamed_`.
-    References are updated. Raises ConfigError if two objects have one id, which Mitsuba refuses as well.
+    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Ids that are empty or
+    start with `_unnamed_` are replaced, and references to them are updated. Raises ConfigError if two objects have one
+    id, which Mitsuba refuses as well.
     """
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
@@ -267,7 +147,6 @@ def _name_objects(root: Element) -> list[Note]:
     taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
     owners: dict[str, Element] = {}
     renamed: dict[str, str] = {}
-    notes: list[Note] = []
     numbers: Counter[str] = Counter()
     for element in objects:
         kind = element.type[:1].upper() + element.type[1:]
@@ -275,7 +154,7 @@ def _name_objects(root: Element) -> list[Note]:
         own = element.id
         if own in owners:
             raise element.fail("", f"id {quoted(own)} is also that of {owners[own].place}; rename one of them")
-        if own.strip() and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED):
+        if own.strip() and not own.startswith(_UNNAMED):
             owners[own] = element
             continue
         if element in grouped and not own:
@@ -287,41 +166,30 @@ def _name_objects(root: Element) -> list[Note]:
             name = f"{first}_{number}"
         taken.add(name)
         element.attributes["id"] = name
-        if own.strip() and own not in renamed:
-            renamed[own] = name
-            if not own.startswith(_UNNAMED):
-                notes.append(Note(element, f"id {quoted(own)} cannot be part of a key", f"named {name}"))
+        if own.strip():
+            renamed.setdefault(own, name)
     for element in root.walk("ref", "alias"):
         if element.id in renamed:
             element.attributes["id"] = renamed[element.id]
-    return notes
-
-
-CURRENT_VERSION = "3.0.0"
 
 
 def mend(description: Description) -> list[Note]:
-    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts of the scene that Mitsuba 3's
-    parser would refuse.
+    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts that are left out and on
+    spectra that become colours.
 
-    Notes omit the conversions that Mitsuba itself makes for files from before version 2. Materials, lights and shapes
-    keep their meaning. Materials, lights and shapes that Mitsuba 3 lacks stay unchanged, and a later check refuses
-    them. Unused parameters are found only when the scene is built.
+    Materials, lights and shapes keep their meaning. Materials, lights and shapes that Mitsuba 3 lacks stay unchanged,
+    and a later check refuses them. Unused parameters are found only when the scene is built.
     """
     mender, root = _Mender(description), description.root
-    mender.notes += _name_objects(root)
-    given = root.attributes.pop("version", None)
-    if root.source.version is None:
-        wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
-        mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
+    _name_objects(root)
+    root.attributes.pop("version", None)
     if root.is_object:
         mender.mend_element(root)
     mender.mend_below(root)
-    mender.mend_spectra(root)
-    # Remove references to objects that were left out.
-    for element in root.walk() if mender.gone else ():
-        element.children[:] = [child for child in element.children if child.tag != "ref" or child.id not in mender.gone]
-    root.attributes["version"] = CURRENT_VERSION
+    for spectrum in convert_spectra(root):
+        wrong = f"RGB variants have no spectrum `{spectrum.type}`"
+        mender.notes.append(Note(spectrum, wrong, done="read as its colour"))
+    root.attributes["version"] = "3.0.0"
     return mender.notes
 
 
@@ -329,72 +197,46 @@ class _Mender:
     def __init__(self, description: Description) -> None:
         self.find_file = description.find_file
         self.notes: list[Note] = []
-        self.gone: set[str] = set()
-
-    def note(self, element: Element, wrong: str, done: str) -> None:
-        self.notes.append(Note(element, wrong, done))
 
     def mend_below(self, element: Element) -> None:
         """Mend all elements below `element`. `element` itself must be mended already."""
-        kept = []
         names = {child.name for child in element.children}
-        for child in element.children:
-            # The experiment's integrator replaces that of the scene.
-            is_kept = child.tag != "integrator" and self.mend_element(child)
-            if not is_kept or (child.is_object and not self._plugin(child)):
-                self.gone.update(other.id for other in child.objects())
-            elif not element.is_object or self._parameter(child, element, names):
-                kept.append(child)
+        # The experiment's integrator replaces that of the scene.
+        kept = [child for child in element.children if child.tag != "integrator" and self.mend_element(child)]
+        if element.is_object:
+            kept = [child for child in kept if self._parameter(child, element, names)]
         element.children[:] = kept
         if element.is_object:
             self._repetitions(element)
         if element.tag == "texture":
-            replaced = transform_coordinates(element)
-            if replaced is not None and not element.source.is_old:
-                self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
+            transform_coordinates(element)
         for child in element.children:
             self.mend_below(child)
 
-    # --- elements and plugins -----------------------------------------------------------------------------------------
-
     def mend_element(self, element: Element) -> bool:
-        """Mend tag and attributes. Return False if the element must be left out."""
+        """Mend the tag, the attributes and the plugin. Return False if the element must be left out."""
         tag = element.tag
         if tag == "srgb":
             element.attributes["value"] = linear(element)
-        if tag in ELEMENTS:
-            element.tag = ELEMENTS[tag]
-            self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", f"read as <{element.tag}>")
+        element.tag = ELEMENTS.get(tag, tag)
         known = OBJECT_ATTRIBUTES if element.is_object else ATTRIBUTES.get(element.tag)
         if known is None:
             if tag in LOST_ELEMENTS:
                 raise element.fail("", f"<{tag}> is {LOST_ELEMENTS[tag]}")
-            self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", "left out")
+            self.notes.append(Note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3"))
             return False
         for attribute in [name for name in element.attributes if name not in known]:
-            self.note(element, f"<{tag}> has no attribute {quoted(attribute)} in Mitsuba 3", "left out")
+            self.notes.append(Note(element, f"<{tag}> has no attribute {quoted(attribute)} in Mitsuba 3"))
             del element.attributes[attribute]
-        return True
-
-    def _plugin(self, element: Element) -> bool:
-        """Mend the name of an object's plugin. Return False if the object must be left out."""
         type = element.type
-        wrong = f"there is no {element.tag} {quoted(type)} in Mitsuba 3"
-        other = PLUGINS.get((element.tag, type), type.lower())
-        if is_known(type):
-            if element.tag == "sampler" and type != "independent":
-                # Other samplers round the sample count, which the experiment sets, and fail if it is split differently.
-                element.attributes["type"] = "independent"
-                element.children[:] = [child for child in element.children if child.name == "sample_count"]
-        elif is_known(other):
-            self.note(element, wrong, f"read as `{other}`")
-            element.attributes["type"] = other
-        elif element.tag in REPLACEABLE:
-            self.note(element, wrong, f"left out ({REPLACEABLE[element.tag]})")
-            return False
+        if tag == "sampler" and type != "independent":
+            # Other samplers round the sample count, which the experiment sets, and fail if it is split differently.
+            element.attributes["type"] = "independent"
+            element.children[:] = [child for child in element.children if child.name == "sample_count"]
+        elif element.is_object and not is_known(type):
+            other = PLUGINS.get((tag, type), type.lower())
+            element.attributes["type"] = other if is_known(other) else type
         return True
-
-    # --- parameters ---------------------------------------------------------------------------------------------------
 
     def _parameter(self, element: Element, owner: Element, names: set[str]) -> bool:
         """Mend the name and the value of a parameter of `owner`. `names` are the names of all parameters of `owner`.
@@ -406,14 +248,21 @@ class _Mender:
             element.attributes.pop("name", None)
             return True
         self._name(element, owner, names)
-        value = element.value
-        if element.tag == "spectrum" and "type" not in element.attributes and len(_floats(value)) == 3:
-            self.note(element, "a <spectrum> of three numbers is unknown to Mitsuba 3", "read as <rgb>")
+        name, value = element.name, element.value
+        if element.tag == "spectrum" and "type" not in element.attributes and len(floats(value)) == 3:
             element.tag = "rgb"
         elif element.tag == "rgb" and value.startswith("#"):
             element.attributes["value"] = hexadecimal(element)
-            self.note(element, f"a colour cannot be written as {quoted(value)} in Mitsuba 3", "read as three numbers")
-        return element.tag != "string" or self._text(element, owner, value)
+        if element.tag != "string":
+            return True
+        if owner.type == "hdrfilm" and name == "pixel_format":
+            value = value.partition(",")[0].strip()  # a list has one format per image; keep the first
+        if name == "filename" and "\\" in value and self.find_file(value) is None:
+            slashed = value.replace("\\", "/")
+            value = slashed if self.find_file(slashed) is not None else value
+        element.attributes["value"] = VALUES.get((owner.type, name), {}).get(value, value)
+        # Films write no files here, and Mitsuba 3 does not have all formats of earlier versions.
+        return owner.type != "hdrfilm" or name not in ("file_format", "component_format")
 
     def _name(self, element: Element, owner: Element, names: set[str]) -> None:
         old, name = element.name, snake_case(element.name)
@@ -421,28 +270,8 @@ class _Mender:
             name = "reflectance"
         # Users choose the names of mesh attributes.
         is_attribute = owner.tag == "shape" and old.startswith(("vertex_", "face_"))
-        if name == old or is_attribute or name in names:
-            return
-        element.attributes["name"], element.written = name, old
-        if not element.source.is_old:
-            self.note(element, f"{quoted(old)} has the spelling before Mitsuba 2", f"read as {quoted(name)}")
-
-    def _text(self, element: Element, owner: Element, value: str) -> bool:
-        wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
-        if owner.type == "hdrfilm" and value.lower() not in FORMATS.get(element.name, (value.lower(),)):
-            self.note(element, wrong, "left out")  # the film writes no files here
-            return False
-        other = VALUES.get((owner.type, element.name), {}).get(value)
-        if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
-            other = value.partition(",")[0].strip()  # a list has one format per image; keep the first
-        if element.name == "filename" and "\\" in value and self.find_file(value) is None:
-            slashed = value.replace("\\", "/")
-            if self.find_file(slashed) is not None:
-                other, wrong = slashed, f"there is no file {quoted(value)}"
-        if other is not None:
-            element.attributes["value"] = other
-            self.note(element, wrong, f"read as {quoted(other)}")
-        return True
+        if name != old and not is_attribute and name not in names:
+            element.attributes["name"], element.written = name, old
 
     def _repetitions(self, owner: Element) -> None:
         """If a parameter is given more than once, keep only the last one, as in Mitsuba 0.6."""
@@ -451,24 +280,7 @@ class _Mender:
         for child in owner.children:
             earlier = last.get(child.name) if child.name else None
             if earlier is not None and (earlier.is_value or child.is_value):
-                self.note(earlier, f"{quoted(child.name)} is given again in line {child.line}", "left out")
+                self.notes.append(Note(earlier, f"{quoted(child.name)} is given again in line {child.line}"))
                 dropped.add(earlier)
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]
-
-    def mend_spectra(self, root: Element) -> None:
-        """Replace spectrum plugins by <spectrum> parameters, since RGB variants cannot evaluate these plugins."""
-        named = {id: item for id, item in root.by_id().items() if item.type in SPECTRA}
-        for owner in [element for element in root.objects() if element.type != "specfilm"]:
-            kept = []
-            for child in owner.children:
-                meant = named.get(child.id)
-                if meant is None:
-                    kept.append(child)
-                elif owner is not root:
-                    name = child.name or meant.name
-                    if not name:
-                        raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name, that of a parameter")
-                    kept.append(child.new("spectrum", name=name, **by_wavelength(meant, owner)))
-                    self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as its colour")
-            owner.children[:] = kept

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,17 +37,12 @@ def quoted(text: str, mark: str = "`") -> str:
     return f"{mark}{text if text.isprintable() else repr(text)[1:-1]}{mark}"
 
 
-@dataclass(frozen=True)
-class Source:
-    """One file of a scene. `version` is the Mitsuba version that the file declares, or None."""
-
-    file: Path
-    version: tuple[int, ...] | None
-
-    @property
-    def is_old(self) -> bool:
-        """Whether the file is for a Mitsuba before version 2, which spelled parameters differently."""
-        return self.version is not None and self.version < (2,)
+def floats(text: str) -> list[float]:
+    """Parse a list of numbers. Returns an empty list if any word of the text is not a number."""
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        return []
 
 
 @dataclass(slots=True, eq=False)
@@ -60,7 +54,7 @@ class Element:
 
     tag: str
     attributes: dict[str, str]
-    source: Source
+    file: Path
     line: int
     children: list[Element] = field(default_factory=list)
     written: str = ""
@@ -68,7 +62,7 @@ class Element:
     @property
     def place(self) -> str:
         """File and line, for errors."""
-        return f"{self.source.file}:{self.line}"
+        return f"{self.file}:{self.line}"
 
     @property
     def is_object(self) -> bool:
@@ -146,13 +140,10 @@ class Element:
 
     def new(self, tag: str, /, *children: Element, **attributes: str) -> Element:
         """Return a new element with the location of this one. It is not added to the children."""
-        return Element(tag, attributes, self.source, self.line, list(children))
+        return Element(tag, attributes, self.file, self.line, list(children))
 
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-#: An ampersand that does not start an XML reference. Mitsuba's parser reads it literally.
-_BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[0-9a-fA-F]+);)")
-_DECLARED_ENCODING = re.compile(rb"""^\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)["']""")
 
 
 def read_document(file: Path) -> Element:
@@ -160,17 +151,15 @@ def read_document(file: Path) -> Element:
     XML.
     """
     text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), _decode(read_file(file)))
-    return _parse(file, _BARE_AMPERSAND.sub("&amp;", text))
+    return _parse(file, text)
 
 
 def _decode(data: bytes) -> str:
     """Decode the text of a file. Never fails, since Mitsuba's parser also accepts bytes of a wrong encoding."""
-    declared = _DECLARED_ENCODING.match(data)
-    encodings = ["utf-8-sig", *([declared[1].decode("ascii")] if declared else [])]
-    for encoding in ["utf-16"] if data.startswith((b"\xff\xfe", b"\xfe\xff")) else encodings:
-        with suppress(LookupError, UnicodeError):
-            return data.decode(encoding)
-    return data.decode("latin-1")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeError:
+        return data.decode("latin-1")
 
 
 def _parse(file: Path, text: str) -> Element:
@@ -179,8 +168,7 @@ def _parse(file: Path, text: str) -> Element:
     roots: list[Element] = []
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        source = stack[0].source if stack else Source(file, _version(attributes.get("version", "")))
-        element = Element(tag, attributes, source, parser.CurrentLineNumber)
+        element = Element(tag, attributes, file, parser.CurrentLineNumber)
         (stack[-1].children if stack else roots).append(element)
         stack.append(element)
 
@@ -191,11 +179,6 @@ def _parse(file: Path, text: str) -> Element:
     except expat.ExpatError as error:
         raise ConfigError(f"{file}:{error.lineno}", "", f"not valid XML: {expat.ErrorString(error.code)}") from None
     return roots[0]
-
-
-def _version(text: str) -> tuple[int, ...] | None:
-    """Parse a version. Return None unless the text consists of three numbers, as Mitsuba requires."""
-    return tuple(map(int, text.split("."))) if re.fullmatch(r"\d+\.\d+\.\d+", text) else None
 
 
 #: An unescaped `$`, and the text after it that may be the name of a variable, at most 256 characters.
@@ -226,8 +209,7 @@ class Description:
     def named_files(self) -> Iterator[tuple[Element, str]]:
         """Yield the element and the file name for each file that Mitsuba opens for the scene.
 
-        The `material` of a metal names two of Mitsuba's own tables. The two tables of a metal's `material` are included
-        if files in `folders` replace Mitsuba's own tables.
+        The two tables of a metal's `material` are included if `folders` contain them.
         """
         for element in self.root.walk():
             if element.file_attribute:
@@ -334,7 +316,7 @@ class _Reader:
         """Return the elements that replace `include`. A scene file gives its objects, and any other file gives its
         single object.
         """
-        here = [include.source.file.absolute().parent, *folders]
+        here = [include.file.absolute().parent, *folders]
         if (file := _find(_required(include, "filename"), here)) is None:
             raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
         root = self.read(file, here, include)
@@ -361,7 +343,7 @@ def _find(name: str, folders: Sequence[Path]) -> Path | None:
 
 def _folder(element: Element, folders: list[Path]) -> Path:
     name = _required(element, "value")
-    folder = _find(name, [element.source.file.absolute().parent, *folders])
+    folder = _find(name, [element.file.absolute().parent, *folders])
     if folder is None or not folder.is_dir():
         raise element.fail("", f"<path>: folder {quoted(name)} not found")
     return folder.absolute()
