@@ -1,6 +1,6 @@
 """This machine: backends and packages for `reslrb doctor`, and the device's name, memory, and number of resident paths.
 
-Forecasts of memory use `free_bytes`, `resident_bytes`, `local_bytes` and `resident_paths` as limits.
+Forecasts of memory use `free_bytes`, `resident_bytes` and `local_bytes` as limits.
 """
 
 from __future__ import annotations
@@ -20,9 +20,6 @@ from pathlib import Path
 from reslrb_cli.backend import llvm
 from reslrb_cli.backend.variant import missing_cuda, package_version, probe
 from reslrb_cli.errors import BackendError
-
-#: Lanes of a vector on the CPU, at most (AVX-512); resident threads of a large GPU, where the driver does not tell.
-LLVM_LANES, LARGE_GPU = 16, 132 * 2048
 
 #: Stack size of a thread if the system sets no limit: glibc's default.
 _UNLIMITED_STACK = 2 * 2**20
@@ -125,29 +122,6 @@ def local_bytes() -> int:
     stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
     flags = (of_system("/proc/cpuinfo", "flags") or "").split()
     return max(stack - _IN_USE, 0) // next((lanes for name, lanes in _LANES if name in flags), 4)
-
-
-def resident_paths() -> int:
-    """Return the number of lanes that the current device runs simultaneously. Each lane has its own thread-local
-    memory.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    if not mi.variant().startswith("cuda"):
-        return (dr.thread_count() + 1) * LLVM_LANES
-    import ctypes
-
-    try:
-        driver, count = ctypes.CDLL("libcuda.so.1"), []
-        for attribute in (16, 39):  # multiprocessors, and the most threads on each
-            value = ctypes.c_int()
-            if driver.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0):
-                return LARGE_GPU
-            count.append(value.value)
-    except (OSError, AttributeError):
-        return LARGE_GPU
-    return count[0] * count[1]
 
 
 @dataclass(frozen=True)

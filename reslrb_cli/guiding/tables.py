@@ -258,12 +258,11 @@ def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths
 class Guiding:
     """Grid and tables of one scene, for a light tracer.
 
-    `images` tells whether samples that serve only an image are guided. Tables that are `held` do not learn. `lessons`
-    counts the updates of all tables together.
+    Tables that are `held` do not learn. `lessons` counts the updates of all tables together.
     """
 
-    def __init__(self, images: bool = True) -> None:
-        self.images, self.held, self.lessons = images, False, 0
+    def __init__(self) -> None:
+        self.held, self.lessons = False, 0
         self.grid: Grid | None = None
         self._emission: tuple[list[bool], list[float], int] | None = None  # scene data that `grid_for` needs
         self.box = np.zeros((2, 3), np.float32)  # of the scene, as first seen
@@ -298,10 +297,6 @@ class Guiding:
             self.learned = {number: one.on(self.grid, before) for number, one in kept.items()}
             self._tables.clear()
         return self.grid
-
-    def serves(self, purpose: Purpose) -> bool:
-        """Whether samples for this purpose are guided."""
-        return self.images or purpose is not Purpose.IMAGE
 
     def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
         """Return the table for samples of sensor `number`.

@@ -151,7 +151,7 @@ class Preparation:
         self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, sampling: SamplingOptions
     ) -> None:  # fmt: skip
         self.sampling = sampling
-        self.guiding = Guiding(sampling.images) if sampling.guided else None
+        self.guiding = Guiding() if sampling.guided else None
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
         self._found = AboutScene([])

@@ -121,8 +121,7 @@ class Motion:
 class SamplingOptions:
     """Options of a light tracer for its choice of paths. Raises ValueError, which names the option, for a wrong value.
 
-    - `guided` tells whether emission is guided (`tables.py`). `images` tells whether samples that serve only an image
-        are guided, too. Camera paths alone are never guided.
+    - `guided` tells whether emission is guided (`tables.py`). Camera paths alone are never guided.
     - `low_discrepancy` tells whether the first numbers of a path are low-discrepancy numbers (`sobol.py`).
     - `paths` are light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
         only one kind of paths remains.
@@ -134,7 +133,6 @@ class SamplingOptions:
     """
 
     guided: bool = False
-    images: bool = True
     low_discrepancy: bool = False
     paths: str = "light"
     light_share: float = 0.5
@@ -151,8 +149,7 @@ class SamplingOptions:
         if paths == "both" and self.light_share in (0, 1):
             paths = "light" if self.light_share else "camera"
         guided = self.guided and paths != "camera"  # no camera path starts from a table
-        settled = {"paths": paths, "whole": self.whole or paths != "light", "guided": guided}
-        for name, value in {**settled, "images": self.images or not guided}.items():
+        for name, value in {"paths": paths, "whole": self.whole or paths != "light", "guided": guided}.items():
             object.__setattr__(self, name, value)
 
 

@@ -139,8 +139,7 @@ class LightTracer(StepIntegrator):
         if asked not in job.plans:  # once per step, not once per batch
             job.plans[asked] = self.preparation.plan(job.scene, job.sensor, job.params, unit, asked[1])
         plan, table = job.plans[asked], None
-        guiding = self.preparation.guiding
-        if guiding is not None and guiding.serves(purpose):
+        if (guiding := self.preparation.guiding) is not None:
             table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
         given = job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table
         return passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
