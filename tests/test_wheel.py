@@ -127,6 +127,7 @@ def test_existing_files_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wo
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.long
 def test_an_example_runs_from_another_folder(python: Path, tmp_path: Path, llvm: str) -> None:
     """The run also writes its page, whose templates are in the package. A second command runs by `reslrb` itself."""
     program, elsewhere = python.with_name("reslrb"), tmp_path / "elsewhere"

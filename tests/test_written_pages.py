@@ -240,6 +240,7 @@ def test_ratios_are_of_medians() -> None:
     assert made.splitlines()[2:] == ["| `ptracer` | 1.00 | out of memory | 2.0 |", "| `stack` | 0.50 | | 2.0 to 4.0 |"]
 
 
+@pytest.mark.long
 def test_a_measurement_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, llvm: str) -> None:
     monkeypatch.setattr(benchmarks_measure, "RECORDS", tmp_path)
     benchmarks_measure.measure("tiny", TINY)

@@ -309,6 +309,7 @@ class Interrupting(logging.Handler):
             os.kill(os.getpid(), signal.SIGINT)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("call", "words", "later"),
     [

@@ -231,6 +231,7 @@ def test_colours_and_exposure_from_a_photograph(tmp_path: Path, monkeypatch: pyt
     assert {"exposure", *TRUE} & set(misses(run)) > {"exposure"}
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("llvm")
 def test_the_same_in_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The run has fewer pixels, and fewer but larger iterations."""

@@ -104,6 +104,7 @@ def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: py
     assert line in error
 
 
+@pytest.mark.long
 def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     json_file = tmp_path / "a.jsonl"
     words = ["--integrators", "reslrb:stack", "--json", str(json_file)]

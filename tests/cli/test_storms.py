@@ -144,6 +144,7 @@ def test_a_small_disk(experiment: Path, disk: Path, monkeypatch: pytest.MonkeyPa
             assert f"saved: the state after {int(state['iteration'])} of " in line
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("llvm")
 def test_a_run_without_a_terminal(experiment: Path) -> None:
     script = "import sys; sys.argv = ['reslrb', 'optimize', 'tiny.yaml']; from reslrb_cli.cli import run; run()"

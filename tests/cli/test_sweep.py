@@ -191,6 +191,7 @@ def test_damage_is_located(folder):
 # --- runs, kills and what is left -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
     """The test copies what a kill would leave at four moments: in the middle of a run, before a run has saved a
     checkpoint, while final images are written, and between two runs.

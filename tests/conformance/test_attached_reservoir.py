@@ -92,6 +92,7 @@ def bias(scene: AttachedScene, sampling: str, count: int, **options: Any) -> Bia
     return Bias(float(along.mean()), float(along.std(ddof=1) / np.sqrt(count)), float(noise))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scene", [pytest.param(ONE, marks=pytest.mark.long), TWO], ids=lambda scene: scene.name)
 def test_no_bias_behind_diffuse_vertices(scene: AttachedScene):
     found = bias(scene, "stay", 12)
@@ -271,6 +272,7 @@ def gradients(scene: AttachedScene, sampling: str, count: int, first: int = 1) -
     return scene.case().gradients(tracer, seeds(count, first), scene.spp)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FEWEST else pytest.mark.long) for n in AGREEING])
 def test_both_agree(name: str):
     count = 16 if name in QUICK_SAMPLING else 64

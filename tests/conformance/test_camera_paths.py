@@ -264,6 +264,7 @@ def test_light_that_camera_paths_cannot_find_is_left_to_light_paths():
     assert compare(ours[:, caustic][:, None], light[:, caustic][:, None])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("paths", a_few(["camera", "both"], ["both"]))
 def test_fewer_paths_than_pixels(paths: str):
     """Means do not change with one sample per pixel, even if only a few paths are light paths."""
@@ -362,6 +363,7 @@ def test_both_has_the_expectation_of_camera_paths(case: GradientCase):
     assert compare(ours, reference, block=None)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("estimator", a_few(["gather", "event", "reservoir"], ["gather", "reservoir"]))
 def test_every_estimator_handles_weighted_connections(estimator: str):
     case = next(case for case in CASES if case.name == "texture")

@@ -301,6 +301,7 @@ MOTIONS = ("latents", "spot", "mesh", "bounces_4")
 QUICK = {"guided-spot-stack", "sequence-spot-stack"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("way", "name", "estimator"),
     [

@@ -65,6 +65,7 @@ def test_a_recorded_step_equals_the_step(case: GradientCase, estimator: str) -> 
     assert counts[-1] == counts[-2]
 
 
+@pytest.mark.long
 @taking_turns("estimator", ESTIMATORS, "adjoint", list(KINDS), ("reservoir", "event", "gather"))
 def test_unrecordable_calls_are_computed_plainly(estimator: str, adjoint: str) -> None:
     case = BY_NAME["thin_lens"]

@@ -83,6 +83,7 @@ def agree(case: GradientCase, count: int, candidates: dict[str, dict], adjoint: 
 FEW = ("texture", "roulette", "crop", "glass", "mask_texture_in_view", "area_texture", "two_emitters")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", a_few(CASES, ["texture"]))
 def test_random_estimators_agree(case: GradientCase):
     count = 16 if case.name == "texture" else 200 if case.name in FEW else 40

@@ -291,6 +291,7 @@ def test_tables_learn_often_at_first_and_regularly_later() -> None:
     assert [learnings(k) for k in range(1, 101)] == [sum(one <= k for one in learned) for k in range(1, 101)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("worse", [1.0, 3.0])
 def test_harmful_tables_learn_as_often_as_at_first(worse: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tables that remain harmful do not learn more often than at first. The schedule restarts only when tables learn

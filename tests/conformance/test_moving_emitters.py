@@ -173,6 +173,7 @@ LAMPS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", a_few(LAMPS, ["sphere"]))
 def test_the_outline_of_a_visible_lamp_moves(kind: str):
     """Primary rays either hit the lamp or miss it, so their differences are noisy. The test uses large steps and many

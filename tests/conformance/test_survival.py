@@ -35,6 +35,7 @@ BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat in z
 BOUNCES = next(case for case in MOVING if case.name == "bounces")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("estimator", "table", "rr_depth"),
     [

@@ -216,6 +216,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     return folder / "runs/lens"
 
 
+@pytest.mark.long
 def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     said = done("export", run, "-o", out, "--set", "fabrication.tool_radius=1000").output

@@ -130,6 +130,7 @@ def test_light_is_classified_by_its_destination(folder: Path) -> None:
         assert sum(part for other, part in found.items() if other not in ("inside", name)) < 3e-3
 
 
+@pytest.mark.long
 def test_shares_match_a_film_that_sees_the_whole_receiver(folder: Path) -> None:
     """The reference is Mitsuba's light tracer with as many reflections. The receiver is so dark that no light returns
     from it.

@@ -68,6 +68,7 @@ def test_the_derivative_of_the_equation_matches_differences() -> None:
     assert np.sqrt(np.mean(difference**2)) < 0.03 * np.sqrt(np.mean(expected**2))
 
 
+@pytest.mark.long
 def test_a_floor_is_the_smallest_without_tears() -> None:
     optics, square = Gradient(np.ones((2, 2)), (1, 1)), (1.0, 1.0)
     assert least_floor(optics, smooth(32), square, square, even(square, square)) == 0

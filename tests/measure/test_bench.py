@@ -92,6 +92,7 @@ def test_a_cold_step_finds_no_compiled_kernels(tmp_path: Path, monkeypatch: pyte
     assert not (tmp_path / "kernels").exists()
 
 
+@pytest.mark.long
 def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "bench.json"
     monkeypatch.setattr(methods, "memory_bytes", lambda variant: 100 * 2**20)
@@ -166,6 +167,7 @@ def test_a_second_signal_leaves_no_processes_or_files(tmp_path: Path) -> None:
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.long
 def test_ctrl_c_keeps_finished_measurements(tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "bench", *SMALL, "--max-depth", "1024"]

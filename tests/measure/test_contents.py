@@ -183,6 +183,7 @@ def test_code_named_by_a_command_counts(folder: Path) -> None:
         restore()
 
 
+@pytest.mark.long
 def test_a_run_continues_with_its_original_files(folder: Path) -> None:
     """A resumed run refuses changed files, except files of initial values, which its state has. A measurement that
     starts from its values detects the run's progress.

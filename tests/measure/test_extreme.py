@@ -54,6 +54,7 @@ def test_camera_paths_are_left_out_of_light_that_they_cannot_find(name: str, rea
     assert reason in record.message
 
 
+@pytest.mark.long
 def test_along_the_border_camera_paths_are_compared_with_a_complete_reference():
     """`ptracer` loses light along the film's border, and is therefore no reference for camera paths. The comparison
     would report the missing light.
@@ -85,6 +86,7 @@ def test_selection_by_contribution_loses_later_vertices_of_a_heavy_one(monkeypat
     assert {record.estimator for record in records if record.holds is False} == {"reservoir", "event"}
 
 
+@pytest.mark.long
 def test_roulette_by_throughput_loses_light_behind_a_dark_surface(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("reslrb_cli.transport.factors.DIM", 1e-30)
     assert lost("albedo_1e-6_roulette", "stack")

@@ -86,6 +86,7 @@ def test_it_holds():
         assert 0.8 < of[Reference.PTRACER].variance_ratio < 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "drawn",
     a_few(["guiding=on", "sequence=low_discrepancy", "paths=both,pixels=measured"],
@@ -157,6 +158,7 @@ def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.
     assert failures(check(estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
 
 
+@pytest.mark.long
 def test_rows_are_printed_as_they_are_measured():
     """The first row is available before the last estimator takes a step, and later rows reuse the measurements of
     earlier rows.
@@ -347,6 +349,7 @@ def test_directions_stay_within_the_bounds():
 WAYS = "stack,stack(paths=both,light_share=0.25)"
 
 
+@pytest.mark.long
 def test_paths_are_compared_with_their_naive_ad_at_equal_seeds():
     records = check("scene.options.size=8", estimators=WAYS, seeds=4)
     assert not [record for record in records if record.holds is False]
@@ -416,6 +419,7 @@ def test_references_depend_on_the_paths():
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
+@pytest.mark.long
 def test_a_moving_lamp():
     records = checked(room_moving("lamp_over_floor.xml", "lamp.position"), "stack", 4)
     of = {record.reference: record for record in records if record.parameter is not None}

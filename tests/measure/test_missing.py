@@ -117,6 +117,7 @@ def test_a_texture_has_a_complete_derivative():
     assert "detect no missing part" in record.line()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scene", "known", "count"),
     [
@@ -287,12 +288,14 @@ def test_a_bending_slab():
     assert found.standard_error < STANDARD_ERROR, found
 
 
+@pytest.mark.long
 def test_a_moving_receiver():
     found = compare_with_differences(replace(SCENES["moved_receiver"], spp=16), count=3)
     assert found.error < ERROR, found
     assert found.standard_error < STANDARD_ERROR, found
 
 
+@pytest.mark.long
 def test_slopes_of_the_shading_correction_without_its_jumps(monkeypatch: pytest.MonkeyPatch):
     """Faces slide through the light. Within each face the shading correction has a slope, and at the face's edges the
     correction jumps back.

@@ -81,6 +81,7 @@ def checked(capsys: pytest.CaptureFixture[str], options: str, *more: str) -> tup
     return code, [line for line in lines if line.startswith(f"{name}:")]
 
 
+@pytest.mark.long
 def test_a_correct_integrator_holds(capsys: pytest.CaptureFixture[str]) -> None:
     assert checked(capsys, "", *FEW) == (0, [])
 

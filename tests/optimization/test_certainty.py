@@ -175,6 +175,7 @@ def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
     assert spreads[0] < 0.7 * spreads[1]
 
 
+@pytest.mark.long
 def test_noisy_curvature_is_measured_again_with_all_samples(folder, monkeypatch):
     """If the first measurement finds no curvature of a colour, a second one with all samples does."""
     asked, along = [], measuring.LossCurvature.along

@@ -93,6 +93,7 @@ def test_other_shapes_are_refused_and_missing_grids_reported(tmp_path, with_quad
         configured(tmp_path, "mesh: back, resolution: [4, 4], grid: 1")
 
 
+@pytest.mark.long
 def test_a_run_on_a_grid_is_exported_and_continued(tmp_path, monkeypatch):
     import mitsuba as mi
     from click.testing import CliRunner

@@ -192,6 +192,7 @@ def test_a_short_run_uses_camera_paths_if_they_find_all_light():
     assert found.low > 10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("paths", ["auto", "camera"])
 def test_camera_paths_of_a_guided_run_are_unchanged(paths: str, monkeypatch: pytest.MonkeyPatch):
     """No table determines where camera paths begin, whether camera paths were found to pay or were requested."""

@@ -74,6 +74,7 @@ def gradient(problem: Problem, spp: int = 4) -> np.ndarray:
     return found
 
 
+@pytest.mark.long
 def test_a_box_moves_to_its_place(tmp_path: Path) -> None:
     """Camera paths render the picture. Light paths alone move the box the other way."""
     problem = find_reached(unguided(assemble(load(write_experiment(tmp_path), []))))

@@ -134,6 +134,7 @@ def test_in_its_own_units_no_scale_remains(type):
     np.testing.assert_allclose(descend(1.0, 1e-12), expected, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_a_stiff_problem_is_solved_with_one_learning_rate():
     """An albedo is recovered together with an intensity of 1e7. The error is below a tenth of that of plain Adam at its
     best learning rate.

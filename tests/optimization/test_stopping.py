@@ -135,6 +135,7 @@ def test_a_run_stops_after_a_kill_as_well(experiment: Path, monkeypatch: pytest.
     assert differences(whole, left) == []
 
 
+@pytest.mark.long
 def test_a_stopped_run_continues_on_request(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stop = ["--set", "run.stop={patience: 5, relative: 0.9}", "--set", "run.iterations=24"]
     assert optimize("tiny.yaml", "--quiet", *SETS, *stop) == 0

@@ -102,6 +102,7 @@ OWN_SETS = ["run.shards=3", "run.adjoint=batched", "loss={type: custom, file: ow
             "integrator={type: custom, file: own.py:BasicPRBIntegrator, max_depth: 3}"]  # fmt: skip
 
 
+@pytest.mark.long
 def test_workers_run_users_code_with_permission(experiment: Path) -> None:
     (experiment / "own.py").write_text(OWN)
     compare(experiment, OWN_SETS, 1)

@@ -129,6 +129,7 @@ def test_a_run_with_wrong_tables_resumes(experiment: Path, monkeypatch: pytest.M
     assert differences(whole, left) == []
 
 
+@pytest.mark.long
 def test_a_resumed_run_can_be_resumed_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A finished run is resumed twice with more iterations. Its result equals that of one run with all iterations."""
     assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE, "--set", "run.name=whole") == 0
@@ -273,6 +274,7 @@ def kill_at_random(process: subprocess.Popen[str], run: Path, chance: random.Ran
     process.communicate()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
 @pytest.mark.parametrize(

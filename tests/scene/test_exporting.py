@@ -188,6 +188,7 @@ def test_mitsuba_reads_back_the_recovered_values(names: list[str], file: Path, t
         assert own.shape != old.shape or not np.allclose(own, old, rtol=1e-3), f"{key} was not changed"
 
 
+@pytest.mark.long
 def test_the_image_of_all_parameters_equals_that_of_the_scene(file: Path, tmp_path: Path) -> None:
     scene, description, selection = changed(file, TOGETHER)
     export(description, selection, tmp_path / "out")
