@@ -1,7 +1,7 @@
 """`reslrb inspect`: list the contents of a scene, and the parameters that can be recovered.
 
 The argument is a scene file, a possibly incomplete configuration, or a run folder (`read_subject`). The output lists
-the scene, its sensors, the plan of a step and the parameters (`templates/inspect.txt.j2`).
+the scene, its sensors and the parameters (`templates/inspect.txt.j2`).
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from pydantic_core import to_jsonable_python
 
 from reslrb_cli.cli.options import overrides_option, start_variant
 from reslrb_cli.cli.terminal import fill
+from reslrb_cli.config.integrators import Reslrb
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
-from reslrb_cli.errors import ConfigError, UnsupportedScene
-from reslrb_cli.records.manifest import MANIFEST_FILE, read_manifest
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
-    from reslrb_cli.integrators.plan_report import PlanRow
     from reslrb_cli.optimization.sensitivity import Conditioning
     from reslrb_cli.scene.catalog import ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.needs import SceneNeeds
@@ -110,12 +110,6 @@ def _sized(sensor: SensorSummary) -> str:
 def _needed(needs: SceneNeeds) -> str:
     names = [name for name, value in vars(needs).items() if value is True]
     return ", ".join(name.removeprefix("has_").replace("_", " ") for name in names) or "nothing special"
-
-
-def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
-    """Format the plan as a table. The features that the plan contains come first."""
-    ordered = sorted(rows, key=lambda row: not row.needed)
-    return table([("needed" if row.needed else "left out", row.feature, row.reason) for row in ordered])
 
 
 # --- parameters -------------------------------------------------------------------------------------------------------
@@ -222,8 +216,7 @@ def command(
 
     PATH is a scene file (XML), a configuration or a run folder. The configuration may be incomplete. The command first
     lists the parameter keys that `parameters` of a configuration may use. For all other keys, the command gives the
-    reason why a configuration cannot use the key. If the configuration has `parameters`, the plan of a step lists the
-    features that its kernels contain or leave out, and why.
+    reason why a configuration cannot use the key.
 
     --conditioning measures how different the sensitivities of the parameters are at their initial values: for each
     parameter the root mean square of its values, its gradient and the noise of one step's gradient, the relative change
@@ -248,11 +241,10 @@ def command(
     summary = summarise(scene, config.integrator.hide_emitters)
     selection = None if "parameters" in subject.missing else select(config, scene)
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
-    plan = None if selection is None else make_plan(subject, scene, selection)
-    measured = measure(subject, overrides) if conditioning else None
+    obstacle = selection if isinstance(selection, str) else None
+    measured = measure(config) if conditioning else None
     if as_json:
-        known = {"run": subject.run, **vars(summary)}
-        known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan and {"rows": plan}, "edges": edges}
+        known = {"run": subject.run, **vars(summary), "obstacle": obstacle, "edges": edges}
         if measured is not None:
             known["conditioning"] = measured.to_json()
         # Objects of the scene are written as their ids.
@@ -277,8 +269,8 @@ def command(
         scene=config.scene.file,
         summary=summary,
         sensors=summary.sensors if everything else summary.sensors[:LISTED_SENSORS],
-        plan=[f"none: {plan}"] if isinstance(plan, str) else plan and plan_lines(plan),
         parameters=[*parameters, *moving_lines(summary.movable, everything)],
+        obstacle=obstacle,
         edges=edges,
         measured=measured,
         next=None if measured else next_step(subject, summary),
@@ -310,16 +302,15 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
     return f"`reslrb optimize {subject.config.source}`" + (" runs it again" if subject.run else " runs it")
 
 
-def measure(subject: Subject, overrides: tuple[str, ...]) -> Conditioning:
-    """Measure the conditioning of the experiment. The conditioning does not depend on the estimator, so the estimator
-    `auto` becomes `stack`.
+def measure(config: Config) -> Conditioning:
+    """Measure the conditioning of the experiment. The conditioning does not depend on settings that a run decides, so
+    these are off.
     """
     from reslrb_cli.optimization.assemble import assemble
     from reslrb_cli.optimization.sensitivity import measure_conditioning
 
-    config = subject.config
-    if config.integrator.options().get("estimator") == "auto":
-        config = read_subject(subject.path, (*overrides, "integrator.estimator=stack")).config
+    if isinstance(config.integrator, Reslrb):
+        config = config.model_copy(update={"integrator": config.integrator.undecided_off()})
     return measure_conditioning(assemble(config, logging.getLogger(__name__).info), SAMPLES)
 
 
@@ -341,46 +332,3 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
 
     moved = where_moved(selection.params, selection.scene_keys)
     return [item.id for item in moved if item.casts_edges(scene)]
-
-
-def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[PlanRow] | str:
-    """Plan a step for the first sensor in use. Return the plan's rows, or the reason if there is no plan.
-
-    Afterwards the selected parameters of `scene` track derivatives.
-    """
-    import drjit as dr
-
-    from reslrb_cli.integrators.plan_report import plan_rows
-    from reslrb_cli.integrators.reslrb import Reslrb
-    from reslrb_cli.optimization.autotune.sampling import as_decided, decided, explained, open_settings
-    from reslrb_cli.optimization.loading import choose_sensors, make_configured, moves_anything, pass_spp, paths_of
-    from reslrb_cli.records.decisions import Decision
-
-    config = subject.config
-    if isinstance(selection, str):
-        return selection
-    if config.integrator.type != "reslrb":
-        return f"integrator.type is {config.integrator.type}; only `reslrb` has a plan"
-    try:
-        decisions = decided(config, map(Decision.from_json, (subject.run or {}).get("decisions", ())))
-    except TypeError as error:
-        raise ConfigError(config.source.parent / MANIFEST_FILE, "decisions", str(error)) from None
-    try:
-        [sensor, *_] = sensors = choose_sensors(config, scene)
-        paths = paths_of(config.integrator, scene, sensors, moves_anything(config, selection))
-        integrator = as_decided(make_configured(config, config.integrator, paths), decisions)
-        assert isinstance(integrator, Reslrb)
-        integrator.expect(pass_spp(config))
-        params = selection.params
-        for key in selection.scene_keys:
-            leaf = type(params[key])(dr.detach(params[key]))
-            dr.enable_grad(leaf)
-            params[key] = leaf
-        params.update()
-        rows = plan_rows(integrator.plan(scene, scene.sensors()[sensor], params))
-    except (ConfigError, UnsupportedScene) as error:
-        return str(error)
-    if not decisions:
-        open_ = open_settings(config, paths)
-        decisions = [Decision(setting=setting, value="auto", why="which a run decides") for setting in open_]
-    return explained(rows, decisions)
