@@ -206,7 +206,7 @@ def test_camera_paths_of_a_guided_run_are_unchanged(paths: str, monkeypatch: pyt
 def test_a_stored_decision_must_be_one_of_the_values():
     stored = [Decision(setting="paths", value="sideways", why="edited")]
     with pytest.raises(TypeError, match="paths is `sideways`; possible are light, camera, both"):
-        sampling.decided(load("tiny.yaml"), stored)
+        sampling.decided(load("tiny.yaml", AUTO), stored)
 
 
 def test_a_short_run_keeps_its_caustic():
