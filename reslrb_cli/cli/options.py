@@ -149,15 +149,8 @@ def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCo
     return ExitCode.DONE if done else ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
 
 
-class FolderPath(click.Path):
-    """Path for which a shell completes folders. The code that opens the path checks its type."""
-
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return [CompletionItem(incomplete, type="dir")]
-
-
 #: Type of an argument or an option that names the folder of a run, or of a sweep.
-FOLDER = FolderPath(path_type=Path)
+FOLDER = click.Path(file_okay=False, path_type=Path)
 
 
 def complete_setting(_context: click.Context, _parameter: click.Parameter, start: str) -> list[CompletionItem]:

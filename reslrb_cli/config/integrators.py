@@ -291,24 +291,13 @@ def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = 
     unit = min(per_pass or spp, spp)
     parts = -(-unit // PASS_SAMPLES) if splits else 1
     paths = -(-unit // parts) * pixels
-    most = largest_pass(spp, pixels)
     if paths > PASS_PATHS:
-        advice = f"set integrator.samples_per_pass to {most}, or lower run.spp" if splits and most else "lower run.spp"
-        advice = advice if PASS_PATHS >= pixels else "use a smaller film"
+        advice = f"set integrator.samples_per_pass to at most {PASS_PATHS // pixels}, or lower run.spp"
+        advice = advice if splits else "lower run.spp"
         return f"makes {paths} light paths in one pass, above the limit of {PASS_PATHS}; {advice}"
     if spp // unit * parts > PASSES:
-        advice = f"set integrator.samples_per_pass to {most}" if most and spp // most <= PASSES else "lower run.spp"
-        return f"makes {spp // unit * parts} passes of a step, above the limit of {PASSES}; {advice}"
+        return (
+            f"makes {spp // unit * parts} passes of a step, above the limit of {PASSES}; "
+            "raise integrator.samples_per_pass, or lower run.spp"
+        )
     return None
-
-
-def largest_pass(spp: int, pixels: int) -> int | None:
-    """Return the largest `samples_per_pass` that divides `spp` and fits into a pass, or None if there is none."""
-    most = min(PASS_PATHS // pixels, PASS_SAMPLES, spp)
-    return max((n for n in divisors(spp) if n <= most), default=None)
-
-
-def divisors(number: int) -> list[int]:
-    """Return all divisors of a number in ascending order. Fast for numbers of 31 bits."""
-    small = [n for n in range(1, int(number**0.5) + 1) if number % n == 0]
-    return sorted({*small, *(number // n for n in small)})

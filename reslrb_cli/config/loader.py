@@ -225,18 +225,11 @@ def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem:
     """Return the origin of `problem`: the override that causes it, or the file.
 
     `stages` holds several versions of the settings: first the settings of the file, then the settings after each
-    override. The function uses bisection, because each check takes time.
+    override.
     """
-    without, having = 0, len(stages) - 1
-    if having == 0 or problem in _validate(stages[0], path)[1]:
-        return str(path)
-    while having - without > 1:
-        middle = (without + having) // 2
-        if problem in _validate(stages[middle], path)[1]:
-            having = middle
-        else:
-            without = middle
-    return overrides[without].label
+    origins = [str(path), *(override.label for override in overrides)]
+    found = (origin for origin, stage in zip(origins, stages, strict=True) if problem in _validate(stage, path)[1])
+    return next(found, origins[-1])
 
 
 def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: dict[str, Any]) -> Config:

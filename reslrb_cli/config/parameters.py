@@ -171,15 +171,11 @@ class MotionSpec(Section):
         return self
 
 
-ColorSpace = Literal["auto", "linear", "srgb"]
-COLOR_SPACE = "Encoding of the values: `linear`, `srgb`, or `auto` (srgb for 8-bit files, linear for float files)."
-
-
 class ImageFile(Section):
     """An image file that holds a texture."""
 
-    file: ConfigPath = Field(description="EXR, PNG, JPG or HDR file, relative to the config file.")
-    color_space: ColorSpace = Field(default="auto", description=COLOR_SPACE)
+    file: ConfigPath
+    """EXR, PNG, JPG or HDR file, relative to the config file. Values of 8 and 16 bits are sRGB, and floats linear."""
 
 
 class RunValue(Section):
@@ -202,7 +198,7 @@ Value = Annotated[
 def _initial_tag(value: Any) -> str | None:
     if isinstance(value, RunValue) or (isinstance(value, dict) and "run" in value):
         return MARK + RunValue.TAG
-    if isinstance(value, ByWord) or (isinstance(value, dict) and not {"file", "color_space"} & value.keys()):
+    if isinstance(value, ByWord) or (isinstance(value, dict) and "file" not in value):
         return MARK + ByWord.TAG
     return kind_tag(value, "scene")
 
