@@ -31,7 +31,6 @@ from reslrb_cli.report.format import table
 if TYPE_CHECKING:
     from reslrb_cli.optimization.sensitivity import Conditioning
     from reslrb_cli.scene.catalog import ParameterInfo, SceneSummary, SensorSummary
-    from reslrb_cli.scene.needs import SceneNeeds
     from reslrb_cli.scene.parameters import Selection
 
 
@@ -105,11 +104,6 @@ def _sized(sensor: SensorSummary) -> str:
     (x, y), (width, height) = sensor.crop
     crop = "" if (x, y) == (0, 0) and (width, height) == sensor.size else f", crop {width}x{height} at ({x}, {y})"
     return f"{sensor.size[0]}x{sensor.size[1]}{crop}"
-
-
-def _needed(needs: SceneNeeds) -> str:
-    names = [name for name, value in vars(needs).items() if value is True]
-    return ", ".join(name.removeprefix("has_").replace("_", " ") for name in names) or "nothing special"
 
 
 # --- parameters -------------------------------------------------------------------------------------------------------
@@ -260,7 +254,6 @@ def command(
         {
             "counted": _counted,
             "sized": _sized,
-            "needed": _needed,
             "shares": lambda view: ", ".join(f"{name} {100 * share:.0f} %" for name, share in vars(view).items()),
             "conditioning": conditioning_lines,
         },

@@ -7,6 +7,7 @@ then has one object per line. The file is updated while the command runs.
 from __future__ import annotations
 
 import errno
+import functools
 import os
 import re
 import shutil
@@ -293,9 +294,8 @@ def experiment_arguments(function: Callable[..., Any], required: bool = True) ->
     return argument(overrides_option(function))
 
 
-def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add CONFIG and `--set` to a command in which CONFIG is optional. Without CONFIG, `config_file` is None."""
-    return experiment_arguments(function, required=False)
+#: Adds CONFIG and `--set` to a command in which CONFIG is optional. Without CONFIG, `config_file` is None.
+optional_experiment_arguments = functools.partial(experiment_arguments, required=False)
 
 
 @dataclass(frozen=True)

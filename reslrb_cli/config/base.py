@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args
@@ -201,9 +202,17 @@ Seed = Annotated[int, Field(ge=0, lt=SEED_END)]
 Size = Annotated[tuple[Count, Count], Field(strict=False)]
 
 
-def few(what: str, reason: str = "") -> AfterValidator:
-    """Return a validator that limits the product of the two numbers in a size. `what` names the unit in errors."""
+def size_of(size: int | tuple[int, int]) -> tuple[int, int]:
+    """Return a size as (width, height). One number stands for both width and height."""
+    return (size, size) if isinstance(size, int) else size
+
+
+def few(what: str, reason: str = "", least: int = 1) -> AfterValidator:
+    """Return a validator that limits the product of the two numbers in a size, and each number to at least `least`.
+    `what` names the unit in errors.
+    """
+    start = "must have" if least == 1 else f"must be at least {least}, and have"
     return must(
-        lambda size: size[0] * size[1] <= PIXELS,
-        lambda size: f"must have at most {PIXELS} {what}, not {size[0] * size[1]}{reason}",
+        lambda size: min(size_of(size)) >= least and math.prod(size_of(size)) <= PIXELS,
+        lambda size: f"{start} at most {PIXELS} {what}, not {math.prod(size_of(size))}{reason}",
     )

@@ -50,7 +50,7 @@ def parse_override(text: str, option: str = "--set", example: str = "KEY=VALUE, 
     def in_shell(mended: str) -> str:
         return f"{option} {shlex.quote(f'{path}={mended}')}"
 
-    return Override(label, location, parse(value, label, name_line=False, example=in_shell))
+    return Override(label, location, parse(value, label, in_shell))
 
 
 def _parse_location(path: str, label: str) -> Location:
