@@ -15,9 +15,11 @@ from pydantic import (
     Discriminator,
     Field,
     GetCoreSchemaHandler,
+    SerializerFunctionWrapHandler,
     Tag,
     ValidationInfo,
     WithJsonSchema,
+    model_serializer,
 )
 from pydantic_core import CoreSchema, PydanticCustomError
 
@@ -34,8 +36,20 @@ class Section(BaseModel):
     """
 
     model_config = ConfigDict(
-        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True,
+        ser_json_inf_nan="constants",
+    )  # fmt: skip
+
+    def idle(self) -> set[str]:
+        """Return the settings that have no effect beside the others. They are not written, so that the configuration
+        can be read again.
+        """
+        return set()
+
+    @model_serializer(mode="wrap")
+    def _without_idle(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        idle = self.idle()
+        return {name: value for name, value in handler(self).items() if name not in idle}
 
 
 def located(key: str, message: str) -> PydanticCustomError:

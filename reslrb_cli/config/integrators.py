@@ -6,13 +6,11 @@ The limits on samples, passes and paths are checked here, before a scene is load
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
     Discriminator,
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 from typing_extensions import Self
@@ -184,15 +182,10 @@ class Reslrb(AttachingTracer):
                 "remove it, or use stack",
             )
         _check_share(self.paths, self.light_share)
-        for option in sorted(self._foreign() & self.model_fields_set):
+        for option in sorted(self.idle() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
             raise located(option, f"has no effect with estimator `{self.estimator}`, only with {owners}; remove it")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_foreign(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        return {name: value for name, value in values.items() if name not in self._foreign()}
 
     def undecided_off(self) -> Reslrb:
         """Return these options with estimator `stack` instead of `auto`, and with all measured options turned off."""
@@ -201,7 +194,7 @@ class Reslrb(AttachingTracer):
             undecided["estimator"] = AUTO_ESTIMATOR
         return self.model_copy(update=undecided) if undecided else self
 
-    def _foreign(self) -> set[str]:
+    def idle(self) -> set[str]:
         """Return the options that belong only to other estimators."""
         return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS[self.estimator]}
 

@@ -10,8 +10,6 @@ from pydantic import (
     AfterValidator,
     Discriminator,
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 from typing_extensions import Self
@@ -38,12 +36,8 @@ class Loss(Choice):
     """Factor of an entry in a list of losses, such as `loss: [{type: l2, weight: 1}, {type: ssim, weight: 0.1}]`. Only
     in a list."""
 
-    @model_serializer(mode="wrap")
-    def _without_unasked(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if values.get("weight") == 1.0:
-            del values["weight"]
-        return values
+    def idle(self) -> set[str]:
+        return {"weight"} if self.weight == 1 else set()
 
     def own_options(self) -> dict[str, Any]:
         """Return the options of the function itself (epsilon, ...), without those that all losses share."""
@@ -194,12 +188,8 @@ class OptimizerSettings(Choice):
             raise located("scale", f"curvature needs type: sgd; steps of {self.type} do not grow with gradients")
         return self
 
-    @model_serializer(mode="wrap")
-    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if self.schedule == "constant":
-            values.pop("final_fraction", None)
-        return values
+    def idle(self) -> set[str]:
+        return {"final_fraction"} if self.schedule == "constant" else set()
 
     def own_options(self) -> dict[str, Any]:
         """Return the options of the update rule itself (beta_1, ...), without those that all optimisers share."""
