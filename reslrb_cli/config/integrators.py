@@ -25,32 +25,15 @@ from reslrb_cli.config.base import (
     code_file,
     located,
     mark,
-    must,
 )  # fmt: skip
 from reslrb_cli.config.files import CAPACITY, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
-
-_DEPTH = must(
-    lambda depth: depth <= PATH_LENGTH,
-    lambda depth: (
-        f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {depth}: Russian roulette ends "
-        "paths long before"
-    ),
-)
-
-_CAPACITY = must(
-    lambda capacity: capacity <= CAPACITY,
-    lambda capacity: (
-        f"must be at most {CAPACITY}, not {capacity}: each stored connection adds code to the kernel, which would "
-        "take hours to compile; estimator gather uses all connections"
-    ),
-)
 
 
 class Integrator(Choice):
     """Options of all integrators."""
 
     type: str
-    max_depth: Annotated[int, _DEPTH] = Field(default=8, ge=-1, json_schema_extra={"maximum": PATH_LENGTH})
+    max_depth: int = Field(default=8, ge=-1, le=PATH_LENGTH)
     """Length of the longest path in segments, from the emitter to the sensor. 1: only emitters that the sensor sees
     directly. 2: also direct light. -1: no limit; only Russian roulette ends paths. `trajectory` needs a limit, because
     its record of a path has room for this many vertices."""
@@ -118,9 +101,9 @@ class Reslrb(AttachingTracer):
     all connections, by a second traversal. `event`: a few scattering events, selected at random. `stack`: all
     connections, stored in thread-local memory. `auto`: `stack`, the most efficient one in every experiment that was
     measured."""
-    capacity: Annotated[Count, _CAPACITY] = Field(default=1, json_schema_extra={"maximum": CAPACITY})
-    """Number of connections (`reservoir`) or scattering events (`event`) that are stored for each path. Only with
-    estimators `reservoir` and `event`."""
+    capacity: Annotated[Count, Field(le=CAPACITY)] = 1
+    """Number of connections (`reservoir`) or scattering events (`event`) that are stored for each path. Each adds
+    code to the kernel; `gather` uses all connections. Only with estimators `reservoir` and `event`."""
     weight: Literal["luminance", "adjoint"] = "luminance"
     """Selection probability of a connection: in proportion to its `luminance`, or to its contribution to the objective
     (`adjoint`). `adjoint` has less variance; it does not work with `run.adjoint: correlated`. Only with estimators
@@ -181,7 +164,8 @@ class Reslrb(AttachingTracer):
                 f"`{self.estimator}` needs the connections of light paths, and paths: camera has none; "
                 "remove it, or use stack",
             )
-        _check_share(self.paths, self.light_share)
+        if self.light_share != UNDECIDED["light_share"] and self.paths in ("light", "camera"):
+            raise located("light_share", f"has no effect with paths: {self.paths}, only with both; remove it")
         for option in sorted(self.idle() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
             raise located(option, f"has no effect with estimator `{self.estimator}`, only with {owners}; remove it")
@@ -267,11 +251,6 @@ class Own(Integrator, json_schema_extra=NEEDS_TYPE):
 AnyIntegrator = Annotated[
     Reslrb | Ptracer | Prb | PrbProjective | WalkAdConfig | TrajectoryConfig | Own, ByType("reslrb")
 ]
-
-
-def _check_share(paths: str, light_share: float) -> None:
-    if light_share != UNDECIDED["light_share"] and paths in ("light", "camera"):
-        raise located("light_share", f"has no effect with paths: {paths}, only with both; remove it")
 
 
 def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:

@@ -59,7 +59,7 @@ class SceneConfig(Section):
     file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.5 to 3), relative to the config file.")
     options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(default={})
     """Values of the scene file's `$name` variables."""
-    size: Annotated[Size, few("pixels", ": each image of a step takes 12 bytes or more of every one")] | None = None
+    size: Annotated[Size, few("pixels")] | None = None
     """[width, height] of the film of every sensor in pixels, without a crop window. The view stays the same if the
     ratio does. null: the size in the scene file."""
     cameras: ConfigPath | None = None
