@@ -61,7 +61,7 @@ def read_subject(path: Path, overrides: tuple[str, ...]) -> Subject:
     if manifest is None and file.name == "config.yaml":
         manifest = read_manifest(file.parent)
     is_scene = _is_scene(file)
-    text = write({"scene": {"file": str(file.absolute())}}) if is_scene else read_text(file, str(file))
+    text = write({"scene": {"file": str(file.absolute())}}) if is_scene else read_text(file)
     data = parse(text, str(file))
     given = {str(parse_override(override).location[0]) for override in overrides}
     sections = {key for key, value in data.items() if value is not None} if isinstance(data, dict) else set(_STAND_INS)

@@ -91,11 +91,6 @@ class Choice(Section):
 # --- paths ------------------------------------------------------------------------------------------------------------
 
 
-def _folder(info: ValidationInfo) -> Path:
-    """Return the folder of the configuration file, or the working directory."""
-    return Path((info.context or {}).get("folder", "")).absolute()
-
-
 def _path(folder: Path, value: Any) -> Path:
     """Return the path `value` relative to `folder`. `..` is kept, because it may follow a symbolic link."""
     if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
@@ -113,13 +108,16 @@ def _path(folder: Path, value: Any) -> Path:
 
 _PATH_SCHEMA = WithJsonSchema({"type": "string", "format": "path"})
 
-#: A path relative to the folder of the config file.
-ConfigPath = Annotated[Path, BeforeValidator(lambda value, info: config_path(value, info)), _PATH_SCHEMA]
-
 
 def config_path(value: Any, info: ValidationInfo) -> Path:
-    """Return an absolute path from a path relative to the configuration file's folder. Raises a validator's error."""
-    return _path(_folder(info), value)
+    """Return an absolute path from a path relative to the configuration file's folder, or to the working directory
+    without a file. Raises a validator's error.
+    """
+    return _path(Path((info.context or {}).get("folder", "")).absolute(), value)
+
+
+#: A path relative to the folder of the config file.
+ConfigPath = Annotated[Path, BeforeValidator(config_path), _PATH_SCHEMA]
 
 
 def code_place(value: Any, info: ValidationInfo) -> str:

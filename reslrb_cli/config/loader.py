@@ -108,7 +108,7 @@ def load(path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
 
     Raises ConfigError. The error names the key, and either the file or the wrong override.
     """
-    return loads(read_text(Path(path), str(path)), path, overrides)
+    return loads(read_text(Path(path)), path, overrides)
 
 
 def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
@@ -253,12 +253,12 @@ def dump(config: Config) -> str:
     return write(config.model_dump(mode="json", exclude_none=True))
 
 
-def read_text(path: Path, source: str) -> str:
-    """Return the text of a configuration file, named `source` in errors. Raises ConfigError if it is not text."""
+def read_text(path: Path) -> str:
+    """Return the text of a configuration file. Raises ConfigError if it is not text."""
     try:
         return read_file(path).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise ConfigError(source, "", "is not UTF-8 text; a configuration is a YAML file") from None
+        raise ConfigError(path, "", "is not UTF-8 text; a configuration is a YAML file") from None
 
 
 def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[SettingError]]:

@@ -117,11 +117,6 @@ Losses = Annotated[
 ]
 
 
-def losses_of(given: Loss | Sequence[Loss]) -> list[Loss]:
-    """Return the entries of `loss` as a list. A single loss becomes a list with one entry."""
-    return [given] if isinstance(given, Loss) else list(given)
-
-
 def loss_keys(name: str, given: Loss | Sequence[Loss]) -> list[tuple[str, Loss]]:
     """Return the entries of `loss`. Each entry comes with the key of its option `name`."""
     if isinstance(given, Loss):
@@ -129,9 +124,9 @@ def loss_keys(name: str, given: Loss | Sequence[Loss]) -> list[tuple[str, Loss]]
     return [(f"loss[{number}].{name}", one) for number, one in enumerate(given)]
 
 
-def loss_words(given: Loss | Sequence[Loss]) -> str:
-    """Return the loss in short: `l2`, or `l2 + 0.1 ssim`."""
-    parts = [f"{loss.type}" if loss.weight == 1 else f"{loss.weight:g} {loss.type}" for loss in losses_of(given)]
+def loss_words(losses: Sequence[Loss]) -> str:
+    """Return the losses in short: `l2`, or `l2 + 0.1 ssim`."""
+    parts = [f"{loss.type}" if loss.weight == 1 else f"{loss.weight:g} {loss.type}" for loss in losses]
     return " + ".join(parts)
 
 

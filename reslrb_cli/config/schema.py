@@ -40,7 +40,6 @@ from reslrb_cli.config.optimizers import (
     Loss,
     Losses,
     loss_keys,
-    losses_of,
 )
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.run import AUTO_SHARDS, RunConfig
@@ -186,7 +185,7 @@ class Config(Section):
     @property
     def losses(self) -> list[Loss]:
         """The entries of `loss` as a list, even if `loss` is a single loss."""
-        return losses_of(self.loss)
+        return [self.loss] if isinstance(self.loss, Loss) else list(self.loss)
 
     @property
     def allows_code(self) -> bool:
