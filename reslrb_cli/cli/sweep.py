@@ -28,7 +28,6 @@ from reslrb_cli.cli.options import (
     COUNT,
     FOLDER,
     allow_code_option,
-    complete_setting,
     is_given,
     optional_experiment_arguments,
 )
@@ -66,7 +65,6 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     "--vary",
     multiple=True,
     metavar="KEY=[VALUE, ...]",
-    shell_complete=complete_setting,
     help="Setting to vary, as for --set, and a list of its values in YAML. If repeated, all combinations are "
     "run. A value of `integrator` may be TYPE[:ESTIMATOR][(OPTION=VALUE,...)].",
 )
