@@ -343,9 +343,14 @@ def traced(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Return the `paths` of a run by `reslrb`, the share of light paths, and whether light paths are guided. Other runs
     have None.
     """
-    plan = manifest.get("plan") or {}
-    share = {"light": 1.0, "camera": 0.0}.get(plan.get("paths"))  # with both kinds, the configuration has the share
-    return {"paths": plan.get("paths"), "light_share": share, "guided": plan.get("guided")}
+    rows = {row["feature"]: row for row in (manifest.get("plan") or {}).get("rows") or ()}
+    camera = rows.get("camera paths")
+    if camera is None:
+        return {"paths": None, "light_share": None, "guided": None}
+    found = re.match(r"paths: (\w+)", camera["reason"]) if camera["needed"] else None
+    paths = found[1] if found else "light"
+    share = {"light": 1.0, "camera": 0.0}.get(paths)  # with both kinds, the configuration has the share
+    return {"paths": paths, "light_share": share, "guided": rows["guided emission"]["needed"]}
 
 
 def read_lines(file: Path) -> list[dict[str, Any]]:

@@ -209,11 +209,22 @@ def test_the_readme_uses_figures_of_records(folder: Path) -> None:
     assert row not in text
 
 
-@pytest.mark.parametrize("paths", ["both", "camera", "light"])
-def test_the_paths_of_a_run_match_its_manifest(paths: str) -> None:
-    row = benchmarks_measure.traced({"plan": {"integrator": "reslrb", "paths": paths, "guided": True}})
-    assert pages.paths_of(pages.Record({}, [row])) == f"{paths}, guided"
-    of_prb = benchmarks_measure.traced({"plan": {"integrator": "prb"}})
+@pytest.mark.parametrize(
+    ("needed", "reason", "shown"),
+    [
+        (True, "paths: both", "both, guided"),
+        (True, "paths: camera; paths: auto, 3 times", "camera, guided"),
+        (False, "paths: light; paths: auto, 3 times", "light, guided"),
+    ],
+)
+def test_the_paths_of_a_run_match_its_manifest(needed: bool, reason: str, shown: str) -> None:
+    rows = [
+        {"feature": "camera paths", "needed": needed, "reason": reason},
+        {"feature": "guided emission", "needed": True, "reason": ""},
+    ]
+    row = benchmarks_measure.traced({"plan": {"rows": rows}})
+    assert pages.paths_of(pages.Record({}, [row])) == shown
+    of_prb = benchmarks_measure.traced({"plan": {"rows": []}})
     assert pages.paths_of(pages.Record({}, [of_prb])) == ""
 
 

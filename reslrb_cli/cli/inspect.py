@@ -1,7 +1,7 @@
 """`reslrb inspect`: list the contents of a scene, and the parameters that can be recovered.
 
 The argument is a scene file, a possibly incomplete configuration, or a run folder (`read_subject`). The output lists
-the scene, its sensors and the parameters (`templates/inspect.txt.j2`).
+the scene, its sensors, the plan of a step and the parameters (`templates/inspect.txt.j2`).
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from pydantic_core import to_jsonable_python
 
 from reslrb_cli.cli.options import overrides_option, start_variant
 from reslrb_cli.cli.terminal import fill
-from reslrb_cli.config.integrators import Reslrb
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
-from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.errors import ConfigError, UnsupportedScene
+from reslrb_cli.records.manifest import MANIFEST_FILE, read_manifest
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
+    from reslrb_cli.integrators.plan_report import PlanRow
     from reslrb_cli.optimization.sensitivity import Conditioning
     from reslrb_cli.scene.catalog import ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.parameters import Selection
@@ -104,6 +105,12 @@ def _sized(sensor: SensorSummary) -> str:
     (x, y), (width, height) = sensor.crop
     crop = "" if (x, y) == (0, 0) and (width, height) == sensor.size else f", crop {width}x{height} at ({x}, {y})"
     return f"{sensor.size[0]}x{sensor.size[1]}{crop}"
+
+
+def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
+    """Format the plan as a table. The features that the plan contains come first."""
+    ordered = sorted(rows, key=lambda row: not row.needed)
+    return table([("needed" if row.needed else "left out", row.feature, row.reason) for row in ordered])
 
 
 # --- parameters -------------------------------------------------------------------------------------------------------
@@ -210,7 +217,8 @@ def command(
 
     PATH is a scene file (XML), a configuration or a run folder. The configuration may be incomplete. The command first
     lists the parameter keys that `parameters` of a configuration may use. For all other keys, the command gives the
-    reason why a configuration cannot use the key.
+    reason why a configuration cannot use the key. If the configuration has `parameters`, the plan of a step lists the
+    features that its kernels contain or leave out, and why.
 
     --conditioning measures how different the sensitivities of the parameters are at their initial values: for each
     parameter the root mean square of its values, its gradient and the noise of one step's gradient, the relative change
@@ -235,10 +243,11 @@ def command(
     summary = summarise(scene, config.integrator.hide_emitters)
     selection = None if "parameters" in subject.missing else select(config, scene)
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
-    obstacle = selection if isinstance(selection, str) else None
+    plan = None if selection is None else make_plan(subject, scene, selection)
     measured = measure(config) if conditioning else None
     if as_json:
-        known = {"run": subject.run, **vars(summary), "obstacle": obstacle, "edges": edges}
+        known = {"run": subject.run, **vars(summary)}
+        known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan and {"rows": plan}, "edges": edges}
         if measured is not None:
             known["conditioning"] = measured.to_json()
         # Objects of the scene are written as their ids.
@@ -262,8 +271,8 @@ def command(
         scene=config.scene.file,
         summary=summary,
         sensors=summary.sensors if everything else summary.sensors[:LISTED_SENSORS],
+        plan=[f"none: {plan}"] if isinstance(plan, str) else plan and plan_lines(plan),
         parameters=[*parameters, *moving_lines(summary.movable, everything)],
-        obstacle=obstacle,
         edges=edges,
         measured=measured,
         next=None if measured else next_step(subject, summary),
@@ -302,7 +311,7 @@ def measure(config: Config) -> Conditioning:
     from reslrb_cli.optimization.assemble import assemble
     from reslrb_cli.optimization.sensitivity import measure_conditioning
 
-    if isinstance(config.integrator, Reslrb):
+    if isinstance(config.integrator, ReslrbConfig):
         config = config.model_copy(update={"integrator": config.integrator.undecided_off()})
     return measure_conditioning(assemble(config, logging.getLogger(__name__).info), SAMPLES)
 
@@ -325,3 +334,46 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
 
     moved = where_moved(selection.params, selection.scene_keys)
     return [item.id for item in moved if item.casts_edges(scene)]
+
+
+def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[PlanRow] | str:
+    """Plan a step for the first sensor in use. Return the plan's rows, or the reason if there is no plan.
+
+    Afterwards the selected parameters of `scene` track derivatives.
+    """
+    import drjit as dr
+
+    from reslrb_cli.integrators.plan_report import plan_rows
+    from reslrb_cli.integrators.reslrb import Reslrb
+    from reslrb_cli.optimization.autotune.sampling import as_decided, decided, explained, open_settings
+    from reslrb_cli.optimization.loading import choose_sensors, make_configured, moves_anything, pass_spp, paths_of
+    from reslrb_cli.records.decisions import Decision
+
+    config = subject.config
+    if isinstance(selection, str):
+        return selection
+    if config.integrator.type != "reslrb":
+        return f"integrator.type is {config.integrator.type}; only `reslrb` has a plan"
+    try:
+        decisions = decided(config, map(Decision.from_json, (subject.run or {}).get("decisions", ())))
+    except TypeError as error:
+        raise ConfigError(config.source.parent / MANIFEST_FILE, "decisions", str(error)) from None
+    try:
+        [sensor, *_] = sensors = choose_sensors(config, scene)
+        paths = paths_of(config.integrator, scene, sensors, moves_anything(config, selection))
+        integrator = as_decided(make_configured(config, config.integrator, paths), decisions)
+        assert isinstance(integrator, Reslrb)
+        integrator.expect(pass_spp(config))
+        params = selection.params
+        for key in selection.scene_keys:
+            leaf = type(params[key])(dr.detach(params[key]))
+            dr.enable_grad(leaf)
+            params[key] = leaf
+        params.update()
+        rows = plan_rows(integrator.plan(scene, scene.sensors()[sensor], params))
+    except (ConfigError, UnsupportedScene) as error:
+        return str(error)
+    if not decisions:
+        open_ = open_settings(config, paths)
+        decisions = [Decision(setting=setting, value="auto", why="which a run decides") for setting in open_]
+    return explained(rows, decisions)

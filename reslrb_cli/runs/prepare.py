@@ -20,12 +20,15 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.backend.doctor import device_name
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
+from reslrb_cli.integrators.plan_report import plan_rows
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.sampling import explained
 from reslrb_cli.optimization.loop import Watch
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Best, Images, Least, Results
@@ -46,17 +49,18 @@ from reslrb_cli.scene.visibility import sees_lamps
 
 
 def plan_record(problem: Problem) -> dict[str, Any]:
-    """Return how the first view is traced: integrator, estimator, kinds of paths, and whether light paths are guided.
+    """Return the integrator, its estimator, and which features the kernels of the first view contain, with reasons.
 
-    For integrators other than `reslrb`, the record has only the integrator.
+    `rows` is empty for integrators without a plan, and `estimator` is None for integrators without an estimator.
     """
     config, integrator = problem.config.integrator, problem.integrator
     if not isinstance(integrator, Reslrb):
-        return {"integrator": config.type}
+        return {"integrator": config.type, "estimator": None, "rows": []}
     plan = integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]], problem.selection.params)
+    rows = [vars(row) for row in explained(plan_rows(plan), problem.decisions)]
     estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
-    guided = plan.grid is not None
-    return {"integrator": config.type, "estimator": estimator, "paths": plan.paths, "guided": guided}
+    assert isinstance(config, ReslrbConfig)
+    return {"integrator": config.type, "estimator": estimator, "rows": rows}
 
 
 #: Settings that do not affect the iterations done so far. A change of any other setting would make it another run.

@@ -1,4 +1,4 @@
-"""`reslrb inspect` lists a scene and its parameters."""
+"""`reslrb inspect` shows the plan for a step."""
 
 from __future__ import annotations
 
@@ -10,6 +10,37 @@ import pytest
 from cli.tiny import done, outcome, settings
 
 pytestmark = pytest.mark.usefixtures("llvm")
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "cornell_floor.yaml"
+TINY = ["--set", "scene.options={resx: 16, resy: 16}", "--set", "integrator.max_depth=4"]
+
+
+def inspect(*arguments: str) -> str:
+    """Return the output of `inspect`."""
+    return done("inspect", CONFIG, *TINY, *arguments).stdout
+
+
+def plan_lines(text: str) -> list[str]:
+    """Return the lines below `plan`."""
+    lines = text.splitlines()
+    return lines[lines.index("plan") + 1 : lines.index("parameters")]
+
+
+def test_the_plan_lists_needed_and_omitted_features():
+    lines = plan_lines(inspect())
+    assert any(line.split()[:3] == ["needed", "derivatives", "of"] for line in lines)
+    assert any("left out" in line and "delta lobes" in line for line in lines)
+    rows = {row["feature"]: row for row in json.loads(inspect("--json"))["plan"]["rows"]}
+    assert rows["derivatives of BSDFs"]["needed"]
+    assert not rows["null surfaces"]["needed"]
+
+
+def test_a_missing_plan_has_a_reason():
+    [line] = plan_lines(inspect("--set", "integrator.type=ptracer"))
+    assert "none" in line
+    assert "ptracer" in line
+    [line] = plan_lines(inspect("--set", "parameters=[{key: no.such.key}]"))
+    assert "parameters[0].key" in line
+
 
 SCENE = """<scene version="3.0.0">
 <default name="power" value="5"/>
@@ -68,6 +99,7 @@ def test_a_scene_file_by_itself(scene):
     assert "4 is recovered as a motion" in others
     assert sum(int(line.split()[0]) for line in others[1:]) == 25
     assert found[-1] == "next: `reslrb init scene.xml --target PHOTO` writes a configuration"
+    assert "plan" not in found
 
 
 def test_a_long_list_is_cut(scene):
@@ -84,7 +116,7 @@ def test_a_long_list_is_cut(scene):
 
 def test_everything_as_json(scene):
     report = json.loads(done("inspect", "scene.xml", "--json").stdout)
-    assert (report["obstacle"], report["run"]) == (None, None)
+    assert (report["plan"], report["run"]) == (None, None)
     parameters = {entry["key"]: entry for entry in report["parameters"]}
     assert len(parameters) == 34
     assert parameters["Sphere_1.emitter.radiance.value"]["value"] == {
@@ -101,6 +133,7 @@ def test_a_selected_8_bit_texture_is_shown_as_floats(scene):
     config.write_text('scene: {file: scene.xml}\nparameters: [{key: "wall.*"}]')
     found = lines_of("c.yaml")
     assert "* wall.reflectance.data 4x4 texels of 3, mean 0.1248, 0.1248 to 0.1248" in found
+    assert any(line.startswith("needed derivatives of BSDFs") for line in found)
 
 
 @pytest.mark.parametrize(
@@ -117,6 +150,7 @@ def test_an_incomplete_configuration_is_accepted(scene, text, next_step):
     found = lines_of("c.yaml")
     assert found[-1].startswith(f"next: {next_step}")
     has_parameters = "Sphere_1.*" in text
+    assert ("plan" in found) is has_parameters
     assert ("* Sphere_1.emitter.radiance.value [5, 2, 0.25]" in found) is has_parameters
     assert ("can be recovered: 9 (* in `parameters`)" in found) is has_parameters
 
@@ -157,10 +191,24 @@ def test_a_run_folder_shows_its_progress(scene):
         assert found[-1] == "next: `reslrb optimize runs/c/config.yaml` runs it again"
 
 
-def test_an_unknown_parameter_has_a_reason(scene):
-    Path("c.yaml").write_text("scene: {file: scene.xml}\nparameters: [{key: no.such.key}]")
-    line = next(line for line in lines_of("c.yaml") if line.startswith("`parameters` cannot be recovered: "))
-    assert "c.yaml: parameters[0].key: " in line
+def test_an_edited_decision_is_one_located_line(scene):
+    Path("run").mkdir()
+    text = "scene: {file: ../scene.xml}\nparameters: [{key: Sphere_1.emitter.radiance.value}]\n"
+    Path("run/config.yaml").write_text(text)
+
+    def decide(**decision: str) -> None:
+        content = {"program": "reslrb", "decisions": [{"setting": "paths", **decision}]}
+        Path("run/manifest.json").write_text(json.dumps(content))
+
+    for decision, said in (
+        ({"value": "sideways", "why": "edited"}, "paths is `sideways`; possible are light, camera, both"),
+        ({"value": "camera"}, "no Decision: "),
+    ):
+        decide(**decision)
+        code, _, err = outcome("inspect", "run")
+        assert (code, f"run/manifest.json: decisions: {said}" in err) == (2, True), err
+    decide(value="camera", why="edited by hand")
+    assert "paths: auto, edited by hand" in " ".join(lines_of("run"))
 
 
 STIFF = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"

@@ -200,12 +200,16 @@ def test_pages_keep_to_their_share_of_the_time(monkeypatch):
 def test_the_manifest_has_the_plan_and_perceptual_errors(optimize):
     optimize("--set", "run.iterations=1")
     manifest = read_content(RUN)
-    assert manifest["plan"] == {"integrator": "reslrb", "estimator": "stack", "paths": "light", "guided": False}
+    plan = manifest["plan"]
+    assert (plan["integrator"], plan["estimator"]) == ("reslrb", "stack")
+    rows = {row["feature"]: row["needed"] for row in plan["rows"]}
+    assert (rows["derivatives of BSDFs"], rows["derivatives of emission"]) == (True, False)
     seen = manifest["results"]["seen"]
     assert set(seen[""]) == {"exposure", "initial", "final"}
     assert seen[""]["final"]["ssim"] is None  # 8x8 is too small
     page = PAGE.read_text()
-    assert "<h2>Errors as people see them</h2>" in page
+    for title in ("Plan", "Errors as people see them"):
+        assert f"<h2>{title}</h2>" in page
 
 
 def test_unmeasurable_errors_do_not_end_a_run(optimize, monkeypatch):

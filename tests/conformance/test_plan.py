@@ -15,6 +15,7 @@ from turns import taking_turns
 
 from reslrb_cli.estimators import gather, reservoir, stack
 from reslrb_cli.integrators.context import Preparation
+from reslrb_cli.integrators.plan_report import plan_rows
 from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, texture, transform
@@ -186,6 +187,14 @@ def test_emitters_alone_need_no_replay(estimator: str):
         plan = ours.plan(case.scene, case.scene.sensors()[0], case.params)
         walk, *others = count(ours, plan, case.scene, case.scene.sensors()[0])
     assert sum(others) < walk / 2
+
+
+def test_rows_explain_needed_features() -> None:
+    case, ours = Case(through_a_lens(), (FLOOR,)), integrator("reslrb", 5, estimator="stack")
+    with tracking(case.params, case.keys):
+        rows = plan_rows(ours.plan(case.scene, case.scene.sensors()[0], case.params))
+    assert {row.feature for row in rows if row.needed} == {"visible emitters", "lens sampling", "derivatives of BSDFs"}
+    assert all(row.reason for row in rows)
 
 
 def test_a_step_makes_two_plans(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -198,15 +198,10 @@ def test_camera_paths_of_a_guided_run_are_unchanged(paths: str, monkeypatch: pyt
     fix_times(monkeypatch, {"paths": 0.01})
     words = [*SMALL, "integrator.guiding=on", "integrator.estimator=stack", f"integrator.paths={paths}"]
     assert optimize("tiny.yaml", *tiny.settings(*words)) == 0
-    plan = read_manifest(RUN)["plan"]
-    assert (plan["paths"], plan["guided"]) == ("camera", False)
+    rows = {row["feature"]: row for row in read_manifest(RUN)["plan"]["rows"]}
+    assert rows["camera paths"]["needed"]
+    assert not rows["guided emission"]["needed"]
     assert optimize("--resume", str(RUN), "--set", "run.iterations=3") == 0
-
-
-def test_a_stored_decision_must_be_one_of_the_values():
-    stored = [Decision(setting="paths", value="sideways", why="edited")]
-    with pytest.raises(TypeError, match="paths is `sideways`; possible are light, camera, both"):
-        sampling.decided(load("tiny.yaml", AUTO), stored)
 
 
 def test_a_short_run_keeps_its_caustic():

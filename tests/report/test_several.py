@@ -29,7 +29,10 @@ from reslrb_cli.report.sources import Measurements, ShownRun, read_sources
 
 # One page about several runs and measurements: its content, and damaged or hostile input.
 
-PLAN = {"integrator": "reslrb", "estimator": "stack", "paths": "light", "guided": False}
+PLAN = {"integrator": "reslrb", "estimator": "stack", "rows": [
+    {"feature": "roulette", "needed": False, "reason": "paths are short"},
+    {"feature": "masks", "needed": True, "reason": "the scene has masks"},
+]}  # fmt: skip
 
 
 def page_of(*paths):
@@ -68,12 +71,14 @@ def test_every_record_of_each_run_is_shown(tmp_path):
         make_run(tmp_path / "b", iterations=0, command_line=["reslrb", "optimize", "b"]),
     )
     own = page.sections["Run a"]
-    for words in ("Choice of the samples", "not measured", 
+    for words in ("Plan", "the scene has masks", "Choice of the samples", "not measured", 
                   "Scale of the parameters", "Configuration", "versions", "mitsuba"):  # fmt: skip
         assert words in own
     assert page.row("Run b", "command line")[1] == "reslrb optimize b"
     assert page.row("Run b", "to repeat it")[1] == f"reslrb optimize {tmp_path / 'b' / 'config.yaml'}"
     assert page.row("Runs", "a")[2] == PLAN["estimator"]
+    rows = [["masks", "yes", "the scene has masks"], ["roulette", "left out", "paths are short"]]
+    assert page_of(make_run(tmp_path / "c", plan=PLAN, iterations=0)).cells["Plan"][1:] == rows
 
 
 def test_perceptual_errors(tmp_path):
@@ -230,7 +235,7 @@ def damage(folder, change):
     [
         lambda manifest: manifest.update(results={"parameters": {"a": 3}, "seen": {"": 7}}),
         lambda manifest: manifest.update(results={"parameters": 5, "rmse": 3}),
-        lambda manifest: manifest.update(decisions=[{"rows": 3}], scaling=[{}]),
+        lambda manifest: manifest.update(decisions=[{"rows": 3}], scaling=[{}], plan={"rows": "no"}),
         lambda manifest: manifest.update(started="soon", views=[{"sensor": "x"}], versions={}),
     ],
 )

@@ -35,6 +35,7 @@ import mitsuba as mi
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.pixels import noted_part
+from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, PlanRow, with_reason
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sets_of, sizes
@@ -306,6 +307,7 @@ class Option:
     - `decide` takes the decision.
     - `values` are the possible decisions. `apply` returns an integrator with one of them.
     - `paths` are the kinds of paths that leave the setting open: those that can render the scene (`Problem.paths`).
+    - `feature` is the row of the plan that shows the reason.
     - `prepare` measures what the value needs, decided or configured.
     """
 
@@ -313,6 +315,7 @@ class Option:
     values: tuple[str, ...]
     apply: Callable[[Any, str], Any]
     paths: tuple[str, ...]
+    feature: str
     prepare: Callable[[Tuner], None] = lambda tuner: None
 
 
@@ -321,19 +324,19 @@ OPTIONS = {
     "sequence": Option(
         _sequence, ("low_discrepancy", "independent"),
         lambda tracer, value: tracer.afresh(low_discrepancy=value == "low_discrepancy"),
-        ("light", "both"),
+        ("light", "both"), SEQUENCE,
     ),
     "paths": Option(
-        _paths, tuple(SHARES), lambda tracer, value: tracer.afresh(light_share=SHARES[value]), ("both",)
+        _paths, tuple(SHARES), lambda tracer, value: tracer.afresh(light_share=SHARES[value]), ("both",), PATHS_FROM
     ),
     "pixels": Option(
         _pixels, ("even", "measured"), lambda tracer, value: tracer.afresh(shares_out=value == "measured"),
-        ("camera", "both"), _measure_pixels,
+        ("camera", "both"), PIXELS, _measure_pixels,
     ),
     "guiding": Option(
         _guiding, ("off", "on", "on for gradients"),
         lambda tracer, value: tracer.afresh(guided=value != "off", images=value == "on"),
-        ("light", "both"),
+        ("light", "both"), GUIDED,
     ),
 }  # fmt: skip
 
@@ -375,3 +378,10 @@ def as_decided(integrator: Any, decisions: Iterable[Decision]) -> Any:
     for each in decisions:
         integrator = OPTIONS[each.setting].apply(integrator, each.value)
     return integrator
+
+
+def explained(rows: list[PlanRow], decisions: Iterable[Decision]) -> list[PlanRow]:
+    """Return the rows of a plan with the reasons of decisions."""
+    for each in decisions:
+        rows = with_reason(rows, OPTIONS[each.setting].feature, f"{each.setting}: auto, {each.why}")
+    return rows

@@ -134,6 +134,7 @@ def record_parts(run: ShownRun) -> dict[str, Markup]:
         "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
         "Regularizers": lambda: lay_out("run.regularized", results.get("regularized") or {}),
         "Run": lambda: lay_out("run.run", run, step_words(run.records), _wall(manifest)),
+        "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
         "Choice of the samples": lambda: Markup().join(
             soft(Decision.from_json(each).line(cost=True)) for each in manifest.get("decisions") or ()
         ),
