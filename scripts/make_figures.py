@@ -78,7 +78,7 @@ def lens_panels(picture: Path, folder: Path) -> list[Panel]:
     target, final = (read_image(folder / "images" / f"{name}.exr") for name in ("target", "final"))
     rows, columns = (np.flatnonzero(target[:, :, 1].any(axis=axis)) for axis in (1, 0))
     thrown = final[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    heights = read_image(folder / "parameters" / "face.heightmap.exr", signed=True)[::-1, ::-1, 0]
+    heights = read_image(folder / "parameters" / "face.heightmap.exr", "linear", signed=True)[::-1, ::-1, 0]
     y, x = np.mgrid[-1 : 1 : 1j * heights.shape[0], -1 : 1 : 1j * heights.shape[1]]
     dome = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
     relief = heights.ravel() - dome @ np.linalg.lstsq(dome, heights.ravel(), rcond=None)[0]

@@ -156,7 +156,7 @@ def _default(value: dict[str, Any]) -> str:
 
 #: Sections that are written in the line of their key.
 _IN_A_LINE = {
-    "ImageFile": "{file}",
+    "ImageFile": "{file, color_space}",
     "RunValue": "{run}",
     "CheckpointEvery": "{iterations} or {seconds}",
     **dict.fromkeys(

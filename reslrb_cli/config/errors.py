@@ -50,8 +50,6 @@ REMOVED = {
     "mask.alpha": "list the kinds of pixels to leave out, such as mask: {kinds: [specular, border, clipped]}",
     "run.images_every": "a run saves its first and its last image; in Python, `Run.images` renders those between",
     "scene.sensors": "list them in `views`, such as views: [{sensor: 0}, {sensor: 1}]; all of scene.cameras are used",
-    "target.color_space": "files of 8 and 16 bits are sRGB, and files of floats linear; write linear values as EXR",
-    "initial.color_space": "files of 8 and 16 bits are sRGB, and files of floats linear; write linear values as EXR",
     "views.loss": "all views have the loss that `loss` says",
     "render.seed": "the target always has the same samples; remove it",
     "integrator.freeze": "steps are always recorded; remove it",

@@ -155,11 +155,15 @@ class MotionSpec(Section):
         return self
 
 
+ColorSpace = Literal["auto", "linear", "srgb"]
+COLOR_SPACE = "Encoding of the values: `linear`, `srgb`, or `auto` (srgb for 8-bit files, linear for float files)."
+
+
 class ImageFile(Section):
     """An image file that holds a texture."""
 
-    file: ConfigPath
-    """EXR, PNG, JPG or HDR file, relative to the config file. Values of 8 and 16 bits are sRGB, and floats linear."""
+    file: ConfigPath = Field(description="EXR, PNG, JPG or HDR file, relative to the config file.")
+    color_space: ColorSpace = Field(default="auto", description=COLOR_SPACE)
 
 
 class RunValue(Section):
@@ -182,7 +186,7 @@ Value = Annotated[
 def _initial_tag(value: Any) -> str | None:
     if isinstance(value, RunValue) or (isinstance(value, dict) and "run" in value):
         return MARK + RunValue.TAG
-    if isinstance(value, ByWord) or (isinstance(value, dict) and "file" not in value):
+    if isinstance(value, ByWord) or (isinstance(value, dict) and not {"file", "color_space"} & value.keys()):
         return MARK + ByWord.TAG
     return kind_tag(value, "scene")
 

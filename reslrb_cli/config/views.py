@@ -18,7 +18,7 @@ from typing_extensions import Self
 
 from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, each_once, located, must, wrong
 from reslrb_cli.config.integrators import AnyIntegrator
-from reslrb_cli.config.parameters import Value
+from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
 
 MaskKind = Literal["specular", "border", "clipped", "alpha"]
 
@@ -131,9 +131,9 @@ class TargetConfig(Section):
     """
 
     file: ConfigPath | None = None
-    """Target image (EXR, PNG, JPG, HDR), relative to the config file. Values of 8 and 16 bits are sRGB, and floats
-    linear. The image is turned by its EXIF orientation, unless `scene.cameras` is given. With several views, set the
-    `target` of each view instead."""
+    """Target image (EXR, PNG, JPG, HDR), relative to the config file. The image is turned by its EXIF orientation,
+    unless `scene.cameras` is given. With several views, set the `target` of each view instead."""
+    color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
     truth: bool = False
     """Whether the target files show the scene with the values in its scene file, as images of another renderer do. The
     run then reports the error of each parameter. Only with files."""
@@ -159,12 +159,14 @@ class TargetConfig(Section):
     def _check_one(self) -> Self:
         if self.file is not None and self.render is not None:
             raise located("", "must have exactly one of `file` and `render`, and has both")
+        if self.render is not None and self.color_space != "auto":
+            raise located("color_space", "has no effect on a rendered target; remove it")
         if self.render is not None and self.truth:
             raise located("truth", "has no effect on a rendered target, which has it; remove it")
         return self
 
     def idle(self) -> set[str]:
-        return set() if self.render is None else {"truth"}
+        return set() if self.render is None else {"color_space", "truth"}
 
 
 class ViewSpec(Section):

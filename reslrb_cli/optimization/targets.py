@@ -76,7 +76,7 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
         found.left_out["nonfinite"] = photo.nonfinite
     if mask.file is not None:
         try:
-            weights = read_photo(mask.file, (width, height), are_upright(config), decoded=False)
+            weights = read_photo(mask.file, "linear", (width, height), are_upright(config))
             found.weights = weights.image.mean(axis=2)
         except ConfigError as error:
             raise ConfigError(config.source, f"{view.mask_key}.file", error.message) from None
@@ -109,7 +109,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
             continue
         size = (int(film.crop_size()[0]), int(film.crop_size()[1]))
         try:
-            photo = read_photo(view.file, size, upright, nonfinite=True)
+            photo = read_photo(view.file, config.target.color_space, size, upright, nonfinite=True)
         except ConfigError as error:
             raise ConfigError(config.source, view.file_key, error.message) from None
         line = turned_line(view.file, upright)

@@ -299,17 +299,17 @@ def turned_line(path: Path, upright: bool = True) -> str | None:
     return f"{path}: not {turned} as its EXIF orientation says: cameras of files use the stored orientation"
 
 
-def read_image(path: Path, size: Size | None = None, signed: bool = False) -> Image:
+def read_image(path: Path, color_space: str = "auto", size: Size | None = None, signed: bool = False) -> Image:
     """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
-    Integers are sRGB, and floats linear. Alpha is dropped. A single channel is copied into three channels. `size` is
-    the required (width, height). Pixels are as stored, as in Mitsuba's textures. If EXIF metadata would rotate the
-    pixels, the function prints a warning.
+    `color_space` is the encoding of the file's values: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
+    Alpha is dropped. A single channel is copied into three channels. `size` is the required (width, height). Pixels are
+    as stored, as in Mitsuba's textures. If EXIF metadata would rotate the pixels, the function prints a warning.
 
     Raises a ConfigError that names the file if the file is missing, no image, damaged, truncated, too large or of
     another size. Raises ConfigError also for non-finite values, and for negative values unless `signed` is true.
     """
-    image = read_photo(path, size, upright=False, signed=signed).image
+    image = read_photo(path, color_space, size, upright=False, signed=signed).image
     orientation = orientation_of(path)
     if orientation > 1:
         logger.warning("%s: the stored orientation is used, not %s as its EXIF says", path, TURNS[orientation])
@@ -318,17 +318,16 @@ def read_image(path: Path, size: Size | None = None, signed: bool = False) -> Im
 
 def read_photo(
     path: Path,
+    color_space: str = "auto",
     size: Size | None = None,
     upright: bool = True,
     signed: bool = False,
     nonfinite: bool = False,
-    decoded: bool = True,
 ) -> Photo:
     """Read an image file like `read_image`, and mark unreliable pixels.
 
     `upright` rotates the image by its EXIF orientation. `size` then refers to the upright image. `signed` allows
-    negative values, and `nonfinite` allows non-finite values. With `decoded=False`, integers are linear. Raises
-    ConfigError, located in the file.
+    negative values, and `nonfinite` allows non-finite values. Raises ConfigError, located in the file.
     """
     bitmap = read_bitmap(path, size, upright)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
@@ -341,7 +340,7 @@ def read_photo(
     bitmap.set_srgb_gamma(False)  # values as stored in the file; decoded below
     bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
     image = np.array(bitmap, dtype=np.float32).reshape(height, width, 3)
-    if decoded and is_integer:
+    if color_space == "srgb" or (color_space == "auto" and is_integer):
         image = decode_srgb(image)
     finite, nothing = np.isfinite(image), np.zeros((height, width), dtype=bool)
     for bad, what in ((~finite & (not nonfinite), "not finite"), (finite & (image < 0) & (not signed), "negative")):

@@ -164,7 +164,7 @@ def _from_file(slot: ParameterValue, current: Array, image_file: Any, any_size: 
         raise place.fail("initial", f"`{slot.key}` is not a texture; give a number or a list of numbers")
     path: Path = image_file.file
     try:
-        image = read_image(path, signed=slot.is_signed)
+        image = read_image(path, image_file.color_space, signed=slot.is_signed)
     except ConfigError as error:
         raise place.fail("initial.file", f"{path}: {error.message}") from None
     if not any_size and image.shape[:2] != current.shape[:2]:

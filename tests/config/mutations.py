@@ -20,12 +20,12 @@ from reslrb_cli.errors import ConfigError
 FULL = """\
 variant: llvm_ad_rgb
 scene: {file: scene.xml, options: {resx: 64, fast: true, scale: 1e-3, text: "1e-3", no: no}}
-target: {exposure: auto}
+target: {color_space: linear}
 views: [{sensor: 2, target: t0.exr}, {sensor: 0, target: /abs/t1.png, mask: w.png}]
 parameters:
   - {key: "*.reflectance.data", initial: 1, bounds: [-.inf, 1E0], learning_rate: 5e-2, resolution: [64, 32]}
   - {key: white.reflectance.value, initial: [.5, +0.5, 1], bounds: [0, .inf], transform: log}
-  - {key: floor.data, initial: {file: floor.png}}
+  - {key: floor.data, initial: {file: floor.png, color_space: srgb}}
 integrator: {type: reslrb, max_depth: -1, rr_depth: 3, hide_emitters: true, estimator: event, capacity: 2}
 loss: {type: relative_l2, epsilon: 1e-3}
 optimizer: {type: adam, learning_rate: 1e-1, schedule: cosine, final_fraction: 1e-2, beta_1: 0, scale: auto}

@@ -89,7 +89,7 @@ ADDED: dict[str, str | tuple[str, ...]] = {
 }
 #: An entry of `parameters`, and parts of the error line.
 ENTRIES: dict[str, str | tuple[str, ...]] = {
-    "{key: a, initial: {file: x, colour: 3}}": "parameters[0].initial.colour: unknown key; known here: file",
+    "{key: a, initial: {file: x, colour_space: srgb}}": ("parameters[0].initial.colour_space:", "`color_space`"),
     "{key: ''}": "parameters[0].key: must be nonempty text",
     "{key: a, bounds: [1, 0]}": ("parameters[0].bounds: ", "low < high"),
     "{key: a, bounds: [0, .nan]}": ("parameters[0].bounds: ", "low < high"),
@@ -133,7 +133,9 @@ TARGETS: dict[str, str | tuple[str, ...]] = {
     "{render: {}, file: a.exr}": "target: must have exactly one of",
     "{file: 3}": "target.file: must be a path",
     "{file: [a.exr, b.exr]}": "target.file: is a list; give each view its own in `views`",
+    "{render: {}, color_space: srgb}": "target.color_space: has no effect",
     "{render: {}, truth: true}": "target.truth: has no effect on a rendered",
+    "{file: a.png, color_space: sRGB}": "target.color_space: must be one of auto, linear, srgb (did you mean srgb?)",
     "{render: {parameters: {a.b.value: [1, x]}}}": "target.render.parameters.a.b.value[1]: must be a number",
     "{render: {integrator: {type: path}}}": "target.render.integrator.type: must be one of reslrb, ptracer, prb,",
     "{render: {parameters: {'': 1}}}": "target.render.parameters: must have keys that are not empty",
@@ -233,8 +235,8 @@ def test_the_suggested_override_is_valid(tmp_path: Path) -> None:
 def test_removed_settings_are_refused_with_a_replacement(name: str, tmp_path: Path) -> None:
     place, _, value = name.partition(": ")
     lists = {
-        "initial.": "parameters[0].initial.", "views.": "views[0].", "render.": "target.render.",
-        "mask.": "target.mask.", "regularizers.": "parameters[0].regularizers[0].",
+        "views.": "views[0].", "render.": "target.render.", "mask.": "target.mask.",
+        "regularizers.": "parameters[0].regularizers[0].",
     }  # fmt: skip
     for short, whole in lists.items():
         place = whole + place.removeprefix(short) if place.startswith(short) else place

@@ -35,14 +35,14 @@ scene:
   file: ../scenes/a b.xml
   options: {resx: 64, fast: true, scale: 1e-3, text: "1e-3", country: no, day: 2024-01-01, octal: 010, time: "12:30"}
 target:
-  exposure: auto
+  color_space: linear
 views:
   - {sensor: 2, target: t0.exr}
   - {sensor: 0, target: /abs/t1.png, mask: weights.png}
 parameters:
   - {key: "*.reflectance.data", initial: 1, bounds: [-.inf, 1E0], learning_rate: 5e-2, resolution: [64, 32]}
   - {key: white.reflectance.value, initial: [.5, +0.5, 1], bounds: [0, .inf]}
-  - {key: floor.data, initial: {file: floor.png}}
+  - {key: floor.data, initial: {file: floor.png, color_space: srgb}}
   - {key: lamp.emitter.radiance.value}
 integrator: {type: walk_ad, max_depth: -1, rr_depth: 3, hide_emitters: true, samples_per_pass: 8}
 loss: {type: relative_l2, epsilon: 1e-3}
@@ -98,7 +98,7 @@ def test_values_and_paths(tmp_path: Path) -> None:
     assert first.learning_rate == 5e-2
     assert first.resolution == (64, 32)
     assert second.initial == [0.5, 0.5, 1.0]
-    assert third.initial == ImageFile(file=tmp_path / "floor.png")
+    assert third.initial == ImageFile(file=tmp_path / "floor.png", color_space="srgb")
     assert fourth.initial == "scene"
     assert config.integrator.options()["samples_per_pass"] == 8
     assert config.loss.options() == {"epsilon": 1e-3}

@@ -113,7 +113,7 @@ def test_the_start_casts_the_picture_upright_with_the_right_brightness(kind: str
     result = CliRunner().invoke(command, args, catch_exceptions=False)
     assert result.exit_code == 0
     assert " mm deep; nothing darker" in result.output
-    heights = read_image(folder / "start.exr", signed=True)[:, :, 0]
+    heights = read_image(folder / "start.exr", "linear", signed=True)[:, :, 0]
     image = np.array(mi.render(flattened(heights, folder), spp=256, seed=1))[:, :, 1]
     target = read_image(folder / "target.exr")[:, :, 1]
     rows, columns = wanted.shape
@@ -204,7 +204,7 @@ def test_a_run_continues_with_its_momentum_and_measured_steepness(tmp_path: Path
     done("optimize", tmp_path / "lens/lens.yaml", *words("whole", 4))
     done("optimize", "--resume", tmp_path / "runs/part", "--set", "run.iterations=4")
     start, *ends = (
-        read_image(path, signed=True)
+        read_image(path, "linear", signed=True)
         for path in (tmp_path / "lens/start.exr", *(tmp_path / "runs" / name / "parameters/face.heightmap.exr"
                                                     for name in ("part", "whole")))
     )  # fmt: skip

@@ -261,7 +261,7 @@ def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: P
     assert numbers.dtype == np.uint16
     step = map["png"]["step"]
     assert np.abs(map["png"]["offset"] + step * numbers.reshape(48, 36) - wanted).max() <= 0.51 * step
-    exact = read_image(out / "heights.exr", signed=True)[:, :, 0]
+    exact = read_image(out / "heights.exr", "linear", signed=True)[:, :, 0]
     assert np.array_equal(exact, wanted)
     assert map["pitch"] == pytest.approx([75 / 35, 100 / 47])
 
@@ -292,7 +292,7 @@ def test_the_reloaded_solid_casts_the_image_of_the_scene(kind: str, run: Path, t
     assert read.is_watertight
     assert read.is_winding_consistent
     told = json.loads((tmp_path / "out/fabrication.json").read_text())
-    heights = read_image(tmp_path / "out/heights.exr", signed=True)[:, :, 0].astype(np.float64)
+    heights = read_image(tmp_path / "out/heights.exr", "linear", signed=True)[:, :, 0].astype(np.float64)
     middles = (heights[1:, 1:] + heights[:-1, 1:] + heights[1:, :-1] + heights[:-1, :-1]) / 4
     assert read.volume == pytest.approx(75 * 100 * (25 + middles.mean()), rel=1e-3)
     assert told["volume_mm3"] == pytest.approx(read.volume, rel=1e-5)

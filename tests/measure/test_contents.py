@@ -55,7 +55,7 @@ def own(image, target, weights):
 """
 CONFIG = f"""variant: llvm_ad_rgb
 scene: {{file: scene.xml, options: {{bright: 8}}}}
-parameters: [{{key: {KEY}, initial: {{file: start.exr}}, bounds: [0, 1]}}]
+parameters: [{{key: {KEY}, initial: {{file: start.exr, color_space: linear}}, bounds: [0, 1]}}]
 integrator: {{max_depth: 3, estimator: stack, paths: light, sequence: independent}}
 run: {{iterations: 1, spp: 4, certainty: false}}
 """

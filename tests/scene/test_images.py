@@ -13,7 +13,7 @@ import pytest
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene import images
-from reslrb_cli.scene.images import decode_srgb, orientation_of, read_bitmap, read_image, read_photo
+from reslrb_cli.scene.images import decode_srgb, orientation_of, read_bitmap, read_image
 from reslrb_cli.scene.proposal import open_photograph, write_smaller
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -284,13 +284,18 @@ def test_exr_is_linear(tmp_path, type_):
     assert np.array_equal(image, values.astype(np.float32))
 
 
-def test_png_is_srgb(tmp_path):
+def test_png_is_srgb_by_default(tmp_path):
     values = np.tile(np.arange(0, 256, 17, dtype=np.uint8)[None, :, None], (2, 1, 3))
     path = write(tmp_path / "a.png", values)
     expected = [srgb(v / 255) for v in range(0, 256, 17)]
     assert np.allclose(read_image(path)[0, :, 0], expected, atol=1e-6)
-    weights = read_photo(path, decoded=False).image
-    assert np.allclose(weights[0, :, 0], np.arange(0, 256, 17) / 255, atol=1e-6)
+    assert np.allclose(read_image(path, "srgb")[0, :, 0], expected, atol=1e-6)
+    assert np.allclose(read_image(path, "linear")[0, :, 0], np.arange(0, 256, 17) / 255, atol=1e-6)
+
+
+def test_float_files_can_be_srgb(tmp_path):
+    path = write(tmp_path / "a.exr", np.full((2, 2, 3), 0.5, np.float32))
+    assert np.allclose(read_image(path, "srgb"), srgb(0.5))
 
 
 def test_jpg_and_hdr(tmp_path):
