@@ -279,8 +279,8 @@ def optimize(
     `experiment` and `overrides` are the arguments of `load`. `experiment` may also be a result of `load`.
 
     `folder` is the run folder. The content is the same as from `reslrb optimize`. If `folder` exists, the run is
-    written to `folder-2` and so on (see `Run.folder`). With `folder`, the setting `run.output` is ignored, with a
-    warning. Without `folder`, only the caches of kernels and measurements are written.
+    written to `folder-2` and so on (see `Run.folder`). With `folder`, the setting `run.output` is ignored.
+    Without `folder`, only the caches of kernels and measurements are written.
 
     `resume` is the folder of an earlier run, in place of `experiment` and `folder`. The run continues exactly where the
     earlier run stopped. `overrides` may change iterations and learning rates. A finished run has no iterations left and
@@ -320,9 +320,6 @@ def optimize(
             raise ConfigError("experiment", "", "is missing; give a configuration, or resume=RUN")
         config = _with_own(load_with(experiment, [*put_in, *named]), loss, allow_code)
         if folder is not None:
-            instead = load_with(experiment, put_in).run.output
-            if instead not in (Path.cwd() / "runs", config.run.output):
-                logger.warning("%s: run.output: %s is not used; folder says where the run is", config.source, instead)
             try:
                 check_output(config.source, config.run.output)
             except ConfigError as error:

@@ -142,7 +142,7 @@ def _conditions(plan: Plan, session: Session) -> str:
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
     roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
-    what = {"fixed": "dL/dI fixed", "loss": f"loss {loss_words(config.loss)}", "image": "the image"}[plan.objective]
+    what = {"fixed": "dL/dI fixed", "loss": f"loss {loss_words(config.losses)}", "image": "the image"}[plan.objective]
     if plan.objective != "image" and any(spec.regularizers for spec in config.parameters):
         what += ", without the regularizers, which have no noise"
     spp = ", ".join(str(count) for count in plan.spps or [config.run.spp])

@@ -201,7 +201,7 @@ def command(
     from reslrb_cli.scene.images import turned_line
     from reslrb_cli.scene.load import load_scene
     from reslrb_cli.scene.parameters import select_parameters
-    from reslrb_cli.scene.proposal import open_photograph, write_smaller
+    from reslrb_cli.scene.proposal import open_photograph, propose, write_smaller
     from reslrb_cli.scene.visibility import find_depth
 
     photo = None if target is None else open_photograph(target)
@@ -218,7 +218,9 @@ def command(
     size = choose_size(own, photo, fixed=own != whole)
     reason = _why_camera(scene, sensor, description.hides_emitters, scene_file)
     is_integer = photo is not None and photo.is_integer
-    proposals = _propose(scene_file, scene, index, lamps=not is_integer and not description.hides_emitters)
+    proposals = propose(scene, index, lamps=not is_integer and not description.hides_emitters)
+    if not proposals:
+        raise ConfigError(scene_file, "", "has no recoverable parameter; reslrb inspect --all says why")
     image, copied = target, photo is not None and photo.size != size
     if photo is not None and copied:
         image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
@@ -289,16 +291,6 @@ def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
         others = [name for number, name in enumerate(named) if number != index]
         more = "" if len(others) <= LISTED_SENSORS else f" and {len(others) - LISTED_SENSORS} more"
         echo(f"sensor {named[index]}; --sensor selects another: {', '.join(others[:LISTED_SENSORS])}{more}")
-
-
-def _propose(scene_file: Path, scene: mi.Scene, index: int, lamps: bool) -> list[Proposal]:
-    """Return the parameters that can be recovered. Raises ConfigError if there are none."""
-    from reslrb_cli.scene.proposal import propose
-
-    proposals = propose(scene, index, lamps)
-    if not proposals:
-        raise ConfigError(scene_file, "", "has no recoverable parameter; reslrb inspect --all says why")
-    return proposals
 
 
 def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> str | None:

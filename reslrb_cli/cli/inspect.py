@@ -19,6 +19,7 @@ from pydantic_core import to_jsonable_python
 
 from reslrb_cli.cli.options import overrides_option, start_variant
 from reslrb_cli.cli.terminal import echo, fill
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanRow
     from reslrb_cli.optimization.sensitivity import Conditioning
     from reslrb_cli.scene.catalog import ParameterInfo, SceneSummary, SensorSummary
-    from reslrb_cli.scene.needs import SceneNeeds
     from reslrb_cli.scene.parameters import Selection
 
 
@@ -64,7 +64,7 @@ def read_subject(path: Path, overrides: tuple[str, ...]) -> Subject:
     if manifest is None and file.name == "config.yaml":
         manifest = read_manifest(file.parent)
     is_scene = _is_scene(file)
-    text = write({"scene": {"file": str(file.absolute())}}) if is_scene else read_text(file, str(file))
+    text = write({"scene": {"file": str(file.absolute())}}) if is_scene else read_text(file)
     data = parse(text, str(file))
     given = {str(parse_override(override).location[0]) for override in overrides}
     sections = {key for key, value in data.items() if value is not None} if isinstance(data, dict) else set(_STAND_INS)
@@ -107,11 +107,6 @@ def _sized(sensor: SensorSummary) -> str:
     (x, y), (width, height) = sensor.crop
     crop = "" if (x, y) == (0, 0) and (width, height) == sensor.size else f", crop {width}x{height} at ({x}, {y})"
     return f"{sensor.size[0]}x{sensor.size[1]}{crop}"
-
-
-def _needed(needs: SceneNeeds) -> str:
-    names = [name for name, value in vars(needs).items() if value is True]
-    return ", ".join(name.removeprefix("has_").replace("_", " ") for name in names) or "nothing special"
 
 
 def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
@@ -249,7 +244,7 @@ def command(
     selection = None if "parameters" in subject.missing else select(config, scene)
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
     plan = None if selection is None else make_plan(subject, scene, selection)
-    measured = measure(subject, overrides) if conditioning else None
+    measured = measure(config) if conditioning else None
     if as_json:
         known = {"run": subject.run, **vars(summary)}
         known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan and {"rows": plan}, "edges": edges}
@@ -268,7 +263,6 @@ def command(
         {
             "counted": _counted,
             "sized": _sized,
-            "needed": _needed,
             "shares": lambda view: ", ".join(f"{name} {100 * share:.0f} %" for name, share in vars(view).items()),
             "conditioning": conditioning_lines,
         },
@@ -336,16 +330,15 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
     return f"`reslrb optimize {subject.config.source}`" + (" runs it again" if subject.run else " runs it")
 
 
-def measure(subject: Subject, overrides: tuple[str, ...]) -> Conditioning:
-    """Measure the conditioning of the experiment. The conditioning does not depend on the estimator, so the estimator
-    `auto` becomes `stack`.
+def measure(config: Config) -> Conditioning:
+    """Measure the conditioning of the experiment. The conditioning does not depend on settings that a run decides, so
+    these are off.
     """
     from reslrb_cli.optimization.assemble import assemble
     from reslrb_cli.optimization.sensitivity import measure_conditioning
 
-    config = subject.config
-    if config.integrator.options().get("estimator") == "auto":
-        config = read_subject(subject.path, (*overrides, "integrator.estimator=stack")).config
+    if isinstance(config.integrator, ReslrbConfig):
+        config = config.model_copy(update={"integrator": config.integrator.undecided_off()})
     return measure_conditioning(assemble(config, logging.getLogger(__name__).info), SAMPLES)
 
 

@@ -66,11 +66,7 @@ class LensOptions:
     pixels: int
 
     def check(self) -> None:
-        """Raise ConfigError if an option is out of range, contradicts another, or names files that exist."""
-        if self.floor is not None and not 0 <= self.floor < 1:
-            raise ConfigError("--floor", "", f"is {self.floor:g}; it must be from 0 to below 1")
-        if not 0 <= self.sun < 10:
-            raise ConfigError("--sun", "", f"is {self.sun:g} degrees; it must be from 0 to below 10 (the sun: 0.53)")
+        """Raise ConfigError if an option contradicts another, or names files that exist."""
         if self.sun and self.light_distance is not None:
             raise ConfigError("--sun", "", "needs parallel light, --light-distance a point light; remove one")
         if self.output.exists() and not self.output.is_dir():
@@ -107,14 +103,14 @@ class LensOptions:
 )
 @click.option(
     "--sun",
-    type=float,
+    type=click.FloatRange(0, 10, max_open=True),
     default=0.0,
     metavar="DEGREES",
     help="Angular diameter of parallel light; that of the sun is 0.53.",
 )
 @click.option(
     "--floor",
-    type=float,
+    type=click.FloatRange(0, 1, max_open=True),
     help="Minimum brightness, as a fraction of the maximum, to which darker parts are raised. Default: chosen.",
 )
 @click.option("--pixels", type=click.IntRange(16, 1024), default=PIXELS, show_default=True,

@@ -1,12 +1,16 @@
 """`reslrb optimize`: recover the parameters of a configuration, or continue a run.
 
-`--dry-run` prints the forecast of a run (`show_forecast`, `templates/forecast.txt.j2`).
+`--dry-run` prints the forecast of a run (`show_forecast`, `templates/forecast.txt.j2`). `Progress` shows how far a run
+is.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +31,8 @@ from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
+    from reslrb_cli.optimization.problem import ErrorMeter
+    from reslrb_cli.records.metrics import Record
     from reslrb_cli.runs.prepare import PreparedRun
 
 
@@ -167,7 +173,6 @@ def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
         with engine_at(begun.course, workers) as engine:
             begun.course.compute_with(engine)
             return _run(begun, None, quiet)
-    from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.records.manifest import Status
     from reslrb_cli.report.run_summary import last_line, parameter_lines, terminal_width
@@ -192,3 +197,57 @@ def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
     if not quiet and status is Status.FINISHED and course.problem.config.fabrication is not None:
         echo(f"next: `reslrb export {os.path.relpath(place.path)} -o FOLDER` writes the solid")
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED
+
+
+#: Without a terminal, a line is written after each tenth of the iterations and after this many seconds.
+SECONDS_PER_LINE = 10.0
+
+#: Format of the bar, and the columns that it needs besides the text `desc`. The end of a longer line is cut off.
+BAR, BAR_COLUMNS = "{percentage:3.0f}%|{bar}| {desc}, {n_fmt}/{total_fmt}, {remaining} left", 38
+
+
+class Progress:
+    """Progress of a run with `total` iterations on standard error: a bar on a terminal, plain lines otherwise.
+
+    As a context manager, `Progress` closes the bar at the end. `done` iterations were finished before the run was
+    resumed. `meter` measures the errors of the parameters.
+    """
+
+    def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
+        self._stream = sys.stderr
+        self._quiet = quiet or self._stream is None  # the program was started without one
+        self._total, self._meter = total, meter
+        self._bar: Any = None
+        self._last_line, self._tenth = time.monotonic(), 10 * done // total
+        if not self._quiet and self._stream.isatty():
+            from tqdm import tqdm
+
+            self._bar = tqdm(
+                total=total, initial=done, file=self._stream, unit="it", dynamic_ncols=True, bar_format=BAR
+            )
+
+    def show(self, record: Record) -> None:
+        """Show that the iteration of `record` is done. A closed terminal does not end the run."""
+        from reslrb_cli.report.run_summary import descriptions
+
+        if self._quiet:
+            return
+        texts, done, now = descriptions(record, self._meter), record.iteration + 1, time.monotonic()
+        with contextlib.suppress(OSError):
+            if self._bar is not None:
+                room = (self._bar.format_dict["ncols"] or 0) - BAR_COLUMNS
+                self._bar.set_description_str(next((t for t in texts if len(t) <= room), texts[-1]), refresh=False)
+                self._bar.update()
+                if done == self._total:  # no iterations follow
+                    self._bar.close()
+            elif 10 * done // self._total != self._tenth or now - self._last_line >= SECONDS_PER_LINE:
+                self._tenth, self._last_line = 10 * done // self._total, now
+                click.echo(f"{done}/{self._total}: {texts[0]}, {record.elapsed_s:.1f} s", file=self._stream)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            with contextlib.suppress(OSError):
+                self._bar.close()

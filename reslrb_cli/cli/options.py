@@ -7,8 +7,8 @@ then has one object per line. The file is updated while the command runs.
 from __future__ import annotations
 
 import errno
+import functools
 import os
-import re
 import shutil
 import tempfile
 import time
@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from click.shell_completion import CompletionItem
 
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.cli.terminal import Interrupts, echo
@@ -145,45 +144,8 @@ def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCo
     return ExitCode.DONE if done else ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
 
 
-class FolderPath(click.Path):
-    """Path for which a shell completes folders. The code that opens the path checks its type."""
-
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return [CompletionItem(incomplete, type="dir")]
-
-
 #: Type of an argument or an option that names the folder of a run, or of a sweep.
-FOLDER = FolderPath(path_type=Path)
-
-
-def complete_setting(_context: click.Context, _parameter: click.Parameter, start: str) -> list[CompletionItem]:
-    """Return the settings whose keys start with `start`, in the form `KEY=`. Indices may be any number."""
-    plain = re.sub(r"\[\d+\]", "[0]", start)
-    return [CompletionItem(f"{start}{key[len(plain) :]}=") for key in setting_keys() if key.startswith(plain)]
-
-
-def setting_keys() -> list[str]:
-    """Return every key of the configuration's schema. Each list has only one key, with index 0:
-    `parameters[0].bounds`.
-    """
-    schema = Config.model_json_schema()
-    return list(dict.fromkeys(_keys(schema, schema["$defs"], "")))
-
-
-def _keys(schema: Mapping[str, Any], definitions: Mapping[str, Any], at: str) -> Iterator[str]:
-    """Yield the keys below `at` for each alternative in `schema`. The search stops after 6 levels, because a schema may
-    refer to itself.
-    """
-    if "$ref" in schema:
-        schema = definitions[schema["$ref"].rpartition("/")[2]]
-    for alternative in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
-        yield from _keys(alternative, definitions, at)
-    if "items" in schema:
-        yield from _keys(schema["items"], definitions, f"{at}[0]")
-    for name, value in schema.get("properties", {}).items() if at.count(".") < 5 else ():
-        key = f"{at}.{name}" if at else name
-        yield key
-        yield from _keys(value, definitions, key)
+FOLDER = click.Path(file_okay=False, path_type=Path)
 
 
 #: Type of a count, such as samples, depths or seeds: 31 bits, as in a configuration.
@@ -254,7 +216,7 @@ budget_option = click.option(
 
 #: `--set` (`overrides`).
 overrides_option = click.option(
-    "--set", "overrides", multiple=True, metavar="KEY=VALUE", shell_complete=complete_setting,
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE",
     help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
 )  # fmt: skip
 
@@ -289,9 +251,8 @@ def experiment_arguments(function: Callable[..., Any], required: bool = True) ->
     return argument(overrides_option(function))
 
 
-def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add CONFIG and `--set` to a command in which CONFIG is optional. Without CONFIG, `config_file` is None."""
-    return experiment_arguments(function, required=False)
+#: Adds CONFIG and `--set` to a command in which CONFIG is optional. Without CONFIG, `config_file` is None.
+optional_experiment_arguments = functools.partial(experiment_arguments, required=False)
 
 
 @dataclass(frozen=True)

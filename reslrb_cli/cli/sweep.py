@@ -7,22 +7,19 @@ killed, `follow` ends its current run, so the sweep can be continued at once.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import logging
 import os
 import re
-import selectors
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import click
 
@@ -31,7 +28,6 @@ from reslrb_cli.cli.options import (
     COUNT,
     FOLDER,
     allow_code_option,
-    complete_setting,
     is_given,
     optional_experiment_arguments,
 )
@@ -56,11 +52,11 @@ _POLL_SECONDS = 0.1
 #: Minimum time between two pages, as a multiple of the time for the last page, because runs wait for it.
 PAGE_SHARE = 5.0
 
-#: Number of last lines of a run in which its error is searched; start of a line of progress.
-MOST_LINES, _PROGRESS = 200, re.compile(r"\d+/\d+: ")
+#: Number of last bytes of a run's output in which its error is searched; start of a line of progress.
+MOST_BYTES, _PROGRESS = 1 << 14, re.compile(r"\d+/\d+: ")
 
-#: The program, in a process that ends with the process of the given number.
-_PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; follow(int(sys.argv.pop(1)))"
+#: The program, in a process that ends with this one.
+_PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; follow()"
 
 
 @click.command("sweep")
@@ -69,7 +65,6 @@ _PROGRAM = "sys.argv[0] = 'reslrb'; from reslrb_cli.cli.sweep import follow; fol
     "--vary",
     multiple=True,
     metavar="KEY=[VALUE, ...]",
-    shell_complete=complete_setting,
     help="Setting to vary, as for --set, and a list of its values in YAML. If repeated, all combinations are "
     "run. A value of `integrator` may be TYPE[:ESTIMATOR][(OPTION=VALUE,...)].",
 )
@@ -212,59 +207,52 @@ def call(arguments: Sequence[str], interrupts: Interrupts, fresh: bool = False) 
     this process. The run folder contains the warnings of the process. A `fresh` process has no cached kernels or
     decisions. Runs with equal time limits therefore start under equal conditions.
     """
-    if fresh:
-        with tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder:
-            caches = dict.fromkeys(("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE"), folder)
-            return _call(arguments, interrupts, {**os.environ, **caches, "CUDA_CACHE_DISABLE": "1"})
-    return _call(arguments, interrupts, None)
-
-
-def _call(arguments: Sequence[str], interrupts: Interrupts, environment: dict[str, str] | None) -> tuple[int, str]:
-    program = [*python_command(_PROGRAM), str(os.getpid()), *arguments]
-    process = subprocess.Popen(
-        program,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-        env=environment,
-    )
-    assert process.stdout is not None
-    assert process.stdin is not None
-    interrupts.last_act = lambda: _end(process)
-    told, said, rest = False, deque[str](maxlen=MOST_LINES), b""
-    try:
-        with selectors.DefaultSelector() as selector:
-            selector.register(process.stdout, selectors.EVENT_READ)
-            while True:
+    environment = dict(os.environ)
+    with (
+        tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder,
+        tempfile.TemporaryFile() as output,
+    ):
+        if fresh:
+            environment |= dict.fromkeys(("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE"), folder)
+            environment["CUDA_CACHE_DISABLE"] = "1"
+        process = subprocess.Popen(
+            [*python_command(_PROGRAM), *arguments],
+            stdin=subprocess.PIPE,  # closes when this process ends
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            env=environment,
+        )
+        interrupts.last_act = lambda: _end(process)
+        told, code = False, None
+        try:
+            while code is None:
                 if interrupts.requested and not told:
-                    process.send_signal(signal.SIGTERM)
+                    process.terminate()
                     told = True
-                if not selector.select(_POLL_SECONDS):
-                    continue
-                chunk = os.read(process.stdout.fileno(), 1 << 16)
-                if not chunk:
-                    break
-                *lines, rest = (rest + chunk).split(b"\n")
-                for line in (line.decode(errors="replace") for line in lines if line.strip()):
-                    said.append(line)
-                    if _PROGRESS.match(line):
-                        _show(line)
-        code = process.wait()
-    finally:
-        interrupts.last_act = lambda: None
-        _show("")
-        if process.poll() is None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    code = process.wait(_POLL_SECONDS)
+                _show(next(filter(_PROGRESS.match, reversed(_last_lines(output))), ""))
+        finally:
+            interrupts.last_act = lambda: None
+            _show("")
             process.kill()
             process.wait()
-        for stream in (process.stdout, process.stdin):
-            with contextlib.suppress(OSError):
-                stream.close()
+            if process.stdin is not None:
+                process.stdin.close()
+        said = _last_lines(output)
     if code < 0:
         name = signal.Signals(-code).name
         memory = " (often sent when memory runs out)" if -code == signal.SIGKILL else ""
         return (ExitCode.INTERRUPTED if told else code), f"ended by {name}{memory}: {last_words(chr(10).join(said))}"
     return code, said[-1] if said else f"ended with exit code {code}, without a message"
+
+
+def _last_lines(output: IO[bytes]) -> list[str]:
+    """Return the last lines of a run. The place at which the run writes is that of `output`, and does not move."""
+    start = max(os.fstat(output.fileno()).st_size - MOST_BYTES, 0)
+    text = os.pread(output.fileno(), MOST_BYTES, start).decode(errors="replace")
+    return [line for line in text.splitlines() if line.strip()]
 
 
 def _show(line: str) -> None:
@@ -284,22 +272,16 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.kill()
 
 
-def follow(parent: int) -> None:
-    """Run the program `reslrb` in a process that always ends together with the process `parent`."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG
-        if os.getppid() != parent:  # the parent has ended already
-            os._exit(ExitCode.INTERRUPTED)
-    else:
-        threading.Thread(target=_end_with_input, daemon=True).start()
+def follow() -> None:
+    """Run the program `reslrb` in a process that ends when its standard input closes. It closes when the sweep ends,
+    even by a kill.
+    """
+
+    def end_with_input() -> None:
+        os.read(0, 1)
+        os._exit(ExitCode.INTERRUPTED)
+
+    threading.Thread(target=end_with_input, daemon=True).start()
     from reslrb_cli.cli import run
 
     run()
-
-
-def _end_with_input() -> None:
-    """End this process when its standard input closes, because the parent process has ended. Used on systems without
-    PR_SET_PDEATHSIG.
-    """
-    os.read(0, 1)
-    os._exit(ExitCode.INTERRUPTED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args
@@ -14,9 +15,11 @@ from pydantic import (
     Discriminator,
     Field,
     GetCoreSchemaHandler,
+    SerializerFunctionWrapHandler,
     Tag,
     ValidationInfo,
     WithJsonSchema,
+    model_serializer,
 )
 from pydantic_core import CoreSchema, PydanticCustomError
 
@@ -33,8 +36,20 @@ class Section(BaseModel):
     """
 
     model_config = ConfigDict(
-        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True,
+        ser_json_inf_nan="constants",
+    )  # fmt: skip
+
+    def idle(self) -> set[str]:
+        """Return the settings that have no effect beside the others. They are not written, so that the configuration
+        can be read again.
+        """
+        return set()
+
+    @model_serializer(mode="wrap")
+    def _without_idle(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        idle = self.idle()
+        return {name: value for name, value in handler(self).items() if name not in idle}
 
 
 def located(key: str, message: str) -> PydanticCustomError:
@@ -76,11 +91,6 @@ class Choice(Section):
 # --- paths ------------------------------------------------------------------------------------------------------------
 
 
-def _folder(info: ValidationInfo) -> Path:
-    """Return the folder of the configuration file, or the working directory."""
-    return Path((info.context or {}).get("folder", "")).absolute()
-
-
 def _path(folder: Path, value: Any) -> Path:
     """Return the path `value` relative to `folder`. `..` is kept, because it may follow a symbolic link."""
     if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
@@ -98,13 +108,16 @@ def _path(folder: Path, value: Any) -> Path:
 
 _PATH_SCHEMA = WithJsonSchema({"type": "string", "format": "path"})
 
-#: A path relative to the folder of the config file.
-ConfigPath = Annotated[Path, BeforeValidator(lambda value, info: config_path(value, info)), _PATH_SCHEMA]
-
 
 def config_path(value: Any, info: ValidationInfo) -> Path:
-    """Return an absolute path from a path relative to the configuration file's folder. Raises a validator's error."""
-    return _path(_folder(info), value)
+    """Return an absolute path from a path relative to the configuration file's folder, or to the working directory
+    without a file. Raises a validator's error.
+    """
+    return _path(Path((info.context or {}).get("folder", "")).absolute(), value)
+
+
+#: A path relative to the folder of the config file.
+ConfigPath = Annotated[Path, BeforeValidator(config_path), _PATH_SCHEMA]
 
 
 def code_place(value: Any, info: ValidationInfo) -> str:
@@ -201,9 +214,17 @@ Seed = Annotated[int, Field(ge=0, lt=SEED_END)]
 Size = Annotated[tuple[Count, Count], Field(strict=False)]
 
 
-def few(what: str, reason: str = "") -> AfterValidator:
-    """Return a validator that limits the product of the two numbers in a size. `what` names the unit in errors."""
+def size_of(size: int | tuple[int, int]) -> tuple[int, int]:
+    """Return a size as (width, height). One number stands for both width and height."""
+    return (size, size) if isinstance(size, int) else size
+
+
+def few(what: str, least: int = 1) -> AfterValidator:
+    """Return a validator that limits the product of the two numbers in a size, and each number to at least `least`.
+    `what` names the unit in errors.
+    """
+    start = "must have" if least == 1 else f"must be at least {least}, and have"
     return must(
-        lambda size: size[0] * size[1] <= PIXELS,
-        lambda size: f"must have at most {PIXELS} {what}, not {size[0] * size[1]}{reason}",
+        lambda size: min(size_of(size)) >= least and math.prod(size_of(size)) <= PIXELS,
+        lambda size: f"{start} at most {PIXELS} {what}, not {math.prod(size_of(size))}",
     )

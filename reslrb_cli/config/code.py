@@ -7,11 +7,12 @@ export a run do not need the user's code.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import sys
 import traceback
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,7 @@ def load_named(file: Path, name: str, source: object, key: str) -> Callable[...,
     if str(file.parent) not in sys.path:
         sys.path.append(str(file.parent))
     sys.modules[module.__name__] = module  # dataclasses and pickle look the module up there
-    with_place = Guard(source, key, file, "the file")
-    with with_place:
+    with guarded(source, key, file, "the file"):
         exec(compile(text, str(file), "exec"), module.__dict__)
     found = getattr(module, name, None)
     if not callable(found):
@@ -44,23 +44,20 @@ def load_named(file: Path, name: str, source: object, key: str) -> Callable[...,
     return found
 
 
-class Guard:
-    """Converts errors of a user's code to one located line. Errors of the machine pass unchanged."""
-
-    def __init__(self, source: object, key: str, file: Path | None, what: str) -> None:
-        self.source, self.key, self.file, self.what = source, key, file, what
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
-        if error is None or not isinstance(error, Exception | SystemExit) or isinstance(error, ConfigError):
-            return
+@contextlib.contextmanager
+def guarded(source: object, key: str, file: Path | None, what: str) -> Iterator[None]:
+    """Convert errors of a user's code to one located line. Errors of the machine pass unchanged."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except (Exception, SystemExit) as error:
         if is_out_of_memory(error) or is_machine_fault(error):
-            return
-        lines = [each.lineno for each in traceback.extract_tb(trace) if self.file and each.filename == str(self.file)]
-        if isinstance(error, SyntaxError) and error.filename == str(self.file):
+            raise
+        trace = traceback.extract_tb(error.__traceback__)
+        lines = [each.lineno for each in trace if file and each.filename == str(file)]
+        if isinstance(error, SyntaxError) and error.filename == str(file):
             lines = [error.lineno]
         where = f" in line {lines[-1]}" if lines else ""
         said = f"{type(error).__name__}: {error}".rstrip(": ") if str(error) else describe(error)
-        raise ConfigError(self.source, self.key, f"{self.what} raises{where} {said}") from error
+        raise ConfigError(source, key, f"{what} raises{where} {said}") from error

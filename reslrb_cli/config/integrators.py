@@ -6,13 +6,11 @@ The limits on samples, passes and paths are checked here, before a scene is load
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
     Discriminator,
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 from typing_extensions import Self
@@ -27,32 +25,15 @@ from reslrb_cli.config.base import (
     code_file,
     located,
     mark,
-    must,
 )  # fmt: skip
 from reslrb_cli.config.files import CAPACITY, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
-
-_DEPTH = must(
-    lambda depth: depth <= PATH_LENGTH,
-    lambda depth: (
-        f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {depth}: Russian roulette ends "
-        "paths long before"
-    ),
-)
-
-_CAPACITY = must(
-    lambda capacity: capacity <= CAPACITY,
-    lambda capacity: (
-        f"must be at most {CAPACITY}, not {capacity}: each stored connection adds code to the kernel, which would "
-        "take hours to compile; estimator gather uses all connections"
-    ),
-)
 
 
 class Integrator(Choice):
     """Options of all integrators."""
 
     type: str
-    max_depth: Annotated[int, _DEPTH] = Field(default=8, ge=-1, json_schema_extra={"maximum": PATH_LENGTH})
+    max_depth: int = Field(default=8, ge=-1, le=PATH_LENGTH)
     """Length of the longest path in segments, from the emitter to the sensor. 1: only emitters that the sensor sees
     directly. 2: also direct light. -1: no limit; only Russian roulette ends paths. `trajectory` needs a limit, because
     its record of a path has room for this many vertices."""
@@ -120,9 +101,9 @@ class Reslrb(AttachingTracer):
     all connections, by a second traversal. `event`: a few scattering events, selected at random. `stack`: all
     connections, stored in thread-local memory. `auto`: `stack`, the most efficient one in every experiment that was
     measured."""
-    capacity: Annotated[Count, _CAPACITY] = Field(default=1, json_schema_extra={"maximum": CAPACITY})
-    """Number of connections (`reservoir`) or scattering events (`event`) that are stored for each path. Only with
-    estimators `reservoir` and `event`."""
+    capacity: Annotated[Count, Field(le=CAPACITY)] = 1
+    """Number of connections (`reservoir`) or scattering events (`event`) that are stored for each path. Each adds
+    code to the kernel; `gather` uses all connections. Only with estimators `reservoir` and `event`."""
     weight: Literal["luminance", "adjoint"] = "luminance"
     """Selection probability of a connection: in proportion to its `luminance`, or to its contribution to the objective
     (`adjoint`). `adjoint` has less variance; it does not work with `run.adjoint: correlated`. Only with estimators
@@ -183,16 +164,12 @@ class Reslrb(AttachingTracer):
                 f"`{self.estimator}` needs the connections of light paths, and paths: camera has none; "
                 "remove it, or use stack",
             )
-        _check_share(self.paths, self.light_share)
-        for option in sorted(self._foreign() & self.model_fields_set):
+        if self.light_share != UNDECIDED["light_share"] and self.paths in ("light", "camera"):
+            raise located("light_share", f"has no effect with paths: {self.paths}, only with both; remove it")
+        for option in sorted(self.idle() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
             raise located(option, f"has no effect with estimator `{self.estimator}`, only with {owners}; remove it")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_foreign(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        return {name: value for name, value in values.items() if name not in self._foreign()}
 
     def undecided_off(self) -> Reslrb:
         """Return these options with estimator `stack` instead of `auto`, and with all measured options turned off."""
@@ -201,7 +178,7 @@ class Reslrb(AttachingTracer):
             undecided["estimator"] = AUTO_ESTIMATOR
         return self.model_copy(update=undecided) if undecided else self
 
-    def _foreign(self) -> set[str]:
+    def idle(self) -> set[str]:
         """Return the options that belong only to other estimators."""
         return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS[self.estimator]}
 
@@ -276,11 +253,6 @@ AnyIntegrator = Annotated[
 ]
 
 
-def _check_share(paths: str, light_share: float) -> None:
-    if light_share != UNDECIDED["light_share"] and paths in ("light", "camera"):
-        raise located("light_share", f"has no effect with paths: {paths}, only with both; remove it")
-
-
 def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:
     """Return why a film of `pixels` pixels cannot be traced with `spp` samples per pixel, and a remedy. Otherwise,
     return None.
@@ -291,24 +263,13 @@ def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = 
     unit = min(per_pass or spp, spp)
     parts = -(-unit // PASS_SAMPLES) if splits else 1
     paths = -(-unit // parts) * pixels
-    most = largest_pass(spp, pixels)
     if paths > PASS_PATHS:
-        advice = f"set integrator.samples_per_pass to {most}, or lower run.spp" if splits and most else "lower run.spp"
-        advice = advice if PASS_PATHS >= pixels else "use a smaller film"
+        advice = f"set integrator.samples_per_pass to at most {PASS_PATHS // pixels}, or lower run.spp"
+        advice = advice if splits else "lower run.spp"
         return f"makes {paths} light paths in one pass, above the limit of {PASS_PATHS}; {advice}"
     if spp // unit * parts > PASSES:
-        advice = f"set integrator.samples_per_pass to {most}" if most and spp // most <= PASSES else "lower run.spp"
-        return f"makes {spp // unit * parts} passes of a step, above the limit of {PASSES}; {advice}"
+        return (
+            f"makes {spp // unit * parts} passes of a step, above the limit of {PASSES}; "
+            "raise integrator.samples_per_pass, or lower run.spp"
+        )
     return None
-
-
-def largest_pass(spp: int, pixels: int) -> int | None:
-    """Return the largest `samples_per_pass` that divides `spp` and fits into a pass, or None if there is none."""
-    most = min(PASS_PATHS // pixels, PASS_SAMPLES, spp)
-    return max((n for n in divisors(spp) if n <= most), default=None)
-
-
-def divisors(number: int) -> list[int]:
-    """Return all divisors of a number in ascending order. Fast for numbers of 31 bits."""
-    small = [n for n in range(1, int(number**0.5) + 1) if number % n == 0]
-    return sorted({*small, *(number // n for n in small)})

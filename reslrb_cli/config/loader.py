@@ -50,7 +50,7 @@ def parse_override(text: str, option: str = "--set", example: str = "KEY=VALUE, 
     def in_shell(mended: str) -> str:
         return f"{option} {shlex.quote(f'{path}={mended}')}"
 
-    return Override(label, location, parse(value, label, name_line=False, example=in_shell))
+    return Override(label, location, parse(value, label, in_shell))
 
 
 def _parse_location(path: str, label: str) -> Location:
@@ -108,7 +108,7 @@ def load(path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
 
     Raises ConfigError. The error names the key, and either the file or the wrong override.
     """
-    return loads(read_text(Path(path), str(path)), path, overrides)
+    return loads(read_text(Path(path)), path, overrides)
 
 
 def loads(text: str, path: Path | str, overrides: Sequence[str | Override] = ()) -> Config:
@@ -225,18 +225,11 @@ def _blame(stages: list[dict[str, Any]], overrides: Sequence[Override], problem:
     """Return the origin of `problem`: the override that causes it, or the file.
 
     `stages` holds several versions of the settings: first the settings of the file, then the settings after each
-    override. The function uses bisection, because each check takes time.
+    override.
     """
-    without, having = 0, len(stages) - 1
-    if having == 0 or problem in _validate(stages[0], path)[1]:
-        return str(path)
-    while having - without > 1:
-        middle = (without + having) // 2
-        if problem in _validate(stages[middle], path)[1]:
-            having = middle
-        else:
-            without = middle
-    return overrides[without].label
+    origins = [str(path), *(override.label for override in overrides)]
+    found = (origin for origin, stage in zip(origins, stages, strict=True) if problem in _validate(stage, path)[1])
+    return next(found, origins[-1])
 
 
 def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: dict[str, Any]) -> Config:
@@ -260,12 +253,12 @@ def dump(config: Config) -> str:
     return write(config.model_dump(mode="json", exclude_none=True))
 
 
-def read_text(path: Path, source: str) -> str:
-    """Return the text of a configuration file, named `source` in errors. Raises ConfigError if it is not text."""
+def read_text(path: Path) -> str:
+    """Return the text of a configuration file. Raises ConfigError if it is not text."""
     try:
         return read_file(path).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise ConfigError(source, "", "is not UTF-8 text; a configuration is a YAML file") from None
+        raise ConfigError(path, "", "is not UTF-8 text; a configuration is a YAML file") from None
 
 
 def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[SettingError]]:

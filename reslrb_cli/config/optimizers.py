@@ -10,8 +10,6 @@ from pydantic import (
     AfterValidator,
     Discriminator,
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 from typing_extensions import Self
@@ -38,12 +36,8 @@ class Loss(Choice):
     """Factor of an entry in a list of losses, such as `loss: [{type: l2, weight: 1}, {type: ssim, weight: 0.1}]`. Only
     in a list."""
 
-    @model_serializer(mode="wrap")
-    def _without_unasked(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if values.get("weight") == 1.0:
-            del values["weight"]
-        return values
+    def idle(self) -> set[str]:
+        return {"weight"} if self.weight == 1 else set()
 
     def own_options(self) -> dict[str, Any]:
         """Return the options of the function itself (epsilon, ...), without those that all losses share."""
@@ -123,11 +117,6 @@ Losses = Annotated[
 ]
 
 
-def losses_of(given: Loss | Sequence[Loss]) -> list[Loss]:
-    """Return the entries of `loss` as a list. A single loss becomes a list with one entry."""
-    return [given] if isinstance(given, Loss) else list(given)
-
-
 def loss_keys(name: str, given: Loss | Sequence[Loss]) -> list[tuple[str, Loss]]:
     """Return the entries of `loss`. Each entry comes with the key of its option `name`."""
     if isinstance(given, Loss):
@@ -135,9 +124,9 @@ def loss_keys(name: str, given: Loss | Sequence[Loss]) -> list[tuple[str, Loss]]
     return [(f"loss[{number}].{name}", one) for number, one in enumerate(given)]
 
 
-def loss_words(given: Loss | Sequence[Loss]) -> str:
-    """Return the loss in short: `l2`, or `l2 + 0.1 ssim`."""
-    parts = [f"{loss.type}" if loss.weight == 1 else f"{loss.weight:g} {loss.type}" for loss in losses_of(given)]
+def loss_words(losses: Sequence[Loss]) -> str:
+    """Return the losses in short: `l2`, or `l2 + 0.1 ssim`."""
+    parts = [f"{loss.type}" if loss.weight == 1 else f"{loss.weight:g} {loss.type}" for loss in losses]
     return " + ".join(parts)
 
 
@@ -194,12 +183,8 @@ class OptimizerSettings(Choice):
             raise located("scale", f"curvature needs type: sgd; steps of {self.type} do not grow with gradients")
         return self
 
-    @model_serializer(mode="wrap")
-    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if self.schedule == "constant":
-            values.pop("final_fraction", None)
-        return values
+    def idle(self) -> set[str]:
+        return {"final_fraction"} if self.schedule == "constant" else set()
 
     def own_options(self) -> dict[str, Any]:
         """Return the options of the update rule itself (beta_1, ...), without those that all optimisers share."""

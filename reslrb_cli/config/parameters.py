@@ -32,7 +32,6 @@ from reslrb_cli.config.base import (
     mark,
     must,
 )
-from reslrb_cli.config.files import PIXELS
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
@@ -110,25 +109,10 @@ _EACH_ONCE = must(each_once, lambda _: "must name each once")
 #: One name, or a list of names.
 Names = Annotated[list[Name], Field(min_length=1), BeforeValidator(list_of_one), _EACH_ONCE, _NAMES]
 
-_TEXELS = must(
-    lambda size: min(size) >= 2 and size[0] * size[1] <= PIXELS,
-    lambda size: f"must be at least [2, 2], and have at most {PIXELS} texels, not {list(size)}",
-)
-
-
-_GRID = must(
-    lambda grid: min(size_of(grid)) >= 2 and size_of(grid)[0] * size_of(grid)[1] <= PIXELS,
-    lambda grid: f"must be at least 2, and have at most {PIXELS} vertices, not {grid}",
-)
-
-
-def size_of(grid: int | tuple[int, int]) -> tuple[int, int]:
-    """Return [width, height] of a grid. One number stands for both width and height."""
-    return (grid, grid) if isinstance(grid, int) else grid
-
-
 _Grid = Annotated[
-    Annotated[Count, mark("number")] | Annotated[Size, mark("list")], by_kind("a number or [width, height]"), _GRID
+    Annotated[Count, mark("number")] | Annotated[Size, mark("list")],
+    by_kind("a number or [width, height]"),
+    few("vertices", least=2),
 ]
 
 
@@ -139,7 +123,7 @@ class HeightmapSpec(Section):
     mesh: Names
     """Id of a mesh with texture coordinates, or a list of ids. Meshes in a list share one map, which is named after the
     first mesh."""
-    resolution: Annotated[Size, _TEXELS]
+    resolution: Annotated[Size, few("texels", least=2)]
     """[width, height] of the map in texels, at least 2 each. Lookups are bilinear, and constant beyond the centres of
     the outermost texels."""
     grid: _Grid | None = None

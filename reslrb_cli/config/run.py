@@ -9,8 +9,6 @@ from typing import Annotated, Any, Literal
 from pydantic import (
     AfterValidator,
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 from typing_extensions import Self
@@ -56,10 +54,6 @@ class CheckpointEvery(Section):
             has = "none" if self.seconds is None else "both"
             raise located("", f"must have exactly one of `iterations` and `seconds`, and has {has}")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: value for key, value in handler(self).items() if value is not None}
 
     def is_due(self, iterations: int, seconds: float) -> bool:
         """Return whether a checkpoint is due this many iterations and seconds after the last one."""
@@ -157,14 +151,8 @@ class RunConfig(Section):
     its loss has stopped falling if losses have 10 % noise, and for about 500 at 30 % ([When a loss is
     flat](steps.md#when-a-loss-is-flat)). `{}`: the defaults. null: never."""
 
-    @model_serializer(mode="wrap")
-    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if self.stop is None:
-            values.pop("stop", None)
-        if self.adjoint not in ("auto", "batched"):
-            del values["batches"]
-        return values
+    def idle(self) -> set[str]:
+        return set() if self.adjoint in ("auto", "batched") else {"batches"}
 
     @property
     def folder_name(self) -> str:

@@ -38,7 +38,6 @@ from reslrb_cli.config.optimizers import (
     Loss,
     Losses,
     loss_keys,
-    losses_of,
 )
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.run import AUTO_SHARDS, RunConfig
@@ -57,7 +56,7 @@ class SceneConfig(Section):
     file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.5 to 3), relative to the config file.")
     options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(default={})
     """Values of the scene file's `$name` variables."""
-    size: Annotated[Size, few("pixels", ": each image of a step takes 12 bytes or more of every one")] | None = None
+    size: Annotated[Size, few("pixels")] | None = None
     """[width, height] of the film of every sensor in pixels, without a crop window. The view stays the same if the
     ratio does. null: the size in the scene file."""
     cameras: ConfigPath | None = None
@@ -179,7 +178,7 @@ class Config(Section):
     @property
     def losses(self) -> list[Loss]:
         """The entries of `loss` as a list, even if `loss` is a single loss."""
-        return losses_of(self.loss)
+        return [self.loss] if isinstance(self.loss, Loss) else list(self.loss)
 
     @property
     def allows_code(self) -> bool:

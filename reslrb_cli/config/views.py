@@ -10,9 +10,7 @@ from pydantic import (
     BeforeValidator,
     Field,
     GetJsonSchemaHandler,
-    SerializerFunctionWrapHandler,
     WithJsonSchema,
-    model_serializer,
     model_validator,
 )
 from pydantic_core import CoreSchema
@@ -167,13 +165,8 @@ class TargetConfig(Section):
             raise located("truth", "has no effect on a rendered target, which has it; remove it")
         return self
 
-    @model_serializer(mode="wrap")
-    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if self.render is not None:
-            values.pop("color_space", None)
-            values.pop("truth", None)
-        return values
+    def idle(self) -> set[str]:
+        return set() if self.render is None else {"color_space", "truth"}
 
 
 class ViewSpec(Section):

@@ -109,17 +109,18 @@ def format_location(location: Location) -> str:
     return text
 
 
-def parse(text: str, source: str, name_line: bool = True, example: Callable[[str], str] | None = None) -> Any:
-    """Return the plain data in YAML `text`. `source` names the text in error messages. If `name_line` is True, messages
-    also give the line number.
+def parse(text: str, source: str, example: Callable[[str], str] | None = None) -> Any:
+    """Return the plain data in YAML `text`. `source` names the text in error messages, with the line number.
 
-    The keys of all mappings are text without control characters. `example` is a function that shows how to write a
-    corrected text in its original form, for example in a shell command. Raises ConfigError if the text is not YAML or
-    is nested too deeply. Tags other than plain data, duplicate keys and keys that are not text also raise ConfigError.
+    The keys of all mappings are text without control characters. If the text is not from a file, `example` shows how to
+    write a corrected text in its original form, for example in a shell command. Messages then have no line number.
+
+    Raises ConfigError if the text is not YAML or is nested too deeply. Tags other than plain data, duplicate keys and
+    keys that are not text also raise ConfigError.
     """
 
     def at(line: int) -> str:
-        return f"{source}:{line}" if name_line and line else source
+        return f"{source}:{line}" if example is None and line else source
 
     try:
         loader = Loader(text, at)

@@ -6,6 +6,7 @@ and `RBIntegrator` provide both methods for classes with `sample`.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.config.base import code_file
-from reslrb_cli.config.code import Guard, load_named
+from reslrb_cli.config.code import guarded, load_named
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.baselines import Replayed
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
@@ -55,7 +56,7 @@ class OwnIntegrator(StepIntegrator):
         options = mi.Properties("custom")
         for key, value in {**self._options, **self._arguments}.items():
             options[key] = value
-        with Guard(self.file, self.name, self.file, "making it"):
+        with self._guarded("making it"):
             plugin = found(options)
         if not isinstance(plugin, mi.Integrator):
             raise ConfigError(
@@ -86,8 +87,8 @@ class OwnIntegrator(StepIntegrator):
             image = plugin.render_forward(job.scene, job.params, job.sensor, job.seed, job.spp)
         return self._checked(job, image)
 
-    def _guarded(self, what: str) -> Guard:
-        return Guard(self.file, self.name, self.file, what)
+    def _guarded(self, what: str) -> AbstractContextManager[None]:
+        return guarded(self.file, self.name, self.file, what)
 
     def _checked(self, job: Job, image: Any) -> mi.TensorXf:
         """Return the image if it has the size of the film. Raises ConfigError otherwise."""

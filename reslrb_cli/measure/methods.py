@@ -156,7 +156,7 @@ def parse_cases(text: str, source: str = _OPTION) -> list[Case]:
             if name == "max_depth":
                 reason = f"all share one depth; use --set integrator.{pair}, or bench --max-depth"
                 raise ConfigError(source, item, reason)
-            options[name] = parse(value, f"{source} {item}", name_line=False)
+            options[name] = parse(value, f"{source} {item}", str)
         case = Case(item, kind, options, source)
         if case.label in [other.label for other in cases]:
             raise ConfigError(source, "", f"`{item}` is given twice")

@@ -12,9 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.base import size_of
 from reslrb_cli.config.integrators import Integrator, Own, WalkAdConfig
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
-from reslrb_cli.config.parameters import size_of
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.context import sensors_in_words

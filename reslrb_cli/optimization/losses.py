@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.code import Guard, load_named
+from reslrb_cli.config.code import guarded, load_named
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.optimizers import Custom
 from reslrb_cli.config.schema import Config
@@ -182,7 +182,7 @@ class OwnLoss:
         if not self._takes_weights:
             self._check_even(weights)
             given = given[:2]
-        with Guard(self.source, self.key, self._file, what):
+        with guarded(self.source, self.key, self._file, what):
             value = function(*given)
         if isinstance(value, mi.TensorXf):
             value = value.array
@@ -208,7 +208,7 @@ class OwnLoss:
         dr.enable_grad(image)
         with dr.resume_grad():
             value = self(image, target, weights)
-            with Guard(self.source, self.key, self._file, "its derivative"):
+            with guarded(self.source, self.key, self._file, "its derivative"):
                 dr.backward(value)
         loss, gradient = float(dr.detach(value)[0]), np.array(dr.grad(image))
         if not np.isfinite(loss):

@@ -1,6 +1,6 @@
 """Preparation of a run, and its progress: the state of the iterations, the results so far, and their checkpoints.
 
-- `plan_record` is the entry in a run's manifest that describes the plan of a step.
+- `plan_record` is the entry in a run's manifest that describes how the first view is traced.
 - `changes` and `check_changes` tell which settings of an experiment may change when its run is resumed.
 - `prepare` makes a problem from a configuration. The problem is ready to run. `manifest_of` makes the problem's
     manifest.

@@ -110,7 +110,7 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     if count > MOST_RUNS:
         product = " x ".join(map(str, [*sizes, f"{seeds} seeds"]))
         raise ConfigError("--vary", "", f"{product} are {count} runs; a sweep has at most {MOST_RUNS}")
-    text = read_text(path, str(path))
+    text = read_text(path)
     first = _with_chosen(text, path, overrides, [each.overrides[0] for each in varied], allow_code).run.seed
     if first + seeds > SEED_END:
         raise ConfigError("--seeds", "", f"exceeds the last seed, {SEED_END - 1}, from run.seed: {first}")

@@ -19,10 +19,8 @@ from reslrb_cli.scene.deformation import BEAMS, PLACES, list_movable, moving_obs
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
     PrimaryHits,
-    SceneNeeds,
     look,
     paths_obstacle,
-    scene_needs,
     unsupported_part,
 )
 
@@ -211,7 +209,7 @@ def _storage_bits(value: Any) -> int | None:
 
 @dataclass(frozen=True)
 class SensorSummary:
-    """Sensor with its film in pixels, its view, and the needs of light tracing. `crop` is offset and size.
+    """Sensor with its film in pixels, and its view. `crop` is offset and size.
 
     `obstacle` is the reason why light tracing cannot render the scene for the sensor, or None. `camera_obstacle` is the
     reason why camera paths (`prb`) cannot render the scene for the sensor, or None. `view` is None if an unsupported
@@ -226,7 +224,6 @@ class SensorSummary:
     crop: tuple[tuple[int, int], tuple[int, int]]
     filter: str
     channels: int
-    needs: SceneNeeds
     view: PrimaryHits | None
     obstacle: str | None
     camera_obstacle: str | None
@@ -282,7 +279,6 @@ def _sensor(scene: Any, index: int, hide_emitters: bool) -> SensorSummary:
         crop=(_pair(film.crop_offset()), _pair(film.crop_size())),
         filter=film.rfilter().class_name(),
         channels=int(film.base_channels_count()),
-        needs=scene_needs(scene, sensor),
         view=look(scene, sensor) if unsupported_part(scene, sensor) is None else None,
         obstacle=paths_obstacle(scene, sensor, "light", hide_emitters),
         camera_obstacle=paths_obstacle(scene, sensor, "prb"),

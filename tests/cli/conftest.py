@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 import pytest
 from cli.tiny import write_experiment
 
-from reslrb_cli.cli import main, progress
+from reslrb_cli.cli import main
+from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.report.page import values
 from reslrb_cli.report.page.layout import diagram
 from reslrb_cli.report.plots import Curve
@@ -68,12 +69,12 @@ def during(monkeypatch):
     """Function that installs `act`, so that the command calls `act(record)` after each iteration."""
 
     def install(act):
-        show = progress.Progress.show
+        show = Progress.show
 
         def acting(self, record):
             show(self, record)
             act(record)
 
-        monkeypatch.setattr(progress.Progress, "show", acting)
+        monkeypatch.setattr(Progress, "show", acting)
 
     return install

@@ -263,11 +263,15 @@ def test_a_run_reports_its_views(llvm, tmp_path, monkeypatch):
     pixels[2, 3] = 255
     mi.Bitmap(pixels).write(str(tmp_path / "photo.png"))
     monkeypatch.chdir(tmp_path)
-    sets = settings("target={file: photo.png, exposure: 0.8}", "run.iterations=1", "run.final_spp=4")
+    sets = settings(
+        "target={file: photo.png, color_space: linear, exposure: 0.8}", "run.iterations=1", "run.final_spp=4"
+    )
     said = done("optimize", "tiny.yaml", *sets).stderr
     [view] = manifest_of("runs/tiny")["views"]
     assert (view["kinds"], view["left_out"], view["exposure"]) == ({"clipped": 1}, 1, 0.8)
     assert "view 0: 1 of 64 pixels (1.6%) are left out: 1 are clipped" in said
+    target = np.array(mi.Bitmap("runs/tiny/images/target.exr"))
+    assert np.allclose(target[:, :, :3], pixels / 255, atol=2e-3)
     weights = np.array(mi.Bitmap("runs/tiny/images/weights.exr"))
     assert np.argwhere(weights[:, :, 0] == 0).tolist() == [[2, 3]]
     page = Path("runs/tiny/report.html").read_text()

@@ -18,7 +18,8 @@ from cli import tiny
 from cli.tiny import reslrb
 from click.testing import CliRunner
 
-from reslrb_cli.cli import main, progress, sweep
+from reslrb_cli.cli import main, sweep
+from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.cli.terminal import Interrupts
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.lock import FolderLock
@@ -196,7 +197,7 @@ def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
     """The test copies what a kill would leave at four moments: in the middle of a run, before a run has saved a
     checkpoint, while final images are written, and between two runs.
     """
-    show, begin, calls, moments = progress.Progress.show, recording.Recording._begin, [], []
+    show, begin, calls, moments = Progress.show, recording.Recording._begin, [], []
     end = recording.Recording._write_final_images
 
     def copy(moment):
@@ -226,7 +227,7 @@ def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
             copy("between-runs")
         return call(arguments, interrupts)
 
-    monkeypatch.setattr(progress.Progress, "show", showing)
+    monkeypatch.setattr(Progress, "show", showing)
     monkeypatch.setattr(recording.Recording, "_begin", beginning)
     monkeypatch.setattr(recording.Recording, "_write_final_images", ending)
     monkeypatch.setattr(sweep, "call", calling)
@@ -288,7 +289,7 @@ def test_a_fault_outside_the_run_ends_the_sweep(folder, monkeypatch, code):
 
 
 def test_ctrl_c_ends_it_after_the_iteration_with_complete_folders(folder, monkeypatch):
-    show = progress.Progress.show
+    show = Progress.show
 
     def interrupting(self, record):
         show(self, record)
@@ -296,7 +297,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_complete_folders(folder, monkey
             Path("sent").touch()
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(progress.Progress, "show", interrupting)
+    monkeypatch.setattr(Progress, "show", interrupting)
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "-o", "s"]
     result = reslrb(*words)
     assert result.exit_code == 130

@@ -137,7 +137,6 @@ BAD = {
     "size": (["--size", "nan"], "--size: is nan mm; it must be above 0"),
     "thickness": (["--thickness", "0.5"], "--thickness: the relief is"),
     "light": (["--light-distance", "20"], "--light-distance: is 20 mm, at which no lens was found"),
-    "sun": (["--sun", "40"], "--sun: is 40 degrees; it must be from 0 to below 10"),
     "sun of a point": (["--sun", "0.5", "--light-distance", "300"], "--sun: needs parallel light"),
     "round": (["--mirror", "30", "--outline", "round", "--light-distance", "300"], "--outline: round needs parallel"),
     "one colour": ([], "p.exr: has only one colour"),
@@ -153,7 +152,6 @@ BAD = {
     "far too large": (["--size", "1e7"], "--size: is 1e+07 mm; it must be above 0"),
     "no picture size": (["--picture-size", "0"], "--picture-size: is 0 mm; it must be above 0"),
     "no glass": (["--ior", "9"], "--ior: is 9; glass and plastics"),
-    "floor": (["--floor", "1"], "--floor: is 1; it must be from 0 to below 1"),
     "tilt": (["--tilt", "0", "85"], "--tilt: is 0 and 85 degrees; both must be between"),
     "grazing": (["--mirror", "85"], "--mirror: is 85 degrees; it must be between"),
     "total reflection": (

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from cli import tiny
 
-from reslrb_cli.cli import main, progress
+from reslrb_cli.cli import main
+from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.optimization import loop, optimizers, problem, sensitivity, targets
 from reslrb_cli.optimization.uncertainty import measuring
 from reslrb_cli.records.checkpoint import read_state
@@ -109,10 +110,10 @@ def run_and_kill(
     """Return the folder of a complete run, and a copy of the folder that a process killed after iteration `at` would
     leave.
     """
-    show = progress.Progress.show
+    show = Progress.show
     run, left = Path("runs/tiny"), Path("runs/killed")
 
-    def copying(self: progress.Progress, record: Record) -> None:
+    def copying(self: Progress, record: Record) -> None:
         show(self, record)
         if record.iteration + 1 == at and not left.exists():
             shutil.copytree(run, left)
@@ -120,7 +121,7 @@ def run_and_kill(
                 file.write('{"iteration": ')  # in the middle of a line
 
     with monkeypatch.context() as patch:
-        patch.setattr(progress.Progress, "show", copying)
+        patch.setattr(Progress, "show", copying)
         assert optimize("tiny.yaml", "--quiet", *args) == 0
     act(left)
     return run, left

@@ -70,6 +70,13 @@ def test_file_fills_a_texture(make_scene, tmp_path):
     assert np.array_equal(selection.array(TEXTURE), values)
 
 
+@pytest.mark.parametrize(("color_space", "expected"), [("auto", 0.2140), ("linear", 127 / 255)])
+def test_a_file_of_8_bits_is_decoded_as_its_color_space_says(make_scene, tmp_path, color_space, expected):
+    """Files of roughness and other data that are no colours hold linear values."""
+    file = write(tmp_path / "t.png", np.full((4, 6, 3), 127, np.uint8)).model_copy(update={"color_space": color_space})
+    assert np.allclose(select(make_scene(), {"key": TEXTURE, "initial": file}).array(TEXTURE), expected, atol=2e-3)
+
+
 def test_globs_match_recoverable_parameters(make_scene):
     selection = select(make_scene(), {"key": "floor.*"})  # excludes `to_uv`
     assert selection.keys == [TEXTURE]
