@@ -199,8 +199,6 @@ def started(folder: Path, plan: Plan) -> Iterator[SweepPlan]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise ConfigError("-o", "", f"{folder} is a file, not the folder of a sweep") from None
     except OSError as error:
         raise _unwritable(folder, error) from None
     with _locked(folder):

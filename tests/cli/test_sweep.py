@@ -146,7 +146,7 @@ def test_names_are_short_safe_and_different(folder):
         (["--vary", "integrator=[prb, 'reslrb:']"], "--vary integrator: `reslrb:` is not an integrator; write TYPE"),
         (["--vary", "integrator=[own.py:Own]"], "would run with all your rights; --allow-code permits it"),
         (["--resume", "."], ".: is no sweep's folder: it has no sweep.json"),
-        (["-o", "tiny.yaml"], "-o: tiny.yaml is a file, not the folder of a sweep"),
+        (["-o", "tiny.yaml"], "Directory 'tiny.yaml' is a file"),
         (["-o", "."], ", but no sweep; give a new or empty folder"),
     ],
 )  # fmt: skip
