@@ -24,10 +24,8 @@ from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
 from reslrb_cli.errors import ConfigError, ExitCode, UnsupportedScene
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME
 from reslrb_cli.records.manifest import MANIFEST_FILE, read_manifest
 from reslrb_cli.records.metrics import finite
-from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
@@ -227,6 +225,7 @@ def command(
     of the image per unit, and the length by which it would have to change to explain the
     image. `optimizer.scale: auto` compensates for the parameters' different sensitivities.
     """
+
     subject = read_subject(path, overrides)
     config = subject.config
     if conditioning and subject.missing:
@@ -283,6 +282,9 @@ def command(
 
 def show_nonfinite(subject: Subject, as_json: bool) -> int:
     """Print the origin of the run's first value that is not finite. Return exit code 1 if all values are finite now."""
+    from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME
+    from reslrb_cli.records.run_folder import RunFolder
+
     config = subject.config
     run = config.source.parent
     if subject.run is None:

@@ -218,7 +218,7 @@ def test_refused_within_seconds(experiment: Path, monkeypatch: pytest.MonkeyPatc
     assert seconds < SECONDS
     (experiment / "scene.xml").write_text(SCENE.replace('value="8"', 'value="60000"'))
     line, seconds = refused(experiment)
-    assert line.startswith("tiny.yaml: scene.file: a film of 60000x60000 pixels takes at least ")
+    assert line.startswith("tiny.yaml: scene.file: a film of 60000x60000 pixels: a step takes at least ")
     assert seconds < SECONDS
 
 

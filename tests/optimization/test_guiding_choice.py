@@ -81,7 +81,6 @@ def test_on_enables_guiding_and_off_removes_it(adjoint: str, experiment: Path, m
             assert found.value == WORDS["guiding"][is_on]
         assert (guiding is not None) == is_on
         assert guiding is None or guiding.learned == {}  # the run begins with an empty table
-        assert guiding is None or guiding.images
         assert not any(np.any(np.array(problem.optimizer.gradient(key))) for key in problem.selection.keys)
         counts.append(operations(problem))
         del problem, guiding

@@ -134,12 +134,12 @@ _GROUPS = ("shapegroup", "batch")
 _UNNAMED = "_unnamed_"
 
 
-def _name_objects(root: Element) -> None:
-    """Give every object below `root` an id that is the same at every load.
+def _name_objects(root: Element) -> list[Note]:
+    """Give every object below `root` an id that is the same at every load. Return notes on unprintable ids.
 
     The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Ids that are empty or
-    start with `_unnamed_` are replaced, and references to them are updated. Raises ConfigError if two objects have one
-    id, which Mitsuba refuses as well.
+    unprintable, or start with `_unnamed_`, are replaced, and references to them are updated. Raises ConfigError if two
+    objects have one id, which Mitsuba refuses as well.
     """
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
@@ -147,6 +147,7 @@ def _name_objects(root: Element) -> None:
     taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
     owners: dict[str, Element] = {}
     renamed: dict[str, str] = {}
+    notes: list[Note] = []
     numbers: Counter[str] = Counter()
     for element in objects:
         kind = element.type[:1].upper() + element.type[1:]
@@ -154,7 +155,7 @@ def _name_objects(root: Element) -> None:
         own = element.id
         if own in owners:
             raise element.fail("", f"id {quoted(own)} is also that of {owners[own].place}; rename one of them")
-        if own.strip() and not own.startswith(_UNNAMED):
+        if own.strip() and own.isprintable() and not own.startswith(_UNNAMED):
             owners[own] = element
             continue
         if element in grouped and not own:
@@ -166,11 +167,14 @@ def _name_objects(root: Element) -> None:
             name = f"{first}_{number}"
         taken.add(name)
         element.attributes["id"] = name
-        if own.strip():
-            renamed.setdefault(own, name)
+        if own.strip() and own not in renamed:
+            renamed[own] = name
+            if not own.startswith(_UNNAMED):
+                notes.append(Note(element, f"id {quoted(own)} cannot be part of a key", done=f"named {name}"))
     for element in root.walk("ref", "alias"):
         if element.id in renamed:
             element.attributes["id"] = renamed[element.id]
+    return notes
 
 
 def mend(description: Description) -> list[Note]:
@@ -181,7 +185,7 @@ def mend(description: Description) -> list[Note]:
     and a later check refuses them. Unused parameters are found only when the scene is built.
     """
     mender, root = _Mender(description), description.root
-    _name_objects(root)
+    mender.notes += _name_objects(root)
     root.attributes.pop("version", None)
     if root.is_object:
         mender.mend_element(root)
