@@ -1,4 +1,4 @@
-"""This machine: backends and packages for `reslrb doctor`, and the device's name, memory, and number of resident paths.
+"""This machine: backends and packages for `reslrb doctor`, and the name and memory of the device.
 
 Forecasts of memory use `free_bytes`, `resident_bytes` and `local_bytes` as limits.
 """

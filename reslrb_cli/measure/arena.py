@@ -12,10 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from reslrb_cli.backend.doctor import memory_bytes
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.measure.methods import Measurement
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
 from reslrb_cli.records.measurement_files import Earlier
+
+#: If all processes together hold more than this share of the memory, each releases its own after a step.
+MEMORY_SHARE = 0.7
+MIB = 2**20
 
 #: Maximum number of steps after the cold one until no new kernel is compiled.
 MAX_WARM_UPS = 4
@@ -59,15 +64,19 @@ class Contestant:
 MIN_ROUNDS = 3
 MAX_ROUNDS = 25
 
+#: Factor on the time for the next depth, whose kernels take longer to compile and to run.
+GROWTH = 1.3
+
 #: Message about measurements that exceed the budget.
 NO_TIME = "the budget was spent; allow more with --budget"
 
 
 class Pace:
-    """Divides the time among depths. Each depth gets an equal share of the remaining time.
+    """Divides the time among depths. Each depth gets GROWTH times as much time as the previous depth.
 
-    While there is time, each depth gets at least MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time
-    does not count. Rounds of earlier sessions count.
+    Time that one depth leaves unused goes to the remaining depths. While there is time, each depth gets at least
+    MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time does not count. Rounds of earlier sessions
+    count.
     """
 
     def __init__(
@@ -94,7 +103,7 @@ class Pace:
     def begin_depth(self) -> None:
         """Start a depth."""
         now = self._now()
-        self._depth_end = now + (self._end - now) / self._left
+        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
         self._left -= 1
 
     def begin_rounds(self, before: int = 0) -> None:
@@ -183,6 +192,11 @@ class Arena(Generic[Measured, Worker, Item]):
         """Return the workers that can take more steps."""
         return [member for member in self.members if member.alive]
 
+    def _tight(self) -> bool:
+        """True if workers together use so much memory that each worker must release memory after each step."""
+        mib = sum(member.cold["peak_mib"] for member in self._alive() if member.cold is not None)
+        return bool(mib * MIB > MEMORY_SHARE * memory_bytes(self.plan.variant))
+
     def _answer(self, member: Contestant, over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
         """Wait for a worker's next answer. Returns None if the worker ended, or if the time was up (`over`)."""
         try:
@@ -207,7 +221,7 @@ class Arena(Generic[Measured, Worker, Item]):
         """
         for number in range(1 + MAX_WARM_UPS):
             cold = number == 0
-            member.process.ask(member.question(None) | {"cold": cold})
+            member.process.ask(member.question(None) | {"cold": cold, "release": not cold and self._tight()})
             answer = self._answer(member, self._pace.over)
             if answer is None:
                 return None
@@ -221,12 +235,12 @@ class Arena(Generic[Measured, Worker, Item]):
         """Yield the number of completed rounds after each round. Rounds start at number `first`. Earlier sessions
         completed `before` rounds.
         """
-        round = first
+        tight, round = self._tight(), first
         self._pace.begin_rounds(before)
         while (workers := self._alive()) and self._pace.another(round - first):
             start = round % len(workers)  # the first worker changes from round to round
             for worker in [*workers[start:], *workers[:start]]:
-                worker.process.ask(worker.question(round) | {"cold": False})
+                worker.process.ask(worker.question(round) | {"cold": False, "release": tight})
                 answer = self._answer(worker)
                 if answer is not None:
                     worker.keep(round, answer)

@@ -64,14 +64,15 @@ class TimedSteps:
             dr.eval(result.image, result.loss, gradients)
         return gradients, times
 
-    def told(self, answer: dict[str, Any], cold: bool) -> dict[str, Any]:
-        """Return the answer for a step, and free the allocator's cache for other processes. For a `cold` step, the
-        answer includes the peak memory of Dr.Jit's arrays.
+    def told(self, answer: dict[str, Any], cold: bool, release: bool) -> dict[str, Any]:
+        """Return the answer for a step. For a `cold` step, the answer includes the peak memory of Dr.Jit's arrays.
+        `release` frees the allocator's cache.
         """
         if cold:
             answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
         self.clock.history = []
-        dr.flush_malloc_cache()
+        if release:
+            dr.flush_malloc_cache()
         return answer
 
 
@@ -120,9 +121,9 @@ class Stepper(TimedSteps):
         self.texels = sum(shape[0] * shape[1] for shape in shapes if len(shape) == 3)
         self._given = _noise(*self.size, int(film.base_channels_count()))
 
-    def step(self, round: int, cold: bool) -> dict[str, Any]:
+    def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
         """Take one step and measure it. For a `cold` step, memory is measured as well. Every step that is not `cold`
-        runs twice, and only the second run is timed.
+        runs twice, and only the second run is timed. `release` frees the allocator's cache afterwards.
         """
         run, new_kernels = self.problem.config.run, 0
         at = seed(run.seed, round, self.sensor, "image")
@@ -141,7 +142,7 @@ class Stepper(TimedSteps):
         }
         if cold:
             answer["scratch_bytes"] = scratch_bytes(self.clock.history)
-        return self.told(answer, cold)
+        return self.told(answer, cold, release)
 
 
 def begin_steps(first: dict[str, Any]) -> Begun:
@@ -150,7 +151,7 @@ def begin_steps(first: dict[str, Any]) -> Begun:
     """
     stepper = Stepper(told(first))
     size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
-    return size, lambda question: stepper.step(question["round"], question["cold"])
+    return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
 
 
 def _noise(width: int, height: int, channels: int) -> Any:
@@ -336,6 +337,6 @@ def begin_sampling(first: dict[str, Any]) -> Begun:
             taken.append(times)
         np.save(question["out"], np.stack(rows))
         reply = {"step_ms": [times.wall_ms for times in taken], "new_kernels": sum(t.new_kernels for t in taken)}
-        return sampler.told(reply, question["cold"])
+        return sampler.told(reply, question["cold"], question["release"])
 
     return {}, answer

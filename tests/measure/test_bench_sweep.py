@@ -12,6 +12,7 @@ from measure.pretended_steps import Pretended
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure import arena
 from reslrb_cli.measure.arena import MAX_ROUNDS, MIN_ROUNDS, NO_TIME, Pace
 from reslrb_cli.measure.bench import Bench, BenchResult
 from reslrb_cli.measure.methods import Sweep, depths, parse_cases, sample_counts
@@ -129,6 +130,20 @@ def test_a_stop_keeps_finished_measurements(after: int, kept: list[int]) -> None
     assert all(row.record.status is BenchStatus.OK for row in rows)
 
 
+def test_cases_that_need_shared_memory_release_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bool] = []
+
+    class Noting(Pretended):
+        def ask(self, question: dict[str, Any]) -> None:
+            asked.append(question["release"])
+            super().ask(question)
+
+    for mib in (5, 500):
+        monkeypatch.setattr(arena, "memory_bytes", lambda variant, mib=mib: mib * 2**20)
+        play(sweep(values=[2]), Noting)
+        assert asked[-1] == (mib == 5)
+
+
 def test_pace_divides_the_budget() -> None:
     now = [0.0]
     pace, spent = Pace(100.0, 3, now=lambda: now[0]), Pace(200.0, 2, now=lambda: now[0])
@@ -143,11 +158,11 @@ def test_pace_divides_the_budget() -> None:
             done += 1
         return done
 
-    # The first depth gets 33.3 s of 100 s. The second depth gets 34 s of the remaining 68 s. The third depth gets the
-    # rest.
-    assert rounds(2.0, 3.0) == 10
+    # The shares of 100 s are 1, 1.3 and 1.69, so the first depth gets 25.1 s. The second depth gets 33.5 s of the
+    # remaining 77 s. The third depth gets the rest.
+    assert rounds(2.0, 3.0) == 7
     assert rounds(3.0, 4.0) == 7
-    assert rounds(1.0, 5.0) == 7
+    assert rounds(1.0, 5.0) == 9
     assert 95.0 < now[0] <= 100.0
     assert rounds(1.0, 30.0, spent) == MIN_ROUNDS
     assert rounds(1.0, 50.0, Pace(100.0, 1, now=lambda: now[0])) == 1  # a second round would exceed the whole budget
