@@ -137,7 +137,7 @@ def _conditions(config: Config, sweep: Sweep) -> str:
     """Describe the measurement in one line."""
     rr_depth, own = config.integrator.rr_depth, config.integrator.max_depth
     deepest = max(sweep.values) if sweep.swept == "depth" else own
-    roulette = "no roulette" if 0 <= deepest < rr_depth else f"roulette from depth {rr_depth}"
+    roulette = f"roulette from depth {rr_depth}" if sweep.plays_roulette(deepest) else "no roulette"
     parts = [str(config.source)]
     parts += [] if sweep.swept == "depth" else [f"depth {own}"]
     parts += [] if sweep.swept == "spp" else [f"{config.run.spp} spp"]

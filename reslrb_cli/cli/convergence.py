@@ -141,7 +141,7 @@ def _conditions(plan: Plan, session: Session) -> str:
     """Describe the measurement in one line."""
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
-    roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
+    roulette = f"roulette from depth {rr_depth}" if plan.plays_roulette(depth) else "no roulette"
     what = {"fixed": "dL/dI fixed", "loss": f"loss {loss_words(config.losses)}", "image": "the image"}[plan.objective]
     if plan.objective != "image" and any(spec.regularizers for spec in config.parameters):
         what += ", without the regularizers, which have no noise"

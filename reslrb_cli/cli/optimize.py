@@ -91,11 +91,10 @@ class OptimizeOptions(ExperimentOptions):
     help="Continue the run in this folder, in place of CONFIG. --set may change iterations and learning rates.",
 )
 @allow_code_option
-@click.option("--cluster", metavar="WHERE",
-              help=
-        "Distribute the shards of each step (run.shards) to workers: local:N, N processes on this machine, or "
-        "tls://HOST:PORT, the workers of a dask scheduler; the result is that of one process. Needs `pip install "
-        "reslrb[cluster]`.")  # fmt: skip
+@click.option("--cluster", metavar="WHERE", help=
+              "Distribute the shards of each step (run.shards) to workers: local:N, N processes on this machine, or "
+              "tls://HOST:PORT, the workers of a dask scheduler; the result is that of one process. Needs `pip install "
+              "reslrb[cluster]`.")  # fmt: skip
 @click.option("--quiet", is_flag=True, help="Print only the last line.")
 def command(**given: Any) -> int:
     """Recover the parameters of CONFIG from its target images.

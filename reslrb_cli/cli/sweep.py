@@ -249,7 +249,7 @@ def call(arguments: Sequence[str], interrupts: Interrupts, fresh: bool = False) 
 
 
 def _last_lines(output: IO[bytes]) -> list[str]:
-    """Return the last lines of a run. The place at which the run writes is that of `output`, and does not move."""
+    """Return the last lines of a run's `output`. `pread` leaves the file offset alone, which the run writes at."""
     start = max(os.fstat(output.fileno()).st_size - MOST_BYTES, 0)
     text = os.pread(output.fileno(), MOST_BYTES, start).decode(errors="replace")
     return [line for line in text.splitlines() if line.strip()]
@@ -273,8 +273,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def follow() -> None:
-    """Run the program `reslrb` in a process that ends when its standard input closes. It closes when the sweep ends,
-    even by a kill.
+    """Run the program `reslrb` in a process that ends when its standard input closes. The end of the sweep closes this
+    input, even if the sweep is killed.
     """
 
     def end_with_input() -> None:

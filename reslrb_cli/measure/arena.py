@@ -20,7 +20,6 @@ from reslrb_cli.records.measurement_files import Earlier
 
 #: If all processes together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
-MIB = 2**20
 
 #: Maximum number of steps after the cold one until no new kernel is compiled.
 MAX_WARM_UPS = 4
@@ -195,7 +194,7 @@ class Arena(Generic[Measured, Worker, Item]):
     def _tight(self) -> bool:
         """True if workers together use so much memory that each worker must release memory after each step."""
         mib = sum(member.cold["peak_mib"] for member in self._alive() if member.cold is not None)
-        return bool(mib * MIB > MEMORY_SHARE * memory_bytes(self.plan.variant))
+        return bool(mib * 2**20 > MEMORY_SHARE * memory_bytes(self.plan.variant))
 
     def _answer(self, member: Contestant, over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
         """Wait for a worker's next answer. Returns None if the worker ended, or if the time was up (`over`)."""

@@ -291,6 +291,10 @@ class Measurement:
         codes = code_files([*self.cases, *(each for each in vars(self).values() if isinstance(each, Case))])
         return kept_settings(self.config, codes, self.variant, self.device, **options)
 
+    def plays_roulette(self, depth: int) -> bool:
+        """Whether paths of at most `depth` segments can meet Russian roulette. A depth of -1 is unbounded."""
+        return not 0 <= depth < self.config.integrator.rr_depth
+
     def _options(self) -> dict[str, Any]:
         """Return the command's options that belong to the settings."""
         raise NotImplementedError
@@ -424,8 +428,7 @@ class Plan(Measurement):
         roulette would be wrong.
         """
         depth = self.config.integrator.max_depth
-        roulette = depth < 0 or self.config.integrator.rr_depth <= depth
-        options = {"rr_depth": NEVER} if name == "ptracer" and roulette else {}
+        options = {"rr_depth": NEVER} if name == "ptracer" and self.plays_roulette(depth) else {}
         return Case(name, name, options, "the independent reference").at(self.config, depth, True)
 
     def check(self) -> None:

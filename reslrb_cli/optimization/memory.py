@@ -1,8 +1,7 @@
 """Limits of a run's memory: films, textures and steps that need more memory than is free are refused.
 
 Sizes in the configuration and the scene file are checked before anything is built (`check_described`). Films and
-textures of a hundred million entries would take a minute to make. The memory estimates
-are lower bounds, so the checks refuse nothing that fits into the machine's memory.
+textures of a hundred million entries would take a minute to make. The estimates are lower bounds of the memory.
 """
 
 from __future__ import annotations
