@@ -25,7 +25,7 @@ from reslrb_cli.measure.comparison import (
     compare_expectations,
     entry_count,
 )
-from reslrb_cli.measure.methods import records_of
+from reslrb_cli.measure.methods import plays_roulette, records_of
 from reslrb_cli.measure.participants import CheckSettings, Way
 from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
 from reslrb_cli.records.measurement_files import Earlier
@@ -91,7 +91,7 @@ class Gradcheck:
         """Describe the measurement in one line."""
         parts, integrator = self.participants, self.settings.config.integrator
         width, height = parts.film
-        plays = not 0 <= integrator.max_depth <= integrator.rr_depth
+        plays = plays_roulette(integrator.max_depth, integrator.rr_depth)
         roulette = f"roulette from depth {integrator.rr_depth}" if plays else "no roulette"
         return (
             f"{self.settings.config.source}, film {width}x{height}, {parts.spp} spp "

@@ -293,7 +293,7 @@ class Measurement:
 
     def plays_roulette(self, depth: int) -> bool:
         """Whether paths of at most `depth` segments can meet Russian roulette. A depth of -1 is unbounded."""
-        return not 0 <= depth < self.config.integrator.rr_depth
+        return plays_roulette(depth, self.config.integrator.rr_depth)
 
     def _options(self) -> dict[str, Any]:
         """Return the command's options that belong to the settings."""
@@ -358,6 +358,15 @@ REFERENCES = {
 
 #: An `rr_depth` at which Russian roulette never starts.
 NEVER = 1_000_000
+
+
+def plays_roulette(depth: int, rr_depth: int) -> bool:
+    """Whether paths of at most `depth` segments can meet Russian roulette. A depth of -1 is unbounded.
+
+    The last segment plays no roulette, so roulette needs a `depth` above `rr_depth`.
+    """
+    return not 0 <= depth <= rr_depth
+
 
 #: Number of images whose dL/dI are used in turn for the configuration's loss. The noise of a single image would look
 #: like a bias of methods that take dL/dI from their own images.

@@ -24,7 +24,7 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.gradients import Case, seeds
-from reslrb_cli.measure.methods import NEVER
+from reslrb_cli.measure.methods import NEVER, plays_roulette
 from reslrb_cli.measure.participants import Participants
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 from reslrb_cli.scene.catalog import parameter_kind
@@ -260,7 +260,7 @@ class Looking:
         return found is not None and not found[0].wrong and found[1] <= SAME_PATHS
 
     def _roulette(self) -> bool:
-        return not 0 <= self.depth <= self._options["rr_depth"]
+        return plays_roulette(self.depth, self._options["rr_depth"])
 
     def _from_depth(self, ratio: Callable[[int], Ratio | None]) -> tuple[int | None, bool]:
         """Return the shortest path length with a wrong ratio. Also return True if shorter paths were measured as
