@@ -34,6 +34,7 @@ from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
+from reslrb_cli.transport.edges import EdgeSet
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import PixelShares
 from reslrb_cli.transport.plan import Plan, make_plan
@@ -138,6 +139,8 @@ class AboutScene:
     #: The densities of emitters, by their sources.
     emitters: dict[tuple[Any, ...], EmitterDensities] = field(default_factory=dict)
     recordings: Recordings = field(default_factory=Recordings)
+    #: By the shapes that have them.
+    edges: dict[tuple[mi.Shape, ...], EdgeSet] = field(default_factory=dict)
     #: By density and number of paths.
     shares: dict[tuple[int, int], PixelShares | None] = field(default_factory=dict)
     #: Samples per pixel for which the cells of guided emission are made.
@@ -231,6 +234,13 @@ class Preparation:
         ]
         nodes += [list(which.emission_nodes)] if plan.differentiate_emission else []
         return [sum(which.entries[node] for node in each) for each in nodes]
+
+    def edges(self, plan: Plan) -> EdgeSet:
+        """Return the edges of the plan's moving shapes."""
+        made = self._found.edges
+        if plan.edged not in made:
+            made[plan.edged] = EdgeSet(plan.edged)
+        return made[plan.edged]
 
     def emitters(self, plan: Plan, scene: mi.Scene) -> EmitterDensities:
         """Return the current densities of the scene's emitters, for a plan of the scene."""

@@ -26,6 +26,7 @@ from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.edges import has_edges
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
@@ -102,13 +103,15 @@ class Motion:
 
     `attached` is true, false, or `auto` (true if a parameter moves anything). `filter_normalization` is `attached` or
     `detached`, and `sampling` is `auto`, `follow` or `stay`. Raises ValueError for other values. `obstacle` is the
-    reason why an integrator has no attached derivatives.
+    reason why an integrator has no attached derivatives. `edges` tells whether derivatives contain the light that
+    moving edges cover and uncover.
     """
 
     attached: bool | str = "auto"
     filter_normalization: str = "attached"
     obstacle: str | None = None
     sampling: str = "follow"
+    edges: bool = False
 
     def __post_init__(self) -> None:
         if self.attached not in (True, False, "auto"):
@@ -206,6 +209,7 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, s
         glossy_follows=glossy_follows,
         moving_shapes=which.shapes,
         moving_emitters=which.emitters,
+        edged=tuple(shape for shape in which.shapes if motion.edges and has_edges(shape) and not shape.is_emitter()),
         attached_normalization=motion.filter_normalization == "attached",
     )
 

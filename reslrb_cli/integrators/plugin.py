@@ -33,6 +33,7 @@ OPTIONS: dict[str, Any] = {
     "attached": "auto",
     "filter_normalization": "attached",
     "attached_sampling": "auto",
+    "edges": False,
     "guiding": "off",
     "sequence": "independent",
     "paths": "light",
@@ -112,7 +113,11 @@ def make_reslrb(**given: Any) -> Reslrb:
         one_of(name, value, (OPTIONS[name], other))
         choices[name] = value == other
     motion = Motion(
-        options.pop("attached"), options.pop("filter_normalization"), obstacle, options.pop("attached_sampling")
+        options.pop("attached"),
+        options.pop("filter_normalization"),
+        obstacle,
+        options.pop("attached_sampling"),
+        options.pop("edges"),
     )
     sampling = SamplingOptions(
         guided=choices["guiding"],

@@ -220,6 +220,31 @@ class Guide:
 
 
 @dataclass
+class EdgeTable:
+    """Current edges (E rows). A recording takes the arrays as inputs.
+
+    `a` and `b` are the ends of a segment, or of a cylinder's axis. For a sphere, `a` is the centre. `c` and `d` are the
+    third corners of the two faces at a segment, and equal if the segment has one face. `radius` is that of a sphere or
+    a cylinder. `shape` has the index of each shape's pointer. `lamp`, `sensor` and `anywhere` are cumulative sampling
+    weights of the rows, for edges seen from lamps, and for outlines seen from the sensor and from all directions.
+    `crease` is the angle between the normals of the two faces, divided by pi, or 0 if the shape has no creases because
+    its shading normals are interpolated.
+    """
+
+    kind: mi.UInt32
+    a: mi.Point3f
+    b: mi.Point3f
+    c: mi.Point3f
+    d: mi.Point3f
+    radius: mi.Float
+    shape: mi.UInt32
+    crease: mi.Float
+    lamp: mi.Float
+    sensor: mi.Float
+    anywhere: mi.Float
+
+
+@dataclass
 class Samples:
     """Samples of one pass: `width` light paths, or `width` camera paths if `plan.camera` is true. `seed` is an opaque
     UInt32.
@@ -246,6 +271,8 @@ class Samples:
     emitters: EmitterDensities | None = None
     #: Distribution of the camera paths over the pixels; None: uniform.
     shares: PixelShares | None = None
+    #: The edges of moving shapes, if they are differentiated.
+    edges: EdgeTable | None = None
     #: The camera paths of the same pass, next to light paths.
     camera: Samples | None = None
     #: Cumulative areas of the faces of lamps with moving faces.
@@ -411,7 +438,7 @@ def passes(
                 return camera
         guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
         shared = None if camera is None else camera.shares
-        return Samples(*given, width, own_scale, fraction, guide, net, ratio, emitters, shared, camera)
+        return Samples(*given, width, own_scale, fraction, guide, net, ratio, emitters, shared, camera=camera)
 
     made = {size: part(size) for size in set(sizes)}
     return [_seeded(made[size], s) for size, s in zip(sizes, seeds, strict=True)]

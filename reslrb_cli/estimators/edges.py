@@ -1,0 +1,348 @@
+"""Derivatives of what moving edges cover and uncover.
+
+The gradients of other estimators follow the light along paths whose vertices move with the surfaces. They lack the
+light that a moving edge newly blocks or lets through. Here, p is a point of an outline (`transport/edges.py`), seen
+from a viewpoint y. x is the point behind p on the ray from y, n is the outline's normal, v_p is the velocity of p, and
+w is the light or the importance that passes the edge.
+
+At the start of a light path, y is a place on a lamp, and rays keep their direction. W_p and W_x are the contributions,
+to the objective, of light that continues from p or from x. A light walk estimates them.
+
+    dL/dtheta  +=  w (W_p - W_x) <v_p, n>
+
+At the end of a light path, y is a place on the sensor, and x moves with the light that reaches it. L_x is the radiance
+from x. A camera walk estimates it, apart from light that reaches x through a specular chain from a lamp that only light
+paths find.
+
+    dL/dtheta  -=  w delta(u) L_x <v_p - s v_x, n>,    s = |p - y| / |x - y|
+
+x moves with its surface, or, if light arrives directly from a lamp, slides along this light's direction l.
+
+    v_x = l <v, n_x> / <l, n_x>,    v: velocity of the surface at x
+
+Source: Zhang et al. 2020, "Path-Space Differentiable Rendering". Edges of segments between two surfaces are missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import or_
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.estimators.base import Pass
+from reslrb_cli.scene.graph import interpolates_normals
+from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
+from reslrb_cli.transport.connection import Connection, shading_correction
+from reslrb_cli.transport.edges import Outline, sample_outline, view_from_lamps, view_from_sensor
+from reslrb_cli.transport.emission import Emission
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.walk import Hooks, Vertex, walk
+
+#: Light paths of a step for each outline that is sampled from a lamp, and from the sensor.
+PATHS_PER_OUTLINE = 4
+#: Distance from an edge, in units of Mitsuba's offset of rays, at which rays pass the edge on either side of it.
+BESIDE = 1.0
+#: Distance along the ray, in the same units, within which a hit counts as behind the edge.
+AROUND = 30.0
+#: Streams of random numbers, mixed into the seed.
+LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
+
+
+def differentiate_edges(p: Pass) -> None:
+    """Add the derivatives of the light that the edges of moving shapes cover and uncover. dL/dI must be known."""
+    sides = {LAMP_EDGES: _from_lamps, SENSOR_EDGES: _from_sensor}
+    if p.plan.max_depth > 2:
+        sides[OTHER_EDGES] = _between
+    for stream, side in sides.items():
+        samples = _samples(p.samples, stream)
+        side(Pass(samples, None, p.adjoint), samples.stream(stream))
+
+
+def _samples(samples: Samples, stream: int) -> Samples:
+    """Return samples for outlines next to the light paths `samples`. Nothing is differentiated along their paths."""
+    plan = replace(
+        samples.plan, attached=False, stays=False, glossy_follows=False, moving_shapes=(), moving_emitters=(),
+        grid=None, aims=False, sequence=None, differentiate_bsdfs=False, differentiate_emission=False,
+        track_zeros=False, only_bsdfs=(), differentiate_delta=False, differentiate_null=False, evened_lamps=(),
+    )  # fmt: skip
+    width = max(samples.width // PATHS_PER_OUTLINE, 1)
+    seed = mi.sample_tea_32(samples.seed, mi.UInt32(stream))[0]
+    scale = samples.scale * (dr.opaque(mi.Float, samples.width) / dr.opaque(mi.Float, width))
+    return replace(samples, plan=plan, seed=seed, spp=1, width=width, scale=scale, guide=None, net=None)
+
+
+@dataclass
+class Beside:
+    """Rays from the viewpoint past an outline: `over` meets the shape, and `past` passes it. `active` lanes reach the
+    edge. `pi` is the intersection of `over`.
+    """
+
+    over: mi.Ray3f
+    past: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    active: mi.Bool
+
+
+def _offset(outline: Outline) -> mi.Float:
+    """Return the distance by which Mitsuba offsets rays at the outline."""
+    return mi.math.RayEpsilon * (1 + dr.max(dr.abs(outline.p)))
+
+
+def _beside(samples: Samples, outline: Outline) -> Beside:
+    """Return the rays on both sides of an outline. Lanes are active if nothing stands before the edge."""
+    scene, view, d = samples.scene, outline.view, -outline.view.to_y
+    offset = _offset(outline)
+    back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset)
+    active = outline.active & (back > 0)
+
+    def ray(side: float) -> mi.Ray3f:
+        return mi.Ray3f(outline.p + outline.normal * (side * BESIDE * offset) - d * back, d)
+
+    over, past = ray(-1), ray(1)
+    pi = scene.ray_intersect_preliminary(over, coherent=False, active=active)
+    active = active & pi.is_valid() & (pi.shape == outline.shape)
+    before = mi.Ray3f(past)
+    before.maxt = back - AROUND * offset
+    active = active & ~scene.ray_test(before, active)
+    past.o = past.o + d * before.maxt
+    return Beside(over, past, pi, active)
+
+
+def _moved(beside: Beside, adjoint: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    """Return <p, `adjoint`> with the derivative of p. p moves with its surface."""
+    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
+    si = beside.pi.compute_surface_interaction(beside.over, flags, active)
+    return dr.select(active, dr.dot(si.p, adjoint), 0)
+
+
+# ---- Seen from lamps ----
+
+
+class Contribution(Hooks):
+    """Contribution of a light path to the objective.
+
+    In the lanes `smooth`, the first vertex lies on the outline of a mesh with interpolated normals. The correction for
+    shading normals has no limit there. It is left out at this vertex, as its derivative is (`shading_correction`).
+    """
+
+    def __init__(self, p: Pass, smooth: mi.Bool | None = None) -> None:
+        self.p, self.smooth = p, smooth
+
+    def start(self, product: Product) -> list[mi.Float]:
+        return [mi.Float(0)] if self.smooth is None else [mi.Float(0), mi.Float(1)]
+
+    def vertex(
+        self, state: list[mi.Float], vertex: Vertex, connection: Connection, scattering: Scattering,
+        numbers: list[mi.Float],
+    ) -> list[mi.Float]:  # fmt: skip
+        C = vertex.product.times(connection.c, vertex.depth).value()
+        own = dr.select(connection.active, dr.dot(C, self.p.delta(connection.u, connection.active)), 0)
+        if self.smooth is None:
+            return [state[0] + own]
+        here = self.smooth & (vertex.depth == 1)
+        si = vertex.si
+        correction, _ = shading_correction(self.p.plan, si, -vertex.ray.d, si.to_world(connection.wo), connection.wo)
+        own = dr.select(here, own / correction, own * state[1])
+        return [
+            state[0] + dr.select(dr.isfinite(own), own, 0),
+            dr.select(here, dr.rcp(scattering.correction), state[1]),
+        ]
+
+
+def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines seen from lamps. Half of the lanes continue from p, and half from x."""
+    samples = p.samples
+    assert samples.edges is not None
+    view = view_from_lamps(samples, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
+    outline = sample_outline(samples, samples.edges.lamp, view, numbers, creases=True)
+    beside = _beside(samples, outline)
+    over = dr.arange(mi.UInt32, samples.width) % 2 == 0
+    ray = dr.select(over, beside.over, beside.past)
+    emission = Emission(ray, 2 * outline.weight, dr.zeros(mi.EmitterPtr))
+    smooth = [shape for shape in samples.plan.edged if interpolates_normals(shape)]
+    on_smooth = reduce(or_, (outline.shape == mi.ShapePtr(shape) for shape in smooth)) & over if smooth else None
+    W = walk(samples, Contribution(p, on_smooth), beside.active, emission)[0] * p.scale
+    weight = dr.select(dr.isfinite(W), W, 0) * dr.select(over, 1, -1)
+    with dr.resume_grad(), dr.isolate_grad():
+        dr.backward_from(_moved(beside, weight * outline.normal, beside.active & (weight != 0)), flags=_MAY_LACK)
+
+
+#: A moving shape may cast no edge.
+_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+
+
+# ---- Seen from the sensor ----
+
+
+@dataclass
+class Arrived:
+    """Radiance from x (C,): `all` of it, and `slid`, multiplied by the component of its velocity along the outline's
+    normal per unit of <v, n_x>, of light that arrives at x directly. `rest` is the other light. `counts` is 0 if the
+    first event is specular, because light paths do not connect there.
+    """
+
+    all: mi.Spectrum
+    slid: mi.Spectrum
+    rest: mi.Spectrum
+    counts: mi.Float
+    n_x: mi.Vector3f
+
+
+class Behind(CameraHooks):
+    """Radiance from x. `normal` is that of the outline."""
+
+    def __init__(self, normal: mi.Vector3f) -> None:
+        self.normal = normal
+
+    def start(self, first: FilmRay) -> Arrived:
+        return Arrived(mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Vector3f(0))
+
+    def vertex(
+        self, state: Arrived, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
+    ) -> Arrived:  # fmt: skip
+        P, first = vertex.product.value() * state.counts, vertex.depth == 1
+        n_x = dr.select(first, mi.Vector3f(vertex.si.n), state.n_x)
+        total, slid, rest = state.all, state.slid, state.rest
+
+        def slope(towards: mi.Vector3f) -> mi.Float:
+            return dr.dot(self.normal, towards) / dr.dot(n_x, towards)
+
+        if met is not None:
+            L = dr.select(met.active, P * met.Le * met.weight, 0)
+            direct = vertex.depth == 2
+            total = total + L
+            slid = slid + dr.select(direct, L * slope(vertex.ray.d), 0)
+            rest = rest + dr.select(direct, 0, L)
+        if event is not None:
+            L = dr.select(event.active, P * event.c, 0)
+            total = total + L
+            slid = slid + dr.select(first, L * slope(event.ds.d), 0)
+            rest = rest + dr.select(first, 0, L)
+        counts = dr.select(first & scattering.is_delta, 0, state.counts)
+        return Arrived(total, slid, rest, counts, n_x)
+
+
+def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines seen from the sensor."""
+    samples = p.samples
+    samples = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
+    assert samples.edges is not None
+    view = view_from_sensor(samples, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
+    outline = sample_outline(samples, samples.edges.sensor, view, numbers)
+    beside = _beside(samples, outline)
+    x = samples.scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
+    n = outline.normal
+    # Where the shape touches the surface behind it, lamps and the sensor lose the point x at once. It counts once: as
+    # seen from the lamps.
+    touches = x.is_valid() & (x.t < 2 * AROUND * _offset(outline))
+    beside.active = beside.active & ~touches
+    _, L = camera_walk(samples, Behind(n), beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
+    weight = p.delta(outline.view.u, beside.active) * outline.weight * p.scale
+    still, slid, rest = (dr.dot(weight, part) for part in (L.all, L.slid, L.rest))
+    active = beside.active & dr.isfinite(still) & dr.isfinite(slid) & (still != 0)
+    s = outline.view.distance / dr.norm(beside.past.o + beside.past.d * x.t - outline.view.y)
+    with dr.resume_grad(), dr.isolate_grad():
+        moved = _moved(beside, -still * n, active)
+        moves = active & x.is_valid()
+        si = x.compute_surface_interaction(beside.past, mi.RayFlags.All | mi.RayFlags.FollowShape, moves)
+        moved += dr.select(moves, dr.dot(si.p, s * (slid * L.n_x + rest * n)), 0)
+        dr.backward_from(moved, flags=_MAY_LACK)
+
+
+# ---- Between two surfaces ----
+
+
+@dataclass
+class Chosen:
+    """One of the contributions to the radiance from y, chosen in proportion to its size.
+
+    `L` (C,) is its radiance, and `total` the size of all contributions. `segments` is the number of segments from the
+    lamp to y. If `direct` is 1, the light arrives at y from the direction `towards`.
+    """
+
+    L: mi.Spectrum
+    total: mi.Float
+    segments: mi.UInt32
+    direct: mi.Float
+    towards: mi.Vector3f
+    n_y: mi.Vector3f
+    counts: mi.Float
+    numbers: mi.PCG32
+
+    def offered(
+        self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, direct: mi.Bool, towards: mi.Vector3f
+    ) -> Chosen:  # fmt: skip
+        """Return the choice after another contribution."""
+        size = dr.select(active, dr.max(L), 0)
+        total, number = self.total + size, self.numbers.next_float32()
+        takes = active & (size > 0) & (number * total < size)
+        return replace(
+            self,
+            L=dr.select(takes, L / size, self.L),
+            total=total,
+            segments=dr.select(takes, segments, self.segments),
+            direct=dr.select(takes, dr.select(direct, mi.Float(1), 0), self.direct),
+            towards=dr.select(takes, towards, self.towards),
+        )
+
+
+class Choice(CameraHooks):
+    """Chooses one contribution to the radiance from y, without the emission of a lamp at y."""
+
+    def __init__(self, numbers: mi.PCG32) -> None:
+        self.numbers = numbers
+
+    def start(self, first: FilmRay) -> Chosen:
+        none = mi.Vector3f
+        return Chosen(
+            mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0), none(0), none(0), mi.Float(1), self.numbers
+        )
+
+    def vertex(
+        self, state: Chosen, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
+    ) -> Chosen:  # fmt: skip
+        P, first = vertex.product.value() * state.counts, vertex.depth == 1
+        state = replace(state, n_y=dr.select(first, mi.Vector3f(vertex.si.n), state.n_y))
+        if met is not None:
+            L, active = P * met.Le * met.weight, met.active & ~first
+            state = state.offered(L, active, vertex.depth - 1, vertex.depth == 2, vertex.ray.d)
+        if event is not None:
+            state = state.offered(P * event.c, event.active, vertex.depth, first, event.ds.d)
+        return replace(state, counts=dr.select(first & scattering.is_delta, 0, state.counts))
+
+
+def _between(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines on segments between two surfaces. The first of them is not specular."""
+    samples, scene = p.samples, p.samples.scene
+    assert samples.edges is not None
+    outline = sample_outline(samples, samples.edges.anywhere, None, numbers)
+    n, to_y = outline.normal, outline.view.to_y
+    offset = _offset(outline)
+    back = mi.Ray3f(outline.p + n * (BESIDE * offset), to_y)
+    y = scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
+    outline.active = outline.active & y.is_valid()
+    outline.view.distance = y.t
+    beside = _beside(samples, outline)
+    x = scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
+    active = beside.active & x.is_valid()
+    camera = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
+    _, found = camera_walk(camera, Choice(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1)))
+    weight = outline.weight * found.L * found.total
+    emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
+    W = walk(samples, Contribution(p), active & (found.total > 0), emission, found.segments + 1)[0] * p.scale
+    active = active & dr.isfinite(W) & (W != 0)
+    s = y.t / (y.t + x.t - AROUND * offset)
+    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
+    slope = dr.select(found.direct != 0, dr.dot(n, found.towards) / dr.dot(found.n_y, found.towards), 0)
+    along = dr.select(found.direct != 0, slope * found.n_y, n)
+    with dr.resume_grad(), dr.isolate_grad():
+        moved = _moved(beside, -W * n, active)
+        at_x = x.compute_surface_interaction(beside.past, flags, active)
+        at_y = y.compute_surface_interaction(back, flags, active)
+        moved += dr.select(active, W * (dr.dot(at_x.p, s * n) + dr.dot(at_y.p, (1 - s) * along)), 0)
+        dr.backward_from(moved, flags=_MAY_LACK)
