@@ -34,7 +34,7 @@ from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
-from reslrb_cli.transport.edges import EdgeSet
+from reslrb_cli.transport.edges import EdgeSet, has_edges
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import PixelShares
 from reslrb_cli.transport.plan import Plan, make_plan
@@ -204,6 +204,9 @@ class Preparation:
         plan = replace(plan, evened_lamps=drawn)
         if moves:
             plan = attach(plan, which, self._motion, scene, sensor)
+            if self.sampling.edges:
+                edged = tuple(shape for shape in which.shapes if has_edges(shape) and not shape.is_emitter())
+                plan = replace(plan, edged=edged)
         if plan.stays and self._motion.sampling == "auto":
             if sensor not in about.stays:  # once, because another answer would recompile kernels
                 about.stays[sensor] = bounces(plan, scene, sensor)

@@ -26,7 +26,6 @@ from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.edges import has_edges
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
@@ -103,15 +102,13 @@ class Motion:
 
     `attached` is true, false, or `auto` (true if a parameter moves anything). `filter_normalization` is `attached` or
     `detached`, and `sampling` is `auto`, `follow` or `stay`. Raises ValueError for other values. `obstacle` is the
-    reason why an integrator has no attached derivatives. `edges` tells whether derivatives contain the light that
-    moving edges cover and uncover.
+    reason why an integrator has no attached derivatives.
     """
 
     attached: bool | str = "auto"
     filter_normalization: str = "attached"
     obstacle: str | None = None
     sampling: str = "follow"
-    edges: bool = False
 
     def __post_init__(self) -> None:
         if self.attached not in (True, False, "auto"):
@@ -132,6 +129,7 @@ class SamplingOptions:
     - `shares_out` tells whether camera paths are distributed over the pixels by need. The distribution by sensor,
         (H, W), may be `given` for all scenes with the same sensors. Otherwise it is stored for each scene and its
         parameters.
+    - `edges` tells whether derivatives contain the light that moving edges cover and uncover (`estimators/edges.py`).
     - `expected` is the sample count of the passes that tables learn from. If it is None, each pass uses its own count.
     """
 
@@ -142,6 +140,7 @@ class SamplingOptions:
     whole: bool = False
     shares_out: bool = False
     given: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+    edges: bool = False
     expected: int | None = None
 
     def __post_init__(self) -> None:
@@ -209,7 +208,6 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, s
         glossy_follows=glossy_follows,
         moving_shapes=which.shapes,
         moving_emitters=which.emitters,
-        edged=tuple(shape for shape in which.shapes if motion.edges and has_edges(shape) and not shape.is_emitter()),
         attached_normalization=motion.filter_normalization == "attached",
     )
 

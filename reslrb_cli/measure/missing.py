@@ -48,15 +48,18 @@ from reslrb_cli.measure.methods import NEVER, parse_cases
 from reslrb_cli.measure.participants import MOVING_DIRECTIONS, PATHS
 from reslrb_cli.measure.references import ends
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.sampling import as_decided, is_auto
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
 from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES
 from reslrb_cli.optimization.views import View
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.needs import camera_finds_all
 from reslrb_cli.statistics import jackknife_variance
+from reslrb_cli.transport.edges import has_edges
 
 #: Seeds for choosing steps, and the minimum for a share.
 PILOT_SEEDS, FEWEST = 4, 4
@@ -189,6 +192,7 @@ class MissingCheck:
             reason = "has no derivative at the initial values, which equal those of the target"
             raise ConfigError(self.source, "loss", reason)
         options = problem.config.integrator.options()
+        options["edges"] = "off" if config.integrator.options().get("edges") == "off" else "on"
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")}
         self._tracer = make_integrator("reslrb", **options, freeze=True)
         self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
@@ -274,16 +278,34 @@ SHORT, LONG = 0.01, 0.25
 MOST_SEEDS, MOST_VIEWS = 64, 4
 
 
-def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[MissingRecord]:
-    """Measure the missing share of the loss's derivative before a run, for each parameter that moves light.
+def check_missing(
+    problem: Problem, say: Callable[[str], None], warn: Callable[[str], None]
+) -> tuple[Problem, list[MissingRecord]]:  # fmt: skip
+    """Measure the missing share of the loss's derivative before a run, for each parameter that moves light. Return the
+    problem, and the records of the parameters.
 
+    If `integrator.edges` is `auto`, and a significant or an unknown share is missing, the problem gets the derivatives
+    of edges. The share is then measured again, and unknown shares no longer count. `say` is called with this decision.
     Calls `warn` with one line if a derivative is incomplete, or if its missing share is unknown. Raises ConfigError if
     a missing share exceeds one half by more than two standard errors, unless the run accepts incomplete derivatives.
     """
     config, found = problem.config, measure_missing(problem)
+    if is_auto(config, "edges") and found:
+        lacking = [record for record in found if record.is_incomplete]
+        why = "no significant part of the derivative is missing without them"
+        if lacking:
+            why = f"without them, the derivative of {lacking[0].parameter} lacks {lacking[0].percent()}"
+        decision = Decision(setting="edges", value="on" if lacking else "off", why=why)
+        integrator = as_decided(problem.integrator, [decision])
+        problem = replace(problem, decisions=[*problem.decisions, decision], integrator=integrator)
+        if lacking:
+            say(f"chosen by measurement: {decision.line()}")
+            found = measure_missing(problem)
+    if _has_all_edges(problem):
+        found = [record for record in found if not record.is_unknown]
     told = [record for record in found if record.is_incomplete]
     if not told:
-        return found
+        return problem, found
     line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective"
     camera = camera_finds_all(problem.scene, config.integrator.max_depth)
     if any(record.is_for_the_most_part for record in told) and not config.run.accept_incomplete:
@@ -291,7 +313,16 @@ def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[Missing
         raise ConfigError(config.source, "integrator.type", f"{line}; {first} --set run.accept_incomplete=true runs it "
                                                             "anyway")  # fmt: skip
     warn(f"{line}; --set {way} includes all of it" if camera else line)
-    return found
+    return problem, found
+
+
+def _has_all_edges(problem: Problem) -> bool:
+    """True if the derivatives contain the edges of everything that moves."""
+    tracer = problem.integrator
+    if not (isinstance(tracer, LightTracer) and tracer.preparation.sampling.edges):
+        return False
+    moving = where_moved(problem.selection.params, problem.selection.scene_keys)
+    return all(item.is_shape and has_edges(item.node) and not item.node.is_emitter() for item in moving)
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:

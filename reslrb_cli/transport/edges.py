@@ -78,7 +78,7 @@ class Outline:
     active: mi.Bool
 
 
-Viewer = Callable[[mi.Point3f, mi.Bool], View]
+Viewer = Callable[[Any, Any], View]  # (point, active lanes) -> view
 
 
 def view_from_lamps(samples: Samples, numbers: mi.Point2f) -> Viewer:
