@@ -210,7 +210,8 @@ class Behind(CameraHooks):
         total, slid, rest = state.all, state.slid, state.rest
 
         def slope(towards: mi.Vector3f) -> mi.Float:
-            return dr.dot(self.normal, towards) / dr.dot(n_x, towards)
+            cos = dr.dot(n_x, towards)
+            return dr.select(cos != 0, dr.dot(self.normal, towards) / cos, 0)  # no surface: 0
 
         if met is not None:
             L = dr.select(met.active, P * met.Le * met.weight, 0)
@@ -246,11 +247,12 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     still, slid, rest = (dr.dot(weight, part) for part in (L.all, L.slid, L.rest))
     active = beside.active & dr.isfinite(still) & dr.isfinite(slid) & (still != 0)
     s = outline.view.distance / dr.norm(beside.past.o + beside.past.d * x.t - outline.view.y)
+    moves = active & x.is_valid()
+    at_x = dr.select(moves, s * (slid * L.n_x + rest * n), 0)  # s is NaN if the ray leaves the scene
     with dr.resume_grad(), dr.isolate_grad():
         moved = _moved(beside, -still * n, active)
-        moves = active & x.is_valid()
         si = x.compute_surface_interaction(beside.past, mi.RayFlags.All | mi.RayFlags.FollowShape, moves)
-        moved += dr.select(moves, dr.dot(si.p, s * (slid * L.n_x + rest * n)), 0)
+        moved += dr.select(moves, dr.dot(si.p, at_x), 0)
         dr.backward_from(moved, flags=_MAY_LACK)
 
 
@@ -339,10 +341,11 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     s = y.t / (y.t + x.t - AROUND * offset)
     flags = mi.RayFlags.All | mi.RayFlags.FollowShape
     slope = dr.select(found.direct != 0, dr.dot(n, found.towards) / dr.dot(found.n_y, found.towards), 0)
-    along = dr.select(found.direct != 0, slope * found.n_y, n)
+    at_y = dr.select(active, (W * (1 - s)) * dr.select(found.direct != 0, slope * found.n_y, n), 0)
+    at_x = dr.select(active, (W * s) * n, 0)
     with dr.resume_grad(), dr.isolate_grad():
         moved = _moved(beside, -W * n, active)
-        at_x = x.compute_surface_interaction(beside.past, flags, active)
-        at_y = y.compute_surface_interaction(back, flags, active)
-        moved += dr.select(active, W * (dr.dot(at_x.p, s * n) + dr.dot(at_y.p, (1 - s) * along)), 0)
+        for point, ray, adjoint in ((x, beside.past, at_x), (y, back, at_y)):
+            si = point.compute_surface_interaction(ray, flags, active)
+            moved += dr.select(active, dr.dot(si.p, adjoint), 0)
         dr.backward_from(moved, flags=_MAY_LACK)
