@@ -219,20 +219,28 @@ def _from(first: View, p: mi.Point3f, again: View, moved: mi.Bool) -> View:
 
 @dataclass
 class _Mesh:
-    """Edges of a mesh, by the indices of their ends and of the third corners of their faces."""
+    """Edges of a mesh, as vertex indices (`welded_edges`)."""
 
     shape: mi.Shape
     corners: list[mi.UInt32]
 
-    @property
-    def single(self) -> mi.Bool:
-        """Edges with one face."""
-        return self.corners[2] == self.corners[3]
-
     def rows(self) -> list[mi.Point3f]:
         """Return the current a, b, c and d of all edges."""
         positions = dr.detach(self.shape.vertex_positions_buffer())
-        return [dr.gather(mi.Point3f, positions, index) for index in self.corners]
+        return [dr.gather(mi.Point3f, positions, index) for index in self.corners[:4]]
+
+    def creases(self, rows: list[mi.Point3f]) -> mi.Float:
+        """Return the angle between the normals of the two faces at each edge, divided by pi. If normals are
+        interpolated, it is the angle between the shading normals.
+        """
+        a, b, c, d = rows
+        angle = dr.pi - _turned(b - a, c - a, d - a)
+        if interpolates_normals(self.shape):
+            buffer = dr.detach(self.shape.vertex_normals_buffer())
+            i, j, _, _, i_2, j_2 = (dr.normalize(dr.gather(mi.Vector3f, buffer, index)) for index in self.corners)
+            angle = dr.maximum(_angle(i, i_2), _angle(j, j_2))
+        single = self.corners[2] == self.corners[3]
+        return dr.select(single | ~dr.isfinite(angle), 0, angle * dr.inv_pi)
 
 
 @dataclass
@@ -290,11 +298,7 @@ class EdgeSet:
                 rows = part.rows()
                 n = dr.width(rows[0])
                 corners.append(rows)
-                crease = dr.zeros(mi.Float, n)
-                if isinstance(part, _Mesh) and not interpolates_normals(part.shape):
-                    a, b, c, d = rows
-                    crease = dr.select(part.single, 0, 1 - _turned(b - a, c - a, d - a) * dr.inv_pi)
-                creases.append(dr.select(dr.isfinite(crease), crease, 0))
+                creases.append(part.creases(rows) if isinstance(part, _Mesh) else dr.zeros(mi.Float, n))
                 kinds.append(dr.full(mi.UInt32, SEGMENT, n))
                 radii.append(dr.zeros(mi.Float, n))
                 shapes.append(dr.full(mi.UInt32, _index(part.shape), n))
@@ -332,7 +336,11 @@ def _across(along: mi.Vector3f, corner: mi.Vector3f) -> mi.Vector3f:
 
 def _turned(along: mi.Vector3f, c: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
     """Return the angle in [0, pi] between the faces with the corners `c` and `d` at an edge."""
-    first, second = _across(along, c), _across(along, d)
+    return _angle(_across(along, c), _across(along, d))
+
+
+def _angle(first: mi.Vector3f, second: mi.Vector3f) -> mi.Float:
+    """Return the angle between unit vectors."""
     return 2 * dr.atan2(dr.norm(first - second), dr.norm(first + second))
 
 
@@ -391,23 +399,28 @@ def _is_outline(table: EdgeTable, view: View) -> mi.Bool:
 
 
 def welded_edges(positions: Array, faces: Array) -> Array:
-    """Return the edges of a mesh as vertex indices (E, 4): both ends, and the third corner of each face.
+    """Return the edges of a mesh as vertex indices (E, 6).
 
-    Vertices at the same place are one vertex. An edge with one face repeats the third corner. An edge with more than
-    two faces has a row for each pair of them. `positions` is (V, 3), and `faces` is (F, 3).
+    The columns are both ends, the third corners of the first and of the second face, and both ends in the second face.
+    Vertices at the same place are one vertex. An edge with one face repeats the first face. An edge with more than two
+    faces has a row for each pair of them. `positions` is (V, 3), and `faces` is (F, 3).
     """
     size = float(np.ptp(positions, axis=0).max()) or 1.0
     _, vertex = np.unique(np.round(positions / (WELD * size)), axis=0, return_inverse=True)
+    vertex = vertex.ravel()
     corners = np.concatenate([faces[:, [0, 1, 2]], faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
-    ends = np.sort(vertex.ravel()[corners[:, :2]], axis=1)
+    ends = np.sort(vertex[corners[:, :2]], axis=1)
     corners, ends = corners[ends[:, 0] != ends[:, 1]], ends[ends[:, 0] != ends[:, 1]]
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     corners, ends = corners[order], ends[order]
     begins = np.r_[True, np.any(ends[1:] != ends[:-1], axis=1)]
     number = np.arange(len(ends)) - np.maximum.accumulate(np.where(begins, np.arange(len(ends)), 0))
     odd = number % 2 == 1
-    third = np.where(np.r_[odd[1:], False], np.r_[corners[1:, 2], 0], corners[:, 2])
-    return np.column_stack([corners, third])[~odd].astype(np.uint32)
+    # The second face is that of the next row, if it has the same ends.
+    second = np.where(np.r_[odd[1:], False][:, None], np.roll(corners, -1, 0), corners)
+    same = vertex[second[:, 0]] == vertex[corners[:, 0]]
+    other_ends = np.where(same[:, None], second[:, :2], second[:, 1::-1])
+    return np.column_stack([corners, second[:, 2], other_ends])[~odd].astype(np.uint32)
 
 
 def _rim(z: float, inner_radius: float, inner_z: float) -> list[mi.Point3f]:

@@ -227,8 +227,8 @@ class EdgeTable:
     third corners of the two faces at a segment, and equal if the segment has one face. `radius` is that of a sphere or
     a cylinder. `shape` has the index of each shape's pointer. `lamp`, `sensor` and `anywhere` are cumulative sampling
     weights of the rows, for edges seen from lamps, and for outlines seen from the sensor and from all directions.
-    `crease` is the angle between the normals of the two faces, divided by pi, or 0 if the shape has no creases because
-    its shading normals are interpolated.
+    `crease` is the angle between the normals of the two faces, divided by pi. It is 0 for a smooth edge of a mesh with
+    interpolated normals.
     """
 
     kind: mi.UInt32
