@@ -37,7 +37,7 @@ from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, shading_correction
-from reslrb_cli.transport.edges import Outline, sample_outline, view_from_lamps, view_from_sensor
+from reslrb_cli.transport.edges import Chances, Outline, sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.samples import Samples
@@ -74,6 +74,12 @@ def _samples(samples: Samples, stream: int) -> Samples:
     seed = mi.sample_tea_32(samples.seed, mi.UInt32(stream))[0]
     scale = samples.scale * (dr.opaque(mi.Float, samples.width) / dr.opaque(mi.Float, width))
     return replace(samples, plan=plan, seed=seed, spp=1, width=width, scale=scale, guide=None, net=None)
+
+
+def _chances(samples: Samples, numbers: mi.PCG32) -> Chances:
+    """Return the random numbers of one outline per lane."""
+    lane = dr.arange(mi.UInt32, samples.width)
+    return Chances.spread(numbers, samples.seed, lane, dr.opaque(mi.UInt32, samples.width))
 
 
 @dataclass
@@ -158,10 +164,12 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines seen from lamps. Half of the lanes continue from p, and half from x."""
     samples = p.samples
     assert samples.edges is not None
-    view = view_from_lamps(samples, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
-    outline = sample_outline(samples, samples.edges.lamp, view, numbers, creases=True)
+    lane = dr.arange(mi.UInt32, samples.width)
+    over = lane % 2 == 0
+    chances = Chances.spread(numbers, samples.seed, lane // 2, dr.opaque(mi.UInt32, (samples.width + 1) // 2))
+    view = view_from_lamps(samples, chances.viewpoint)
+    outline = sample_outline(samples, samples.edges.lamp, view, chances, creases=True)
     beside = _beside(samples, outline)
-    over = dr.arange(mi.UInt32, samples.width) % 2 == 0
     ray = dr.select(over, beside.over, beside.past)
     emission = Emission(ray, 2 * outline.weight, dr.zeros(mi.EmitterPtr))
     smooth = [shape for shape in samples.plan.edged if interpolates_normals(shape)]
@@ -233,8 +241,8 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     samples = p.samples
     samples = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
     assert samples.edges is not None
-    view = view_from_sensor(samples, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
-    outline = sample_outline(samples, samples.edges.sensor, view, numbers)
+    chances = _chances(samples, numbers)
+    outline = sample_outline(samples, samples.edges.sensor, view_from_sensor(samples, chances.viewpoint), chances)
     beside = _beside(samples, outline)
     x = samples.scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
     n = outline.normal
@@ -322,7 +330,7 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines on segments between two surfaces. The first of them is not specular."""
     samples, scene = p.samples, p.samples.scene
     assert samples.edges is not None
-    outline = sample_outline(samples, samples.edges.anywhere, None, numbers)
+    outline = sample_outline(samples, samples.edges.anywhere, None, _chances(samples, numbers))
     n, to_y = outline.normal, outline.view.to_y
     offset = _offset(outline)
     back = mi.Ray3f(outline.p + n * (BESIDE * offset), to_y)

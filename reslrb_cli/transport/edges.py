@@ -37,6 +37,8 @@ UNLIKELY = 0.02
 FLAT = 1e-4
 #: Points on the lamps from which edges are probed.
 PROBES = 4
+#: Stream of random numbers, mixed into the seed.
+SPREAD_STREAM = 0x5B4EAD
 #: Vertices are one vertex if their distance is below this part of the size of the mesh.
 WELD = 1e-6
 
@@ -110,8 +112,30 @@ def view_from_sensor(samples: Samples, aperture: mi.Point2f) -> Viewer:
     return view
 
 
+@dataclass
+class Chances:
+    """Random numbers of an outline: the edge, the place on it, and the viewpoint. They are spread evenly over lanes."""
+
+    edge: mi.Float
+    place: mi.Float
+    viewpoint: mi.Point2f
+
+    @staticmethod
+    def spread(numbers: mi.PCG32, seed: mi.UInt32, index: mi.UInt32, count: mi.UInt32) -> Chances:
+        """Return the numbers of points with an `index` below `count`. `count` is opaque.
+
+        They are Hammersley points and a Kronecker sequence (Roberts 2018), with a random offset for each seed.
+        """
+        edge = (mi.Float(index) + numbers.next_float32()) / mi.Float(count)
+        first, second = mi.sample_tea_32(seed, mi.UInt32(SPREAD_STREAM))
+        third, _ = mi.sample_tea_32(seed, mi.UInt32(SPREAD_STREAM + 1))
+        words = dr.brev(index) + first, index * 3242174889 + second, index * 2447445414 + third
+        place, x, y = (mi.Float(word >> 8) * 2.0**-24 for word in words)
+        return Chances(dr.minimum(edge, dr.one_minus_epsilon(mi.Float)), place, mi.Point2f(x, y))
+
+
 def sample_outline(
-    samples: Samples, weights: mi.Float, view: Viewer | None, numbers: mi.PCG32, creases: bool = False
+    samples: Samples, weights: mi.Float, view: Viewer | None, chances: Chances, creases: bool = False
 ) -> Outline:  # fmt: skip
     """Return a random point of an outline per lane. `weights` are cumulative weights of the edges. If `view` is None,
     the outline is seen from a random direction, out of all directions. With `creases`, the points may lie on creases,
@@ -121,7 +145,7 @@ def sample_outline(
     """
     table, kinds = samples.edges, edge_kinds(samples.plan.edged)
     assert table is not None
-    row_number, place = numbers.next_float32(), numbers.next_float32()
+    row_number, place = chances.edge, chances.place
     rows = dr.width(weights)
     total = dr.gather(mi.Float, weights, rows - 1)
     row = dr.binary_search(0, rows - 1, lambda i: dr.gather(mi.Float, weights, i) <= row_number * total)
@@ -139,7 +163,7 @@ def sample_outline(
     if SPHERE in kinds or TUBE in kinds:
         is_round = kind != SEGMENT
         p = dr.select(kind == SPHERE, a, dr.select(kind == TUBE, dr.lerp(a, b, 0.5), p))
-    view = _view_from_anywhere(table, kinds, row, kind, along, p, numbers) if view is None else view
+    view = _view_from_anywhere(table, kinds, row, kind, along, p, chances) if view is None else view
     seen = view(p, active)
     normal = mi.Vector3f(0)
     if SPHERE in kinds or TUBE in kinds:
@@ -346,13 +370,13 @@ def _angle(first: mi.Vector3f, second: mi.Vector3f) -> mi.Float:
 
 def _view_from_anywhere(
     table: EdgeTable, kinds: frozenset[int], row: mi.UInt32, kind: mi.UInt32, along: mi.Vector3f, p: mi.Point3f,
-    numbers: mi.PCG32,
+    chances: Chances,
 ) -> Viewer:  # fmt: skip
     """Return the view of an edge from a random direction. For a segment, it is one of the directions from which the
     segment is an outline. The distribution is uniform in solid angle.
     """
-    first, second = numbers.next_float32(), numbers.next_float32()
-    to_y, density = mi.warp.square_to_uniform_sphere(mi.Point2f(first, second)), mi.Float(dr.inv_four_pi)
+    first, second = chances.viewpoint
+    to_y, density = mi.warp.square_to_uniform_sphere(chances.viewpoint), mi.Float(dr.inv_four_pi)
     if SEGMENT in kinds:
         c, d = dr.gather(mi.Point3f, table.c, row) - p, dr.gather(mi.Point3f, table.d, row) - p
         angle, x = _turned(along, c, d), _across(along, c)
