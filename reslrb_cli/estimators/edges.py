@@ -99,7 +99,7 @@ def _offset(outline: Outline) -> mi.Float:
     return mi.math.RayEpsilon * (1 + dr.max(dr.abs(outline.p)))
 
 
-def _beside(samples: Samples, outline: Outline) -> Beside:
+def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside:
     """Return the rays on both sides of an outline. Lanes are active if nothing stands before the edge."""
     scene, view, d = samples.scene, outline.view, -outline.view.to_y
     offset = _offset(outline)
@@ -116,6 +116,10 @@ def _beside(samples: Samples, outline: Outline) -> Beside:
     before.maxt = back - AROUND * offset
     active = active & ~scene.ray_test(before, active)
     past.o = past.o + d * before.maxt
+    if creases:
+        # Behind a crease lies the other face. It may be narrower than the offset if it is seen at a grazing angle.
+        other = scene.ray_intersect_preliminary(past, coherent=False, active=active & outline.crease)
+        active = active & (~outline.crease | (other.is_valid() & (other.shape == outline.shape)))
     return Beside(over, past, pi, active)
 
 
@@ -169,7 +173,7 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     chances = Chances.spread(numbers, samples.seed, lane // 2, dr.opaque(mi.UInt32, (samples.width + 1) // 2))
     view = view_from_lamps(samples, chances.viewpoint)
     outline = sample_outline(samples, samples.edges.lamp, view, chances, creases=True)
-    beside = _beside(samples, outline)
+    beside = _beside(samples, outline, creases=True)
     ray = dr.select(over, beside.over, beside.past)
     emission = Emission(ray, 2 * outline.weight, dr.zeros(mi.EmitterPtr))
     smooth = [shape for shape in samples.plan.edged if interpolates_normals(shape)]

@@ -69,7 +69,7 @@ class Outline:
 
     `normal` is perpendicular to the edge and to the ray from the viewpoint, and points away from the shape. `weight`
     (C,) is the light or the importance that passes the edge per unit of normal velocity, divided by the sample's
-    density.
+    density. In lanes `crease`, the edge is no outline, and `normal` points away from the first face.
     """
 
     p: mi.Point3f
@@ -78,6 +78,7 @@ class Outline:
     weight: mi.Spectrum
     shape: mi.ShapePtr
     active: mi.Bool
+    crease: mi.Bool
 
 
 Viewer = Callable[[Any, Any], View]  # (point, active lanes) -> view
@@ -159,7 +160,7 @@ def sample_outline(
 
     # ---- A segment: its place does not depend on the viewpoint ----
     p, density, active = a + (b - a) * place, dr.rcp(length), probability > 0
-    is_round = mi.Bool(False)
+    is_round, is_crease = mi.Bool(False), mi.Bool(False)
     if SPHERE in kinds or TUBE in kinds:
         is_round = kind != SEGMENT
         p = dr.select(kind == SPHERE, a, dr.select(kind == TUBE, dr.lerp(a, b, 0.5), p))
@@ -199,17 +200,17 @@ def sample_outline(
     if SEGMENT in kinds:
         c, other = dr.gather(mi.Point3f, table.c, row), dr.gather(mi.Point3f, table.d, row)
         side, across_it = dr.dot(raw, c - p), dr.dot(raw, other - p)
-        counts = side * across_it > 0
+        outlines = is_round | (side * across_it > 0)
         if creases:
-            counts |= dr.gather(mi.Float, table.crease, row) > FLAT
-        active &= is_round | counts
+            is_crease = ~outlines & (dr.gather(mi.Float, table.crease, row) > FLAT)
+        active &= outlines | is_crease
         normal = dr.select(is_round, normal, -dr.mulsign(raw, side) / dr.maximum(sine, 1e-30))
     if SPHERE in kinds:
         sine = dr.select(kind == SPHERE, 1, sine)
     active &= seen.active & (sine > 1e-6)
     weight = seen.weight * dr.select(active, sine / (density * probability), 0)
     shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, table.shape, row, active))
-    return Outline(p, normal, seen, weight, shape, active)
+    return Outline(p, normal, seen, weight, shape, active, is_crease)
 
 
 def _from(first: View, p: mi.Point3f, again: View, moved: mi.Bool) -> View:
