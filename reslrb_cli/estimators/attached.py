@@ -26,7 +26,8 @@ to position x_{i-1}. The adjoint gives vertex i-1 no derivative with respect to 
 previous vertex's data for the derivative of s_{i-1} at vertex i.
 
 The surface-integral form comes from Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry". With the
-surface-integral form, edges that do not move contribute no error. Neither form has the derivative of visibility.
+surface-integral form, edges that do not move contribute no error. Neither form has the derivative of visibility, which
+`edges.py` adds for the edges of moving shapes.
 
 The stack starts with the first vertex that moves or whose BSDF has a parameter. Earlier vertices depend only on
 parameters of the emitter. The stack works as in `stack.py`. Here, T behind the last pushed vertex equals the roulette

@@ -1,26 +1,43 @@
-"""Derivatives of what moving edges cover and uncover.
+"""Derivatives of the light that moving edges cover and uncover.
 
-The gradients of other estimators follow the light along paths whose vertices move with the surfaces. They lack the
-light that a moving edge newly blocks or lets through. Here, p is a point of an outline (`transport/edges.py`), seen
-from a viewpoint y. x is the point behind p on the ray from y, n is the outline's normal, v_p is the velocity of p, and
-w is the light or the importance that passes the edge.
+The other estimators differentiate light along paths whose vertices move with the surfaces. They lack the light that a
+moving edge starts to block or to let through. This light is an integral over outlines (`transport/edges.py`). Here, p
+is a point on an outline, seen from a viewpoint y. x is the point behind p on the ray from y. n is the normal of the
+outline, and points away from the shape. v_p is the velocity of p, and w is the weight of the sample: the light or the
+importance that the edge covers per unit of <v_p, n>, divided by the density.
 
-At the start of a light path, y is a place on a lamp, and rays keep their direction. W_p and W_x are the contributions,
-to the objective, of light that continues from p or from x. A light walk estimates them.
+At the start of a light path, y is a place on a lamp, and rays from y keep their direction. W_p and W_x are the
+contributions to the objective of light that continues from p and from x. A light walk estimates them.
 
     dL/dtheta  +=  w (W_p - W_x) <v_p, n>
 
+Creases need this term, too. A crease is an edge between two flat-shaded faces that are both lit. The contribution of
+the light jumps there, because the faces have different normals. At a crease, x is a point on the second face.
+
 At the end of a light path, y is a place on the sensor, and x moves with the light that reaches it. L_x is the radiance
-from x. A camera walk estimates it, apart from light that reaches x through a specular chain from a lamp that only light
-paths find.
+from x. A camera walk estimates L_x. Light that reaches x through a specular chain is missing if only light paths find
+it.
 
     dL/dtheta  -=  w delta(u) L_x <v_p - s v_x, n>,    s = |p - y| / |x - y|
 
-x moves with its surface, or, if light arrives directly from a lamp, slides along this light's direction l.
+Between two surfaces, light goes from y on the first surface past p to x on the second. L_y is the radiance from y, and
+W_x the contribution of L_y after it continues from x. A camera walk selects one contribution to L_y, and a light walk
+estimates W_x.
 
-    v_x = l <v, n_x> / <l, n_x>,    v: velocity of the surface at x
+    dL/dtheta  -=  w W_x <v_p - s v_x - (1 - s) v_y, n>
 
-Source: Zhang et al. 2020, "Path-Space Differentiable Rendering". Edges of segments between two surfaces are missing.
+A point that light reaches directly from a lamp slides along the direction l of this light. Other points move with their
+surface. v is the velocity of the surface, and n_x its normal.
+
+    v_x = l <v, n_x> / <l, n_x>   if light arrives directly from a lamp,   otherwise   v_x = v
+
+v_y is defined in the same way. x in the last formula always moves with its surface.
+
+If a shape touches the surface behind it, lamps and the sensor lose x at the same time. This light counts once, as seen
+from the lamps.
+
+Sources: Zhang et al. 2020, "Path-Space Differentiable Rendering"; Li et al. 2018, "Differentiable Monte Carlo Ray
+Tracing through Edge Sampling".
 """
 
 from __future__ import annotations
@@ -43,18 +60,18 @@ from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
-#: Light paths of a step for each outline that is sampled from a lamp, and from the sensor.
+#: Light paths of a step per sampled point on an outline, for each of the three terms.
 PATHS_PER_OUTLINE = 4
-#: Distance from an edge, in units of Mitsuba's offset of rays, at which rays pass the edge on either side of it.
+#: Distance between an edge and the two rays beside it, in units of Mitsuba's ray offset.
 BESIDE = 1.0
-#: Distance along the ray, in the same units, within which a hit counts as behind the edge.
+#: Distance along a ray within which a surface counts as being at the edge, in units of Mitsuba's ray offset.
 AROUND = 30.0
 #: Streams of random numbers, mixed into the seed.
 LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
 
 
 def differentiate_edges(p: Pass) -> None:
-    """Add the derivatives of the light that the edges of moving shapes cover and uncover. dL/dI must be known."""
+    """Add the derivatives of the light that edges of moving shapes cover and uncover. dL/dI must be known."""
     sides = {LAMP_EDGES: _from_lamps, SENSOR_EDGES: _from_sensor}
     if p.plan.max_depth > 2:
         sides[OTHER_EDGES] = _between
@@ -64,7 +81,9 @@ def differentiate_edges(p: Pass) -> None:
 
 
 def _samples(samples: Samples, stream: int) -> Samples:
-    """Return samples for outlines next to the light paths `samples`. Nothing is differentiated along their paths."""
+    """Return samples of outlines for the light paths `samples`. Nothing along the paths of the result is
+    differentiated.
+    """
     plan = replace(
         samples.plan, attached=False, stays=False, glossy_follows=False, moving_shapes=(), moving_emitters=(),
         grid=None, aims=False, sequence=None, differentiate_bsdfs=False, differentiate_emission=False,
@@ -84,8 +103,8 @@ def _chances(samples: Samples, numbers: mi.PCG32) -> Chances:
 
 @dataclass
 class Beside:
-    """Rays from the viewpoint past an outline: `over` meets the shape, and `past` passes it. `active` lanes reach the
-    edge. `pi` is the intersection of `over`.
+    """Two rays from the viewpoint beside an outline. `over` hits the shape, with intersection `pi`. `past` misses the
+    edge. Rays in `active` lanes reach the edge.
     """
 
     over: mi.Ray3f
@@ -95,12 +114,12 @@ class Beside:
 
 
 def _offset(outline: Outline) -> mi.Float:
-    """Return the distance by which Mitsuba offsets rays at the outline."""
+    """Return Mitsuba's ray offset at the outline."""
     return mi.math.RayEpsilon * (1 + dr.max(dr.abs(outline.p)))
 
 
 def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside:
-    """Return the rays on both sides of an outline. Lanes are active if nothing stands before the edge."""
+    """Return the rays on both sides of an outline. Lanes are active if nothing hides the edge from the viewpoint."""
     scene, view, d = samples.scene, outline.view, -outline.view.to_y
     offset = _offset(outline)
     back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset)
@@ -124,7 +143,7 @@ def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside
 
 
 def _moved(beside: Beside, adjoint: mi.Vector3f, active: mi.Bool) -> mi.Float:
-    """Return <p, `adjoint`> with the derivative of p. p moves with its surface."""
+    """Return <p, `adjoint`> with the derivative of the point p on the shape. p moves with its surface."""
     flags = mi.RayFlags.All | mi.RayFlags.FollowShape
     si = beside.pi.compute_surface_interaction(beside.over, flags, active)
     return dr.select(active, dr.dot(si.p, adjoint), 0)
@@ -137,7 +156,8 @@ class Contribution(Hooks):
     """Contribution of a light path to the objective.
 
     In the lanes `smooth`, the first vertex lies on the outline of a mesh with interpolated normals. The correction for
-    shading normals has no limit there. It is left out at this vertex, as its derivative is (`shading_correction`).
+    shading normals has no limit there, so it is left out at this vertex. The other estimators leave out its derivative
+    (`shading_correction`).
     """
 
     def __init__(self, p: Pass, smooth: mi.Bool | None = None) -> None:
@@ -165,7 +185,9 @@ class Contribution(Hooks):
 
 
 def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
-    """Add the derivatives of outlines seen from lamps. Half of the lanes continue from p, and half from x."""
+    """Add the derivatives of outlines and creases seen from lamps. Half of the lanes continue from p, the others from
+    x.
+    """
     samples = p.samples
     assert samples.edges is not None
     lane = dr.arange(mi.UInt32, samples.width)
@@ -184,7 +206,7 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
         dr.backward_from(_moved(beside, weight * outline.normal, beside.active & (weight != 0)), flags=_MAY_LACK)
 
 
-#: A moving shape may cast no edge.
+#: The result depends on no parameter if, for example, no lane is active.
 _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
@@ -193,9 +215,11 @@ _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 @dataclass
 class Arrived:
-    """Radiance from x (C,): `all` of it, and `slid`, multiplied by the component of its velocity along the outline's
-    normal per unit of <v, n_x>, of light that arrives at x directly. `rest` is the other light. `counts` is 0 if the
-    first event is specular, because light paths do not connect there.
+    """Radiance from x (C,), in three sums.
+
+    `all` is the whole radiance. `slid` is the radiance of light that arrives at x directly from a lamp, times
+    <v_x, n> / <v, n_x>. `rest` is the radiance of other light. `counts` is 0 if x is specular, because light paths do
+    not connect from specular surfaces. `n_x` is the normal at x.
     """
 
     all: mi.Spectrum
@@ -206,7 +230,7 @@ class Arrived:
 
 
 class Behind(CameraHooks):
-    """Radiance from x. `normal` is that of the outline."""
+    """Hooks that sum the radiance from x. `normal` is the normal of the outline."""
 
     def __init__(self, normal: mi.Vector3f) -> None:
         self.normal = normal
@@ -250,8 +274,8 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     beside = _beside(samples, outline)
     x = samples.scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
     n = outline.normal
-    # Where the shape touches the surface behind it, lamps and the sensor lose the point x at once. It counts once: as
-    # seen from the lamps.
+    # If the shape touches the surface behind it, lamps and the sensor lose the point x at the same time. It counts
+    # once, as seen from the lamps.
     touches = x.is_valid() & (x.t < 2 * AROUND * _offset(outline))
     beside.active = beside.active & ~touches
     _, L = camera_walk(samples, Behind(n), beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
@@ -273,10 +297,11 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
 
 @dataclass
 class Chosen:
-    """One of the contributions to the radiance from y, chosen in proportion to its size.
+    """One contribution to the radiance from y, selected in proportion to its size (the largest channel).
 
-    `L` (C,) is its radiance, and `total` the size of all contributions. `segments` is the number of segments from the
-    lamp to y. If `direct` is 1, the light arrives at y from the direction `towards`.
+    `L` (C,) is the radiance of the contribution divided by its size, and `total` is the sum of all sizes. `segments` is
+    the number of segments from the lamp to y. `direct` is 1 if the light arrives at y directly from a lamp; its
+    direction is then `towards`. `n_y` is the normal at y. `counts` is 0 if y is specular.
     """
 
     L: mi.Spectrum
@@ -291,7 +316,7 @@ class Chosen:
     def offered(
         self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, direct: mi.Bool, towards: mi.Vector3f
     ) -> Chosen:  # fmt: skip
-        """Return the choice after another contribution."""
+        """Return the selection after another contribution."""
         size = dr.select(active, dr.max(L), 0)
         total, number = self.total + size, self.numbers.next_float32()
         takes = active & (size > 0) & (number * total < size)
@@ -306,7 +331,7 @@ class Chosen:
 
 
 class Choice(CameraHooks):
-    """Chooses one contribution to the radiance from y, without the emission of a lamp at y."""
+    """Hooks that select one contribution to the radiance from y. Emission of a lamp at y is left out."""
 
     def __init__(self, numbers: mi.PCG32) -> None:
         self.numbers = numbers
@@ -331,7 +356,7 @@ class Choice(CameraHooks):
 
 
 def _between(p: Pass, numbers: mi.PCG32) -> None:
-    """Add the derivatives of outlines on segments between two surfaces. The first of them is not specular."""
+    """Add the derivatives of outlines on segments between two surfaces. The first surface is not specular."""
     samples, scene = p.samples, p.samples.scene
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.anywhere, None, _chances(samples, numbers))

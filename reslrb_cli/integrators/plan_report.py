@@ -53,7 +53,7 @@ def plan_rows(plan: Plan) -> list[PlanRow]:
          "after diffuse bounces light goes on to the same point, so edges at rest count",
          "all follow: no moving object is seen after a diffuse bounce, or attached_sampling: follow"),
         (EDGES, bool(plan.edged), "the light that they cover and uncover has a derivative",
-         "no shape moves, or edges: off"),
+         "no shape moves, edges: off, or edges: auto before a run decides"),
         ("moving emitters", plan.moving_emission, "rays include the derivative of their origins",
          "emitters are at rest"),
         ("moving lamps in view", bool(plan.visible_moving_lamps),

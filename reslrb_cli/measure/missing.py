@@ -1,7 +1,8 @@
 """Terms that attached gradients lack: silhouettes, shadow edges, and light that leaves the film.
 
-Finite differences of the image at common random numbers contain the terms that attached gradients lack (`Missing`). F_k
-is the finite difference along direction k, and g_k is the attached gradient along direction k. There are K directions.
+`integrator.edges` adds silhouettes and shadow edges of moving shapes (`estimators/edges.py`). Other edges are still
+missing. Finite differences of the image at common random numbers contain all of these terms (`Missing`). F_k is the
+finite difference along direction k, and g_k is the gradient along direction k. There are K directions.
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 
@@ -13,8 +14,8 @@ to the squares is subtracted. The reported standard error is the error of the me
 `gradcheck --missing` for an experiment. With the steps of `choose_step` and no extrapolation, the complete derivative
 of configs/lens_pose.yaml seems to lack 1.1 %.
 
-`check_missing` measures the missing share before a run's first iteration. The measurement is limited to a part of the
-run's samples, and uses one or two finite-difference steps.
+`check_missing` measures the missing share before a run's first iteration, and decides `edges: auto`. Each measurement
+is limited to a part of the run's samples, and uses one or two finite-difference steps.
 """
 
 from __future__ import annotations
@@ -282,12 +283,14 @@ def check_missing(
     problem: Problem, say: Callable[[str], None], warn: Callable[[str], None]
 ) -> tuple[Problem, list[MissingRecord]]:  # fmt: skip
     """Measure the missing share of the loss's derivative before a run, for each parameter that moves light. Return the
-    problem, and the records of the parameters.
+    problem, and one record per parameter.
 
-    If `integrator.edges` is `auto`, and a significant or an unknown share is missing, the problem gets the derivatives
-    of edges. The share is then measured again, and unknown shares no longer count. `say` is called with this decision.
-    Calls `warn` with one line if a derivative is incomplete, or if its missing share is unknown. Raises ConfigError if
-    a missing share exceeds one half by more than two standard errors, unless the run accepts incomplete derivatives.
+    With `integrator.edges: auto`, edges are turned on in the returned problem if a significant share is missing
+    without them, or if the share is unknown. `say` then receives this decision, and the share is measured again. If
+    everything that moves has known edges, and edges are on, records of unknown shares are dropped.
+
+    `warn` receives one line if a derivative is incomplete, or if its missing share is unknown. Raises ConfigError if a
+    missing share exceeds one half by more than two standard errors, unless `run.accept_incomplete` is true.
     """
     config, found = problem.config, measure_missing(problem)
     if is_auto(config, "edges") and found:
@@ -317,7 +320,7 @@ def check_missing(
 
 
 def _has_all_edges(problem: Problem) -> bool:
-    """True if the derivatives contain the edges of everything that moves."""
+    """True if the gradient includes the edges of everything that moves."""
     tracer = problem.integrator
     if not (isinstance(tracer, LightTracer) and tracer.preparation.sampling.edges):
         return False
@@ -335,7 +338,7 @@ def measure_missing(problem: Problem) -> list[MissingRecord]:
     """
     selection, kind = problem.selection, problem.config.integrator.type
     moving = [key for key in selection.keys if key not in selection.factors and moves_light(selection.params, key)]
-    if not moving or kind == "custom" or kind.endswith("_projective"):  # these have edge terms, or may have them
+    if not moving or kind == "custom" or kind.endswith("_projective"):  # these have edges, or may have them
         return []
     problem.apply()
     try:

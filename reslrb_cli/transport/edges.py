@@ -1,11 +1,12 @@
-"""Edges of shapes: curves at which a shape starts to block a ray.
+"""Edges of shapes, and points on outlines: the curves at which a shape starts to block rays from a viewpoint.
 
-`EdgeSet` finds the edges of shapes once. `EdgeSet.now` returns their current places, and the probabilities with which
-they are sampled. `sample_outline` samples points at which an edge is the outline of its shape, as a lamp or the sensor
-sees it. A table has one row per edge, of three kinds.
+`EdgeSet` finds the edges of shapes once. `EdgeSet.now` returns a table of their current places, with the weights by
+which edges are sampled. `sample_outline` samples points on outlines, as a lamp, the sensor, or any direction sees them.
+A table has one row per edge. There are three kinds of edges.
 
 - `SEGMENT`: an edge of a mesh or of a rectangle, or a chord of the rim of a disk or a cylinder. A segment belongs to
-    the outline if both of its faces lie on the same side of it. A segment with one face always does.
+    the outline if, seen from the viewpoint, both of its faces lie on the same side of it. A segment with one face
+    always belongs to the outline.
 - `SPHERE`: the circle at which rays from the viewpoint touch a sphere.
 - `TUBE`: the two lines at which rays from the viewpoint touch a cylinder.
 """
@@ -29,17 +30,17 @@ from reslrb_cli.transport.samples import EdgeTable, Samples
 Array = np.ndarray[Any, Any]
 
 SEGMENT, SPHERE, TUBE = range(3)
-#: Chords of a circle. A chord leaves the circle by at most 2e-5 of its radius.
+#: Number of chords that approximate a circle. The distance between a chord and its arc is at most 2e-5 of the radius.
 CHORDS = 512
-#: Weight of an edge that no probe sees as an outline, relative to an outline of the same length.
+#: Sampling weight of an edge that no probe sees as an outline, relative to an outline of the same length.
 UNLIKELY = 0.02
-#: Faces whose normals differ by less than this part of pi make no crease.
+#: An edge is a crease if the angle between the normals of its faces, divided by pi, exceeds this value.
 FLAT = 1e-4
-#: Points on the lamps from which edges are probed.
+#: Number of points on the lamps that probe whether an edge is an outline.
 PROBES = 4
 #: Stream of random numbers, mixed into the seed.
 SPREAD_STREAM = 0x5B4EAD
-#: Vertices are one vertex if their distance is below this part of the size of the mesh.
+#: Vertices count as one vertex if their distance, divided by the size of the mesh, is below this value.
 WELD = 1e-6
 
 
@@ -47,10 +48,10 @@ WELD = 1e-6
 class View:
     """View of a point from a viewpoint `y`: a place on a lamp or on the sensor's aperture.
 
-    `weight` (C,) is the light or the importance that arrives at the point, divided by the density of the viewpoint.
-    `to_y` is the unit vector to the viewpoint, and `distance` is that of the viewpoint. If `parallel`, the viewpoint is
-    infinitely far away. `surface` has the lamp's normal if the viewpoint is a point of a surface, otherwise zeros. `u`
-    is the film position if the viewpoint is the sensor.
+    `weight` (C,) is the radiance or the importance that arrives at the point, divided by the density of the viewpoint.
+    Occlusion is not included. `to_y` is the unit vector to the viewpoint, and `distance` is the distance of the
+    viewpoint. If `parallel` is true, the viewpoint is infinitely far away. `surface` is the lamp's normal if the
+    viewpoint lies on a surface, otherwise zero. `u` is the film position if the viewpoint is the sensor.
     """
 
     y: mi.Point3f
@@ -65,11 +66,12 @@ class View:
 
 @dataclass
 class Outline:
-    """Point `p` of a shape's outline, seen from a viewpoint.
+    """Point `p` on a shape's outline, seen from a viewpoint.
 
     `normal` is perpendicular to the edge and to the ray from the viewpoint, and points away from the shape. `weight`
-    (C,) is the light or the importance that passes the edge per unit of normal velocity, divided by the sample's
-    density. In lanes `crease`, the edge is no outline, and `normal` points away from the first face.
+    (C,) is the light or the importance that the edge covers per unit of its velocity along the normal, divided by the
+    density of the sample. Occlusion is not included. In `crease` lanes, the edge is a crease and not an outline, and
+    `normal` points away from its first face.
     """
 
     p: mi.Point3f
@@ -85,7 +87,7 @@ Viewer = Callable[[Any, Any], View]  # (point, active lanes) -> view
 
 
 def view_from_lamps(samples: Samples, numbers: mi.Point2f) -> Viewer:
-    """Return the view from lamps. The random `numbers` choose the lamp and the place on it."""
+    """Return the view from lamps. The random `numbers` select the lamp and the place on the lamp."""
 
     def view(p: mi.Point3f, active: mi.Bool) -> View:
         here = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
@@ -138,11 +140,11 @@ class Chances:
 def sample_outline(
     samples: Samples, weights: mi.Float, view: Viewer | None, chances: Chances, creases: bool = False
 ) -> Outline:  # fmt: skip
-    """Return a random point of an outline per lane. `weights` are cumulative weights of the edges. If `view` is None,
-    the outline is seen from a random direction, out of all directions. With `creases`, the points may lie on creases,
-    too; `normal` then points away from the first face of the edge.
+    """Return a random point on an outline for each lane. `weights` are cumulative sampling weights of the edges.
 
-    Code for spheres and cylinders is compiled only if the moving shapes contain any.
+    If `view` is None, each outline is seen from a random direction. If `creases` is true, points may also lie on
+    creases, where `normal` points away from the first face of the edge. Code for spheres and cylinders is compiled only
+    if the moving shapes contain any.
     """
     table, kinds = samples.edges, edge_kinds(samples.plan.edged)
     assert table is not None
@@ -158,7 +160,7 @@ def sample_outline(
     length = dr.norm(along)
     along = along / dr.maximum(length, 1e-30)
 
-    # ---- A segment: its place does not depend on the viewpoint ----
+    # ---- Choose a point on the edge. On a segment, it does not depend on the viewpoint ----
     p, density, active = a + (b - a) * place, dr.rcp(length), probability > 0
     is_round, is_crease = mi.Bool(False), mi.Bool(False)
     if SPHERE in kinds or TUBE in kinds:
@@ -193,7 +195,7 @@ def sample_outline(
             active &= ~here | (distance > 0) & (cos < 1)
         seen = _from(seen, p, view(p, active & is_round), is_round)
 
-    # ---- Where the edge is an outline, and on which side of it the shape lies ----
+    # ---- Test whether the edge is an outline, and on which side of it the shape lies ----
     d = -seen.to_y
     raw = dr.cross(along, d)
     sine = dr.norm(raw)
@@ -214,11 +216,11 @@ def sample_outline(
 
 
 def _from(first: View, p: mi.Point3f, again: View, moved: mi.Bool) -> View:
-    """Return the view of `p` from the viewpoint of `first`, in lanes `moved`. `again` is the view of `p` with the same
-    random numbers.
+    """Return the view of `p` from the viewpoint of `first`, in the lanes `moved`. `again` is the view of `p` with the
+    same random numbers.
 
-    A lamp with a surface may be sampled at another place if another point sees it. The first place then stays, and the
-    weight changes with the solid angle of the place.
+    The same random numbers may select another place on a lamp for another point `p`. If the lamp has a surface, the
+    place of `first` is used, and the weight is multiplied by the ratio of the solid angles of this place.
     """
     on_surface = dr.any(first.surface != 0)
     there = first.y - p
@@ -270,7 +272,7 @@ class _Mesh:
 
 @dataclass
 class _Curves:
-    """Edges of an analytic shape, (E, 3) each in the shape's own coordinates."""
+    """Edges of an analytic shape. `corners` are the points a, b, c and d of each edge, in the shape's coordinates."""
 
     shape: mi.Shape
     corners: list[mi.Point3f]
@@ -282,18 +284,18 @@ class _Curves:
 
 
 def has_edges(shape: mi.Shape) -> bool:
-    """True if the edges of this kind of shape are known."""
+    """True if this module knows the edges of this kind of shape."""
     return shape.is_mesh() or shape.class_name() in ("Rectangle", "Disk", "Sphere", "Cylinder")
 
 
 def edge_kinds(shapes: Iterable[mi.Shape]) -> frozenset[int]:
-    """Return the kinds of the edges of these shapes."""
+    """Return the kinds of edges that these shapes have."""
     kinds = {"Sphere": {SPHERE}, "Cylinder": {SEGMENT, TUBE}}
     return frozenset(kind for shape in shapes for kind in kinds.get(shape.class_name(), {SEGMENT}))
 
 
 class EdgeSet:
-    """Edges of the given shapes of a scene."""
+    """Edges of the given shapes of a scene. Shapes without known edges are ignored."""
 
     def __init__(self, shapes: Iterable[mi.Shape]) -> None:
         self._parts: list[_Mesh | _Curves] = []
@@ -315,7 +317,7 @@ class EdgeSet:
                 self._parts.append(_Mesh(shape, [own_memory(mi.UInt32, np.ascontiguousarray(e)) for e in edges.T]))
 
     def now(self, samples: Samples) -> EdgeTable:
-        """Return the current edges, and their weights for the samples' lamps and sensor."""
+        """Return the current edges with their sampling weights for the lamps and the sensor of `samples`."""
         with dr.suspend_grad():
             corners: list[list[mi.Point3f]] = []
             kinds, radii, shapes, creases = [], [], [], []
@@ -346,7 +348,7 @@ class EdgeSet:
                     table.kind == SPHERE, dr.two_pi * table.radius, 2 * dr.norm(b - a)))  # fmt: skip
             table.lamp = dr.cumsum(lengths * _seen_from_lamps(samples, table))
             table.sensor = dr.cumsum(lengths * _seen_from_sensor(samples, table))
-            free = mi.Float(4 * dr.pi)  # solid angle
+            free = mi.Float(4 * dr.pi)  # solid angle of the directions that see the edge as an outline
             if SEGMENT in {*np.array(table.kind)}:
                 free = dr.select(table.kind == SEGMENT, 4 * (dr.pi - _turned(table.b - a, c - a, d - a)), free)
             table.anywhere = dr.cumsum(dr.select(dr.isfinite(free), lengths * free, 0))
@@ -373,8 +375,8 @@ def _view_from_anywhere(
     table: EdgeTable, kinds: frozenset[int], row: mi.UInt32, kind: mi.UInt32, along: mi.Vector3f, p: mi.Point3f,
     chances: Chances,
 ) -> Viewer:  # fmt: skip
-    """Return the view of an edge from a random direction. For a segment, it is one of the directions from which the
-    segment is an outline. The distribution is uniform in solid angle.
+    """Return the view of an edge from a random direction, uniform in solid angle. For a segment, the directions are
+    limited to those that see the segment as an outline.
     """
     first, second = chances.viewpoint
     to_y, density = mi.warp.square_to_uniform_sphere(chances.viewpoint), mi.Float(dr.inv_four_pi)
@@ -449,8 +451,8 @@ def welded_edges(positions: Array, faces: Array) -> Array:
 
 
 def _rim(z: float, inner_radius: float, inner_z: float) -> list[mi.Point3f]:
-    """Return chords of the unit circle at height `z`. The face at each chord goes to the circle `inner_radius`,
-    `inner_z`.
+    """Return chords of the unit circle at height `z`. The face at each chord extends to the circle of radius
+    `inner_radius` at height `inner_z`.
     """
     angle = np.linspace(0, 2 * np.pi, CHORDS + 1)
     points = np.stack([np.cos(angle), np.sin(angle), np.full_like(angle, z)], 1)

@@ -221,14 +221,17 @@ class Guide:
 
 @dataclass
 class EdgeTable:
-    """Current edges (E rows). A recording takes the arrays as inputs.
+    """Current edges of moving shapes, one per row. A recording takes the arrays as inputs.
 
-    `a` and `b` are the ends of a segment, or of a cylinder's axis. For a sphere, `a` is the centre. `c` and `d` are the
-    third corners of the two faces at a segment, and equal if the segment has one face. `radius` is that of a sphere or
-    a cylinder. `shape` has the index of each shape's pointer. `lamp`, `sensor` and `anywhere` are cumulative sampling
-    weights of the rows, for edges seen from lamps, and for outlines seen from the sensor and from all directions.
-    `crease` is the angle between the normals of the two faces, divided by pi. It is 0 for a smooth edge of a mesh with
-    interpolated normals.
+    - `kind` is one of the kinds in `edges.py`.
+    - `a` and `b` are the ends of a segment, or of a cylinder's axis. For a sphere, `a` is the centre.
+    - `c` and `d` are the third corners of the two faces at a segment. They are equal if the segment has one face.
+    - `radius` is the radius of a sphere or a cylinder, otherwise 0.
+    - `shape` is the index of the shape's pointer.
+    - `crease` is the angle between the normals of the two faces, divided by pi. It is 0 if the edge has only one face,
+        or if the shape interpolates its normals across the edge.
+    - `lamp`, `sensor` and `anywhere` are cumulative sampling weights: for outlines and creases seen from lamps, and for
+        outlines seen from the sensor and from all directions.
     """
 
     kind: mi.UInt32
@@ -271,7 +274,7 @@ class Samples:
     emitters: EmitterDensities | None = None
     #: Distribution of the camera paths over the pixels; None: uniform.
     shares: PixelShares | None = None
-    #: The edges of moving shapes, if they are differentiated.
+    #: The edges of moving shapes, if the gradient includes the derivatives of edges.
     edges: EdgeTable | None = None
     #: The camera paths of the same pass, next to light paths.
     camera: Samples | None = None
