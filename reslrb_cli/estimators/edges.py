@@ -73,7 +73,7 @@ LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
 def differentiate_edges(p: Pass) -> None:
     """Add the derivatives of the light that edges of moving shapes cover and uncover. dL/dI must be known."""
     sides = {LAMP_EDGES: _from_lamps, SENSOR_EDGES: _from_sensor}
-    if p.plan.max_depth > 2:
+    if p.plan.stays:
         sides[OTHER_EDGES] = _between
     for stream, side in sides.items():
         samples = _samples(p.samples, stream)

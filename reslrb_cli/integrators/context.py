@@ -203,11 +203,13 @@ class Preparation:
         drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
         plan = replace(plan, evened_lamps=drawn)
         if moves:
-            plan = attach(plan, which, self._motion, scene, sensor)
+            edged, motion = (), self._motion
             if self.sampling.edges:
                 edged = tuple(shape for shape in which.shapes if has_edges(shape) and not shape.is_emitter())
-                plan = replace(plan, edged=edged)
-        if plan.stays and self._motion.sampling == "auto":
+            if edged and motion.sampling == "auto":
+                motion = replace(motion, sampling="stay")  # as in the terms of the edges
+            plan = replace(attach(plan, which, motion, scene, sensor), edged=edged)
+        if plan.stays and self._motion.sampling == "auto" and not plan.edged:
             if sensor not in about.stays:  # once, because another answer would recompile kernels
                 about.stays[sensor] = bounces(plan, scene, sensor)
             if not about.stays[sensor]:

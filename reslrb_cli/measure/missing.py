@@ -293,39 +293,36 @@ def check_missing(
     missing share exceeds one half by more than two standard errors, unless `run.accept_incomplete` is true.
     """
     config, found = problem.config, measure_missing(problem)
-    if is_auto(config, "edges") and found:
+    moving = where_moved(problem.selection.params, problem.selection.scene_keys)
+    edged = [item for item in moving if item.is_shape and has_edges(item.node) and not item.node.is_emitter()]
+    tracer = problem.integrator if edged and isinstance(problem.integrator, LightTracer) else None
+    if tracer is not None and is_auto(config, "edges") and found:
         lacking = [record for record in found if record.is_incomplete]
         why = "no significant part of the derivative is missing without them"
         if lacking:
             why = f"without them, the derivative of {lacking[0].parameter} lacks {lacking[0].percent()}"
         decision = Decision(setting="edges", value="on" if lacking else "off", why=why)
-        integrator = as_decided(problem.integrator, [decision])
-        problem = replace(problem, decisions=[*problem.decisions, decision], integrator=integrator)
+        tracer = as_decided(tracer, [decision])
+        problem = replace(problem, decisions=[*problem.decisions, decision], integrator=tracer)
         if lacking:
             say(f"chosen by measurement: {decision.line()}")
             found = measure_missing(problem)
-    if _has_all_edges(problem):
+    has_edge_terms = tracer is not None and tracer.preparation.sampling.edges
+    if has_edge_terms and len(edged) == len(moving):
         found = [record for record in found if not record.is_unknown]
     told = [record for record in found if record.is_incomplete]
     if not told:
         return problem, found
     line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective"
-    camera = camera_finds_all(problem.scene, config.integrator.max_depth)
+    helps = camera_finds_all(problem.scene, config.integrator.max_depth)
+    if tracer is not None and not has_edge_terms:
+        way, helps = "integrator.edges=on", True
     if any(record.is_for_the_most_part for record in told) and not config.run.accept_incomplete:
-        first = f"--set {way} includes all of it, and" if camera else "the steps would have wrong directions;"
+        first = f"--set {way} includes all of it, and" if helps else "the steps would have wrong directions;"
         raise ConfigError(config.source, "integrator.type", f"{line}; {first} --set run.accept_incomplete=true runs it "
                                                             "anyway")  # fmt: skip
-    warn(f"{line}; --set {way} includes all of it" if camera else line)
+    warn(f"{line}; --set {way} includes all of it" if helps else line)
     return problem, found
-
-
-def _has_all_edges(problem: Problem) -> bool:
-    """True if the gradient includes the edges of everything that moves."""
-    tracer = problem.integrator
-    if not (isinstance(tracer, LightTracer) and tracer.preparation.sampling.edges):
-        return False
-    moving = where_moved(problem.selection.params, problem.selection.scene_keys)
-    return all(item.is_shape and has_edges(item.node) and not item.node.is_emitter() for item in moving)
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:
