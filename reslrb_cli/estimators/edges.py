@@ -296,7 +296,7 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
 
 
 @dataclass
-class Chosen:
+class Pick:
     """One contribution to the radiance from y, selected in proportion to its size (the largest channel).
 
     `L` (C,) is the radiance of the contribution divided by its size, and `total` is the sum of all sizes. `segments` is
@@ -315,7 +315,7 @@ class Chosen:
 
     def offered(
         self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, direct: mi.Bool, towards: mi.Vector3f
-    ) -> Chosen:  # fmt: skip
+    ) -> Pick:  # fmt: skip
         """Return the selection after another contribution."""
         size = dr.select(active, dr.max(L), 0)
         total, number = self.total + size, self.numbers.next_float32()
@@ -330,21 +330,19 @@ class Chosen:
         )
 
 
-class Choice(CameraHooks):
+class PickLight(CameraHooks):
     """Hooks that select one contribution to the radiance from y. Emission of a lamp at y is left out."""
 
     def __init__(self, numbers: mi.PCG32) -> None:
         self.numbers = numbers
 
-    def start(self, first: FilmRay) -> Chosen:
+    def start(self, first: FilmRay) -> Pick:
         none = mi.Vector3f
-        return Chosen(
-            mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0), none(0), none(0), mi.Float(1), self.numbers
-        )
+        return Pick(mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0), none(0), none(0), mi.Float(1), self.numbers)
 
     def vertex(
-        self, state: Chosen, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
-    ) -> Chosen:  # fmt: skip
+        self, state: Pick, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
+    ) -> Pick:  # fmt: skip
         P, first = vertex.product.value() * state.counts, vertex.depth == 1
         state = replace(state, n_y=dr.select(first, mi.Vector3f(vertex.si.n), state.n_y))
         if met is not None:
@@ -370,7 +368,7 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     x = scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
     active = beside.active & x.is_valid()
     camera = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
-    _, found = camera_walk(camera, Choice(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1)))
+    _, found = camera_walk(camera, PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1)))
     weight = outline.weight * found.L * found.total
     emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
     W = walk(samples, Contribution(p), active & (found.total > 0), emission, found.segments + 1)[0] * p.scale

@@ -30,11 +30,11 @@ from reslrb_cli.integrators.plans import (
     with_shading_normals,
 )
 from reslrb_cli.scene.deformation import Surroundings
+from reslrb_cli.scene.edges import EdgeSet, has_edges
 from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
-from reslrb_cli.transport.edges import EdgeSet, has_edges
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import PixelShares
 from reslrb_cli.transport.plan import Plan, make_plan

@@ -30,6 +30,7 @@ from reslrb_cli.integrators.forward import tangent_of
 from reslrb_cli.integrators.plans import Motion, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
+from reslrb_cli.transport.edges import weigh_edges
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.film import AdjointImage, PixelShares
 from reslrb_cli.transport.plan import Plan
@@ -146,7 +147,7 @@ class LightTracer(StepIntegrator):
         parts = passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
         if not plan.edged or purpose is Purpose.IMAGE:
             return parts
-        edges = self.preparation.edges(plan).now(parts[0])
+        edges = weigh_edges(parts[0], self.preparation.edges(plan).now())
         return [replace(part, edges=edges) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:

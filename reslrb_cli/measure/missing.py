@@ -58,9 +58,9 @@ from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
 from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.edges import has_edges
 from reslrb_cli.scene.needs import camera_finds_all
 from reslrb_cli.statistics import jackknife_variance
-from reslrb_cli.transport.edges import has_edges
 
 #: Seeds for choosing steps, and the minimum for a share.
 PILOT_SEEDS, FEWEST = 4, 4

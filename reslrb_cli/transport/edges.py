@@ -1,37 +1,24 @@
-"""Edges of shapes, and points on outlines: the curves at which a shape starts to block rays from a viewpoint.
+"""Points on outlines: places where an edge of a shape starts to block rays from a viewpoint.
 
-`EdgeSet` finds the edges of shapes once. `EdgeSet.now` returns a table of their current places, with the weights by
-which edges are sampled. `sample_outline` samples points on outlines, as a lamp, the sensor, or any direction sees them.
-A table has one row per edge. There are three kinds of edges.
-
-- `SEGMENT`: an edge of a mesh or of a rectangle, or a chord of the rim of a disk or a cylinder. A segment belongs to
-    the outline if, seen from the viewpoint, both of its faces lie on the same side of it. A segment with one face
-    always belongs to the outline.
-- `SPHERE`: the circle at which rays from the viewpoint touch a sphere.
-- `TUBE`: the two lines at which rays from the viewpoint touch a cylinder.
+`weigh_edges` gives the edges of a table (`scene/edges.py`) their sampling weights. `sample_outline` samples points on
+outlines, as a lamp, the sensor, or any direction sees them. A segment belongs to the outline if, seen from the
+viewpoint, both of its faces lie on the same side of it. A segment with one face always belongs to the outline.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from reslrb_cli.backend.memory import own_memory
-from reslrb_cli.scene.graph import interpolates_normals
+from reslrb_cli.scene.edges import SEGMENT, SPHERE, TUBE, EdgeTable, across, edge_kinds, turned
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect
-from reslrb_cli.transport.samples import EdgeTable, Samples
+from reslrb_cli.transport.samples import Samples
 
-Array = np.ndarray[Any, Any]
-
-SEGMENT, SPHERE, TUBE = range(3)
-#: Number of chords that approximate a circle. The distance between a chord and its arc is at most 2e-5 of the radius.
-CHORDS = 512
 #: Sampling weight of an edge that no probe sees as an outline, relative to an outline of the same length.
 UNLIKELY = 0.02
 #: An edge is a crease if the angle between the normals of its faces, divided by pi, exceeds this value.
@@ -40,13 +27,11 @@ FLAT = 1e-4
 PROBES = 4
 #: Stream of random numbers, mixed into the seed.
 SPREAD_STREAM = 0x5B4EAD
-#: Vertices count as one vertex if their distance, divided by the size of the mesh, is below this value.
-WELD = 1e-6
 
 
 @dataclass
-class View:
-    """View of a point from a viewpoint `y`: a place on a lamp or on the sensor's aperture.
+class EdgeView:
+    """EdgeView of a point from a viewpoint `y`: a place on a lamp or on the sensor's aperture.
 
     `weight` (C,) is the radiance or the importance that arrives at the point, divided by the density of the viewpoint.
     Occlusion is not included. `to_y` is the unit vector to the viewpoint, and `distance` is the distance of the
@@ -76,27 +61,27 @@ class Outline:
 
     p: mi.Point3f
     normal: mi.Vector3f
-    view: View
+    view: EdgeView
     weight: mi.Spectrum
     shape: mi.ShapePtr
     active: mi.Bool
     crease: mi.Bool
 
 
-Viewer = Callable[[Any, Any], View]  # (point, active lanes) -> view
+Viewer = Callable[[Any, Any], EdgeView]  # (point, active lanes) -> view
 
 
 def view_from_lamps(samples: Samples, numbers: mi.Point2f) -> Viewer:
     """Return the view from lamps. The random `numbers` select the lamp and the place on the lamp."""
 
-    def view(p: mi.Point3f, active: mi.Bool) -> View:
+    def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
         here = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
         here.p = p
         ds, weight = sample_lamp(samples, here, numbers, active)
         parallel = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         surface = dr.select(ds.delta | parallel, mi.Normal3f(0), ds.n)
         seen = active & (ds.pdf > 0) & dr.isfinite(ds.pdf) & dr.any(weight > 0)
-        return View(ds.p, ds.d, ds.dist, parallel, weight, surface, mi.Point2f(0), seen)
+        return EdgeView(ds.p, ds.d, ds.dist, parallel, weight, surface, mi.Point2f(0), seen)
 
     return view
 
@@ -104,13 +89,13 @@ def view_from_lamps(samples: Samples, numbers: mi.Point2f) -> Viewer:
 def view_from_sensor(samples: Samples, aperture: mi.Point2f) -> Viewer:
     """Return the view from the sensor, through the point `aperture` of its aperture."""
 
-    def view(p: mi.Point3f, active: mi.Bool) -> View:
+    def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
         here = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
         here.p = p
         seen = connect(samples.plan, samples.sensor, here, None, aperture, active)
         ds, _ = samples.sensor.sample_direction(here, aperture, active)
         none = mi.Normal3f(0)
-        return View(ds.p, ds.d, ds.dist, mi.Bool(False), seen.weight, none, seen.u, active & seen.active)
+        return EdgeView(ds.p, ds.d, ds.dist, mi.Bool(False), seen.weight, none, seen.u, active & seen.active)
 
     return view
 
@@ -215,7 +200,7 @@ def sample_outline(
     return Outline(p, normal, seen, weight, shape, active, is_crease)
 
 
-def _from(first: View, p: mi.Point3f, again: View, moved: mi.Bool) -> View:
+def _from(first: EdgeView, p: mi.Point3f, again: EdgeView, moved: mi.Bool) -> EdgeView:
     """Return the view of `p` from the viewpoint of `first`, in the lanes `moved`. `again` is the view of `p` with the
     same random numbers.
 
@@ -229,7 +214,7 @@ def _from(first: View, p: mi.Point3f, again: View, moved: mi.Bool) -> View:
     before = -dr.dot(first.surface, first.to_y) / dr.square(first.distance)
     solid = dr.maximum(-dr.dot(first.surface, to_y), 0) / dr.square(distance) / before
     keeps = moved & on_surface
-    return View(
+    return EdgeView(
         y=dr.select(moved & ~on_surface, again.y, first.y),
         to_y=dr.select(keeps, to_y, dr.select(moved, again.to_y, first.to_y)),
         distance=dr.select(keeps, distance, dr.select(moved, again.distance, first.distance)),
@@ -241,134 +226,26 @@ def _from(first: View, p: mi.Point3f, again: View, moved: mi.Bool) -> View:
     )
 
 
-# ---- The edges of shapes ----
+# ---- Sampling weights ----
 
 
-@dataclass
-class _Mesh:
-    """Edges of a mesh, as vertex indices (`welded_edges`)."""
+def weigh_edges(samples: Samples, table: EdgeTable) -> EdgeTable:
+    """Return the edges with cumulative sampling weights for the lamps and the sensor of `samples`.
 
-    shape: mi.Shape
-    corners: list[mi.UInt32]
-
-    def rows(self) -> list[mi.Point3f]:
-        """Return the current a, b, c and d of all edges."""
-        positions = dr.detach(self.shape.vertex_positions_buffer())
-        return [dr.gather(mi.Point3f, positions, index) for index in self.corners[:4]]
-
-    def creases(self, rows: list[mi.Point3f]) -> mi.Float:
-        """Return the angle between the normals of the two faces at each edge, divided by pi. If normals are
-        interpolated, it is the angle between the shading normals.
-        """
-        a, b, c, d = rows
-        angle = dr.pi - _turned(b - a, c - a, d - a)
-        if interpolates_normals(self.shape):
-            buffer = dr.detach(self.shape.vertex_normals_buffer())
-            i, j, _, _, i_2, j_2 = (dr.normalize(dr.gather(mi.Vector3f, buffer, index)) for index in self.corners)
-            angle = dr.maximum(_angle(i, i_2), _angle(j, j_2))
-        single = self.corners[2] == self.corners[3]
-        return dr.select(single | ~dr.isfinite(angle), 0, angle * dr.inv_pi)
-
-
-@dataclass
-class _Curves:
-    """Edges of an analytic shape. `corners` are the points a, b, c and d of each edge, in the shape's coordinates."""
-
-    shape: mi.Shape
-    corners: list[mi.Point3f]
-
-    def rows(self) -> list[mi.Point3f]:
-        """Return the current a, b, c and d of all edges."""
-        to_world = dr.detach(mi.traverse(self.shape)["to_world"])
-        return [to_world @ corner for corner in self.corners]
-
-
-def has_edges(shape: mi.Shape) -> bool:
-    """True if this module knows the edges of this kind of shape."""
-    return shape.is_mesh() or shape.class_name() in ("Rectangle", "Disk", "Sphere", "Cylinder")
-
-
-def edge_kinds(shapes: Iterable[mi.Shape]) -> frozenset[int]:
-    """Return the kinds of edges that these shapes have."""
-    kinds = {"Sphere": {SPHERE}, "Cylinder": {SEGMENT, TUBE}}
-    return frozenset(kind for shape in shapes for kind in kinds.get(shape.class_name(), {SEGMENT}))
-
-
-class EdgeSet:
-    """Edges of the given shapes of a scene. Shapes without known edges are ignored."""
-
-    def __init__(self, shapes: Iterable[mi.Shape]) -> None:
-        self._parts: list[_Mesh | _Curves] = []
-        self._round: list[tuple[int, mi.Shape]] = []
-        for shape in shapes:
-            name = shape.class_name()
-            if name == "Sphere":
-                self._round.append((SPHERE, shape))
-            elif name == "Cylinder":
-                self._round.append((TUBE, shape))
-                self._parts += [_Curves(shape, _rim(z, 1.0, 0.5)) for z in (0.0, 1.0)]
-            elif name == "Disk":
-                self._parts.append(_Curves(shape, _rim(0.0, 0.0, 0.0)))
-            elif name == "Rectangle":
-                self._parts.append(_Curves(shape, _frame()))
-            elif shape.is_mesh():
-                positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-                edges = welded_edges(positions, np.array(shape.faces_buffer()).reshape(-1, 3))
-                self._parts.append(_Mesh(shape, [own_memory(mi.UInt32, np.ascontiguousarray(e)) for e in edges.T]))
-
-    def now(self, samples: Samples) -> EdgeTable:
-        """Return the current edges with their sampling weights for the lamps and the sensor of `samples`."""
-        with dr.suspend_grad():
-            corners: list[list[mi.Point3f]] = []
-            kinds, radii, shapes, creases = [], [], [], []
-            for part in self._parts:
-                rows = part.rows()
-                n = dr.width(rows[0])
-                corners.append(rows)
-                creases.append(part.creases(rows) if isinstance(part, _Mesh) else dr.zeros(mi.Float, n))
-                kinds.append(dr.full(mi.UInt32, SEGMENT, n))
-                radii.append(dr.zeros(mi.Float, n))
-                shapes.append(dr.full(mi.UInt32, _index(part.shape), n))
-            for kind, shape in self._round:
-                to_world = dr.detach(mi.traverse(shape)["to_world"])
-                a, b = to_world @ mi.Point3f(0), to_world @ mi.Point3f(0, 0, 1)
-                corners.append([a, b, a, a])
-                creases.append(mi.Float(0))
-                kinds.append(dr.full(mi.UInt32, kind, 1))
-                radii.append(dr.norm(to_world @ mi.Vector3f(1, 0, 0)))
-                shapes.append(dr.full(mi.UInt32, _index(shape), 1))
-            a, b, c, d = (mi.Point3f(*(dr.concat([p[axis] for p in points]) for axis in range(3)))
-                          for points in zip(*corners, strict=True))  # fmt: skip
-            zero = mi.Float(0)
-            table = EdgeTable(
-                dr.concat(kinds), a, b, c, d, dr.concat(radii), dr.concat(shapes), dr.concat(creases), zero, zero, zero
-            )
-            lengths = dr.select(
-                table.kind == SEGMENT, dr.norm(b - a), dr.select(
-                    table.kind == SPHERE, dr.two_pi * table.radius, 2 * dr.norm(b - a)))  # fmt: skip
-            table.lamp = dr.cumsum(lengths * _seen_from_lamps(samples, table))
-            table.sensor = dr.cumsum(lengths * _seen_from_sensor(samples, table))
-            free = mi.Float(4 * dr.pi)  # solid angle of the directions that see the edge as an outline
-            if SEGMENT in {*np.array(table.kind)}:
-                free = dr.select(table.kind == SEGMENT, 4 * (dr.pi - _turned(table.b - a, c - a, d - a)), free)
-            table.anywhere = dr.cumsum(dr.select(dr.isfinite(free), lengths * free, 0))
-            dr.make_opaque(table)
-            return table
-
-
-def _across(along: mi.Vector3f, corner: mi.Vector3f) -> mi.Vector3f:
-    """Return the unit vector from an edge to a corner, perpendicular to the edge."""
-    return dr.normalize(corner - along * (dr.dot(along, corner) / dr.squared_norm(along)))
-
-
-def _turned(along: mi.Vector3f, c: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
-    """Return the angle in [0, pi] between the faces with the corners `c` and `d` at an edge."""
-    return _angle(_across(along, c), _across(along, d))
-
-
-def _angle(first: mi.Vector3f, second: mi.Vector3f) -> mi.Float:
-    """Return the angle between unit vectors."""
-    return 2 * dr.atan2(dr.norm(first - second), dr.norm(first + second))
+    A weight is the length of the edge, times a factor. The factor favours edges that probes see as outlines. For all
+    directions, it is the solid angle of the directions that see the edge as an outline.
+    """
+    with dr.suspend_grad():
+        free = 4 * (dr.pi - turned(table.b - table.a, table.c - table.a, table.d - table.a))
+        free = dr.select(table.kind == SEGMENT, free, 4 * dr.pi)
+        table = replace(
+            table,
+            lamp=dr.cumsum(table.lamp * _seen_from_lamps(samples, table)),
+            sensor=dr.cumsum(table.sensor * _seen_from_sensor(samples, table)),
+            anywhere=dr.cumsum(dr.select(dr.isfinite(free), table.anywhere * free, 0)),
+        )
+        dr.make_opaque(table)
+        return table
 
 
 def _view_from_anywhere(
@@ -382,7 +259,7 @@ def _view_from_anywhere(
     to_y, density = mi.warp.square_to_uniform_sphere(chances.viewpoint), mi.Float(dr.inv_four_pi)
     if SEGMENT in kinds:
         c, d = dr.gather(mi.Point3f, table.c, row) - p, dr.gather(mi.Point3f, table.d, row) - p
-        angle, x = _turned(along, c, d), _across(along, c)
+        angle, x = turned(along, c, d), across(along, c)
         y = dr.cross(along, x)
         y = dr.mulsign(y, dr.dot(y, d))  # the second face is on this side
         rest = dr.pi - angle
@@ -394,16 +271,12 @@ def _view_from_anywhere(
         to_y = dr.select(here, along * cos + sin * (x * t + y * s), to_y)
         density = dr.select(here, dr.rcp(4 * rest), density)
 
-    def view(p: mi.Point3f, active: mi.Bool) -> View:
+    def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
         seen = active & dr.isfinite(density)
         weight = mi.Spectrum(dr.select(seen, dr.rcp(density), 0))
-        return View(p, to_y, mi.Float(1), mi.Bool(True), weight, mi.Normal3f(0), mi.Point2f(0), seen)
+        return EdgeView(p, to_y, mi.Float(1), mi.Bool(True), weight, mi.Normal3f(0), mi.Point2f(0), seen)
 
     return view
-
-
-def _index(shape: mi.Shape) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def _seen_from_lamps(samples: Samples, table: EdgeTable) -> mi.Float:
@@ -420,52 +293,6 @@ def _seen_from_sensor(samples: Samples, table: EdgeTable) -> mi.Float:
     return dr.select(_is_outline(table, view) | (table.kind != SEGMENT), 1.0, UNLIKELY)
 
 
-def _is_outline(table: EdgeTable, view: View) -> mi.Bool:
+def _is_outline(table: EdgeTable, view: EdgeView) -> mi.Bool:
     raw = dr.cross(table.b - table.a, view.to_y)
     return dr.dot(raw, table.c - table.a) * dr.dot(raw, table.d - table.a) > 0
-
-
-def welded_edges(positions: Array, faces: Array) -> Array:
-    """Return the edges of a mesh as vertex indices (E, 6).
-
-    The columns are both ends, the third corners of the first and of the second face, and both ends in the second face.
-    Vertices at the same place are one vertex. An edge with one face repeats the first face. An edge with more than two
-    faces has a row for each pair of them. `positions` is (V, 3), and `faces` is (F, 3).
-    """
-    size = float(np.ptp(positions, axis=0).max()) or 1.0
-    _, vertex = np.unique(np.round(positions / (WELD * size)), axis=0, return_inverse=True)
-    vertex = vertex.ravel()
-    corners = np.concatenate([faces[:, [0, 1, 2]], faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
-    ends = np.sort(vertex[corners[:, :2]], axis=1)
-    corners, ends = corners[ends[:, 0] != ends[:, 1]], ends[ends[:, 0] != ends[:, 1]]
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    corners, ends = corners[order], ends[order]
-    begins = np.r_[True, np.any(ends[1:] != ends[:-1], axis=1)]
-    number = np.arange(len(ends)) - np.maximum.accumulate(np.where(begins, np.arange(len(ends)), 0))
-    odd = number % 2 == 1
-    # The second face is that of the next row, if it has the same ends.
-    second = np.where(np.r_[odd[1:], False][:, None], np.roll(corners, -1, 0), corners)
-    same = vertex[second[:, 0]] == vertex[corners[:, 0]]
-    other_ends = np.where(same[:, None], second[:, :2], second[:, 1::-1])
-    return np.column_stack([corners, second[:, 2], other_ends])[~odd].astype(np.uint32)
-
-
-def _rim(z: float, inner_radius: float, inner_z: float) -> list[mi.Point3f]:
-    """Return chords of the unit circle at height `z`. The face at each chord extends to the circle of radius
-    `inner_radius` at height `inner_z`.
-    """
-    angle = np.linspace(0, 2 * np.pi, CHORDS + 1)
-    points = np.stack([np.cos(angle), np.sin(angle), np.full_like(angle, z)], 1)
-    inner = np.stack([inner_radius * np.cos(angle), inner_radius * np.sin(angle), np.full_like(angle, inner_z)], 1)
-    return _corners(points[:-1], points[1:], inner[:-1])
-
-
-def _frame() -> list[mi.Point3f]:
-    """Return the edges of a rectangle."""
-    points = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-    return _corners(points, np.roll(points, -1, 0), np.zeros((4, 3)))
-
-
-def _corners(a: Array, b: Array, c: Array) -> list[mi.Point3f]:
-    return [mi.Point3f(*(own_memory(mi.Float, np.ascontiguousarray(column, np.float32)) for column in points.T))
-            for points in (a, b, c, c)]  # fmt: skip

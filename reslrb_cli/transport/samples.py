@@ -21,6 +21,7 @@ import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
+from reslrb_cli.scene.edges import EdgeTable
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.aim import Aim
 from reslrb_cli.transport.bsdf import EventNumbers
@@ -217,34 +218,6 @@ class Guide:
             begin, end = (dr.gather(mi.Float, self.table.edges, emitter + k) for k in (0, 1))
             choice = dr.minimum(dr.fma(choice, end - begin, begin), end * below)
         return Drawn(choice, mi.Point2f(numbers[0], numbers[1]), mi.Point2f(numbers[2], numbers[3]), cell, weight)
-
-
-@dataclass
-class EdgeTable:
-    """Current edges of moving shapes, one per row. A recording takes the arrays as inputs.
-
-    - `kind` is one of the kinds in `edges.py`.
-    - `a` and `b` are the ends of a segment, or of a cylinder's axis. For a sphere, `a` is the centre.
-    - `c` and `d` are the third corners of the two faces at a segment. They are equal if the segment has one face.
-    - `radius` is the radius of a sphere or a cylinder, otherwise 0.
-    - `shape` is the index of the shape's pointer.
-    - `crease` is the angle between the normals of the two faces, divided by pi. It is 0 if the edge has only one face,
-        or if the shape interpolates its normals across the edge.
-    - `lamp`, `sensor` and `anywhere` are cumulative sampling weights: for outlines and creases seen from lamps, and for
-        outlines seen from the sensor and from all directions.
-    """
-
-    kind: mi.UInt32
-    a: mi.Point3f
-    b: mi.Point3f
-    c: mi.Point3f
-    d: mi.Point3f
-    radius: mi.Float
-    shape: mi.UInt32
-    crease: mi.Float
-    lamp: mi.Float
-    sensor: mi.Float
-    anywhere: mi.Float
 
 
 @dataclass
