@@ -62,8 +62,9 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 #: Light paths of a step per sampled point on an outline, for each of the three terms.
 PATHS_PER_OUTLINE = 4
-#: Distance between an edge and the two rays beside it, in units of Mitsuba's ray offset.
-BESIDE = 1.0
+#: Distance between an edge and the ray that hits the shape, in units of Mitsuba's ray offset, on spheres. The ray
+#: hits a sphere before the edge, by the square root of this distance. On other shapes, rounding needs a distance of 1.
+ON_SPHERES = 0.02
 #: Distance along a ray within which a surface counts as being at the edge, in units of Mitsuba's ray offset.
 AROUND = 30.0
 #: Streams of random numbers, mixed into the seed.
@@ -125,10 +126,10 @@ def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside
     back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset)
     active = outline.active & (back > 0)
 
-    def ray(side: float) -> mi.Ray3f:
-        return mi.Ray3f(outline.p + outline.normal * (side * BESIDE * offset) - d * back, d)
+    def ray(side: float | mi.Float) -> mi.Ray3f:
+        return mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d)
 
-    over, past = ray(-1), ray(1)
+    over, past = ray(dr.select(outline.is_sphere, -ON_SPHERES, -1)), ray(1)
     pi = scene.ray_intersect_preliminary(over, coherent=False, active=active)
     active = active & pi.is_valid() & (pi.shape == outline.shape)
     before = mi.Ray3f(past)
@@ -360,7 +361,7 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     outline = sample_outline(samples, samples.edges.anywhere, None, _chances(samples, numbers))
     n, to_y = outline.normal, outline.view.to_y
     offset = _offset(outline)
-    back = mi.Ray3f(outline.p + n * (BESIDE * offset), to_y)
+    back = mi.Ray3f(outline.p + n * offset, to_y)
     y = scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
     outline.active = outline.active & y.is_valid()
     outline.view.distance = y.t
