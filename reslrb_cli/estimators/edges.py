@@ -62,9 +62,9 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 #: Light paths of a step per sampled point on an outline, for each of the three terms.
 PATHS_PER_OUTLINE = 4
-#: Distance between an edge and the ray that hits the shape, in units of Mitsuba's ray offset, on spheres. The ray
-#: hits a sphere before the edge, by the square root of this distance. On other shapes, rounding needs a distance of 1.
-ON_SPHERES = 0.02
+#: Distance between an edge and the ray that hits the shape, in units of Mitsuba's ray offset, on spheres and
+#: cylinders. The ray hits them before the edge, by the square root of this distance. On other shapes it is 1.
+ROUND = 0.1
 #: Distance along a ray within which a surface counts as being at the edge, in units of Mitsuba's ray offset.
 AROUND = 30.0
 #: Streams of random numbers, mixed into the seed.
@@ -129,7 +129,7 @@ def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside
     def ray(side: float | mi.Float) -> mi.Ray3f:
         return mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d)
 
-    over, past = ray(dr.select(outline.is_sphere, -ON_SPHERES, -1)), ray(1)
+    over, past = ray(dr.select(outline.is_round, -ROUND, -1)), ray(1)
     pi = scene.ray_intersect_preliminary(over, coherent=False, active=active)
     active = active & pi.is_valid() & (pi.shape == outline.shape)
     before = mi.Ray3f(past)

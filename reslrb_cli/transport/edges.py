@@ -56,7 +56,8 @@ class Outline:
     `normal` is perpendicular to the edge and to the ray from the viewpoint, and points away from the shape. `weight`
     (C,) is the light or the importance that the edge covers per unit of its velocity along the normal, divided by the
     density of the sample. Occlusion is not included. In `crease` lanes, the edge is a crease and not an outline, and
-    `normal` points away from its first face. `is_sphere` lanes lie on a sphere.
+    `normal` points away from its first face. `is_round` lanes lie on a sphere or on the side of a
+    cylinder.
     """
 
     p: mi.Point3f
@@ -66,7 +67,7 @@ class Outline:
     shape: mi.ShapePtr
     active: mi.Bool
     crease: mi.Bool
-    is_sphere: mi.Bool
+    is_round: mi.Bool
 
 
 Viewer = Callable[[Any, Any], EdgeView]  # (point, active lanes) -> view
@@ -148,9 +149,9 @@ def sample_outline(
 
     # ---- Choose a point on the edge. On a segment, it does not depend on the viewpoint ----
     p, density, active = a + (b - a) * place, dr.rcp(length), probability > 0
-    is_round, is_sphere, is_crease = mi.Bool(False), mi.Bool(False), mi.Bool(False)
+    is_round, is_crease = mi.Bool(False), mi.Bool(False)
     if SPHERE in kinds or TUBE in kinds:
-        is_round, is_sphere = kind != SEGMENT, kind == SPHERE
+        is_round = kind != SEGMENT
         p = dr.select(kind == SPHERE, a, dr.select(kind == TUBE, dr.lerp(a, b, 0.5), p))
     view = _view_from_anywhere(table, kinds, row, kind, along, p, chances) if view is None else view
     seen = view(p, active)
@@ -198,7 +199,7 @@ def sample_outline(
     active &= seen.active & (sine > 1e-6)
     weight = seen.weight * dr.select(active, sine / (density * probability), 0)
     shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, table.shape, row, active))
-    return Outline(p, normal, seen, weight, shape, active, is_crease, is_sphere)
+    return Outline(p, normal, seen, weight, shape, active, is_crease, is_round)
 
 
 def _from(first: EdgeView, p: mi.Point3f, again: EdgeView, moved: mi.Bool) -> EdgeView:
