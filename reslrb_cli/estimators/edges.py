@@ -56,7 +56,7 @@ from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEven
 from reslrb_cli.transport.connection import Connection, shading_correction
 from reslrb_cli.transport.edges import Chances, Outline, sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.emission import Emission
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import Product, showing
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
@@ -178,11 +178,12 @@ class Contribution(Hooks):
         here = self.smooth & (vertex.depth == 1)
         si = vertex.si
         correction, _ = shading_correction(self.p.plan, si, -vertex.ray.d, si.to_world(connection.wo), connection.wo)
-        own = dr.select(here, own / correction, own * state[1])
-        return [
-            state[0] + dr.select(dr.isfinite(own), own, 0),
-            dr.select(here, dr.rcp(scattering.correction), state[1]),
-        ]
+        own = own * dr.select(here, _inverse(correction), state[1])
+        return [state[0] + own, dr.select(here, _inverse(scattering.correction), state[1])]
+
+
+def _inverse(correction: mi.Float) -> mi.Float:
+    return dr.select(correction != 0, dr.rcp(correction), 0)
 
 
 def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
@@ -202,7 +203,7 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     smooth = [shape for shape in samples.plan.edged if interpolates_normals(shape)]
     on_smooth = reduce(or_, (outline.shape == mi.ShapePtr(shape) for shape in smooth)) & over if smooth else None
     W = walk(samples, Contribution(p, on_smooth), beside.active, emission)[0] * p.scale
-    weight = dr.select(dr.isfinite(W), W, 0) * dr.select(over, 1, -1)
+    weight = showing(W) * dr.select(over, 1, -1)
     with dr.resume_grad(), dr.isolate_grad():
         dr.backward_from(_moved(beside, weight * outline.normal, beside.active & (weight != 0)), flags=_MAY_LACK)
 
@@ -281,8 +282,8 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     beside.active = beside.active & ~touches
     _, L = camera_walk(samples, Behind(n), beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
     weight = p.delta(outline.view.u, beside.active) * outline.weight * p.scale
-    still, slid, rest = (dr.dot(weight, part) for part in (L.all, L.slid, L.rest))
-    active = beside.active & dr.isfinite(still) & dr.isfinite(slid) & (still != 0)
+    still, slid, rest = (showing(dr.dot(weight, part)) for part in (L.all, L.slid, L.rest))
+    active = beside.active & (still != 0)
     s = outline.view.distance / dr.norm(beside.past.o + beside.past.d * x.t - outline.view.y)
     moves = active & x.is_valid()
     at_x = dr.select(moves, s * (slid * L.n_x + rest * n), 0)  # s is NaN if the ray leaves the scene
@@ -370,10 +371,12 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     active = beside.active & x.is_valid()
     camera = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
     _, found = camera_walk(camera, PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1)))
-    weight = outline.weight * found.L * found.total
+    total = showing(found.total)
+    weight = outline.weight * found.L * total
     emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
-    W = walk(samples, Contribution(p), active & (found.total > 0), emission, found.segments + 1)[0] * p.scale
-    active = active & dr.isfinite(W) & (W != 0)
+    W = walk(samples, Contribution(p), active & (total > 0), emission, found.segments + 1)[0] * p.scale
+    W = showing(W)
+    active = active & (W != 0)
     s = y.t / (y.t + x.t - AROUND * offset)
     flags = mi.RayFlags.All | mi.RayFlags.FollowShape
     slope = dr.select(found.direct != 0, dr.dot(n, found.towards) / dr.dot(found.n_y, found.towards), 0)
