@@ -1,7 +1,7 @@
 """Cases of test_edges.py: moving shapes, a lamp, and surfaces on which the shapes' shadows fall. z is up.
 
-`PYTHONPATH=tests python -m conformance.edge_cases` writes edge_values.json, with the finite differences of all `RECORDED` cases.
-Names as arguments restrict it to these cases. A case takes a minute or more.
+`PYTHONPATH=tests python -m conformance.edge_cases` writes edge_values.json, with the finite differences of all
+`RECORDED` cases. Names as arguments restrict it to these cases. A case takes a minute or more.
 """
 
 from __future__ import annotations
