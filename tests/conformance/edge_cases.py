@@ -276,7 +276,7 @@ RECORDED = [
     EdgeCase("box", "indirect", 3, spp=512, options={"attached_sampling": "stay"}), EdgeCase("sphere", "room", 5),
 ]  # fmt: skip
 CASES = [
-    *RECORDED, standing("room", 5),
+    *RECORDED,
     *(EdgeCase("flat", lamp, spp=512) for lamp in ("sphere_lamp", "point", "spot", "directional")),
     *(EdgeCase(shape, lamp) for shape in ("sphere", "cylinder") for lamp in ("area", "sphere_lamp", "spot")),
     *(EdgeCase(shape, "room", 3, spp=1024) for shape in ("box", "cylinder")), EdgeCase("box", "room", 5, spp=512),
