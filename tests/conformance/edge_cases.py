@@ -269,7 +269,9 @@ def standing(lamp: str, depth: int, **options: Any) -> EdgeCase:
     return EdgeCase("standing", lamp, depth, ("x", "y", "turn"), (0, 0, 1), **options)
 
 
-#: Cases of which finite differences are on file.
+#: Cases of which finite differences are on file. Under the near lamp, the sphere moves along x only. The offset of rays
+#: beside its outline biases the other derivatives by about 5 % of the gradient. Light from the ceiling needs `stay`:
+#: with `follow`, directions turn with the box, and the term between two surfaces does not fit.
 RECORDED = [
     EdgeCase("flat", "area", spp=512), EdgeCase("sphere", "near", motion=("x",)), EdgeCase("box", "sphere_lamp"),
     EdgeCase("sphere", "point", spp=1024), EdgeCase("rectangle", "spot"), EdgeCase("cylinder", "directional", spp=2048),
@@ -280,8 +282,8 @@ CASES = [
     *RECORDED,
     *(EdgeCase("flat", lamp, spp=512) for lamp in ("sphere_lamp", "directional")),
     EdgeCase("flat", "point", spp=512, step=SMALLER),
-    *(EdgeCase(shape, lamp) for shape in ("sphere", "cylinder") for lamp in ("area", "sphere_lamp", "spot")),
-    *(EdgeCase(shape, "room", 3, spp=1024) for shape in ("box", "cylinder")), EdgeCase("box", "room", 5, spp=512),
+    *(EdgeCase("sphere", lamp) for lamp in ("area", "sphere_lamp", "spot")),
+    *(EdgeCase("cylinder", lamp, spp=2048) for lamp in ("area", "sphere_lamp")), EdgeCase("box", "room", 3, spp=1024),
 ]  # fmt: skip
 
 
