@@ -98,6 +98,29 @@ def test_a_continued_run_remembers_the_missing_share(run: tuple[str, Path]):
     assert after["results"]["certainty"]["parameters"]["box.x"]["verdict"] == "derivative incomplete"
 
 
+def test_a_run_with_derivatives_of_edges_finds_the_place(experiment: Path):
+    """The run measures that edges matter. It then needs no permission for an incomplete derivative."""
+    moving = "parameters=[{motion: {of: box, free: [x, z]}, learning_rate: 0.03}]"
+    choices = settings(
+        "integrator.edges=auto",
+        moving,
+        "run.iterations=24",
+        "run.certainty=false",
+        f"run.output={experiment.parent / 'on'}",
+    )
+    output, folder = done("optimize", experiment, *choices).output, experiment.parent / "on/box"
+    assert "chosen by measurement: edges on: without them, the derivative of box.x lacks" in output
+    first: dict[str, Any] = read_manifest(folder) or {}
+    [decision] = [each for each in first["decisions"] if each["setting"] == "edges"]
+    assert decision["value"] == "on"
+    values = np.load(folder / "parameters/parameters.npz")
+    assert np.hypot(values["box.x"] - 0.25, values["box.z"]).item() < 0.25 / 3
+    resumed = done("optimize", "--resume", folder, *settings("run.iterations=26"))
+    again: dict[str, Any] = read_manifest(folder) or {}
+    assert again["decisions"] == first["decisions"]
+    assert "chosen by measurement" not in resumed.output
+
+
 def test_an_unmeasured_share_is_reported(experiment: Path):
     """A dry run reports an unmeasured share."""
     result = done("optimize", experiment, "--dry-run", *settings("run.measuring=0"))
