@@ -29,7 +29,8 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.step import StepResult, gradient_step
 from reslrb_cli.measure.gradients import integrator, relative, seeds
-from reslrb_cli.transport.edges import sample_outline, view_from_lamps, view_from_sensor, welded_edges
+from reslrb_cli.scene.edges import welded_edges
+from reslrb_cli.transport.edges import Chances, sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.samples import Samples
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -79,7 +80,7 @@ FAULTS = [
     Fault("edge_without_its_probability", "box-sphere_lamp-2", "transport.edges:sample_outline",
           "sine / (density * probability)", "sine / density"),
     Fault("every_edge_counts", "points", "transport.edges:sample_outline",
-          "counts = side * across_it > 0", "counts = mi.Bool(True)"),
+          "(side * across_it > 0)", "mi.Bool(True)"),
     Fault("creases_left_out", "box-sphere_lamp-2", "transport.edges:sample_outline", "if creases:", "if False:"),
     Fault("contact_counted_twice", "standing-front-2", "estimators.edges:_from_sensor",
           "beside.active & ~touches", "beside.active"),
@@ -146,8 +147,8 @@ def test_a_box_of_split_vertices_has_18_edges():
     """A box has 12 edges, and a diagonal on each of its six sides."""
     points, faces = split_box((0.3, 0, 1), (0.5, 0.4, 0.3))
     found = welded_edges(points, faces)
-    assert (len(points), found.shape) == (24, (18, 4))
-    a, b, c, d = (points[column] for column in found.T)
+    assert (len(points), found.shape) == (24, (18, 6))
+    a, b, c, d = (points[column] for column in found[:, :4].T)
     first, second = (np.cross(b - a, corner - a) for corner in (c, d))
     cos = np.sum(first * second, 1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1))
     # The faces of a diagonal lie in one plane, on different sides of it.
@@ -160,7 +161,7 @@ def test_an_open_sheet_has_edges_with_one_face():
     single = found[:, 2] == found[:, 3]
     assert ends(found[single]) == {(0, 1), (1, 2), (2, 3), (0, 3)}
     assert ends(found[~single]) == {(0, 2)}
-    assert set(found[~single][0, 2:].tolist()) == {1, 3}
+    assert set(found[~single][0, 2:4].tolist()) == {1, 3}
 
 
 def test_an_edge_of_three_faces_has_a_row_for_each_pair():
@@ -168,11 +169,11 @@ def test_an_edge_of_three_faces_has_a_row_for_each_pair():
     found = welded_edges(points, np.concatenate([HALVES, [[0, 2, 4]]]))
     shared = found[[tuple(sorted(edge)) == (0, 2) for edge in found[:, :2].tolist()]]
     assert len(shared) == 2
-    assert set(shared[:, 2:].ravel().tolist()) == {1, 3, 4}
+    assert set(shared[:, 2:4].ravel().tolist()) == {1, 3, 4}
 
 
 def test_a_mesh_without_faces_has_no_edges():
-    assert welded_edges(SQUARE, np.zeros((0, 3), int)).shape == (0, 4)
+    assert welded_edges(SQUARE, np.zeros((0, 3), int)).shape == (0, 6)
 
 
 @pytest.mark.parametrize("face", [(1, 1, 2), (1, 1, 1), (1, 4, 2)])
@@ -208,10 +209,12 @@ def check_points(viewpoint: str, creases: bool) -> None:
     moving, half, degrees = SMALL.moving(), np.array([0.3, 0.25, 0.3]), 23.0
     part = passes(moving, "on", "shape.vertex_positions")[0]
     numbers = mi.PCG32(1 << 12, initstate=3)
-    two = mi.Point2f(numbers.next_float32(), numbers.next_float32())
+    chances = Chances.spread(numbers, part.seed, dr.arange(mi.UInt32, 1 << 12), mi.UInt32(1 << 12))
     assert part.edges is not None
-    view = {"lamp": view_from_lamps, "sensor": view_from_sensor}.get(viewpoint, lambda *_: None)(part, two)
-    outline = sample_outline(part, getattr(part.edges, viewpoint), view, numbers, creases)
+    view = {"lamp": view_from_lamps, "sensor": view_from_sensor}.get(viewpoint, lambda *_: None)(
+        part, chances.viewpoint
+    )
+    outline = sample_outline(part, getattr(part.edges, viewpoint), view, chances, creases)
     active, back = np.array(outline.active), Rotation.from_euler("z", -degrees, degrees=True)
     p, to_y, n = (back.apply(np.array(v).T[active]) for v in (outline.p, outline.view.to_y, outline.normal))
     p -= back.apply([0.1, -0.1, 0.3])  # its centre
