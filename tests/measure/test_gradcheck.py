@@ -108,7 +108,8 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
 
     of, play = Survival.of, walk.play
     monkeypatch.setattr(tables.Survival, "of", staticmethod(lambda box, chances: of(box, np.zeros(CELLS))))
-    assert failures(records := check(f"integrator.guiding={guiding}", estimators="stack")) == set()
+    small = (f"integrator.guiding={guiding}", "scene.options.size=16")
+    assert failures(records := check(*small, estimators="stack")) == set()
     assert [each.seeds for each in records if each.reference is Reference.UNGUIDED] == [8]
 
     def without_weight(plan: Any, survival: Any, *rest: Any) -> Any:
@@ -116,7 +117,7 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
         return survives, weight if survival is None else mi.Float(1)
 
     monkeypatch.setattr(walk, "play", without_weight)
-    found = failures(check(f"integrator.guiding={guiding}", estimators="stack"))
+    found = failures(check(*small, estimators="stack"))
     assert ("stack", "unguided") in found
     assert guiding == "on" or found == {("stack", "unguided")}
 
