@@ -313,15 +313,15 @@ def check_missing(
     told = [record for record in found if record.is_incomplete]
     if not told:
         return problem, found
-    line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective"
+    line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective includes all of it"
     helps = camera_finds_all(problem.scene, config.integrator.max_depth)
     if tracer is not None and not has_edge_terms:
-        way, helps = "integrator.edges=on", True
+        way, helps = "integrator.edges=on includes silhouettes and shadow edges", True
     if any(record.is_for_the_most_part for record in told) and not config.run.accept_incomplete:
-        first = f"--set {way} includes all of it, and" if helps else "the steps would have wrong directions;"
+        first = f"--set {way}, and" if helps else "the steps would have wrong directions;"
         raise ConfigError(config.source, "integrator.type", f"{line}; {first} --set run.accept_incomplete=true runs it "
                                                             "anyway")  # fmt: skip
-    warn(f"{line}; --set {way} includes all of it" if helps else line)
+    warn(f"{line}; --set {way}" if helps else line)
     return problem, found
 
 

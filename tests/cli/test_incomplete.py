@@ -69,7 +69,7 @@ def test_a_derivative_that_lacks_more_than_half_is_refused(experiment: Path):
     *_, line = result.output.splitlines()
     assert line.startswith(f"{experiment}: integrator.type: box.x: ")
     assert "of the derivative is missing (silhouettes, shadow edges" in line
-    assert "--set integrator.type=prb_projective includes all of it" in line
+    assert "--set integrator.edges=on includes silhouettes and shadow edges" in line
     assert f"--set {ACCEPT} runs it anyway" in line
 
 
@@ -125,7 +125,7 @@ def test_an_unmeasured_share_is_reported(experiment: Path):
     """A dry run reports an unmeasured share."""
     result = done("optimize", experiment, "--dry-run", *settings("run.measuring=0"))
     assert "box.x: the derivative may lack silhouettes and shadow edges; the missing share" in result.output
-    assert "--set integrator.type=prb_projective includes all of it" in result.output
+    assert "--set integrator.edges=on includes silhouettes and shadow edges" in result.output
 
 
 @pytest.mark.parametrize("measuring", [0.36, 0.5, 0.9])
