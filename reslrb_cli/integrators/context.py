@@ -55,6 +55,11 @@ def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
     return bool(dr.any(singular))
 
 
+#: `Plan.near`, relative to the diagonal of the smallest moving shape. A box on a floor, at depth 5: the standard error
+#: falls from 14 % to 0.9 % of the derivative, which agrees with finite differences.
+NEAR = 0.05
+
+
 class Renewal:
     """Updates of one scene's plans before tracing. Only plans that have changed are updated."""
 
@@ -118,6 +123,8 @@ class AboutParameters:
 
     which: Differentiated
     track_zeros: bool = False
+    #: `Plan.near`, or 0 while it is unknown.
+    near: float = 0.0
     #: Whether vertices stay, by sensor.
     stays: dict[mi.Sensor, bool] = field(default_factory=dict)
     #: Distribution of camera paths over the pixels (H, W), by the number of the sensor.
@@ -208,7 +215,9 @@ class Preparation:
                 edged = tuple(shape for shape in which.shapes if has_edges(shape) and not shape.is_emitter())
             if edged and motion.sampling == "auto":
                 motion = replace(motion, sampling="stay")  # as in the terms of the edges
-            plan = replace(attach(plan, which, motion, scene, sensor), edged=edged)
+            if edged and not about.near:  # once, because another number would recompile kernels
+                about.near = NEAR * min(float(dr.norm(shape.bbox().extents())) for shape in edged)
+            plan = replace(attach(plan, which, motion, scene, sensor), edged=edged, near=about.near)
         if plan.stays and self._motion.sampling == "auto" and not plan.edged:
             if sensor not in about.stays:  # once, because another answer would recompile kernels
                 about.stays[sensor] = bounces(plan, scene, sensor)
