@@ -179,8 +179,9 @@ def gradient(
     """Return the loss of an experiment and its gradients by key.
 
     Each gradient is a float32 array with the shape of its parameter. The unit of a gradient is the loss per unit of the
-    parameter. The result equals the gradient of a run's first iteration. The adjoint image also comes from the samples
-    that `run.adjoint` selects. The parameters have their initial values, or `values` as for `render`.
+    parameter. The result equals the gradient of a run's first iteration, but `integrator.edges: auto` counts as `off`.
+    If shapes move, set `edges: on`. The adjoint image also comes from the samples that `run.adjoint` selects. The
+    parameters have their initial values, or `values` as for `render`.
 
     `spp` replaces `run.spp`. `seed` replaces `run.seed` for the samples only. The target and the measurements before
     the first iteration (`guiding: auto`, ...) still use the experiment's seed. Regularizers contribute to the gradient

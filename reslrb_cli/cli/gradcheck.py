@@ -192,8 +192,8 @@ logger = logging.getLogger(__name__)
               help="Samples per pixel of one gradient. Default: 65536 light paths, at most run.spp.")  # fmt: skip
 @click.option("--missing", is_flag=True,
               help=
-        "Instead, measure the share of each parameter's derivative that silhouettes, shadow edges and light "
-        "that leaves the film make up, which no gradient here includes.")  # fmt: skip
+        "Instead, measure the share of each parameter's derivative that the gradient lacks: light that leaves the "
+        "film, and edges of silhouettes and shadows, with integrator.edges unless it is off.")  # fmt: skip
 def command(**given: Any) -> int:
     """Compare the gradients of every parameter of CONFIG with references. The parameters have their initial values.
 

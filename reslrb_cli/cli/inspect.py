@@ -357,7 +357,7 @@ def select(config: Config, scene: Any) -> Selection | str:
 
 
 def edges_of(scene: Any, selection: Selection) -> list[str]:
-    """Return the ids of moving shapes that have moving edges."""
+    """Return the ids of moving shapes with silhouettes or shadows."""
     from reslrb_cli.scene.deformation import where_moved
 
     moved = where_moved(selection.params, selection.scene_keys)

@@ -48,7 +48,9 @@ def show_forecast(config: Config) -> None:
     from reslrb_cli.records.decisions import DecisionCache
 
     say = logger.info
-    forecast = make_forecast(config, say, DecisionCache(), lambda problem: check_missing(problem, logger.warning))
+    forecast = make_forecast(
+        config, say, DecisionCache(), lambda problem: check_missing(problem, say, logger.warning)[0]
+    )
     sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
     sums += f" + {duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
     text = fill(

@@ -82,6 +82,7 @@ UNDECIDED: dict[str, str | float] = {
     "guiding": "off",
     "sequence": "independent",
     "pixels": "even",
+    "edges": "off",
 }
 
 #: The estimator for `auto`: only `stack` has derivatives of camera paths and both `follow` and `stay`.
@@ -148,6 +149,12 @@ class Reslrb(AttachingTracer):
     get noisier. `auto`: `measured` if there are camera paths, the loss is `l2`, and the measurement takes at most 2 %
     of the samples of the run. The default is `auto` with estimator `auto`, and `even` with an estimator that you
     name."""
+    edges: Literal["auto", "on", "off"] = "auto"
+    """Whether the derivatives of moving shapes contain their outlines and shadows: the light that edges cover and
+    uncover. `on`: a step also samples points on the edges of moving shapes, as lamps, the sensor and other surfaces see
+    them. Meshes, rectangles, disks, spheres and cylinders have edges. `auto`: `on` if finite differences before the
+    first iteration find that a significant part of the derivative is missing otherwise, or cannot tell. The default is
+    `auto` with estimator `auto`, and `off` with an estimator that you name."""
 
     @model_validator(mode="after")
     def _leave_off(self) -> Self:

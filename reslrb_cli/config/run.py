@@ -130,13 +130,15 @@ class RunConfig(Section):
     """Time limit for measurements before the first iteration, as a fraction of the expected time of the run. They
     decide `integrator.paths` and `integrator.guiding` if these are `auto`. The limit includes the compilation of
     kernels for the measurement. First steps of camera paths, which most runs need anyway, may take longer. If there is
-    no time for a measurement, `paths` is `both`, and `guiding` is `off`. 0: measure nothing."""
+    no time for a measurement, `paths` is `both`, and `guiding` is `off`. The share of the derivative that is missing,
+    which decides `integrator.edges`, takes at most the same fraction of the samples of the run, and as many again if
+    edges are turned on. 0: measure nothing."""
     accept_incomplete: bool = False
-    """Run even if more than half of the derivative of the loss is missing for a parameter that moves light. The
-    derivative lacks silhouettes and shadow edges. A run measures their share before its first iteration, with a
-    fraction `measuring` of its samples. By default it refuses to start if the share is more than half, because the
-    steps could go the wrong way. A parameter that lacks a significant share gets the verdict `derivative incomplete`,
-    and never `settled`."""
+    """Run even if more than half of the derivative of the loss is missing for a parameter that moves light. Without
+    `integrator.edges`, the derivative lacks silhouettes and shadow edges. With it, some edges are still missing. A run
+    measures the missing share before its first iteration, with a fraction `measuring` of its samples. By default it
+    refuses to start if the share is more than half, because the steps could go the wrong way. A parameter that lacks a
+    significant share gets the verdict `derivative incomplete`, and never `settled`."""
     certainty: bool = True
     """Whether to measure, after the last iteration, how certain the values are: their spread, and a verdict for each
     parameter. This takes as long as some iterations, about ten if there are few parameters. Runs of fewer than 20

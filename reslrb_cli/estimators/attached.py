@@ -26,7 +26,10 @@ to position x_{i-1}. The adjoint gives vertex i-1 no derivative with respect to 
 previous vertex's data for the derivative of s_{i-1} at vertex i.
 
 The surface-integral form comes from Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry". With the
-surface-integral form, edges that do not move contribute no error. Neither form has the derivative of visibility.
+surface-integral form, edges that do not move contribute no error. The derivative of s_{i-1} grows as 1 / r for two
+vertices at a distance r. Its variance is infinite where a moving shape touches another surface. With derivatives of
+edges, it is therefore multiplied by r^2 / (r^2 + near^2) (`Plan.near`). Neither form has the derivative of visibility,
+which `edges.py` adds for the edges of moving shapes.
 
 The stack starts with the first vertex that moves or whose BSDF has a parameter. Earlier vertices depend only on
 parameters of the emitter. The stack works as in `stack.py`. Here, T behind the last pushed vertex equals the roulette
@@ -133,6 +136,9 @@ def reach(
     si = dr.select(stays, stayed, slid)
     there = mi.Ray3f(ray)
     there.d = dr.select(stays, reaching.d, ray.d)
+    if plan.near > 0:
+        distance = dr.squared_norm(dr.detach(stayed.p - ray.o))
+        changed = 1 + (changed - 1) * (distance / (distance + plan.near**2))
     return Hit(si, si.bsdf(), there), dr.select(stays, changed, 1)
 
 

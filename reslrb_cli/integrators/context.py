@@ -30,6 +30,7 @@ from reslrb_cli.integrators.plans import (
     with_shading_normals,
 )
 from reslrb_cli.scene.deformation import Surroundings
+from reslrb_cli.scene.edges import EdgeSet, has_edges
 from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
 from reslrb_cli.transport.aim import film_blocks, worthwhile
@@ -52,6 +53,11 @@ def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
     if {"opacity", "weight"} & set(key.split(".")):
         singular |= flat == 1
     return bool(dr.any(singular))
+
+
+#: `Plan.near`, relative to the diagonal of the smallest moving shape. A box on a floor, at depth 5: the standard error
+#: falls from 14 % to 0.9 % of the derivative, which agrees with finite differences.
+NEAR = 0.05
 
 
 class Renewal:
@@ -117,6 +123,8 @@ class AboutParameters:
 
     which: Differentiated
     track_zeros: bool = False
+    #: `Plan.near`, or 0 while it is unknown.
+    near: float = 0.0
     #: Whether vertices stay, by sensor.
     stays: dict[mi.Sensor, bool] = field(default_factory=dict)
     #: Distribution of camera paths over the pixels (H, W), by the number of the sensor.
@@ -138,6 +146,8 @@ class AboutScene:
     #: The densities of emitters, by their sources.
     emitters: dict[tuple[Any, ...], EmitterDensities] = field(default_factory=dict)
     recordings: Recordings = field(default_factory=Recordings)
+    #: By the shapes that have them.
+    edges: dict[tuple[mi.Shape, ...], EdgeSet] = field(default_factory=dict)
     #: By density and number of paths.
     shares: dict[tuple[int, int], PixelShares | None] = field(default_factory=dict)
     #: Samples per pixel for which the cells of guided emission are made.
@@ -200,8 +210,15 @@ class Preparation:
         drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
         plan = replace(plan, evened_lamps=drawn)
         if moves:
-            plan = attach(plan, which, self._motion, scene, sensor)
-        if plan.stays and self._motion.sampling == "auto":
+            edged, motion = (), self._motion
+            if self.sampling.edges:
+                edged = tuple(shape for shape in which.shapes if has_edges(shape) and not shape.is_emitter())
+            if edged and motion.sampling == "auto":
+                motion = replace(motion, sampling="stay")  # as in the terms of the edges
+            if edged and not about.near:  # once, because another number would recompile kernels
+                about.near = NEAR * min(float(dr.norm(shape.bbox().extents())) for shape in edged)
+            plan = replace(attach(plan, which, motion, scene, sensor), edged=edged, near=about.near)
+        if plan.stays and self._motion.sampling == "auto" and not plan.edged:
             if sensor not in about.stays:  # once, because another answer would recompile kernels
                 about.stays[sensor] = bounces(plan, scene, sensor)
             if not about.stays[sensor]:
@@ -231,6 +248,13 @@ class Preparation:
         ]
         nodes += [list(which.emission_nodes)] if plan.differentiate_emission else []
         return [sum(which.entries[node] for node in each) for each in nodes]
+
+    def edges(self, plan: Plan) -> EdgeSet:
+        """Return the edges of the plan's moving shapes."""
+        made = self._found.edges
+        if plan.edged not in made:
+            made[plan.edged] = EdgeSet(plan.edged)
+        return made[plan.edged]
 
     def emitters(self, plan: Plan, scene: mi.Scene) -> EmitterDensities:
         """Return the current densities of the scene's emitters, for a plan of the scene."""

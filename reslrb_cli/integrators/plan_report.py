@@ -13,6 +13,7 @@ PATHS_FROM = "camera paths"
 GUIDED = "guided emission"
 SEQUENCE = "low-discrepancy numbers"
 PIXELS = "camera paths by pixel"
+EDGES = "edges of moving shapes"
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,8 @@ def plan_rows(plan: Plan) -> list[PlanRow]:
         ("vertices that stay", plan.attached and plan.stays,
          "after diffuse bounces light goes on to the same point, so edges at rest count",
          "all follow: no moving object is seen after a diffuse bounce, or attached_sampling: follow"),
+        (EDGES, bool(plan.edged), "the light that they cover and uncover has a derivative",
+         "no shape moves, edges: off, or edges: auto before a run decides"),
         ("moving emitters", plan.moving_emission, "rays include the derivative of their origins",
          "emitters are at rest"),
         ("moving lamps in view", bool(plan.visible_moving_lamps),

@@ -129,6 +129,7 @@ class SamplingOptions:
     - `shares_out` tells whether camera paths are distributed over the pixels by need. The distribution by sensor,
         (H, W), may be `given` for all scenes with the same sensors. Otherwise it is stored for each scene and its
         parameters.
+    - `edges` tells whether derivatives contain the light that moving edges cover and uncover (`estimators/edges.py`).
     - `expected` is the sample count of the passes that tables learn from. If it is None, each pass uses its own count.
     """
 
@@ -139,6 +140,7 @@ class SamplingOptions:
     whole: bool = False
     shares_out: bool = False
     given: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+    edges: bool = False
     expected: int | None = None
 
     def __post_init__(self) -> None:

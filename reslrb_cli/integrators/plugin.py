@@ -33,6 +33,7 @@ OPTIONS: dict[str, Any] = {
     "attached": "auto",
     "filter_normalization": "attached",
     "attached_sampling": "auto",
+    "edges": "off",
     "guiding": "off",
     "sequence": "independent",
     "paths": "light",
@@ -107,12 +108,20 @@ def make_reslrb(**given: Any) -> Reslrb:
             f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
             f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
         )
-    for name, other in (("guiding", "on"), ("sequence", "low_discrepancy"), ("pixels", "measured")):
+    for name, other in (
+        ("guiding", "on"),
+        ("sequence", "low_discrepancy"),
+        ("pixels", "measured"),
+        ("edges", "on"),
+    ):
         value = options.pop(name)
         one_of(name, value, (OPTIONS[name], other))
         choices[name] = value == other
     motion = Motion(
-        options.pop("attached"), options.pop("filter_normalization"), obstacle, options.pop("attached_sampling")
+        options.pop("attached"),
+        options.pop("filter_normalization"),
+        obstacle,
+        options.pop("attached_sampling"),
     )
     sampling = SamplingOptions(
         guided=choices["guiding"],
@@ -120,6 +129,7 @@ def make_reslrb(**given: Any) -> Reslrb:
         paths=options.pop("paths"),
         light_share=options.pop("light_share"),
         shares_out=choices["pixels"],
+        edges=choices["edges"],
     )
     own = {name: options.pop(name) for name in options_of(estimator) if name in options}
     return Reslrb(make_estimator(estimator, own), motion=motion, sampling=sampling, **options)

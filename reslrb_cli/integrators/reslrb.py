@@ -20,6 +20,7 @@ from typing_extensions import Self
 
 from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
+from reslrb_cli.estimators.edges import differentiate_edges
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
@@ -29,6 +30,7 @@ from reslrb_cli.integrators.forward import tangent_of
 from reslrb_cli.integrators.plans import Motion, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
+from reslrb_cli.transport.edges import weigh_edges
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.film import AdjointImage, PixelShares
 from reslrb_cli.transport.plan import Plan
@@ -142,7 +144,11 @@ class LightTracer(StepIntegrator):
         if (guiding := self.preparation.guiding) is not None:
             table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
         given = job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table
-        return passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
+        parts = passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
+        if not plan.edged or purpose is Purpose.IMAGE:
+            return parts
+        edges = weigh_edges(parts[0], self.preparation.edges(plan).now())
+        return [replace(part, edges=edges) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
         """Return the share of light paths. Also return the emitters' densities if paths from both sides are
@@ -356,6 +362,8 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
             estimator.of(side.plan).backward(p, state)
         elif not done:
             differentiate_camera_paths(p, estimator.stack_size)
+    if samples.edges is not None:
+        differentiate_edges(Pass(samples, None, adjoint))
 
 
 def replay_stored(estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any) -> None:

@@ -1,7 +1,8 @@
 """Terms that attached gradients lack: silhouettes, shadow edges, and light that leaves the film.
 
-Finite differences of the image at common random numbers contain the terms that attached gradients lack (`Missing`). F_k
-is the finite difference along direction k, and g_k is the attached gradient along direction k. There are K directions.
+`integrator.edges` adds silhouettes and shadow edges of moving shapes (`estimators/edges.py`). Other edges are still
+missing. Finite differences of the image at common random numbers contain all of these terms (`Missing`). F_k is the
+finite difference along direction k, and g_k is the gradient along direction k. There are K directions.
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 
@@ -13,8 +14,8 @@ to the squares is subtracted. The reported standard error is the error of the me
 `gradcheck --missing` for an experiment. With the steps of `choose_step` and no extrapolation, the complete derivative
 of configs/lens_pose.yaml seems to lack 1.1 %.
 
-`check_missing` measures the missing share before a run's first iteration. The measurement is limited to a part of the
-run's samples, and uses one or two finite-difference steps.
+`check_missing` measures the missing share before a run's first iteration, and decides `edges: auto`. Each measurement
+is limited to a part of the run's samples, and uses one or two finite-difference steps.
 """
 
 from __future__ import annotations
@@ -48,13 +49,16 @@ from reslrb_cli.measure.methods import NEVER, parse_cases
 from reslrb_cli.measure.participants import MOVING_DIRECTIONS, PATHS
 from reslrb_cli.measure.references import ends
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.sampling import as_decided, is_auto
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
 from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES
 from reslrb_cli.optimization.views import View
+from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
 from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.edges import has_edges
 from reslrb_cli.scene.needs import camera_finds_all
 from reslrb_cli.statistics import jackknife_variance
 
@@ -189,6 +193,7 @@ class MissingCheck:
             reason = "has no derivative at the initial values, which equal those of the target"
             raise ConfigError(self.source, "loss", reason)
         options = problem.config.integrator.options()
+        options["edges"] = "off" if config.integrator.options().get("edges") == "off" else "on"
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")}
         self._tracer = make_integrator("reslrb", **options, freeze=True)
         self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
@@ -274,24 +279,50 @@ SHORT, LONG = 0.01, 0.25
 MOST_SEEDS, MOST_VIEWS = 64, 4
 
 
-def check_missing(problem: Problem, warn: Callable[[str], None]) -> list[MissingRecord]:
-    """Measure the missing share of the loss's derivative before a run, for each parameter that moves light.
+def check_missing(
+    problem: Problem, say: Callable[[str], None], warn: Callable[[str], None]
+) -> tuple[Problem, list[MissingRecord]]:  # fmt: skip
+    """Measure the missing share of the loss's derivative before a run, for each parameter that moves light. Return the
+    problem, and one record per parameter.
 
-    Calls `warn` with one line if a derivative is incomplete, or if its missing share is unknown. Raises ConfigError if
-    a missing share exceeds one half by more than two standard errors, unless the run accepts incomplete derivatives.
+    With `integrator.edges: auto`, edges are turned on in the returned problem if a significant share is missing
+    without them, or if the share is unknown. `say` then receives this decision, and the share is measured again. If
+    everything that moves has known edges, and edges are on, records of unknown shares are dropped.
+
+    `warn` receives one line if a derivative is incomplete, or if its missing share is unknown. Raises ConfigError if a
+    missing share exceeds one half by more than two standard errors, unless `run.accept_incomplete` is true.
     """
     config, found = problem.config, measure_missing(problem)
+    moving = where_moved(problem.selection.params, problem.selection.scene_keys)
+    edged = [item for item in moving if item.is_shape and has_edges(item.node) and not item.node.is_emitter()]
+    tracer = problem.integrator if edged and isinstance(problem.integrator, LightTracer) else None
+    if tracer is not None and is_auto(config, "edges") and found:
+        lacking = [record for record in found if record.is_incomplete]
+        why = "no significant part of the derivative is missing without them"
+        if lacking:
+            why = f"without them, the derivative of {lacking[0].parameter} lacks {lacking[0].percent()}"
+        decision = Decision(setting="edges", value="on" if lacking else "off", why=why)
+        tracer = as_decided(tracer, [decision])
+        problem = replace(problem, decisions=[*problem.decisions, decision], integrator=tracer)
+        if lacking:
+            say(f"chosen by measurement: {decision.line()}")
+            found = measure_missing(problem)
+    has_edge_terms = tracer is not None and tracer.preparation.sampling.edges
+    if has_edge_terms and len(edged) == len(moving):
+        found = [record for record in found if not record.is_unknown]
     told = [record for record in found if record.is_incomplete]
     if not told:
-        return found
-    line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective"
-    camera = camera_finds_all(problem.scene, config.integrator.max_depth)
+        return problem, found
+    line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective includes all of it"
+    helps = camera_finds_all(problem.scene, config.integrator.max_depth)
+    if tracer is not None and not has_edge_terms:
+        way, helps = "integrator.edges=on includes silhouettes and shadow edges", True
     if any(record.is_for_the_most_part for record in told) and not config.run.accept_incomplete:
-        first = f"--set {way} includes all of it, and" if camera else "the steps would have wrong directions;"
+        first = f"--set {way}, and" if helps else "the steps would have wrong directions;"
         raise ConfigError(config.source, "integrator.type", f"{line}; {first} --set run.accept_incomplete=true runs it "
                                                             "anyway")  # fmt: skip
-    warn(f"{line}; --set {way} includes all of it" if camera else line)
-    return found
+    warn(f"{line}; --set {way}" if helps else line)
+    return problem, found
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:
@@ -304,7 +335,7 @@ def measure_missing(problem: Problem) -> list[MissingRecord]:
     """
     selection, kind = problem.selection, problem.config.integrator.type
     moving = [key for key in selection.keys if key not in selection.factors and moves_light(selection.params, key)]
-    if not moving or kind == "custom" or kind.endswith("_projective"):  # these have edge terms, or may have them
+    if not moving or kind == "custom" or kind.endswith("_projective"):  # these have edges, or may have them
         return []
     problem.apply()
     try:

@@ -164,7 +164,7 @@ class Looking:
         if self.parts.attached:
             return (
                 "wrong if light moves: check derivatives of silhouettes, of shadow edges, and of the direction of "
-                "light; --missing, without --integrators, measures the first two"
+                "light; --missing, without --integrators, measures the first two with --set integrator.edges=off"
             )
         if any(record.parameter is None for record in failing) and (image := self.images()).wrong:
             return self._of_image(image)

@@ -119,7 +119,16 @@ class CheckSettings:
     def configs(self) -> dict[str, Config]:
         """Return one experiment for each integrator, by label. Raises ConfigError if one is invalid."""
         depth = self.config.integrator.max_depth
-        return {case.label: case.at(self.config, depth, self.known) for case in self.integrators}
+        config = without_edges(self.config)
+        return {case.label: case.at(config, depth, self.known) for case in self.integrators}
+
+
+def without_edges(config: Config) -> Config:
+    """Return the experiment without the derivatives of edges, which no reference has."""
+    integrator = config.integrator
+    if integrator.options().get("edges") != "on":
+        return config
+    return config.model_copy(update={"integrator": integrator.model_copy(update={"edges": "off"})})
 
 
 def settings_of(

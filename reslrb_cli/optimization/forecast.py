@@ -97,18 +97,19 @@ def make_forecast(
     config: Config,
     say: Callable[[str], None],
     cache: DecisionCache | None = None,
-    before: Callable[[Problem], object] = lambda problem: None,
+    before: Callable[[Problem], Problem] = lambda problem: problem,
 ) -> Forecast:
     """Measure a few steps of the run that `config` describes. A variant must be set.
 
     `say` is called with lines about slow work. Decisions are stored in `cache` for the run. `before` takes the problem
-    before its first iteration. `before` makes measurements that no cache stores. Raises the same errors as the run.
+    before its first iteration, and returns it. `before` makes measurements that no cache stores. Raises the same errors
+    as the run.
     """
     # Errors are not part of a step.
     problem = replace(assemble(with_short_target(config), say, cache), truth={})
     image_s, views = _image_seconds(problem), len(problem.views)
     begin = time.perf_counter()
-    before(problem)
+    problem = before(problem)
     before_s = time.perf_counter() - begin
     say("measuring a few steps")
     iteration_s, start_s, compile_s, peak = measure_steps(problem)

@@ -402,8 +402,8 @@ class MissingRecord(Line):
         """Return the record as one line of text."""
         if not self.seeds:
             return (
-                f"{self.parameter}: the derivative lacks silhouettes and shadow edges; their share was not measured "
-                "(too few samples, or a derivative of the loss that is 0)"
+                f"{self.parameter}: the derivative may lack silhouettes and shadow edges; the missing share was not "
+                "measured (too few samples, or a derivative of the loss that is 0)"
             )
         if self.share is None or self.standard_error is None:
             return f"{self.parameter}: {self.seeds} seeds cannot distinguish the derivative from 0"

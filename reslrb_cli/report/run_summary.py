@@ -280,8 +280,8 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
 def _reasons(results: Mapping[str, Any]) -> list[str]:
     """Return possible reasons why a run did not improve, as far as its records show."""
     samples = results.get("samples") or {}
-    found = [f"the steps followed derivatives without silhouettes and shadow edges ({record.percent()} of the "
-             f"derivative of {shorten(record.parameter, KEY_WIDTH)} is missing), and a lower rate does not help"
+    found = [f"the steps followed an incomplete derivative ({record.percent()} of the derivative of "
+             f"{shorten(record.parameter, KEY_WIDTH)} is missing), and a lower rate does not help"
              for record in incomplete_records(results.get("incomplete") or ())]  # fmt: skip
     step, target = samples.get("step"), samples.get("target")
     if step and target and target < FEW_STEPS * step:

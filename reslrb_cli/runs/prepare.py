@@ -129,7 +129,7 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgr
     `say` is called with lines about slow steps, `warn` with warnings. Raises ConfigError and UnsupportedScene.
     """
     problem = assemble(config, say, DecisionCache(), to_run=True)
-    missing = check_missing(problem, warn)
+    problem, missing = check_missing(problem, say, warn)
     if missing:  # the check moves geometry, possibly beyond the bounding sphere of the lamps at infinity
         problem = problem.afresh(problem.values())
     manifest = manifest_of(problem, variant, config.source)

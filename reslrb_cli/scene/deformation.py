@@ -119,9 +119,7 @@ class Movable:
         return None
 
     def casts_edges(self, scene: mi.Scene) -> bool:
-        """True if the object can have a silhouette or cast a shadow. Every shape can have a silhouette or cast a
-        shadow, except a shape that encloses all others.
-        """
+        """True if the object can have a silhouette or cast a shadow: any shape, except one that encloses all others."""
         others = [shape.bbox() for shape in scene.shapes() if shape.ptr != self.node.ptr]
         return self.is_shape and not all(self.node.bbox().contains(box, strict=True) for box in others)
 

@@ -174,14 +174,16 @@ class CameraPath:
     rivals: list[Rivals]
 
 
-def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = True) -> tuple[FilmRay, Any]:
+def camera_walk(
+    samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = True, first: FilmRay | None = None
+) -> tuple[FilmRay, Any]:  # fmt: skip
     """Trace one camera path per lane of `samples`, in `active` lanes. Returns the rays and the final state of
-    `hooks`.
+    `hooks`. The paths start with the rays `first` if they are given.
     """
     plan, scene, sensor = samples.plan, samples.scene, samples.sensor
     sampler = samples.sampler()
     surrounded = plan.needs.environment is not None
-    first = film_ray(samples, sampler)
+    first = film_ray(samples, sampler) if first is None else first
     state = hooks.start(first)
     active = mi.Bool(active) & (plan.max_depth > 0)
 
@@ -331,42 +333,45 @@ def _next_event(
     samples: Samples, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, numbers: mi.Point2f, active: mi.Bool
 ) -> NextEvent:  # fmt: skip
     """Sample a point on an emitter, or a direction. `weight` and `scale` do not include w_N yet."""
-    scene = samples.scene
-    unseen = frozenset(lamp.emitter for lamp in samples.plan.needs.lamps if lamp.parallel)
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    with dr.suspend_grad():
-        if unseen:
-            ds, weight = _sample_some(samples, unseen, si, numbers, active)
-        else:
-            ds, weight = scene.sample_emitter_direction(si, numbers, False, active)
+    ds, weight = sample_lamp(samples, si, numbers, active)
     active = active & (ds.pdf > 0) & dr.isfinite(ds.pdf)
     weight, zero = dr.select(active, weight, 0), mi.Point2f(0)
     return NextEvent(
         weight, zero, ds.p, si.to_local(ds.d), active, zero,
         Le=dr.select(active, weight * ds.pdf, 0), scale=dr.select(active, dr.rcp(ds.pdf), 0), ds=ds,
-        through=mi.Spectrum(1), unseen=unseen,
+        through=mi.Spectrum(1), unseen=_unseen(samples),
     )  # fmt: skip
 
 
-def _sample_some(
-    samples: Samples, unseen: frozenset[mi.Emitter], si: mi.SurfaceInteraction3f, numbers: mi.Point2f,
-    active: mi.Bool,
+def _unseen(samples: Samples) -> frozenset[mi.Emitter]:
+    """Return the emitters without next event estimation."""
+    return frozenset(lamp.emitter for lamp in samples.plan.needs.lamps if lamp.parallel)
+
+
+def sample_lamp(
+    samples: Samples, si: mi.SurfaceInteraction3f, numbers: mi.Point2f, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
-    """Replace `sample_emitter_direction` in scenes with emitters that cannot be sampled."""
-    scene = samples.scene
-    index, weight, reused = scene.sample_emitter(numbers.x, active)
-    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
+    """Return a sampled place on an emitter as seen from `si`, or a direction, and radiance / density (C,). Visibility
+    is not tested. Emitters that Mitsuba cannot sample have weight 0.
+    """
+    scene, unseen = samples.scene, _unseen(samples)
+    with dr.suspend_grad():
+        if not unseen:
+            return scene.sample_emitter_direction(si, numbers, False, active)
+        index, weight, reused = scene.sample_emitter(numbers.x, active)
+        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
 
-    def sample(
-        self: mi.Emitter, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
-        if self in unseen:
-            return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
-        return self.sample_direction(si, sample, active)
+        def sample(
+            self: mi.Emitter, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
+        ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
+            if self in unseen:
+                return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+            return self.sample_direction(si, sample, active)
 
-    ds, radiance = dr.dispatch(emitter, sample, si, mi.Point2f(reused, numbers.y), active)
-    ds.pdf /= weight
-    return ds, radiance * weight
+        ds, radiance = dr.dispatch(emitter, sample, si, mi.Point2f(reused, numbers.y), active)
+        ds.pdf /= weight
+        return ds, radiance * weight
 
 
 def _weigh(

@@ -132,6 +132,10 @@ class Plan:
     glossy_follows: bool = False
     moving_shapes: tuple[mi.Shape, ...] = ()
     moving_emitters: tuple[mi.Emitter, ...] = ()
+    # Moving shapes whose edges cover and uncover light, with a derivative.
+    edged: tuple[mi.Shape, ...] = ()
+    # Distance of two vertices below which the derivative of the light between them is damped, if shapes are edged.
+    near: float = 0.0
     # Whether the normalisation of the reconstruction filter has a derivative and the correction for shading normals has
     # none, as in finite differences; otherwise as in `ptracer`.
     attached_normalization: bool = True

@@ -21,6 +21,7 @@ import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
+from reslrb_cli.scene.edges import EdgeTable
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.aim import Aim
 from reslrb_cli.transport.bsdf import EventNumbers
@@ -246,6 +247,8 @@ class Samples:
     emitters: EmitterDensities | None = None
     #: Distribution of the camera paths over the pixels; None: uniform.
     shares: PixelShares | None = None
+    #: The edges of moving shapes, if the gradient includes the derivatives of edges.
+    edges: EdgeTable | None = None
     #: The camera paths of the same pass, next to light paths.
     camera: Samples | None = None
     #: Cumulative areas of the faces of lamps with moving faces.
@@ -411,7 +414,7 @@ def passes(
                 return camera
         guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
         shared = None if camera is None else camera.shares
-        return Samples(*given, width, own_scale, fraction, guide, net, ratio, emitters, shared, camera)
+        return Samples(*given, width, own_scale, fraction, guide, net, ratio, emitters, shared, camera=camera)
 
     made = {size: part(size) for size in set(sizes)}
     return [_seeded(made[size], s) for size, s in zip(sizes, seeds, strict=True)]

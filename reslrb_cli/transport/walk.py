@@ -23,7 +23,7 @@ import mitsuba as mi
 from reslrb_cli.transport.aim import Pending, aims_from, choose
 from reslrb_cli.transport.bsdf import Aimed, EventNumbers, Hit, Scattering, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, Seen, connect, passage
-from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import Product, first_eta, play
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import SELECTION_STREAM, Numbers, Samples
@@ -171,8 +171,14 @@ class Path:
     rivals: list[Rivals]  # if camera paths find the same light
 
 
-def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
-    """Trace one light path per lane of `samples`, in `active` lanes, and return the final state of `hooks`."""
+def walk(
+    samples: Samples, hooks: Hooks, active: mi.Bool | bool = True, emission: Emission | None = None,
+    depth: mi.UInt32 | int = 1,
+) -> Any:  # fmt: skip
+    """Trace one light path per lane of `samples`, in `active` lanes, and return the final state of `hooks`.
+
+    If `emission` is given, the paths start with its rays, and their first vertices have index `depth`.
+    """
     plan, scene, sensor = samples.plan, samples.scene, samples.sensor
     sampler = samples.sampler()
     selection = samples.stream(SELECTION_STREAM) if hooks.numbers else None
@@ -181,7 +187,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
 
     # ---- Leave the emitter ----
     loop_mode = "evaluated" if hooks.tracked and hooks.max_iterations is None else "symbolic"
-    emission = sample_emission(samples, sampler)
+    emission = sample_emission(samples, sampler) if emission is None else emission
     product, active, eta = Product.one(plan.track_zeros, hooks.tracked), mi.Bool(active), mi.Float(1)
     if not hooks.replaying:
         product = product.times(emission.weight, mi.Int32(0))
@@ -189,9 +195,10 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         if plan.roulette:
             eta = first_eta(dr.max(product.weight()), emission.guided)
     state = hooks.start(product)
-    active &= plan.max_depth > 1
+    depth = mi.UInt32(depth)
+    active &= depth < plan.max_depth
     pi, active = intersect(plan, scene, emission.ray, active)
-    path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta, samples.early_numbers(), [], [])
+    path = Path(active, depth, emission.ray, pi, product, eta, samples.early_numbers(), [], [])
     if aim is not None and not hooks.replaying:
         path.pending = [Pending(mi.Float(0), mi.Float(1), mi.Float(-1))]  # no vertex, so nothing is aimed
     if plan.weighs:

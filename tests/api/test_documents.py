@@ -58,8 +58,8 @@ def quick_checkout(llvm: str, tmp_path: Path) -> Path:
     (tmp_path / "configs").mkdir()
     text = (ROOT / "configs/cornell_floor.yaml").read_text(encoding="utf-8")
     assert text.count("\nrun:\n") == text.count("{spp: 1024}") == 1
-    text = text.replace("\nrun:\n", "\nrun:\n  measuring: 0\n").replace("{spp: 1024}", "{spp: 64}")
-    text = text.replace("{resx: 256, resy: 256}", "{resx: 32, resy: 32}")
+    text = text.replace("\nrun:\n", "\nrun:\n  measuring: 0\n").replace("{spp: 1024}", "{spp: 16}")
+    text = text.replace("{resx: 256, resy: 256}", "{resx: 16, resy: 16}").replace("max_depth: 6", "max_depth: 3")
     (tmp_path / "configs/cornell_floor.yaml").write_text(text, encoding="utf-8")
     return tmp_path
 

@@ -69,7 +69,7 @@ def test_a_derivative_that_lacks_more_than_half_is_refused(experiment: Path):
     *_, line = result.output.splitlines()
     assert line.startswith(f"{experiment}: integrator.type: box.x: ")
     assert "of the derivative is missing (silhouettes, shadow edges" in line
-    assert "--set integrator.type=prb_projective includes all of it" in line
+    assert "--set integrator.edges=on includes silhouettes and shadow edges" in line
     assert f"--set {ACCEPT} runs it anyway" in line
 
 
@@ -98,11 +98,34 @@ def test_a_continued_run_remembers_the_missing_share(run: tuple[str, Path]):
     assert after["results"]["certainty"]["parameters"]["box.x"]["verdict"] == "derivative incomplete"
 
 
+def test_a_run_with_derivatives_of_edges_finds_the_place(experiment: Path):
+    """The run measures that edges matter. It then needs no permission for an incomplete derivative."""
+    moving = "parameters=[{motion: {of: box, free: [x, z]}, learning_rate: 0.03}]"
+    choices = settings(
+        "integrator.edges=auto",
+        moving,
+        "run.iterations=24",
+        "run.certainty=false",
+        f"run.output={experiment.parent / 'on'}",
+    )
+    output, folder = done("optimize", experiment, *choices).output, experiment.parent / "on/box"
+    assert "chosen by measurement: edges on: without them, the derivative of box.x lacks" in output
+    first: dict[str, Any] = read_manifest(folder) or {}
+    [decision] = [each for each in first["decisions"] if each["setting"] == "edges"]
+    assert decision["value"] == "on"
+    values = np.load(folder / "parameters/parameters.npz")
+    assert np.hypot(values["box.x"] - 0.25, values["box.z"]).item() < 0.25 / 3
+    resumed = done("optimize", "--resume", folder, *settings("run.iterations=26"))
+    again: dict[str, Any] = read_manifest(folder) or {}
+    assert again["decisions"] == first["decisions"]
+    assert "chosen by measurement" not in resumed.output
+
+
 def test_an_unmeasured_share_is_reported(experiment: Path):
     """A dry run reports an unmeasured share."""
     result = done("optimize", experiment, "--dry-run", *settings("run.measuring=0"))
-    assert "box.x: the derivative lacks silhouettes and shadow edges; their share was not measured" in result.output
-    assert "--set integrator.type=prb_projective includes all of it" in result.output
+    assert "box.x: the derivative may lack silhouettes and shadow edges; the missing share" in result.output
+    assert "--set integrator.edges=on includes silhouettes and shadow edges" in result.output
 
 
 @pytest.mark.parametrize("measuring", [0.36, 0.5, 0.9])
@@ -195,7 +218,5 @@ def test_a_rising_loss_is_explained_by_the_missing_part():
     results["incomplete"] = [vars(record(0.47, 0.02))]
     assert find_remedy(results, "box.color") is None
     told = warnings(results)
-    assert (
-        "silhouettes and shadow edges (47% +- 2.0% of the derivative of box.x is missing), and a lower rate" in told[1]
-    )
+    assert "incomplete derivative (47% +- 2.0% of the derivative of box.x is missing), and a lower rate" in told[1]
     assert "derivative incomplete: box.x (47% +- 2.0% of it is missing)" in told

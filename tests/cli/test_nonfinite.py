@@ -268,7 +268,7 @@ def test_the_step_of_the_run_is_traced_again(spoilt_experiment):
     assert err.startswith(f"{file}: is damaged, cut off, or not written by reslrb")
 
 
-@pytest.mark.parametrize("sequence", ["low_discrepancy", "auto"])
+@pytest.mark.parametrize("sequence", a_few(["low_discrepancy", "auto"], ["auto"]))
 def test_paths_use_the_sequence_of_the_run(spoilt_experiment, monkeypatch, sequence):
     """If the sequence is `auto`, the paths use the sequence that the run chose."""
     sets = ("scene.options={wall: spoilt.exr}", f"integrator.sequence={sequence}", "run.measuring=1000")
@@ -288,7 +288,7 @@ def test_paths_use_the_sequence_of_the_run(spoilt_experiment, monkeypatch, seque
     assert {samples.plan.sequence for samples in parts} == {own}
 
 
-@pytest.mark.parametrize("paths", a_few(["camera", "both, light_share: 0.02", "auto"], ["camera", "auto"]))
+@pytest.mark.parametrize("paths", a_few(["camera", "both, light_share: 0.02", "auto"], ["camera"]))
 def test_camera_paths_are_checked(spoilt_experiment, paths):
     ours = f"integrator={{type: reslrb, max_depth: 4, estimator: stack, paths: {paths}}}"
     _, err = optimize(STOP, "scene.options={wall: spoilt.exr}", ours)
@@ -311,7 +311,7 @@ def test_lamps_hit_by_camera_paths_are_checked(spoilt_experiment):
     assert offender["where"]["samples"].endswith(", camera paths")
 
 
-@pytest.mark.parametrize("integrator", ["prb", "walk_ad"])
+@pytest.mark.parametrize("integrator", a_few(["prb", "walk_ad"], ["prb"]))
 def test_paths_of_other_integrators_are_not_checked(spoilt_experiment, integrator):
     _, err = optimize(STOP, "scene.options={wall: spoilt.exr}", f"integrator={{type: {integrator}, max_depth: 4}}")
     _, [offender] = inspect(err)

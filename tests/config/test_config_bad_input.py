@@ -60,6 +60,7 @@ ADDED: dict[str, str | tuple[str, ...]] = {
     "integrator: {estimator: gather, capacity: 2}": "integrator.capacity: has no effect with estimator `gather`, only",
     "integrator: {capacity: 1}": "integrator.capacity: has no effect with estimator `auto`, only with `reservoir` or",
     "integrator: {estimator: gater}": ("integrator.estimator: must be one of", "(did you mean gather?)"),
+    "integrator: {edges: maybe}": "integrator.edges: must be one of",
     "integrator: {capacity: 0}": "integrator.capacity: must be at least 1",
     "integrator: {weight: adjont}": "integrator.weight: must be luminance or adjoint (did you mean adjoint?)",
     "integrator: {estimator: event, weight: adjoint}\nrun: {adjoint: correlated}": "`adjoint` needs dL/dI before",

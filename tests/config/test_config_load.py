@@ -71,7 +71,7 @@ def test_defaults(tmp_path: Path) -> None:
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto",
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
         "paths": "auto", "light_share": 0.5,
-        "sequence": "auto", "pixels": "auto",
+        "sequence": "auto", "pixels": "auto", "edges": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}
@@ -278,7 +278,7 @@ def test_options_and_defaults_match_the_estimators(name: str) -> None:
     options = Reslrb(estimator=name).options()  # type: ignore[arg-type]
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator"}
     shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence", "paths", "light_share"}
-    shared |= {"pixels"}
+    shared |= {"pixels", "edges"}
     #: Options that are constant in every run.
     constants = {"stack_size", "jacobian_damping"}
     known = {key: value for key, value in options_of(name).items() if key not in constants}

@@ -241,9 +241,9 @@ def test_light_paths_alone_can_have_the_border_of_both():
     film = {"film": {"rfilter": {"type": "gaussian", "stddev": 1.5}}}
     scene = stage(None, looks(**film))
     ours = make_integrator("reslrb", estimator="stack", max_depth=3, rr_depth=100)
-    theirs = images(scene, "path", range(50, 62), 128, max_depth=3, rr_depth=100)
+    theirs = images(scene, "path", range(50, 62), 48, max_depth=3, rr_depth=100)
     for made, holds in ((ours, False), (ours.afresh(light_share=1.0), True)):
-        renders = np.stack([np.array(render_image(made, scene, 0, seed, 128)) for seed in range(12)])
+        renders = np.stack([np.array(render_image(made, scene, 0, seed, 48)) for seed in range(12)])
         assert bool(compare(renders, theirs, block=1)) == holds
 
 
@@ -288,27 +288,42 @@ def test_short_paths(depth: int):
 
 #: Cases whose light both kinds of paths can find. Camera paths cannot find parallel lamps.
 BOTH = [case for case in CASES if case.name not in ("texture_prb", "directionalarea")]
-SOME = ("texture", "mask_texture_in_view", "visible_lamp", "glass")
 
 
 def options_of(case: GradientCase, paths: str, **more: Any) -> dict[str, Any]:
     return {**case.both, "estimator": "stack", "paths": paths, **more}
 
 
-@taking_turns("case", BOTH, "paths", ["camera", "both"], SOME)
-def test_gradients_equal_naive_ad(case: GradientCase, paths: str):
-    """dL/dI becomes known before the image, in one traversal, or after the image. A small stack (one vertex) and
-    recordings are also tested.
-    """
+#: Ways of a step: dL/dI becomes known after the image, or before it, in one traversal; with a small stack (one vertex)
+#: or from a recording.
+STEPS: dict[str, tuple[dict[str, Any], bool]] = {
+    "correlated": ({}, False), "recorded": ({"freeze": True}, True),
+    "known": ({}, True), "beyond": ({"stack_size": 1}, False),
+}  # fmt: skip
+
+
+#: The default suite: each case with one kind of paths and two ways, so that each kind of paths has every way.
+SOME = {
+    "texture": ("camera", ("correlated", "recorded")), "mask_texture_in_view": ("camera", ("known", "beyond")),
+    "visible_lamp": ("both", ("correlated", "recorded")), "glass": ("both", ("known", "beyond")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("case", "paths", "steps"),
+    [
+        *(pytest.param(case, *SOME[case.name], id=f"{case.name}-{SOME[case.name][0]}")
+          for case in BOTH if case.name in SOME),
+        *(pytest.param(case, paths, tuple(STEPS), id=f"{case.name}-{paths}-all", marks=pytest.mark.long)
+          for case in BOTH for paths in ("camera", "both")),
+    ],
+)  # fmt: skip
+def test_gradients_equal_naive_ad(case: GradientCase, paths: str, steps: tuple[str, ...]):
     scene = Case(case.scene(), case.keys)
     reference = scene.gradient(integrator("walk_ad", **case.both, paths=paths), 5, case.spp)
-    ways: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-        "correlated": ({}, {}),
-        "known": ({}, {"step": scene.known_step}),
-        "beyond": ({"stack_size": 1}, {}),
-        "recorded": ({"freeze": True}, {"step": scene.known_step}),
-    }
-    for name, (more, step) in ways.items():
+    for name in steps:
+        more, known = STEPS[name]
+        step = {"step": scene.known_step} if known else {}
         ours = scene.gradient(integrator("reslrb", **options_of(case, paths, **more)), 5, case.spp, **step)
         error = relative(ours, reference)
         print(case.name, paths, name, f"{error:.1e}")

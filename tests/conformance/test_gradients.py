@@ -448,7 +448,7 @@ def l2(target):
 def agreement_adjoint(case: Case, reference: tuple, name: str, estimator: str = "stack") -> Agreement:
     target, expected = reference
     stock = estimator in ("ptracer", "walk_ad", "prb")
-    tracer = integrator(estimator) if stock else integrator("reslrb", estimator=estimator)
+    tracer = integrator(estimator) if stock else integrator("reslrb", estimator=estimator, freeze=True)
     objective = l2(target)
     ours = [case.gradient(tracer, seed, SPP, objective, **ADJOINTS[name]) for seed in seeds(COUNT)]
     return compare(np.stack(ours), expected, block=None)

@@ -159,17 +159,17 @@ BSDFS = [
     ImageCase("thin glass before the sensor", pane),
 ]  # fmt: skip
 #: The default suite. A ball refracts light in and out again, which can hide a fault of one of the two, so that glass is
-#: a sheet as well. Of the BSDFs that throw light on the floor, it takes one of each kind of lobe, and one normal map.
+#: a sheet here, and a ball in test_image_paths.py (shading normals, roulette). Of the BSDFs that throw light on the
+#: floor, it takes one of each kind of lobe, and one normal map.
 #: The other BSDFs have `ptracer` as their reference, or their parts are listed here.
 FEW = (
-    *(f"ball of {name}" for name in ("roughdielectric", "blend", "mask", "null", "bumpmap", "normalmap")),
+    *(f"ball of {name}" for name in ("blend", "mask", "null", "bumpmap")),
     *(f"sheet of {name}" for name in ("roughdielectric", "principledthin", "mask of glass")),
     *(f"light of {name}" for name in ("conductor", "dielectric", "plastic", "normalmap of dielectric")),
     "thin glass before the sensor",
 )  # fmt: skip
 #: The BSDFs that the default suite compares with `ptracer` alone.
-BY_STOCK = ("anisotropic roughconductor", "roughplastic", "principled", "transmitting principled", "twosided",
-            "conductor", "nonlinear plastic")  # fmt: skip
+BY_STOCK = ("anisotropic roughconductor", "transmitting principled", "conductor", "nonlinear plastic")
 
 
 @pytest.mark.usefixtures("samples")
@@ -265,9 +265,11 @@ LIT = [
     ImageCase("several with weights", lambda: several(CONSTANT, 3.0)),
     ImageCase("a sky behind a floor only", far_away),
 ]  # fmt: skip
-#: The cases that need `-m long`: each resembles another case.
-SIMILAR = ("area", "spot", "sunsky", "envmap", "envmap, one axis", "hidden envmap", "hidden envmap, one axis",
-           "hidden sunsky", "hidden sunsky, turned")  # fmt: skip
+#: The cases that need `-m long`: each resembles another case. test_image_paths.py has a lamp in view, and
+#: test_camera_paths.py a sphere.
+SIMILAR = ("area", "visible area", "sphere", "point", "spot", "sunsky", "envmap", "envmap, one axis", "hidden envmap",
+           "hidden envmap, one axis", "hidden envmap, two axes", "hidden sunsky", "hidden sunsky, turned",
+           "several with a constant")  # fmt: skip
 
 
 @pytest.mark.usefixtures("samples")

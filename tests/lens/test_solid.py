@@ -68,7 +68,7 @@ SHAPES: dict[str, tuple[dict[str, Any], float]] = {
 
 def integral(heights: Heights, outline: str) -> float:
     """Return the integral of the heights over the face in mm^3, by the midpoint rule on fine cells."""
-    x, y = np.meshgrid(*((np.arange(1500) + 0.5) / 1500 * s - s / 2 for s in SIZE))
+    x, y = np.meshgrid(*((np.arange(600) + 0.5) / 600 * s - s / 2 for s in SIZE))
     inside = (2 * x / SIZE[0]) ** 2 + (2 * y / SIZE[1]) ** 2 <= 1 if outline == "round" else np.ones_like(x)
     return float(np.mean(heights(x, y) * inside) * SIZE[0] * SIZE[1])
 

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from turns import taking_turns
 
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.gather import Gathering, Taking
@@ -33,10 +34,10 @@ def test_names():
     assert len(CASES) == len(LISTED), "no two have the same"
 
 
-@pytest.mark.parametrize("name", FEW)
-def test_case(name: str):
-    records = list(run_case(CASES[name], estimators := ["stack", WAYS[0]]))
-    assert {record.estimator for record in records} == set(estimators)
+@taking_turns("name", FEW, "estimator", ["stack", WAYS[0]])
+def test_case(name: str, estimator: str):
+    records = list(run_case(CASES[name], [estimator]))
+    assert {record.estimator for record in records} == {estimator}
     assert not failures(records)
 
 

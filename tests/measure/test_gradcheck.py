@@ -58,6 +58,8 @@ from reslrb_cli.transport.factors import CELLS, Survival
 
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
 SMALL += ["integrator.guiding=off"]  # guided steps have their own test
+#: A quarter of the pixels, with twice the samples, for faults that show at equal seeds or in the whole gradient.
+SMALLER = ("scene.options.size=16", "run.spp=16")
 
 
 def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", seeds: int = 8) -> list[GradcheckRecord]:
@@ -71,7 +73,7 @@ def failures(records: list[GradcheckRecord]) -> set[tuple[str | None, str]]:
 
 
 def test_it_holds():
-    records = check("integrator.rr_depth=2")
+    records = check("integrator.rr_depth=2", *SMALLER)
     assert failures(records) == set()
     assert [record.kind for record in records].count(Kind.IMAGE) == 1
     for name in ("reservoir", "event", "gather", "stack"):
@@ -108,7 +110,8 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
 
     of, play = Survival.of, walk.play
     monkeypatch.setattr(tables.Survival, "of", staticmethod(lambda box, chances: of(box, np.zeros(CELLS))))
-    assert failures(records := check(f"integrator.guiding={guiding}", estimators="stack")) == set()
+    small = (f"integrator.guiding={guiding}", *SMALLER)
+    assert failures(records := check(*small, estimators="stack")) == set()
     assert [each.seeds for each in records if each.reference is Reference.UNGUIDED] == [8]
 
     def without_weight(plan: Any, survival: Any, *rest: Any) -> Any:
@@ -116,7 +119,7 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
         return survives, weight if survival is None else mi.Float(1)
 
     monkeypatch.setattr(walk, "play", without_weight)
-    found = failures(check(f"integrator.guiding={guiding}", estimators="stack"))
+    found = failures(check(*small, estimators="stack"))
     assert ("stack", "unguided") in found
     assert guiding == "on" or found == {("stack", "unguided")}
 
@@ -127,20 +130,20 @@ def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
     """
     right = reservoir.slot_adjoint
     monkeypatch.setattr(reservoir, "slot_adjoint", lambda p, W, *rest: right(p, W * 1.2, *rest))
-    found = failures(check(estimators="reservoir,stack", seeds=16))
+    found = failures(check(*SMALLER, estimators="reservoir,stack", seeds=16))
     assert found == {("reservoir", name) for name in ("walk_ad", "ptracer", "finite_difference", "forward_mode")}
 
 
 def test_a_slightly_wrong_derivative(monkeypatch: pytest.MonkeyPatch):
     right = stack.push
     monkeypatch.setattr(stack, "push", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.001))
-    found = failures(check(estimators="stack,gather"))
+    found = failures(check(*SMALLER, estimators="stack,gather"))
     assert found == {("stack", name) for name in ("walk_ad", "finite_difference", "forward_mode")}
 
 
 def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(forward.TangentSplat, "survived", lambda self, state, weight: state)
-    assert failures(check("integrator.rr_depth=1", estimators="stack")) == {("stack", "forward_mode")}
+    assert failures(check("integrator.rr_depth=1", *SMALLER, estimators="stack")) == {("stack", "forward_mode")}
 
 
 def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.MonkeyPatch):
@@ -155,7 +158,7 @@ def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.
         return connection
 
     monkeypatch.setattr(segment, "connect", connect)
-    assert failures(check(estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
+    assert failures(check(*SMALLER, estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
 
 
 @pytest.mark.long

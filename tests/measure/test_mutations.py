@@ -11,6 +11,7 @@ from conformance import (
     attached_cases,
     test_attached,
     test_attached_reservoir,
+    test_edges,
     test_moving_emitters,
     test_small_lamps,
     test_weights,
@@ -26,7 +27,7 @@ def test_the_faults_apply_to_the_code(monkeypatch: pytest.MonkeyPatch):
     """
     assert {fault.check for fault in FAULTS} == set(CHECKS)
     others = [attached_cases.FAULTS, test_attached.FORWARD_FAULTS, test_attached_reservoir.FAULTS,
-              test_moving_emitters.FAULTS, test_small_lamps.FAULTS, test_weights.FAULTS]  # fmt: skip
+              test_edges.FAULTS, test_moving_emitters.FAULTS, test_small_lamps.FAULTS, test_weights.FAULTS]  # fmt: skip
     for fault in (*FAULTS, *(fault for faults in others for fault in faults)):
         with monkeypatch.context() as patch:
             plant(fault, patch)

@@ -111,7 +111,7 @@ QUICK = {"fault=cosine": 3}
 def test_a_fault_is_found_and_explained(capsys: pytest.CaptureFixture[str], fault: str) -> None:
     more = ["--set", TWO] if fault == "fault=lobe" else []
     if fault in QUICK:
-        more = [*FEW, "--set", f"integrator.max_depth={QUICK[fault]}"]
+        more = [*FEW, "--seeds", "8", "--spp", "16", "--set", f"integrator.max_depth={QUICK[fault]}"]
     else:
         Path("scene.xml").write_text(room(MIXED))
     code, lines = checked(capsys, fault, *more)

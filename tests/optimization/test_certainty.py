@@ -142,7 +142,8 @@ def test_verdicts_of_twenty_runs(folder, seed):
 
 #: A texture that its regularizer keeps far from the result of the images alone.
 EVEN = f"{COLOR}, regularizers: [{{type: total_variation, epsilon: 10, weight: 0.06}}]"
-HELD = Toy("a texture that is held even", {POSTER: EVEN}, {POSTER: SETTLED}, ("run.spp=160", "run.iterations=80",
+HELD = Toy("a texture that is held even", {POSTER: EVEN}, {POSTER: SETTLED}, ("run.spp=80", "run.iterations=60",
+                               "target.render.spp=512",
                                "optimizer={type: adam, learning_rate: 0.02, schedule: cosine}"))  # fmt: skip
 
 
@@ -215,7 +216,8 @@ def test_noise_of_a_rendered_target_is_part_of_the_spread(folder):
     found = {}
     for spp in (16, 256):
         toy = noisy("a colour", "l2")
-        about = run(folder, Toy("", toy.parameters, {}, (*toy.settings, f"target.render.spp={spp}"))).certainty
+        settings = (*toy.settings, "run.iterations=60", f"target.render.spp={spp}")
+        about = run(folder, Toy("", toy.parameters, {}, settings)).certainty
         assert (about.target_noise, about.target_spp) == ("measured", spp)
         found[spp] = about.parameters[WALL]
     of_target = {spp: np.mean(about.of_target) for spp, about in found.items()}

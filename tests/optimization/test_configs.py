@@ -60,7 +60,7 @@ def slopes(heights: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["lens_pose", "caustic_heightmap"])
+@pytest.mark.parametrize("name", ["lens_pose", "moved_box", "caustic_heightmap"])
 def test_it_is_recovered_within_a_tenth(name):
     problem = assemble(load(MOVING_CONFIGS / f"{name}.yaml"))
     start = problem.values()

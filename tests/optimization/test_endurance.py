@@ -106,8 +106,8 @@ def test_a_slowdown_is_found(toy: Any) -> None:
 
 # The clock and the allocator's peak, tested with planted costs: a kernel, a sleep, slow files, a leak.
 
-#: Lanes of the kernels, and loop turns of the cheaper kernel, which takes about ten milliseconds.
-LANES, TURNS = 2**16, 256
+#: Lanes of the kernels, and loop turns of the cheaper kernel, which takes some milliseconds.
+LANES, TURNS = 2**14, 256
 SLEEP_S = 0.2
 
 

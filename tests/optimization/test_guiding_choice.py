@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from optimization.deciding import SIZES, SMALL, World, begin, decision, fix_times, inspected, is_even, operations
 from runs.going_on import begin_alone, differences, left_over, optimize, run_and_kill
+from turns import a_few
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
@@ -91,7 +92,7 @@ def test_on_enables_guiding_and_off_removes_it(adjoint: str, experiment: Path, m
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("sequence", ["low_discrepancy", "auto"])
+@pytest.mark.parametrize("sequence", a_few(["low_discrepancy", "auto"], ["auto"]))
 def test_a_named_sequence_stays_and_auto_depends_on_guiding(
     sequence: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,7 @@ from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 
-SEED, SPP = 3, 256
+SEED, SPP = 3, 64
 MOTIONS = "parameters=[{motion: {of: slab, free: [translation, rotation, scale], pivot: [0.2, 1.5, 0.1]}}, "
 MOTIONS += "{heightmap: {mesh: slab, resolution: [5, 4]}}, {motion: {of: lamp}}]"
 NO_TRUTH = "target.render.parameters={}"

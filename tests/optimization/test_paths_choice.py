@@ -254,7 +254,9 @@ def test_moving_light_uses_light_paths():
     assert (naive.paths, naive.integrator.paths) == ("light", "light")
 
 
-@pytest.mark.parametrize("settings", [AUTO, SHORT], ids=["measured at length", "short"])
+@pytest.mark.parametrize(
+    "settings", [pytest.param(AUTO, id="measured at length"), pytest.param(SHORT, id="short", marks=pytest.mark.long)]
+)
 def test_a_resumed_run_keeps_its_paths(settings: list[str], monkeypatch: pytest.MonkeyPatch):
     words = tiny.settings(*settings)
     assert optimize("tiny.yaml", *words) == 0

@@ -52,13 +52,24 @@ def rows(problem: Problem, iterations: int) -> np.ndarray:
     return np.array(found, np.float64)
 
 
-def independent(problem: Problem, rounds: int, spp: int) -> np.ndarray:
-    """Return the gradients of steps with `run.adjoint: independent` and without shards, of shape (rounds, entries)."""
-    found = []
-    for round in range(rounds):
-        sample_gradient(problem, problem.integrator, round, "reference", spp)
-        found.append(np.concatenate(list(take_gradient(problem).values())))
-    return np.array(found, np.float64)
+#: Gradients of `independent` that were computed before, by the loss and the targets.
+FOUND: dict[tuple[Any, ...], np.ndarray] = {}
+
+
+def independent(problem: Problem) -> np.ndarray:
+    """Return the gradients of 16 steps with `run.adjoint: independent` and without shards, of shape (16, entries).
+
+    With 256 samples each, their mean has a fifth of the variance, or less, of the means that are compared with it.
+    """
+    views = [(view.sensor, view.share, np.array(view.target).tobytes()) for view in problem.views]
+    of = (str(problem.config.loss), *views)
+    if of not in FOUND:
+        found = []
+        for round in range(16):
+            sample_gradient(problem, problem.integrator, round, "reference", 256)
+            found.append(np.concatenate(list(take_gradient(problem).values())))
+        FOUND[of] = np.array(found, np.float64)
+    return FOUND[of]
 
 
 # --- unbiased ---------------------------------------------------------------------------------------------------------
@@ -76,27 +87,27 @@ WAYS = {
 
 @pytest.mark.parametrize("way", a_few(WAYS, [way for way in WAYS if way not in ("4 in rounds", "16 in rounds")]))
 def test_gradients_are_unbiased(folder, way):
-    """The reference consists of steps of a thousand samples with a second set for dL/dI. Each shard has one or two
-    samples per pixel.
+    """The reference consists of steps of 256 samples with a second set for dL/dI. Each shard has one or two samples per
+    pixel.
     """
     sets, iterations = WAYS[way]
     loss = [each for each in sets if each.startswith("loss")]
     problem, plain = make(folder, *sets), make(folder, "run.adjoint=independent", *loss)
     plain.views[0].see(np.array(problem.views[0].target))  # a guided problem renders another target
-    found = compare(rows(problem, iterations), independent(plain, 16, 1024), block=None)
+    found = compare(rows(problem, iterations), independent(plain), block=None)
     assert found, found
 
 
 def test_a_single_set_of_samples_would_be_found(folder):
     """The comparison of `test_gradients_are_unbiased` has enough power to detect the bias of a single set."""
-    reference = independent(make(folder, "run.adjoint=independent"), 16, 1024)
+    reference = independent(make(folder, "run.adjoint=independent"))
     found = compare(rows(make(folder, "run.spp=2", "run.shards=2", "run.adjoint=correlated"), 400), reference, None)
     assert not found, found
 
 
 def test_views_and_exposures_are_unbiased(folder):
     """Two views with different weights have two shards each. The second view's exposure is recovered."""
-    reference = independent(make(folder, TWO_VIEWS, "run.adjoint=independent"), 16, 1024)
+    reference = independent(make(folder, TWO_VIEWS, "run.adjoint=independent"))
     found = compare(rows(make(folder, TWO_VIEWS, "run.spp=2", "run.shards=4", ROUNDS), 300), reference, block=None)
     assert found, found
 
@@ -233,7 +244,7 @@ def test_memory_does_not_grow_with_the_shards(folder):
     """The peak memory of the backend's allocator does not grow from 2 to 16 shards of equal size."""
     peaks = []
     for count in (2, 16):
-        problem = make(folder, f"run.spp={64 * count}", f"run.shards={count}", ROUNDS, "scene.size=[64, 64]")
+        problem = make(folder, f"run.spp={64 * count}", f"run.shards={count}", ROUNDS, "scene.size=[32, 32]")
         rows(problem, 1)
         reset_peak()
         rows(problem, 1)

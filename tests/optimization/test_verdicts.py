@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from turns import taking_turns
 
 from reslrb_cli.optimization.results import got_worse
 from reslrb_cli.optimization.trend import Change, find_trend, window
@@ -124,8 +125,7 @@ def simulate(H, response, scale, noise, samples, rates, runs, random, fixed=None
     return offset, gradient
 
 
-@pytest.mark.parametrize("target", [0.0, 0.7, 5.0])
-@pytest.mark.parametrize("iterations", [5, 60, 600])
+@taking_turns("iterations", [5, 60, 600], "target", [0.0, 0.7, 5.0])
 def test_offsets_of_the_model_are_as_wide_as_stated(iterations, target):
     """Coverage over many runs is correct. The estimated way to go is right on average, and the actual error equals the
     stated error.
@@ -404,8 +404,7 @@ def test_pure_noise_is_flat(iterations):
     assert max(found[Change.FELL], found[Change.ROSE]) < 0.04
 
 
-@pytest.mark.parametrize("iterations", [20, 100, 1000])
-@pytest.mark.parametrize("decay", [1, 3, 8])
+@taking_turns("iterations", [20, 100, 1000], "decay", [8, 3, 1])
 def test_a_fall_within_a_few_iterations_is_found(iterations, decay):
     """Up to nine tenths of the run's first tenth may be as low as its end."""
     found = shares_of_verdicts(noisy(lambda i: 1 + 5 * np.exp(-i / decay)), iterations)

@@ -19,6 +19,8 @@ ways (`race.py`), with dL/dI fixed at one image.
     has learned from more paths. If light paths find all light, the guided steps use light paths only. With both kinds
     of paths, the weights ignore guiding and take away most of its benefit. If a parameter moves light, guiding is off
     (rule), because low-discrepancy numbers help most there.
+- `edges` (measured after all others, by `measure/missing.py`): on if the derivative lacks a significant share without
+    them.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ import mitsuba as mi
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.pixels import noted_part
-from reslrb_cli.integrators.plan_report import GUIDED, PATHS_FROM, PIXELS, SEQUENCE, PlanRow, with_reason
+from reslrb_cli.integrators.plan_report import EDGES, GUIDED, PATHS_FROM, PIXELS, SEQUENCE, PlanRow, with_reason
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sizes
@@ -336,6 +338,9 @@ OPTIONS = {
     ),
     "guiding": Option(
         _guiding, ("off", "on"), lambda tracer, value: tracer.afresh(guided=value == "on"), ("light", "both"), GUIDED,
+    ),
+    "edges": Option(
+        lambda tuner: None, ("off", "on"), lambda tracer, value: tracer.afresh(edges=value == "on"), (), EDGES,
     ),
 }  # fmt: skip
 

@@ -23,8 +23,8 @@ refers to the optimum for a target without noise.
 A `settled` parameter becomes `still moving` if the parameter that compensates for it is `still moving`, because both
 move together.
 
-If the derivative of a parameter lacks a significant share, its verdict is `derivative incomplete`. A run measures the
-missing share before its first iteration (`measure/missing.py`).
+If the derivative of a parameter lacks a significant share, or if this share is unknown, its verdict is `derivative
+incomplete`. A run measures the missing share before its first iteration (`measure/missing.py`).
 
 A parameter of several entries is `settled` if at least `SETTLED_SHARE` of its visible entries with an effect are
 settled. Otherwise, the parameter gets the most frequent verdict of the unsettled visible entries with an effect.

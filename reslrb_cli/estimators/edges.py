@@ -1,0 +1,390 @@
+"""Derivatives of the light that moving edges cover and uncover.
+
+The other estimators differentiate light along paths whose vertices move with the surfaces. They lack the light that a
+moving edge starts to block or to let through. This light is an integral over outlines (`transport/edges.py`). Here, p
+is a point on an outline, seen from a viewpoint y. x is the point behind p on the ray from y. n is the normal of the
+outline, and points away from the shape. v_p is the velocity of p, and w is the weight of the sample: the light or the
+importance that the edge covers per unit of <v_p, n>, divided by the density.
+
+At the start of a light path, y is a place on a lamp, and rays from y keep their direction. W_p and W_x are the
+contributions to the objective of light that continues from p and from x. A light walk estimates them.
+
+    dL/dtheta  +=  w (W_p - W_x) <v_p, n>
+
+Creases need this term, too. A crease is an edge between two flat-shaded faces that are both lit. The contribution of
+the light jumps there, because the faces have different normals. At a crease, x is a point on the second face.
+
+At the end of a light path, y is a place on the sensor, and x moves with the light that reaches it. L_x is the radiance
+from x. A camera walk estimates L_x. Light that reaches x through a specular chain is missing if only light paths find
+it.
+
+    dL/dtheta  -=  w delta(u) L_x <v_p - s v_x, n>,    s = |p - y| / |x - y|
+
+Between two surfaces, light goes from y on the first surface past p to x on the second. L_y is the radiance from y, and
+W_x the contribution of L_y after it continues from x. A camera walk selects one contribution to L_y, and a light walk
+estimates W_x.
+
+    dL/dtheta  -=  w W_x <v_p - s v_x - (1 - s) v_y, n>
+
+A point that light reaches directly from a lamp slides along the direction l of this light. Other points move with their
+surface. v is the velocity of the surface, and n_x its normal.
+
+    v_x = l <v, n_x> / <l, n_x>   if light arrives directly from a lamp,   otherwise   v_x = v
+
+v_y is defined in the same way. x in the last formula always moves with its surface.
+
+If a shape touches the surface behind it, lamps and the sensor lose x at the same time. This light counts once, as seen
+from the lamps.
+
+Sources: Zhang et al. 2020, "Path-Space Differentiable Rendering"; Li et al. 2018, "Differentiable Monte Carlo Ray
+Tracing through Edge Sampling".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import or_
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.estimators.base import Pass
+from reslrb_cli.scene.graph import interpolates_normals
+from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
+from reslrb_cli.transport.connection import Connection, shading_correction
+from reslrb_cli.transport.edges import Chances, Outline, sample_outline, view_from_lamps, view_from_sensor
+from reslrb_cli.transport.emission import Emission
+from reslrb_cli.transport.factors import Product, showing
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.walk import Hooks, Vertex, walk
+
+#: Light paths of a step per sampled point on an outline, for each of the three terms.
+PATHS_PER_OUTLINE = 4
+#: Distance between an edge and the ray that hits the shape, in units of Mitsuba's ray offset, on spheres and
+#: cylinders. The ray hits them before the edge, by the square root of this distance. On other shapes it is 1.
+ROUND = 0.1
+#: Distance along a ray within which a surface counts as being at the edge, in units of Mitsuba's ray offset.
+AROUND = 30.0
+#: Streams of random numbers, mixed into the seed.
+LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
+
+
+def differentiate_edges(p: Pass) -> None:
+    """Add the derivatives of the light that edges of moving shapes cover and uncover. dL/dI must be known."""
+    sides = {LAMP_EDGES: _from_lamps, SENSOR_EDGES: _from_sensor}
+    if p.plan.stays:
+        sides[OTHER_EDGES] = _between
+    for stream, side in sides.items():
+        samples = _samples(p.samples, stream)
+        side(Pass(samples, None, p.adjoint), samples.stream(stream))
+
+
+def _samples(samples: Samples, stream: int) -> Samples:
+    """Return samples of outlines for the light paths `samples`. Nothing along the paths of the result is
+    differentiated.
+    """
+    plan = replace(
+        samples.plan, attached=False, stays=False, glossy_follows=False, moving_shapes=(), moving_emitters=(),
+        grid=None, aims=False, sequence=None, differentiate_bsdfs=False, differentiate_emission=False,
+        track_zeros=False, only_bsdfs=(), differentiate_delta=False, differentiate_null=False, evened_lamps=(),
+    )  # fmt: skip
+    width = max(samples.width // PATHS_PER_OUTLINE, 1)
+    seed = mi.sample_tea_32(samples.seed, mi.UInt32(stream))[0]
+    scale = samples.scale * (dr.opaque(mi.Float, samples.width) / dr.opaque(mi.Float, width))
+    return replace(samples, plan=plan, seed=seed, spp=1, width=width, scale=scale, guide=None, net=None)
+
+
+def _chances(samples: Samples, numbers: mi.PCG32) -> Chances:
+    """Return the random numbers of one outline per lane."""
+    lane = dr.arange(mi.UInt32, samples.width)
+    return Chances.spread(numbers, samples.seed, lane, dr.opaque(mi.UInt32, samples.width))
+
+
+@dataclass
+class Beside:
+    """Two rays from the viewpoint beside an outline. `over` hits the shape, with intersection `pi`. `past` misses the
+    edge. Rays in `active` lanes reach the edge.
+    """
+
+    over: mi.Ray3f
+    past: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    active: mi.Bool
+
+
+def _offset(outline: Outline) -> mi.Float:
+    """Return Mitsuba's ray offset at the outline."""
+    return mi.math.RayEpsilon * (1 + dr.max(dr.abs(outline.p)))
+
+
+def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside:
+    """Return the rays on both sides of an outline. Lanes are active if nothing hides the edge from the viewpoint."""
+    scene, view, d = samples.scene, outline.view, -outline.view.to_y
+    offset = _offset(outline)
+    back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset)
+    active = outline.active & (back > 0)
+
+    def ray(side: float | mi.Float) -> mi.Ray3f:
+        return mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d)
+
+    over, past = ray(dr.select(outline.is_round, -ROUND, -1)), ray(1)
+    pi = scene.ray_intersect_preliminary(over, coherent=False, active=active)
+    active = active & pi.is_valid() & (pi.shape == outline.shape)
+    before = mi.Ray3f(past)
+    before.maxt = back - AROUND * offset
+    active = active & ~scene.ray_test(before, active)
+    past.o = past.o + d * before.maxt
+    if creases:
+        # Behind a crease lies the other face. It may be narrower than the offset if it is seen at a grazing angle.
+        other = scene.ray_intersect_preliminary(past, coherent=False, active=active & outline.crease)
+        active = active & (~outline.crease | (other.is_valid() & (other.shape == outline.shape)))
+    return Beside(over, past, pi, active)
+
+
+def _moved(beside: Beside, adjoint: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    """Return <p, `adjoint`> with the derivative of the point p on the shape. p moves with its surface."""
+    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
+    si = beside.pi.compute_surface_interaction(beside.over, flags, active)
+    return dr.select(active, dr.dot(si.p, adjoint), 0)
+
+
+# ---- Seen from lamps ----
+
+
+class Contribution(Hooks):
+    """Contribution of a light path to the objective.
+
+    In the lanes `smooth`, the first vertex lies on the outline of a mesh with interpolated normals. The correction for
+    shading normals has no limit there, so it is left out at this vertex. The other estimators leave out its derivative
+    (`shading_correction`).
+    """
+
+    def __init__(self, p: Pass, smooth: mi.Bool | None = None) -> None:
+        self.p, self.smooth = p, smooth
+
+    def start(self, product: Product) -> list[mi.Float]:
+        return [mi.Float(0)] if self.smooth is None else [mi.Float(0), mi.Float(1)]
+
+    def vertex(
+        self, state: list[mi.Float], vertex: Vertex, connection: Connection, scattering: Scattering,
+        numbers: list[mi.Float],
+    ) -> list[mi.Float]:  # fmt: skip
+        C = vertex.product.times(connection.c, vertex.depth).value()
+        own = dr.select(connection.active, dr.dot(C, self.p.delta(connection.u, connection.active)), 0)
+        if self.smooth is None:
+            return [state[0] + own]
+        here = self.smooth & (vertex.depth == 1)
+        si = vertex.si
+        correction, _ = shading_correction(self.p.plan, si, -vertex.ray.d, si.to_world(connection.wo), connection.wo)
+        own = own * dr.select(here, _inverse(correction), state[1])
+        return [state[0] + own, dr.select(here, _inverse(scattering.correction), state[1])]
+
+
+def _inverse(correction: mi.Float) -> mi.Float:
+    return dr.select(correction != 0, dr.rcp(correction), 0)
+
+
+def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines and creases seen from lamps. Half of the lanes continue from p, the others from
+    x.
+    """
+    samples = p.samples
+    assert samples.edges is not None
+    lane = dr.arange(mi.UInt32, samples.width)
+    over = lane % 2 == 0
+    chances = Chances.spread(numbers, samples.seed, lane // 2, dr.opaque(mi.UInt32, (samples.width + 1) // 2))
+    view = view_from_lamps(samples, chances.viewpoint)
+    outline = sample_outline(samples, samples.edges.lamp, view, chances, creases=True)
+    beside = _beside(samples, outline, creases=True)
+    ray = dr.select(over, beside.over, beside.past)
+    emission = Emission(ray, 2 * outline.weight, dr.zeros(mi.EmitterPtr))
+    smooth = [shape for shape in samples.plan.edged if interpolates_normals(shape)]
+    on_smooth = reduce(or_, (outline.shape == mi.ShapePtr(shape) for shape in smooth)) & over if smooth else None
+    W = walk(samples, Contribution(p, on_smooth), beside.active, emission)[0] * p.scale
+    weight = showing(W) * dr.select(over, 1, -1)
+    with dr.resume_grad(), dr.isolate_grad():
+        dr.backward_from(_moved(beside, weight * outline.normal, beside.active & (weight != 0)), flags=_MAY_LACK)
+
+
+#: The result depends on no parameter if, for example, no lane is active.
+_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+
+
+# ---- Seen from the sensor ----
+
+
+@dataclass
+class Arrived:
+    """Radiance from x (C,), in three sums.
+
+    `all` is the whole radiance. `slid` is the radiance of light that arrives at x directly from a lamp, times
+    <v_x, n> / <v, n_x>. `rest` is the radiance of other light. `counts` is 0 if x is specular, because light paths do
+    not connect from specular surfaces. `n_x` is the normal at x.
+    """
+
+    all: mi.Spectrum
+    slid: mi.Spectrum
+    rest: mi.Spectrum
+    counts: mi.Float
+    n_x: mi.Vector3f
+
+
+class Behind(CameraHooks):
+    """Hooks that sum the radiance from x. `normal` is the normal of the outline."""
+
+    def __init__(self, normal: mi.Vector3f) -> None:
+        self.normal = normal
+
+    def start(self, first: FilmRay) -> Arrived:
+        return Arrived(mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Vector3f(0))
+
+    def vertex(
+        self, state: Arrived, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
+    ) -> Arrived:  # fmt: skip
+        P, first = vertex.product.value() * state.counts, vertex.depth == 1
+        n_x = dr.select(first, mi.Vector3f(vertex.si.n), state.n_x)
+        total, slid, rest = state.all, state.slid, state.rest
+
+        def slope(towards: mi.Vector3f) -> mi.Float:
+            cos = dr.dot(n_x, towards)
+            return dr.select(cos != 0, dr.dot(self.normal, towards) / cos, 0)  # no surface: 0
+
+        if met is not None:
+            L = dr.select(met.active, P * met.Le * met.weight, 0)
+            direct = vertex.depth == 2
+            total = total + L
+            slid = slid + dr.select(direct, L * slope(vertex.ray.d), 0)
+            rest = rest + dr.select(direct, 0, L)
+        if event is not None:
+            L = dr.select(event.active, P * event.c, 0)
+            total = total + L
+            slid = slid + dr.select(first, L * slope(event.ds.d), 0)
+            rest = rest + dr.select(first, 0, L)
+        counts = dr.select(first & scattering.is_delta, 0, state.counts)
+        return Arrived(total, slid, rest, counts, n_x)
+
+
+def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines seen from the sensor."""
+    samples = p.samples
+    samples = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
+    assert samples.edges is not None
+    chances = _chances(samples, numbers)
+    outline = sample_outline(samples, samples.edges.sensor, view_from_sensor(samples, chances.viewpoint), chances)
+    beside = _beside(samples, outline)
+    x = samples.scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
+    n = outline.normal
+    # If the shape touches the surface behind it, lamps and the sensor lose the point x at the same time. It counts
+    # once, as seen from the lamps.
+    touches = x.is_valid() & (x.t < 2 * AROUND * _offset(outline))
+    beside.active = beside.active & ~touches
+    _, L = camera_walk(samples, Behind(n), beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
+    weight = p.delta(outline.view.u, beside.active) * outline.weight * p.scale
+    still, slid, rest = (showing(dr.dot(weight, part)) for part in (L.all, L.slid, L.rest))
+    active = beside.active & (still != 0)
+    s = outline.view.distance / dr.norm(beside.past.o + beside.past.d * x.t - outline.view.y)
+    moves = active & x.is_valid()
+    at_x = dr.select(moves, s * (slid * L.n_x + rest * n), 0)  # s is NaN if the ray leaves the scene
+    with dr.resume_grad(), dr.isolate_grad():
+        moved = _moved(beside, -still * n, active)
+        si = x.compute_surface_interaction(beside.past, mi.RayFlags.All | mi.RayFlags.FollowShape, moves)
+        moved += dr.select(moves, dr.dot(si.p, at_x), 0)
+        dr.backward_from(moved, flags=_MAY_LACK)
+
+
+# ---- Between two surfaces ----
+
+
+@dataclass
+class Pick:
+    """One contribution to the radiance from y, selected in proportion to its size (the largest channel).
+
+    `L` (C,) is the radiance of the contribution divided by its size, and `total` is the sum of all sizes. `segments` is
+    the number of segments from the lamp to y. `direct` is 1 if the light arrives at y directly from a lamp; its
+    direction is then `towards`. `n_y` is the normal at y. `counts` is 0 if y is specular.
+    """
+
+    L: mi.Spectrum
+    total: mi.Float
+    segments: mi.UInt32
+    direct: mi.Float
+    towards: mi.Vector3f
+    n_y: mi.Vector3f
+    counts: mi.Float
+    numbers: mi.PCG32
+
+    def offered(
+        self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, direct: mi.Bool, towards: mi.Vector3f
+    ) -> Pick:  # fmt: skip
+        """Return the selection after another contribution."""
+        size = dr.select(active, dr.max(L), 0)
+        total, number = self.total + size, self.numbers.next_float32()
+        takes = active & (size > 0) & (number * total < size)
+        return replace(
+            self,
+            L=dr.select(takes, L / size, self.L),
+            total=total,
+            segments=dr.select(takes, segments, self.segments),
+            direct=dr.select(takes, dr.select(direct, mi.Float(1), 0), self.direct),
+            towards=dr.select(takes, towards, self.towards),
+        )
+
+
+class PickLight(CameraHooks):
+    """Hooks that select one contribution to the radiance from y. Emission of a lamp at y is left out."""
+
+    def __init__(self, numbers: mi.PCG32) -> None:
+        self.numbers = numbers
+
+    def start(self, first: FilmRay) -> Pick:
+        none = mi.Vector3f
+        return Pick(mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0), none(0), none(0), mi.Float(1), self.numbers)
+
+    def vertex(
+        self, state: Pick, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
+    ) -> Pick:  # fmt: skip
+        P, first = vertex.product.value() * state.counts, vertex.depth == 1
+        state = replace(state, n_y=dr.select(first, mi.Vector3f(vertex.si.n), state.n_y))
+        if met is not None:
+            L, active = P * met.Le * met.weight, met.active & ~first
+            state = state.offered(L, active, vertex.depth - 1, vertex.depth == 2, vertex.ray.d)
+        if event is not None:
+            state = state.offered(P * event.c, event.active, vertex.depth, first, event.ds.d)
+        return replace(state, counts=dr.select(first & scattering.is_delta, 0, state.counts))
+
+
+def _between(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines on segments between two surfaces. The first surface is not specular."""
+    samples, scene = p.samples, p.samples.scene
+    assert samples.edges is not None
+    outline = sample_outline(samples, samples.edges.anywhere, None, _chances(samples, numbers))
+    n, to_y = outline.normal, outline.view.to_y
+    offset = _offset(outline)
+    back = mi.Ray3f(outline.p + n * offset, to_y)
+    y = scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
+    outline.active = outline.active & y.is_valid()
+    outline.view.distance = y.t
+    beside = _beside(samples, outline)
+    x = scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
+    active = beside.active & x.is_valid()
+    camera = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
+    _, found = camera_walk(camera, PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1)))
+    total = showing(found.total)
+    weight = outline.weight * found.L * total
+    emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
+    W = walk(samples, Contribution(p), active & (total > 0), emission, found.segments + 1)[0] * p.scale
+    W = showing(W)
+    active = active & (W != 0)
+    s = y.t / (y.t + x.t - AROUND * offset)
+    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
+    slope = dr.select(found.direct != 0, dr.dot(n, found.towards) / dr.dot(found.n_y, found.towards), 0)
+    at_y = dr.select(active, (W * (1 - s)) * dr.select(found.direct != 0, slope * found.n_y, n), 0)
+    at_x = dr.select(active, (W * s) * n, 0)
+    with dr.resume_grad(), dr.isolate_grad():
+        moved = _moved(beside, -W * n, active)
+        for point, ray, adjoint in ((x, beside.past, at_x), (y, back, at_y)):
+            si = point.compute_surface_interaction(ray, flags, active)
+            moved += dr.select(active, dr.dot(si.p, adjoint), 0)
+        dr.backward_from(moved, flags=_MAY_LACK)

@@ -1,0 +1,300 @@
+"""Points on outlines: places where an edge of a shape starts to block rays from a viewpoint.
+
+`weigh_edges` gives the edges of a table (`scene/edges.py`) their sampling weights. `sample_outline` samples points on
+outlines, as a lamp, the sensor, or any direction sees them. A segment belongs to the outline if, seen from the
+viewpoint, both of its faces lie on the same side of it. A segment with one face always belongs to the outline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.scene.edges import SEGMENT, SPHERE, TUBE, EdgeTable, across, edge_kinds, turned
+from reslrb_cli.transport.camera import sample_lamp
+from reslrb_cli.transport.connection import connect
+from reslrb_cli.transport.samples import Samples
+
+#: Sampling weight of an edge that no probe sees as an outline, relative to an outline of the same length.
+UNLIKELY = 0.02
+#: An edge is a crease if the angle between the normals of its faces, divided by pi, exceeds this value.
+FLAT = 1e-4
+#: Number of points on the lamps that probe whether an edge is an outline.
+PROBES = 4
+#: Stream of random numbers, mixed into the seed.
+SPREAD_STREAM = 0x5B4EAD
+
+
+@dataclass
+class EdgeView:
+    """EdgeView of a point from a viewpoint `y`: a place on a lamp or on the sensor's aperture.
+
+    `weight` (C,) is the radiance or the importance that arrives at the point, divided by the density of the viewpoint.
+    Occlusion is not included. `to_y` is the unit vector to the viewpoint, and `distance` is the distance of the
+    viewpoint. If `parallel` is true, the viewpoint is infinitely far away. `surface` is the lamp's normal if the
+    viewpoint lies on a surface, otherwise zero. `u` is the film position if the viewpoint is the sensor.
+    """
+
+    y: mi.Point3f
+    to_y: mi.Vector3f
+    distance: mi.Float
+    parallel: mi.Bool
+    weight: mi.Spectrum
+    surface: mi.Normal3f
+    u: mi.Point2f
+    active: mi.Bool
+
+
+@dataclass
+class Outline:
+    """Point `p` on a shape's outline, seen from a viewpoint.
+
+    `normal` is perpendicular to the edge and to the ray from the viewpoint, and points away from the shape. `weight`
+    (C,) is the light or the importance that the edge covers per unit of its velocity along the normal, divided by the
+    density of the sample. Occlusion is not included. In `crease` lanes, the edge is a crease and not an outline, and
+    `normal` points away from its first face. `is_round` lanes lie on a sphere or on the side of a
+    cylinder.
+    """
+
+    p: mi.Point3f
+    normal: mi.Vector3f
+    view: EdgeView
+    weight: mi.Spectrum
+    shape: mi.ShapePtr
+    active: mi.Bool
+    crease: mi.Bool
+    is_round: mi.Bool
+
+
+Viewer = Callable[[Any, Any], EdgeView]  # (point, active lanes) -> view
+
+
+def view_from_lamps(samples: Samples, numbers: mi.Point2f) -> Viewer:
+    """Return the view from lamps. The random `numbers` select the lamp and the place on the lamp."""
+
+    def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
+        here = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+        here.p = p
+        ds, weight = sample_lamp(samples, here, numbers, active)
+        parallel = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        surface = dr.select(ds.delta | parallel, mi.Normal3f(0), ds.n)
+        seen = active & (ds.pdf > 0) & dr.isfinite(ds.pdf) & dr.any(weight > 0)
+        return EdgeView(ds.p, ds.d, ds.dist, parallel, weight, surface, mi.Point2f(0), seen)
+
+    return view
+
+
+def view_from_sensor(samples: Samples, aperture: mi.Point2f) -> Viewer:
+    """Return the view from the sensor, through the point `aperture` of its aperture."""
+
+    def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
+        here = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+        here.p = p
+        seen = connect(samples.plan, samples.sensor, here, None, aperture, active)
+        ds, _ = samples.sensor.sample_direction(here, aperture, active)
+        none = mi.Normal3f(0)
+        return EdgeView(ds.p, ds.d, ds.dist, mi.Bool(False), seen.weight, none, seen.u, active & seen.active)
+
+    return view
+
+
+@dataclass
+class Chances:
+    """Random numbers of an outline: the edge, the place on it, and the viewpoint. They are spread evenly over lanes."""
+
+    edge: mi.Float
+    place: mi.Float
+    viewpoint: mi.Point2f
+
+    @staticmethod
+    def spread(numbers: mi.PCG32, seed: mi.UInt32, index: mi.UInt32, count: mi.UInt32) -> Chances:
+        """Return the numbers of points with an `index` below `count`. `count` is opaque.
+
+        They are Hammersley points and a Kronecker sequence (Roberts 2018), with a random offset for each seed.
+        """
+        edge = (mi.Float(index) + numbers.next_float32()) / mi.Float(count)
+        first, second = mi.sample_tea_32(seed, mi.UInt32(SPREAD_STREAM))
+        third, _ = mi.sample_tea_32(seed, mi.UInt32(SPREAD_STREAM + 1))
+        words = dr.brev(index) + first, index * 3242174889 + second, index * 2447445414 + third
+        place, x, y = (mi.Float(word >> 8) * 2.0**-24 for word in words)
+        return Chances(dr.minimum(edge, dr.one_minus_epsilon(mi.Float)), place, mi.Point2f(x, y))
+
+
+def sample_outline(
+    samples: Samples, weights: mi.Float, view: Viewer | None, chances: Chances, creases: bool = False
+) -> Outline:  # fmt: skip
+    """Return a random point on an outline for each lane. `weights` are cumulative sampling weights of the edges.
+
+    If `view` is None, each outline is seen from a random direction. If `creases` is true, points may also lie on
+    creases, where `normal` points away from the first face of the edge. Code for spheres and cylinders is compiled only
+    if the moving shapes contain any.
+    """
+    table, kinds = samples.edges, edge_kinds(samples.plan.edged)
+    assert table is not None
+    row_number, place = chances.edge, chances.place
+    rows = dr.width(weights)
+    total = dr.gather(mi.Float, weights, rows - 1)
+    row = dr.binary_search(0, rows - 1, lambda i: dr.gather(mi.Float, weights, i) <= row_number * total)
+    below = dr.select(row > 0, dr.gather(mi.Float, weights, dr.maximum(row, 1) - 1), 0)
+    probability = (dr.gather(mi.Float, weights, row) - below) / total
+    kind = dr.gather(mi.UInt32, table.kind, row)
+    a, b = dr.gather(mi.Point3f, table.a, row), dr.gather(mi.Point3f, table.b, row)
+    along = b - a
+    length = dr.norm(along)
+    along = along / dr.maximum(length, 1e-30)
+
+    # ---- Choose a point on the edge. On a segment, it does not depend on the viewpoint ----
+    p, density, active = a + (b - a) * place, dr.rcp(length), probability > 0
+    is_round, is_crease = mi.Bool(False), mi.Bool(False)
+    if SPHERE in kinds or TUBE in kinds:
+        is_round = kind != SEGMENT
+        p = dr.select(kind == SPHERE, a, dr.select(kind == TUBE, dr.lerp(a, b, 0.5), p))
+    view = _view_from_anywhere(table, kinds, row, kind, along, p, chances) if view is None else view
+    seen = view(p, active)
+    normal = mi.Vector3f(0)
+    if SPHERE in kinds or TUBE in kinds:
+        radius, y = dr.gather(mi.Float, table.radius, row), seen.y
+        if SPHERE in kinds:
+            cos = dr.select(seen.parallel, 0, radius / seen.distance)
+            sin, frame = dr.safe_sqrt(1 - dr.square(cos)), mi.Frame3f(seen.to_y)
+            s, c = dr.sincos(dr.two_pi * place)
+            out = cos * seen.to_y + sin * (c * frame.s + s * frame.t)
+            here = kind == SPHERE
+            normal, p = dr.select(here, out, normal), dr.select(here, a + radius * out, p)
+            density = dr.select(here, dr.rcp(dr.two_pi * radius * sin), density)
+            active &= ~here | (sin > 0) & (cos < 1)
+        if TUBE in kinds:
+            to_y = dr.select(seen.parallel, seen.to_y, y - a)
+            across = to_y - along * dr.dot(along, to_y)
+            distance = dr.norm(across)
+            first = across / distance
+            cos = dr.select(seen.parallel, 0, radius / distance)
+            sin = dr.safe_sqrt(1 - dr.square(cos)) * dr.select(place < 0.5, 1, -1)
+            out = cos * first + sin * dr.cross(along, first)
+            here = kind == TUBE
+            axis = a + (b - a) * (2 * place - dr.floor(2 * place))
+            normal, p = dr.select(here, out, normal), dr.select(here, axis + radius * out, p)
+            density = dr.select(here, dr.rcp(2 * length), density)
+            active &= ~here | (distance > 0) & (cos < 1)
+        seen = _from(seen, p, view(p, active & is_round), is_round)
+
+    # ---- Test whether the edge is an outline, and on which side of it the shape lies ----
+    d = -seen.to_y
+    raw = dr.cross(along, d)
+    sine = dr.norm(raw)
+    if SEGMENT in kinds:
+        c, other = dr.gather(mi.Point3f, table.c, row), dr.gather(mi.Point3f, table.d, row)
+        side, across_it = dr.dot(raw, c - p), dr.dot(raw, other - p)
+        outlines = is_round | (side * across_it > 0)
+        if creases:
+            is_crease = ~outlines & (dr.gather(mi.Float, table.crease, row) > FLAT)
+        active &= outlines | is_crease
+        normal = dr.select(is_round, normal, -dr.mulsign(raw, side) / dr.maximum(sine, 1e-30))
+    if SPHERE in kinds:
+        sine = dr.select(kind == SPHERE, 1, sine)
+    active &= seen.active & (sine > 1e-6)
+    weight = seen.weight * dr.select(active, sine / (density * probability), 0)
+    shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, table.shape, row, active))
+    return Outline(p, normal, seen, weight, shape, active, is_crease, is_round)
+
+
+def _from(first: EdgeView, p: mi.Point3f, again: EdgeView, moved: mi.Bool) -> EdgeView:
+    """Return the view of `p` from the viewpoint of `first`, in the lanes `moved`. `again` is the view of `p` with the
+    same random numbers.
+
+    The same random numbers may select another place on a lamp for another point `p`. If the lamp has a surface, the
+    place of `first` is used, and the weight is multiplied by the ratio of the solid angles of this place.
+    """
+    on_surface = dr.any(first.surface != 0)
+    there = first.y - p
+    distance = dr.norm(there)
+    to_y = there / distance
+    before = -dr.dot(first.surface, first.to_y) / dr.square(first.distance)
+    solid = dr.maximum(-dr.dot(first.surface, to_y), 0) / dr.square(distance) / before
+    keeps = moved & on_surface
+    return EdgeView(
+        y=dr.select(moved & ~on_surface, again.y, first.y),
+        to_y=dr.select(keeps, to_y, dr.select(moved, again.to_y, first.to_y)),
+        distance=dr.select(keeps, distance, dr.select(moved, again.distance, first.distance)),
+        parallel=first.parallel,
+        weight=dr.select(keeps, first.weight * solid, dr.select(moved, again.weight, first.weight)),
+        surface=first.surface,
+        u=dr.select(moved, again.u, first.u),
+        active=first.active & (~moved | on_surface | again.active),
+    )
+
+
+# ---- Sampling weights ----
+
+
+def weigh_edges(samples: Samples, table: EdgeTable) -> EdgeTable:
+    """Return the edges with cumulative sampling weights for the lamps and the sensor of `samples`.
+
+    A weight is the length of the edge, times a factor. The factor favours edges that probes see as outlines. For all
+    directions, it is the solid angle of the directions that see the edge as an outline.
+    """
+    with dr.suspend_grad():
+        free = 4 * (dr.pi - turned(table.b - table.a, table.c - table.a, table.d - table.a))
+        free = dr.select(table.kind == SEGMENT, free, 4 * dr.pi)
+        table = replace(
+            table,
+            lamp=dr.cumsum(table.lamp * _seen_from_lamps(samples, table)),
+            sensor=dr.cumsum(table.sensor * _seen_from_sensor(samples, table)),
+            anywhere=dr.cumsum(dr.select(dr.isfinite(free), table.anywhere * free, 0)),
+        )
+        dr.make_opaque(table)
+        return table
+
+
+def _view_from_anywhere(
+    table: EdgeTable, kinds: frozenset[int], row: mi.UInt32, kind: mi.UInt32, along: mi.Vector3f, p: mi.Point3f,
+    chances: Chances,
+) -> Viewer:  # fmt: skip
+    """Return the view of an edge from a random direction, uniform in solid angle. For a segment, the directions are
+    limited to those that see the segment as an outline.
+    """
+    first, second = chances.viewpoint
+    to_y, density = mi.warp.square_to_uniform_sphere(chances.viewpoint), mi.Float(dr.inv_four_pi)
+    if SEGMENT in kinds:
+        c, d = dr.gather(mi.Point3f, table.c, row) - p, dr.gather(mi.Point3f, table.d, row) - p
+        angle, x = turned(along, c, d), across(along, c)
+        y = dr.cross(along, x)
+        y = dr.mulsign(y, dr.dot(y, d))  # the second face is on this side
+        rest = dr.pi - angle
+        turn = 2 * rest * second
+        turn += dr.select(turn < rest, angle, 2 * angle)
+        cos = 2 * first - 1
+        sin, (s, t) = dr.safe_sqrt(1 - dr.square(cos)), dr.sincos(turn)
+        here = kind == SEGMENT
+        to_y = dr.select(here, along * cos + sin * (x * t + y * s), to_y)
+        density = dr.select(here, dr.rcp(4 * rest), density)
+
+    def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
+        seen = active & dr.isfinite(density)
+        weight = mi.Spectrum(dr.select(seen, dr.rcp(density), 0))
+        return EdgeView(p, to_y, mi.Float(1), mi.Bool(True), weight, mi.Normal3f(0), mi.Point2f(0), seen)
+
+    return view
+
+
+def _seen_from_lamps(samples: Samples, table: EdgeTable) -> mi.Float:
+    found = mi.Bool(False)
+    for number in range(PROBES):
+        numbers = mi.Point2f((number + 0.5) / PROBES, (0.5 + 0.618034 * number) % 1)
+        view = view_from_lamps(samples, numbers)(dr.lerp(table.a, table.b, 0.5), mi.Bool(True))
+        found |= _is_outline(table, view) & view.active
+    return dr.select(found | (table.kind != SEGMENT), 1.0, dr.maximum(table.crease, UNLIKELY))
+
+
+def _seen_from_sensor(samples: Samples, table: EdgeTable) -> mi.Float:
+    view = view_from_sensor(samples, mi.Point2f(0.5))(dr.lerp(table.a, table.b, 0.5), mi.Bool(True))
+    return dr.select(_is_outline(table, view) | (table.kind != SEGMENT), 1.0, UNLIKELY)
+
+
+def _is_outline(table: EdgeTable, view: EdgeView) -> mi.Bool:
+    raw = dr.cross(table.b - table.a, view.to_y)
+    return dr.dot(raw, table.c - table.a) * dr.dot(raw, table.d - table.a) > 0

@@ -1,0 +1,304 @@
+"""Cases of test_edges.py: moving shapes, a lamp, and surfaces on which the shapes' shadows fall. z is up.
+
+`PYTHONPATH=tests python -m conformance.edge_cases` writes edge_values.json, with the finite differences of all
+`RECORDED` cases. Names as arguments restrict it to these cases. A case takes a minute or more.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from conformance.moving import Latents, Moving, turned
+
+from reslrb_cli.measure.gradients import integrator, seeds, smooth_weights
+from reslrb_cli.measure.scenes.small import diffuse, lit_square, look_at, rectangle, rgb, transform
+
+#: Finite differences (N, K) by the name of a case.
+VALUES = Path(__file__).with_name("edge_values.json")
+SIZE = 24
+#: Motion of each shape: a translation, and the angle of a rotation about an axis through the origin. The unit of the
+#: angle is `TURN` degrees, so that all derivatives have a similar size.
+MOTION = ("x", "y", "z", "turn")
+TURN = 60.0
+#: Step of the finite differences, and a smaller one for hard shadows on other moving shapes.
+STEP, SMALLER = 0.03, 0.01
+OWN = diffuse(0.6, 0.6, 0.8)
+TWO_SIDED = {"type": "twosided", "bsdf": OWN}
+
+
+@dataclass(frozen=True)
+class EdgeCase:
+    """Moving shapes of `OCCLUDERS`, and a lamp of `LAMPS`, or of `ROOMS` in a room.
+
+    The derivatives are those of each shape's `motion`, which has components of `MOTION`. `axis` is the axis of the
+    rotation. The gradient of each seed uses `spp` samples per pixel. Finite differences have the `step`, and use
+    `reference_spp`. `options` are options of `reslrb`.
+    """
+
+    occluder: str
+    lamp: str
+    depth: int = 2
+    motion: tuple[str, ...] = MOTION
+    axis: tuple[float, float, float] = (0.3, 1.0, 0.5)
+    spp: int = 256
+    reference_spp: int = 2048
+    step: float = STEP
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The name of the test."""
+        return f"{self.occluder}-{self.lamp}-{self.depth}"
+
+    def moving(self) -> Moving:
+        """Load the scene. Each of its moving shapes has its own motion."""
+        shapes = OCCLUDERS[self.occluder]()
+        first: dict[str, Any] = {}
+
+        def place(params: mi.SceneParameters, latents: Latents) -> None:
+            for name in shapes:
+                x, y, z, turn = (latents.get(f"{name}.{part}", mi.Float(0)) for part in MOTION)
+                motion = turned(TURN * turn, list(self.axis), [x, y, z])
+                key = next(key for key in (f"{name}.to_world", f"{name}.vertex_positions") if key in params)
+                if key not in first:
+                    first[key] = type(params[key])(params[key])
+                if key.endswith("to_world"):
+                    params[key] = motion @ mi.AffineTransform4f(first[key].matrix)
+                else:
+                    params[key] = dr.ravel(motion @ dr.unravel(mi.Point3f, first[key]))
+
+        start = {f"{name}.{part}": 0.0 for name in shapes for part in self.motion}
+        moving = Moving((_room(self.lamp) if self.lamp in ROOMS else _open(self.lamp)) | shapes, start, place)
+        moving.weigh(smooth_weights(SIZE, SIZE))
+        return moving
+
+    def gradients(self, count: int = 8, **options: Any) -> np.ndarray:
+        """Return the gradients (N, K) of `reslrb` at `count` seeds."""
+        tracer = integrator("reslrb", self.depth, **{"estimator": "stack", "edges": "on"} | self.options | options)
+        moving = self.moving()
+        return np.array([np.concatenate([*moving.gradient(tracer, seed, self.spp).values()]) for seed in seeds(count)])
+
+    def differences(self, count: int = 8, block: int = 1) -> np.ndarray:
+        """Return finite differences (N, K) of images by `path` at `count` other seeds. `block` chooses the seeds."""
+        moving, path = self.moving(), integrator("path", self.depth)
+
+        def difference(seed: int, name: str) -> float:
+            ends = (moving.value(path, seed, self.reference_spp, **{name: step}) for step in (self.step, -self.step))
+            return float(np.subtract(*ends) / (2 * self.step))
+
+        return np.array([[difference(seed, name) for name in moving.start] for seed in seeds(count, block)])
+
+
+def recorded(case: EdgeCase) -> np.ndarray:
+    """Return the finite differences (N, K) on file."""
+    return np.array(json.loads(VALUES.read_text())[case.name])
+
+
+# ---- Moving shapes ----
+
+
+def mesh(positions: np.ndarray, faces: np.ndarray) -> mi.Mesh:
+    """Return a mesh with flat faces."""
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(OWN)
+    made = mi.Mesh("shape", len(positions), len(faces), properties)
+    params = mi.traverse(made)
+    params["vertex_positions"] = np.asarray(positions, np.float32).ravel()
+    params["faces"] = np.asarray(faces, np.uint32).ravel()
+    params.update()
+    return made
+
+
+def split_box(center: tuple[float, float, float], half: tuple[float, float, float], degrees: float = 23.0
+              ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the vertices (24, 3) and faces (12, 3) of a box turned about z. Each side has its own four vertices."""
+    points, faces = [], []
+    for axis in range(3):
+        for sign in (-1, 1):
+            corners = np.full((4, 3), float(sign))
+            corners[:, (axis + 1) % 3] = np.array([-1, 1, 1, -1]) * sign
+            corners[:, (axis + 2) % 3] = [-1, -1, 1, 1]
+            first = 4 * len(faces) // 2
+            faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
+            points.append(corners)
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return np.concatenate(points) * half @ turn.T + center, np.array(faces)
+
+
+def ball(center: tuple[float, float, float], radius: float, rows: int = 6, columns: int = 9
+         ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the vertices and faces of a coarse ball."""
+    height, turn = np.linspace(0, np.pi, rows + 1)[1:-1], 2 * np.pi * np.arange(columns) / columns
+    rings = np.stack(
+        np.broadcast_arrays(
+            np.sin(height)[:, None] * np.cos(turn), np.sin(height)[:, None] * np.sin(turn), np.cos(height)[:, None]
+        ),
+        -1,
+    )
+    points = np.concatenate([[[0, 0, 1]], rings.reshape(-1, 3), [[0, 0, -1]]])
+    at = 1 + np.arange((rows - 1) * columns).reshape(rows - 1, columns)
+    beside, last = np.roll(at, -1, 1), len(points) - 1
+    faces = [np.stack([np.zeros(columns, int), at[0], beside[0]], 1),
+             np.stack([np.full(columns, last), beside[-1], at[-1]], 1)]  # fmt: skip
+    for a, b, c, d in zip(at[:-1], at[1:], beside[1:], beside[:-1], strict=True):
+        faces += [np.stack([a, b, c], 1), np.stack([a, c, d], 1)]
+    return points * radius + center, np.concatenate(faces)
+
+
+def _box(x: float, y: float, z: float, size: float = 1.0) -> Any:
+    return mesh(*split_box((x, y, z), (0.3 * size, 0.25 * size, 0.3 * size)))
+
+
+def _sphere(x: float, y: float, z: float, size: float = 1.0) -> Any:
+    return {"type": "sphere", "center": [x, y, z], "radius": 0.4 * size, "bsdf": OWN}
+
+
+def _rectangle(x: float, y: float, z: float, size: float = 1.0) -> Any:
+    place = transform(translate=[x, y, z], rotate=([0, 0, 1], 45), scale=[0.5 * size, 0.3 * size, 1])
+    return rectangle(TWO_SIDED, place)
+
+
+def _disk(x: float, y: float, z: float, size: float = 1.0) -> Any:
+    place = transform(translate=[x, y, z], rotate=([1, 0.3, 0], 30), scale=0.4 * size)
+    return {"type": "disk", "to_world": place, "bsdf": TWO_SIDED}
+
+
+def _cylinder(x: float, y: float, z: float, size: float = 1.0) -> Any:
+    ends = ([x + s * size * a for x, a in zip((x, y, z), (0.3, 0.05, 0.08), strict=True)] for s in (-1, 1))
+    return {"type": "cylinder", "radius": 0.2 * size, "bsdf": TWO_SIDED} | dict(zip(("p0", "p1"), ends, strict=True))
+
+
+def _ball(x: float, y: float, z: float, size: float = 1.0) -> Any:
+    return mesh(*ball((x, y, z), 0.4 * size))
+
+
+SHAPES: dict[str, Callable[..., Any]] = {
+    "box": _box, "sphere": _sphere, "rectangle": _rectangle, "disk": _disk, "cylinder": _cylinder, "ball": _ball,
+}  # fmt: skip
+#: `flat` has one shape of each kind without a round side. They cast shadows on each other.
+FLAT = ("box", "rectangle", "disk", "ball")
+OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
+    **{name: lambda make=make: {"shape": make(0.1, -0.1, 0.9)} for name, make in SHAPES.items()},
+    "standing": lambda: {"shape": _box(0.1, -0.1, 0.3)},
+    # The camera sees the plate far behind the box.
+    "two": lambda: {"shape": _box(0.2, -1.6, 1.35, 0.4),
+                    "plate": rectangle(TWO_SIDED, transform(translate=[0.1, 0, 0.5], scale=0.7))},
+    "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
+                     for n, name in enumerate(FLAT)},
+}  # fmt: skip
+
+# ---- Lamps, and surfaces that do not move ----
+
+ABOVE, BELOW = [0.8, 0.3, 3.0], [0.0, 0.0, 0.0]
+
+
+def _towards() -> Any:
+    return look_at(ABOVE, BELOW, [0, 1, 0])
+
+
+LAMPS: dict[str, Callable[[], dict[str, Any]]] = {
+    "area": lambda: lit_square(rgb(10, 10, 10), _towards() @ transform(scale=0.3)),
+    # It lights the sides that the camera sees.
+    "front": lambda: lit_square(rgb(10, 10, 10), look_at([0.9, -2, 2.4], BELOW) @ transform(scale=0.3)),
+    # A lamp so near that the solid angle of its parts differs much over a shape.
+    "near": lambda: lit_square(rgb(10, 10, 10), translate=[0.4, 0.1, 1.7], rotate=([1, 0, 0], 180), scale=0.3),
+    "sphere_lamp": lambda: {"type": "sphere", "center": ABOVE, "radius": 0.3,
+                            "emitter": {"type": "area", "radiance": rgb(10, 10, 10)}},
+    "point": lambda: {"type": "point", "position": ABOVE, "intensity": rgb(10, 10, 10)},
+    "spot": lambda: {"type": "spot", "to_world": _towards(), "cutoff_angle": 40, "intensity": rgb(10, 10, 10)},
+    "directional": lambda: {"type": "directional", "direction": [-0.4, -0.15, -1], "irradiance": rgb(3, 3, 3)},
+    "constant": lambda: {"type": "constant", "radiance": rgb(1, 1, 1)},
+}  # fmt: skip
+
+
+def _camera(origin: list[float], target: list[float], fov: float) -> dict[str, Any]:
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "pixel_format": "rgb", "rfilter": {"type": "gaussian"}}
+    return {"type": "perspective", "fov": fov, "to_world": look_at(origin, target), "film": film,
+            "sampler": {"type": "independent"}}  # fmt: skip
+
+
+def _open(lamp: str) -> dict[str, Any]:
+    """Return a floor, and a lamp above it."""
+    floor = rectangle(diffuse(0.7, 0.5, 0.3), transform(scale=3))
+    return {"type": "scene", "camera": _camera([0.4, -3, 2.2], [0, 0, 0.3], 40), "floor": floor, "lamp": LAMPS[lamp]()}
+
+
+#: Lamps of the room: one shines down, the other at the ceiling.
+ROOMS: dict[str, Callable[[], dict[str, Any]]] = {
+    "room": lambda: lit_square(rgb(10, 10, 10), translate=[0.5, 0.2, 3.4], rotate=([1, 0, 0], 180), scale=0.35),
+    "indirect": lambda: {
+        "type": "spot",
+        "to_world": look_at([0.5, 0.2, 2.5], [0.5, 0.2, 3.5], [0, 1, 0]),
+        "cutoff_angle": 60,
+        "intensity": rgb(20, 20, 20),
+    },
+}
+
+
+def _room(lamp: str) -> dict[str, Any]:
+    """Return a room of five walls and a lamp."""
+
+    def wall(color: tuple[float, float, float], shift: list[float], axis: list[float], angle: float) -> dict[str, Any]:
+        bsdf = {"type": "twosided", "bsdf": diffuse(*color)}
+        return rectangle(bsdf, transform(translate=shift, rotate=(axis, angle), scale=2))
+
+    grey, red, green = (0.7, 0.7, 0.7), (0.7, 0.2, 0.2), (0.2, 0.7, 0.2)
+    return {
+        "type": "scene", "camera": _camera([0.3, -1.95, 2.2], [0, 0.3, 0.4], 60),
+        "floor": wall((0.7, 0.6, 0.5), [0, 0, 0], [0, 0, 1], 0),
+        "ceiling": wall(grey, [0, 0, 3.5], [1, 0, 0], 180), "back": wall(grey, [0, 2, 2], [1, 0, 0], 90),
+        "left": wall(red, [-2, 0, 2], [0, 1, 0], 90), "right": wall(green, [2, 0, 2], [0, 1, 0], 90),
+        "lamp": ROOMS[lamp](),
+    }  # fmt: skip
+
+
+# ---- The cases ----
+
+
+def standing(lamp: str, depth: int, **options: Any) -> EdgeCase:
+    """Return a case of a box that slides and turns on the floor. Derivatives of its height would be one-sided."""
+    return EdgeCase("standing", lamp, depth, ("x", "y", "turn"), (0, 0, 1), **options)
+
+
+#: Cases of which finite differences are on file. Under the near lamp, the sphere moves along x only. The offset of rays
+#: beside its outline biases the other derivatives by about 5 % of the gradient. Light from the ceiling needs `stay`:
+#: with `follow`, directions turn with the box, and the term between two surfaces does not fit.
+RECORDED = [
+    EdgeCase("flat", "area", spp=512), EdgeCase("sphere", "near", motion=("x",)), EdgeCase("box", "sphere_lamp"),
+    EdgeCase("sphere", "point", spp=1024), EdgeCase("rectangle", "spot"), EdgeCase("cylinder", "directional", spp=2048),
+    standing("front", 2, spp=1024), standing("room", 3, spp=1024), EdgeCase("two", "area", 3),
+    EdgeCase("box", "indirect", 3, spp=512, options={"attached_sampling": "stay"}), EdgeCase("sphere", "room", 5),
+]  # fmt: skip
+CASES = [
+    *RECORDED,
+    *(EdgeCase("flat", lamp, spp=512) for lamp in ("sphere_lamp", "directional")),
+    EdgeCase("flat", "point", spp=512, step=SMALLER),
+    *(EdgeCase("sphere", lamp) for lamp in ("area", "sphere_lamp", "spot")),
+    *(EdgeCase("cylinder", lamp, spp=2048) for lamp in ("area", "sphere_lamp")), EdgeCase("box", "room", 3, spp=1024),
+]  # fmt: skip
+
+
+def main() -> None:
+    """Write the finite differences."""
+    import reslrb_cli  # noqa: F401
+
+    mi.set_variant("llvm_ad_rgb")
+    values = json.loads(VALUES.read_text()) if VALUES.exists() else {}
+    for case in RECORDED:
+        if not sys.argv[1:] or case.name in sys.argv[1:]:
+            values[case.name] = np.round(case.differences(), 4).tolist()
+            rows = (f'"{name}": {json.dumps(rows)}' for name, rows in sorted(values.items()))
+            VALUES.write_text("{\n" + ",\n".join(rows) + "\n}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,354 @@
+"""Derivatives of outlines and shadows of moving shapes, against finite differences of images by Mitsuba's `path`.
+
+The images come from another integrator and from other seeds. `edge_cases.py` has the scenes. Finite differences of the
+default suite are on file (edge_values.json), because they take minutes. The long suite takes them again.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from agreement import Agreement, compare
+from conformance.edge_cases import CASES, RECORDED, SIZE, EdgeCase, recorded, split_box, standing
+from conformance.moving import Moving
+from conformance.test_kernels import Kernels
+from measure.faults import Fault, plant, planted
+from scipy.spatial.transform import Rotation
+
+from reslrb_cli import register
+from reslrb_cli.estimators import edges
+from reslrb_cli.estimators.base import Pass
+from reslrb_cli.integrators import reslrb
+from reslrb_cli.integrators.plugin import make_integrator
+from reslrb_cli.integrators.protocol import Job, StepIntegrator
+from reslrb_cli.integrators.step import StepResult, gradient_step
+from reslrb_cli.measure.gradients import integrator, relative, seeds
+from reslrb_cli.scene.edges import welded_edges
+from reslrb_cli.transport.edges import Chances, sample_outline, view_from_lamps, view_from_sensor
+from reslrb_cli.transport.samples import Samples
+
+pytestmark = pytest.mark.usefixtures("llvm")
+BY_NAME = {case.name: case for case in CASES}
+
+# ---- Against finite differences ----
+
+#: Largest standard error of a gradient and its reference, relative to the norm of the reference.
+RESOLUTION = 0.07
+
+
+def check(case: EdgeCase, reference: np.ndarray) -> Agreement:
+    """Return the comparison of a gradient with its reference, after a check that their noise is small enough."""
+    found = case.gradients()
+    noise = np.sqrt(sum(samples.var(0, ddof=1).sum() / len(samples) for samples in (found, reference)))
+    size = np.linalg.norm(reference.mean(0))
+    agreement = compare(found, reference, block=None)
+    print(f"{case.name}: {agreement}; standard error {noise / size:.1%} of the gradient")
+    assert noise < RESOLUTION * size, f"{case.name}: standard error {noise / size:.1%} of the gradient"
+    return agreement
+
+
+@pytest.mark.parametrize("case", RECORDED, ids=lambda case: case.name)
+def test_gradient(case: EdgeCase):
+    agreement = check(case, recorded(case))
+    assert agreement, agreement
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_gradient_with_new_differences(case: EdgeCase):
+    """The differences on file agree with new ones of the scenes as they are now."""
+    differences = case.differences(block=2)
+    agreement = check(case, differences)
+    assert agreement, agreement
+    if case in RECORDED:
+        on_file = compare(recorded(case), differences, block=None)
+        assert on_file, on_file
+
+
+FAULTS = [
+    Fault("cosine_for_sine", "standing-front-2", "transport.edges:sample_outline",
+          "dr.select(active, sine / (density * probability), 0)",
+          "dr.select(active, dr.safe_sqrt(1 - dr.square(sine)) / (density * probability), 0)"),
+    Fault("sides_exchanged", "sphere-point-2", "estimators.edges:_from_lamps",
+          "dr.select(over, beside.over, beside.past)", "dr.select(over, beside.past, beside.over)"),
+    Fault("edge_without_its_probability", "box-sphere_lamp-2", "transport.edges:sample_outline",
+          "sine / (density * probability)", "sine / density"),
+    Fault("every_edge_counts", "points", "transport.edges:sample_outline",
+          "(side * across_it > 0)", "mi.Bool(True)"),
+    Fault("creases_left_out", "box-sphere_lamp-2", "transport.edges:sample_outline", "if creases:", "if False:"),
+    Fault("contact_counted_twice", "standing-front-2", "estimators.edges:_from_sensor",
+          "beside.active & ~touches", "beside.active"),
+    Fault("point_behind_not_scaled", "two-area-3", "estimators.edges:_from_sensor",
+          "s * (slid * L.n_x + rest * n)", "(slid * L.n_x + rest * n)"),
+    Fault("point_behind_does_not_slide", "two-area-3", "estimators.edges:_from_sensor",
+          "slid * L.n_x + rest * n", "(slid + rest) * n"),
+    Fault("first_depth_between_surfaces", "depth", "estimators.edges:_between",
+          "found.segments + 1", "found.segments"),
+    Fault("solid_angle_of_a_lamp_left_out", "sphere-near-2", "transport.edges:_from",
+          "first.weight * solid", "first.weight"),
+]  # fmt: skip
+
+
+@planted(FAULTS)
+def test_fault(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+    plant(fault, monkeypatch)
+    if fault.check in EXACT:
+        with pytest.raises(AssertionError):
+            EXACT[fault.check](monkeypatch)
+        return
+    case = BY_NAME[fault.check]
+    agreement = compare(case.gradients(), recorded(case), block=None)
+    print(f"{fault.name}: {agreement}")
+    assert not agreement
+
+
+def check_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Assert that light past an edge between two surfaces has three segments at least."""
+
+    def between(p: Pass) -> None:
+        samples = edges._samples(p.samples, edges.OTHER_EDGES)
+        edges._between(Pass(samples, None, p.adjoint), samples.stream(edges.OTHER_EDGES))
+
+    monkeypatch.setattr(reslrb, "differentiate_edges", between)
+    for depth, has_any in ((2, False), (3, True)):
+        case = EdgeCase("box", "room", depth, spp=64)
+        on, off = (case.gradients(1, edges=value) for value in ("on", "off"))
+        assert (np.abs(on - off).max() > 0.01) == has_any
+
+
+def test_segments_between_surfaces_count(monkeypatch: pytest.MonkeyPatch):
+    check_depth(monkeypatch)
+
+
+#: Checks of faults that hardly change an expectation.
+EXACT: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
+    "depth": check_depth, "points": lambda monkeypatch: check_points("sensor", False),
+}  # fmt: skip
+
+
+# ---- Edges of a mesh ----
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+HALVES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def ends(found: np.ndarray) -> set[tuple[int, ...]]:
+    """Return the ends of edges, in ascending order."""
+    return {tuple(sorted(edge)) for edge in found[:, :2].tolist()}
+
+
+def test_a_box_of_split_vertices_has_18_edges():
+    """A box has 12 edges, and a diagonal on each of its six sides."""
+    points, faces = split_box((0.3, 0, 1), (0.5, 0.4, 0.3))
+    found = welded_edges(points, faces)
+    assert (len(points), found.shape) == (24, (18, 6))
+    a, b, c, d = (points[column] for column in found[:, :4].T)
+    first, second = (np.cross(b - a, corner - a) for corner in (c, d))
+    cos = np.sum(first * second, 1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1))
+    # The faces of a diagonal lie in one plane, on different sides of it.
+    assert np.sort(cos.round(6)).tolist() == [-1.0] * 6 + [0.0] * 12
+    assert np.sum(np.linalg.norm(b - a, axis=1)[np.abs(cos) < 0.5]) == pytest.approx(4 * (1.0 + 0.8 + 0.6))
+
+
+def test_an_open_sheet_has_edges_with_one_face():
+    found = welded_edges(SQUARE, HALVES)
+    single = found[:, 2] == found[:, 3]
+    assert ends(found[single]) == {(0, 1), (1, 2), (2, 3), (0, 3)}
+    assert ends(found[~single]) == {(0, 2)}
+    assert set(found[~single][0, 2:4].tolist()) == {1, 3}
+
+
+def test_an_edge_of_three_faces_has_a_row_for_each_pair():
+    points = np.concatenate([SQUARE, [[0.5, 0.5, 1]]])
+    found = welded_edges(points, np.concatenate([HALVES, [[0, 2, 4]]]))
+    shared = found[[tuple(sorted(edge)) == (0, 2) for edge in found[:, :2].tolist()]]
+    assert len(shared) == 2
+    assert set(shared[:, 2:4].ravel().tolist()) == {1, 3, 4}
+
+
+def test_a_mesh_without_faces_has_no_edges():
+    assert welded_edges(SQUARE, np.zeros((0, 3), int)).shape == (0, 6)
+
+
+@pytest.mark.parametrize("face", [(1, 1, 2), (1, 1, 1), (1, 4, 2)])
+def test_a_face_without_area_adds_no_edge_of_its_own(face: tuple[int, int, int]):
+    """Vertex 4 is at the place of vertex 1. The edge from 1 to 2 remains an edge of the sheet."""
+    points = np.concatenate([SQUARE, SQUARE[1:2]])
+    found = welded_edges(points, np.concatenate([HALVES, [face]]))
+    assert ends(found) == ends(welded_edges(SQUARE, HALVES))
+
+
+# ---- Points of outlines ----
+
+SMALL = standing("area", 2, spp=32)
+
+
+def tracer(**options: Any) -> StepIntegrator:
+    """Return `reslrb` with derivatives of edges."""
+    return integrator("reslrb", options.pop("max_depth", 2), estimator="stack", **{"edges": "on"} | options)
+
+
+def passes(moving: Moving, value: str, key: str) -> list[Samples]:
+    """Return the samples of a step that differentiates the parameter `key`."""
+    dr.enable_grad(moving.params[key])
+    moving.params.update()
+    job = Job(moving.loaded, moving.loaded.sensors()[0], dr.opaque(mi.UInt32, 1), 4, moving.params)
+    return tracer(edges=value).passes(job)
+
+
+def check_points(viewpoint: str, creases: bool) -> None:
+    """Assert that points lie on edges of a box, not on diagonals. Without creases, the viewpoint sees one face of the
+    edge, and the normal points away from the box.
+    """
+    moving, half, degrees = SMALL.moving(), np.array([0.3, 0.25, 0.3]), 23.0
+    part = passes(moving, "on", "shape.vertex_positions")[0]
+    numbers = mi.PCG32(1 << 12, initstate=3)
+    chances = Chances.spread(numbers, part.seed, dr.arange(mi.UInt32, 1 << 12), mi.UInt32(1 << 12))
+    assert part.edges is not None
+    view = {"lamp": view_from_lamps, "sensor": view_from_sensor}.get(viewpoint, lambda *_: None)(
+        part, chances.viewpoint
+    )
+    outline = sample_outline(part, getattr(part.edges, viewpoint), view, chances, creases)
+    active, back = np.array(outline.active), Rotation.from_euler("z", -degrees, degrees=True)
+    p, to_y, n = (back.apply(np.array(v).T[active]) for v in (outline.p, outline.view.to_y, outline.normal))
+    p -= back.apply([0.1, -0.1, 0.3])  # its centre
+    on = np.abs(np.abs(p) - half) < 1e-5
+    assert (on.sum(1) >= 2).all()
+    assert len(np.unique(np.sign(p) * on, axis=0)) > 3  # several edges
+    assert np.abs(np.sum(n * to_y, 1)).max() < 1e-4
+    if not creases:
+        facing = np.where(on, np.sign(p) * to_y, 0)
+        assert ((facing > 0).sum(1) == 1)[on.sum(1) == 2].all()
+        assert (np.sum(n * p, 1) > 0).all()
+
+
+@pytest.mark.parametrize(("viewpoint", "creases"), [("lamp", True), ("sensor", False), ("anywhere", False)])
+def test_sampled_points_lie_on_outlines(viewpoint: str, creases: bool):
+    check_points(viewpoint, creases)
+
+
+# ---- Plans and options ----
+
+
+@pytest.mark.parametrize(("value", "moves"), [("on", True), ("off", True), ("on", False)])
+def test_only_moving_shapes_have_edges(value: str, moves: bool):
+    parts = passes(SMALL.moving(), value, "shape.vertex_positions" if moves else "floor.bsdf.reflectance.value")
+    has = value == "on" and moves
+    assert [shape.id() for shape in parts[0].plan.edged] == (["shape"] if has else [])
+    assert all((part.edges is not None) == has for part in parts)
+
+
+def test_an_image_has_no_edges():
+    moving = SMALL.moving()
+    job = Job(moving.loaded, moving.loaded.sensors()[0], dr.opaque(mi.UInt32, 1), 4)
+    assert all(part.edges is None and not part.plan.edged for part in tracer().passes(job))
+
+
+def test_the_plugin_takes_the_option():
+    register()
+    chosen = mi.load_dict({"type": "reslrb", "estimator": "stack", "edges": "on"})
+    assert chosen.tracer.preparation.sampling.edges
+    assert not mi.load_dict({"type": "reslrb"}).tracer.preparation.sampling.edges
+
+
+@pytest.mark.parametrize("value", ["auto", "maybe", True])
+def test_other_values_are_refused_in_one_line(value: Any):
+    """Only a run decides what `auto` is."""
+    register()
+    with pytest.raises(ValueError, match=r'^"edges" must be one of off, on, not .*$'):
+        make_integrator("reslrb", edges=value)
+    with pytest.raises(RuntimeError, match='"edges" must be one of off, on, not'):
+        mi.load_dict({"type": "reslrb", "edges": value})
+
+
+# ---- Recordings, kernels, memory and passes ----
+
+
+def moved(step: int, **options: Any) -> tuple[list[np.ndarray], list[dict[str, int]]]:
+    """Return the gradients of `step` steps, and the counts of recordings after each. The shape moves between steps."""
+    moving, chosen = SMALL.moving(), tracer(**options)
+    found, counts = [], []
+    for number in range(step):
+        moving.start["shape.x"] = np.float64(0.05 * number)
+        found.append(np.concatenate([*moving.gradient(chosen, 5 + number, 16).values()]))
+        counts.append(chosen.preparation.recordings.counts())
+    return found, counts
+
+
+def test_recorded_steps_equal_plain_steps():
+    expected, none = moved(4, freeze=False)
+    gc.collect()
+    found, counts = moved(4, freeze=True)
+    for a, b in zip(found, expected, strict=True):
+        assert relative(a, b) < 1e-4
+    assert none[-1] == {}
+    assert counts[-1] == counts[-2] != {}
+
+
+@pytest.mark.parametrize("freeze", [False, True])
+def test_later_steps_compile_nothing(freeze: bool):
+    moving, chosen, kernels = SMALL.moving(), tracer(freeze=freeze), Kernels()
+    for seed in range(1, 6):
+        moving.start["shape.x"] = np.float64(0.01 * seed)
+        found = kernels.new(lambda: moving.gradient(chosen, seed, 16))  # noqa: B023
+        # A recording is made in the second step at the latest.
+        assert seed <= 1 + 2 * freeze or not found, f"step {seed} compiled {len(found)} kernels"
+
+
+SPP = 256
+
+
+def peak(max_depth: int) -> int:
+    """Return the peak memory of a second step, in bytes beyond the memory before the step."""
+    moving, chosen = EdgeCase("box", "room").moving(), tracer(max_depth=max_depth)
+    moving.gradient(chosen, 1, SPP)
+    gc.collect()
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    before = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+    moving.gradient(chosen, 2, SPP)
+    dr.sync_thread()
+    return dr.detail.malloc_watermark(dr.backend_v(mi.Float)) - before
+
+
+def test_memory_is_flat_in_depth():
+    peaks = {depth: peak(depth) for depth in (3, 24)}
+    print(peaks)
+    assert max(peaks.values()) < SPP * SIZE**2  # one byte per path
+    assert max(peaks.values()) <= 1.1 * min(peaks.values()), peaks
+
+
+def test_passes_agree_in_expectation():
+    moving = SMALL.moving()
+    one, several = (
+        np.array([np.concatenate([*moving.gradient(chosen, seed, 512).values()]) for seed in seeds(12, block)])
+        for block, chosen in enumerate((tracer(), tracer(samples_per_pass=128)))
+    )
+    agreement = compare(one, several, block=None)
+    assert agreement, agreement
+    assert agreement.relative_error < 0.07
+
+
+@pytest.mark.parametrize("adjoint", ["correlated", "independent", "batched"])
+def test_every_kind_of_step_contains_edges(adjoint: str):
+    """dL/dI of a linear objective is the same for all kinds of steps."""
+    moving = SMALL.moving()
+
+    def step(chosen: StepIntegrator, scene: mi.Scene, sensor: int, weights: mi.TensorXf, **given: Any) -> StepResult:
+        return gradient_step(chosen, scene, sensor, lambda image: dr.sum(image * weights, axis=None), adjoint=adjoint,
+                             **given)  # fmt: skip
+
+    known = np.array([np.concatenate([*moving.gradient(tracer(), seed, 256).values()]) for seed in seeds(8)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("conformance.moving.known_step", step)
+        found = np.array([np.concatenate([*moving.gradient(tracer(), seed, 256).values()]) for seed in seeds(8, 1)])
+    agreement = compare(found, known, block=None)
+    assert agreement, agreement
+    assert agreement.relative_error < 0.15
