@@ -96,6 +96,11 @@ def _samples(samples: Samples, stream: int) -> Samples:
     return replace(samples, plan=plan, seed=seed, spp=1, width=width, scale=scale, guide=None, net=None)
 
 
+def _from_camera(samples: Samples) -> Samples:
+    """Return the samples for camera paths."""
+    return replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
+
+
 def _chances(samples: Samples, numbers: mi.PCG32) -> Chances:
     """Return the random numbers of one outline per lane."""
     lane = dr.arange(mi.UInt32, samples.width)
@@ -143,10 +148,11 @@ def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside
     return Beside(over, past, pi, active)
 
 
-def _moved(beside: Beside, adjoint: mi.Vector3f, active: mi.Bool) -> mi.Float:
-    """Return <p, `adjoint`> with the derivative of the point p on the shape. p moves with its surface."""
-    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
-    si = beside.pi.compute_surface_interaction(beside.over, flags, active)
+def _moved(
+    pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, adjoint: mi.Vector3f, active: mi.Bool
+) -> mi.Float:  # fmt: skip
+    """Return <p, `adjoint`> with the derivative of the intersection p of `ray`. p moves with its surface."""
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     return dr.select(active, dr.dot(si.p, adjoint), 0)
 
 
@@ -205,7 +211,8 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     W = walk(samples, Contribution(p, on_smooth), beside.active, emission)[0] * p.scale
     weight = showing(W) * dr.select(over, 1, -1)
     with dr.resume_grad(), dr.isolate_grad():
-        dr.backward_from(_moved(beside, weight * outline.normal, beside.active & (weight != 0)), flags=_MAY_LACK)
+        adjoint, active = weight * outline.normal, beside.active & (weight != 0)
+        dr.backward_from(_moved(beside.pi, beside.over, adjoint, active), flags=_MAY_LACK)
 
 
 #: The result depends on no parameter if, for example, no lane is active.
@@ -269,7 +276,7 @@ class Behind(CameraHooks):
 def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines seen from the sensor."""
     samples = p.samples
-    samples = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
+    samples = _from_camera(samples)
     assert samples.edges is not None
     chances = _chances(samples, numbers)
     outline = sample_outline(samples, samples.edges.sensor, view_from_sensor(samples, chances.viewpoint), chances)
@@ -288,9 +295,7 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     moves = active & x.is_valid()
     at_x = dr.select(moves, s * (slid * L.n_x + rest * n), 0)  # s is NaN if the ray leaves the scene
     with dr.resume_grad(), dr.isolate_grad():
-        moved = _moved(beside, -still * n, active)
-        si = x.compute_surface_interaction(beside.past, mi.RayFlags.All | mi.RayFlags.FollowShape, moves)
-        moved += dr.select(moves, dr.dot(si.p, at_x), 0)
+        moved = _moved(beside.pi, beside.over, -still * n, active) + _moved(x, beside.past, at_x, moves)
         dr.backward_from(moved, flags=_MAY_LACK)
 
 
@@ -369,8 +374,9 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     beside = _beside(samples, outline)
     x = scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
     active = beside.active & x.is_valid()
-    camera = replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
-    _, found = camera_walk(camera, PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1)))
+    _, found = camera_walk(
+        _from_camera(samples), PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
+    )
     total = showing(found.total)
     weight = outline.weight * found.L * total
     emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
@@ -378,13 +384,10 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     W = showing(W)
     active = active & (W != 0)
     s = y.t / (y.t + x.t - AROUND * offset)
-    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
     slope = dr.select(found.direct != 0, dr.dot(n, found.towards) / dr.dot(found.n_y, found.towards), 0)
     at_y = dr.select(active, (W * (1 - s)) * dr.select(found.direct != 0, slope * found.n_y, n), 0)
     at_x = dr.select(active, (W * s) * n, 0)
     with dr.resume_grad(), dr.isolate_grad():
-        moved = _moved(beside, -W * n, active)
-        for point, ray, adjoint in ((x, beside.past, at_x), (y, back, at_y)):
-            si = point.compute_surface_interaction(ray, flags, active)
-            moved += dr.select(active, dr.dot(si.p, adjoint), 0)
+        moved = _moved(beside.pi, beside.over, -W * n, active)
+        moved += _moved(x, beside.past, at_x, active) + _moved(y, back, at_y, active)
         dr.backward_from(moved, flags=_MAY_LACK)

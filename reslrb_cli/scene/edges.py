@@ -33,7 +33,7 @@ WELD = 1e-6
 class EdgeTable:
     """Current edges of moving shapes, one per row. A recording takes the arrays as inputs.
 
-    - `kind` is one of the kinds in `edges.py`.
+    - `kind` is `SEGMENT`, `SPHERE` or `TUBE`.
     - `a` and `b` are the ends of a segment, or of a cylinder's axis. For a sphere, `a` is the centre.
     - `c` and `d` are the third corners of the two faces at a segment. They are equal if the segment has one face.
     - `radius` is the radius of a sphere or a cylinder, otherwise 0.
@@ -97,8 +97,9 @@ class _Curves:
 
 
 def has_edges(shape: mi.Shape) -> bool:
-    """True if this module knows the edges of this kind of shape."""
-    return shape.is_mesh() or shape.class_name() in ("Rectangle", "Disk", "Sphere", "Cylinder")
+    """True if this module knows the edges of this kind of shape. The edges of lamps are left out."""
+    known = shape.is_mesh() or shape.class_name() in ("Rectangle", "Disk", "Sphere", "Cylinder")
+    return known and not shape.is_emitter()
 
 
 def edge_kinds(shapes: Iterable[mi.Shape]) -> frozenset[int]:
