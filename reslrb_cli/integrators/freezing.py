@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
+from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.samples import Samples
 
@@ -46,10 +47,7 @@ class Recordings:
 
     def __init__(self) -> None:
         self._functions: dict[Any, Any] = {}  # None if a call is not recorded, or would gain nothing
-
-    def clear(self) -> None:
-        """Clear all recordings, for a new scene."""
-        self._functions.clear()
+        self._recordable: bool | None = None  # None before the first call
 
     def call(self, kind: str, samples: Samples, function: Callable[..., Any], *inputs: Any) -> Any:
         """Call `function(samples, *inputs)`. Uses a recording if there is one. Its results are evaluated.
@@ -70,7 +68,9 @@ class Recordings:
         s.sensor.sampler().seed(0, 1)
         plain = _on_samples(samples, function)
         common = (s.scene, s.sensor, *(_arrays(side) for side in s.sides()))
-        if key not in self._functions and len(self._functions) < MOST_CALLS:
+        if self._recordable is None:
+            self._recordable = not has_software_textures(s.scene)
+        if self._recordable and key not in self._functions and len(self._functions) < MOST_CALLS:
             self._functions[key] = _record(kind, plain, common, inputs)
         recorded = self._functions.get(key)
         if recorded is not None and recorded.n_recordings >= MOST_RECORDINGS:
@@ -127,6 +127,25 @@ def _record(
         logger.debug("not recorded (%s): %s", kind, error.__cause__ or error)
         return None
     return recorded
+
+
+def has_software_textures(scene: mi.Scene) -> bool:
+    """True if a bitmap texture of the scene does not use CUDA's texture units, because it has `accel: false`.
+
+    Dr.Jit 1.5 cannot record a call with a texture like that. It reads uninitialised memory when it collects the inputs
+    (`Texture.traverse_1_cb_ro`), and may end the process.
+    """
+    if not mi.variant().startswith("cuda"):
+        return False
+    with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for texture in SceneGraph.of(scene).of_type(mi.Texture):
+            if texture.class_name().startswith("BitmapTexture"):
+                dr.kernel_history_clear()
+                dr.eval(texture.eval(dr.zeros(mi.SurfaceInteraction3f)))
+                kernels = [kernel["ir"].getvalue() for kernel in dr.kernel_history([dr.KernelType.JIT])]
+                if not any("tex.2d" in code for code in kernels):
+                    return True
+    return False
 
 
 @contextmanager

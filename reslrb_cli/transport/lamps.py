@@ -36,7 +36,7 @@ def lamp_ray(
     black texels of a lamp's texture are sampled, too.
     """
     si, weight = lamp_point(lamp, areas, time, position, active, evened)
-    # For all lanes: with CUDA, Dr.Jit 1.5 ends the process if it records a masked texture lookup outside of a call.
+    # For all lanes, because `environment_ray`'s remark on masked lookups holds here, too.
     _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, True)
     if lamp.parallel:
         d = mi.Vector3f(si.sh_frame.n)  # for a mesh the interpolated normal, as in Mitsuba
@@ -150,7 +150,10 @@ def environment_ray(
     if plan.differentiate_emission:
         ds, weight = _any_direction(environment, reference, direction)
     else:
-        ds, weight = environment.sample_direction(reference, direction, True)
+        # `sample_direction` also returns the weight, but from a masked texture lookup. With CUDA, Dr.Jit 1.5 ends the
+        # process if it records a masked lookup outside of a call.
+        ds, _ = environment.sample_direction(reference, direction, True)
+        weight = dr.select(ds.pdf > 0, environment.eval_direction(reference, ds, True) / ds.pdf, 0)
     d = -dr.detach(ds.d)
     offset = mi.warp.square_to_uniform_disk_concentric(disk)
     perpendicular = mi.Frame3f(d).to_world(mi.Vector3f(offset.x, offset.y, 0))

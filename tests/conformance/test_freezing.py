@@ -8,8 +8,10 @@ import gc
 from collections.abc import Callable
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
+from conformance import gradient_cases
 from conformance.gradient_cases import CASES, GradientCase
 from turns import a_few, taking_turns
 
@@ -63,6 +65,31 @@ def test_a_recorded_step_equals_the_step(case: GradientCase, estimator: str) -> 
     assert none[-1] == {}
     assert set(counts[-1]) == KINDS[adjoint]
     assert counts[-1] == counts[-2]
+
+
+def _software_texture() -> dict:
+    """Return a scene whose floor has a bitmap texture that does not use CUDA's texture units."""
+    return gradient_cases.floor({"type": "diffuse", "reflectance": gradient_cases.texture(4, 4, 0.2, 0.8, 1, 3) | {"accel": False}})
+
+
+#: Scenes with which a recording ended the process with CUDA: an environment map without derivatives, and a texture
+#: without a hardware texture.
+TEXTURES = {
+    "sky": GradientCase("sky", BY_NAME["envmap"].scene, ("floor.brdf_0.reflectance.value",), "prb"),
+    "software": GradientCase("software", _software_texture, ("floor.reflectance.data",), "prb"),
+}
+
+
+@pytest.mark.parametrize("paths", ["light", "both"])
+@pytest.mark.parametrize("name", TEXTURES)
+def test_recordings_of_scenes_with_textures(name: str, paths: str) -> None:
+    case = TEXTURES[name]
+    expected, _ = gradients(case, "batched", freeze=False, paths=paths)
+    gc.collect()
+    found, counts = gradients(case, "batched", freeze=True, paths=paths)
+    for a, b in zip(found, expected, strict=True):
+        assert relative(a, b) < 1e-4
+    assert ("fused" in counts[-1]) == (name != "software" or not mi.variant().startswith("cuda"))
 
 
 @pytest.mark.long
