@@ -69,7 +69,8 @@ def test_a_recorded_step_equals_the_step(case: GradientCase, estimator: str) -> 
 
 def _software_texture() -> dict:
     """Return a scene whose floor has a bitmap texture that does not use CUDA's texture units."""
-    return gradient_cases.floor({"type": "diffuse", "reflectance": gradient_cases.texture(4, 4, 0.2, 0.8, 1, 3) | {"accel": False}})
+    texture = gradient_cases.texture(4, 4, 0.2, 0.8, 1, 3)
+    return gradient_cases.floor({"type": "diffuse", "reflectance": texture | {"accel": False}})
 
 
 #: Scenes with which a recording ended the process with CUDA: an environment map without derivatives, and a texture
