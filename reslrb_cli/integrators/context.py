@@ -211,12 +211,14 @@ class Preparation:
         if moves:
             edged, motion = (), self._motion
             if self.sampling.edges:
-                edged = tuple(shape for shape in which.shapes if has_edges(shape))
+                edged = tuple(shape for shape in which.shapes if has_edges(shape) and not shape.is_emitter())
             if edged and motion.sampling == "auto":
                 motion = replace(motion, sampling="stay")  # as in the terms of the edges
             if edged and not about.near:  # once, because another number would recompile kernels
                 about.near = NEAR * min(float(dr.norm(shape.bbox().extents())) for shape in edged)
-            plan = replace(attach(plan, which, motion, scene, sensor), edged=edged, near=about.near)
+            occluders = self.edges(edged, scene).occluders if edged else ()
+            plan = attach(plan, which, motion, scene, sensor)
+            plan = replace(plan, edged=edged, occluders=occluders, near=about.near)
         if plan.stays and self._motion.sampling == "auto" and not plan.edged:
             if sensor not in about.stays:  # once, because another answer would recompile kernels
                 about.stays[sensor] = bounces(plan, scene, sensor)
@@ -248,12 +250,12 @@ class Preparation:
         nodes += [list(which.emission_nodes)] if plan.differentiate_emission else []
         return [sum(which.entries[node] for node in each) for each in nodes]
 
-    def edges(self, plan: Plan) -> EdgeSet:
-        """Return the edges of the plan's moving shapes."""
+    def edges(self, moving: tuple[mi.Shape, ...], scene: mi.Scene) -> EdgeSet:
+        """Return the edges of the moving shapes, and of shapes that can hide them."""
         made = self._found.edges
-        if plan.edged not in made:
-            made[plan.edged] = EdgeSet(plan.edged)
-        return made[plan.edged]
+        if moving not in made:
+            made[moving] = EdgeSet(moving, scene)
+        return made[moving]
 
     def emitters(self, plan: Plan, scene: mi.Scene) -> EmitterDensities:
         """Return the current densities of the scene's emitters, for a plan of the scene."""

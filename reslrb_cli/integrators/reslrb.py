@@ -147,7 +147,7 @@ class LightTracer(StepIntegrator):
         parts = passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
         if not plan.edged or purpose is Purpose.IMAGE:
             return parts
-        edges = weigh_edges(parts[0], self.preparation.edges(plan).now())
+        edges = weigh_edges(parts[0], self.preparation.edges(plan.edged, job.scene).now())
         return [replace(part, edges=edges) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:

@@ -1,6 +1,7 @@
 """Edges of shapes: curves where a shape can start or stop to block a ray.
 
-A table of edges (`EdgeTable`) has one row per edge, of three kinds.
+A table of edges (`EdgeTable`) has one row per edge. The edges of moving shapes come first. The edges of shapes that do
+not move follow, because these shapes can hide a moving surface. A row has one of three kinds.
 
 - `SEGMENT`: an edge of a mesh or of a rectangle, or a chord of the rim of a disk or a cylinder.
 - `SPHERE`: a sphere. Its outline is the circle where rays from a viewpoint touch it.
@@ -27,11 +28,34 @@ SEGMENT, SPHERE, TUBE = range(3)
 CHORDS = 512
 #: Vertices count as one vertex if their distance, divided by the size of the mesh, is below this value.
 WELD = 1e-6
+#: Number of random rays that test whether light passes an edge, and maximum number of edges that are tested.
+PROBES, MOST_PROBED = 64, 2**15
+#: Distance of these rays from the edge, relative to the coordinates, and the length below which a ray hits something
+#: soon, in units of this distance.
+BESIDE, SOON = 3e-6, 300.0
+#: Faces are parallel if the angle between their normals, divided by pi, is below this value.
+FLAT = 1e-4
+#: Maximum number of balls around moving shapes. More shapes share one ball.
+MOST_BALLS = 8
+
+
+@dataclass
+class Ball:
+    """A ball that contains a moving shape. Both members have one entry."""
+
+    center: mi.Point3f
+    radius: mi.Float
+
+    @staticmethod
+    def around(points: mi.Point3f, radius: mi.Float) -> Ball:
+        """Return a ball around balls of the given radii at `points`."""
+        center = mi.Point3f(*(0.5 * (dr.min(axis) + dr.max(axis)) for axis in points))
+        return Ball(center, 1.01 * dr.max(dr.norm(points - center) + radius))
 
 
 @dataclass
 class EdgeTable:
-    """Current edges of moving shapes, one per row. A recording takes the arrays as inputs.
+    """Current edges, one per row. A recording takes the arrays as inputs.
 
     - `kind` is `SEGMENT`, `SPHERE` or `TUBE`.
     - `a` and `b` are the ends of a segment, or of a cylinder's axis. For a sphere, `a` is the centre.
@@ -40,8 +64,11 @@ class EdgeTable:
     - `shape` is the index of the shape's pointer.
     - `crease` is the angle between the normals of the two faces, divided by pi. It is 0 if the edge has only one face,
         or if the shape interpolates its normals across the edge.
+    - `moves` is true if the shape moves.
     - `lamp`, `sensor` and `anywhere` are cumulative sampling weights: for outlines and creases seen from lamps, and for
         outlines seen from the sensor and from all directions.
+
+    `balls` contain the moving shapes.
     """
 
     kind: mi.UInt32
@@ -52,9 +79,35 @@ class EdgeTable:
     radius: mi.Float
     shape: mi.UInt32
     crease: mi.Float
+    moves: mi.Bool
     lamp: mi.Float
     sensor: mi.Float
     anywhere: mi.Float
+    balls: list[Ball]
+
+
+@dataclass
+class _Rows:
+    """Rows of a table, without sampling weights."""
+
+    kind: mi.UInt32
+    a: mi.Point3f
+    b: mi.Point3f
+    c: mi.Point3f
+    d: mi.Point3f
+    radius: mi.Float
+    shape: mi.UInt32
+    crease: mi.Float
+
+
+def _number(shape: mi.Shape) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
+def _rows(shape: mi.Shape, corners: list[mi.Point3f], kind: int = SEGMENT, radius: Any = 0, crease: Any = 0) -> _Rows:
+    n, wide = dr.width(corners[0]), dr.zeros(mi.Float, dr.width(corners[0]))
+    shapes = dr.full(mi.UInt32, _number(shape), n)
+    return _Rows(dr.full(mi.UInt32, kind, n), *corners, wide + radius, shapes, wide + crease)
 
 
 @dataclass
@@ -64,16 +117,17 @@ class _Mesh:
     shape: mi.Shape
     corners: list[mi.UInt32]
 
-    def rows(self) -> list[mi.Point3f]:
-        """Return the current a, b, c and d of all edges."""
+    def rows(self) -> _Rows:
+        """Return the current rows."""
         positions = dr.detach(self.shape.vertex_positions_buffer())
-        return [dr.gather(mi.Point3f, positions, index) for index in self.corners[:4]]
+        corners = [dr.gather(mi.Point3f, positions, index) for index in self.corners[:4]]
+        return _rows(self.shape, corners, crease=self.creases(corners))
 
-    def creases(self, rows: list[mi.Point3f]) -> mi.Float:
+    def creases(self, corners: list[mi.Point3f]) -> mi.Float:
         """Return the angle between the normals of the two faces at each edge, divided by pi. If normals are
         interpolated, it is the angle between the shading normals.
         """
-        a, b, c, d = rows
+        a, b, c, d = corners
         angle = dr.pi - turned(b - a, c - a, d - a)
         if interpolates_normals(self.shape):
             buffer = dr.detach(self.shape.vertex_normals_buffer())
@@ -90,16 +144,106 @@ class _Curves:
     shape: mi.Shape
     corners: list[mi.Point3f]
 
-    def rows(self) -> list[mi.Point3f]:
-        """Return the current a, b, c and d of all edges."""
+    def rows(self) -> _Rows:
+        """Return the current rows."""
         to_world = dr.detach(mi.traverse(self.shape)["to_world"])
-        return [to_world @ corner for corner in self.corners]
+        return _rows(self.shape, [to_world @ corner for corner in self.corners])
+
+
+@dataclass
+class _Round:
+    """The outline of a sphere, or of the side of a cylinder."""
+
+    shape: mi.Shape
+    kind: int
+
+    def rows(self) -> _Rows:
+        """Return the current row."""
+        to_world = dr.detach(mi.traverse(self.shape)["to_world"])
+        a, b = to_world @ mi.Point3f(0), to_world @ mi.Point3f(0, 0, 1)
+        return _rows(self.shape, [a, b, a, a], self.kind, dr.norm(to_world @ mi.Vector3f(1, 0, 0)))
+
+
+def _edges_of(shape: mi.Shape) -> list[_Mesh | _Curves | _Round]:
+    """Return the edges of a shape that `has_edges`."""
+    name = shape.class_name()
+    if name == "Sphere":
+        return [_Round(shape, SPHERE)]
+    if name == "Cylinder":
+        return [_Round(shape, TUBE), *(_Curves(shape, _rim(z, 1.0, 0.5)) for z in (0.0, 1.0))]
+    if name == "Disk":
+        return [_Curves(shape, _rim(0.0, 0.0, 0.0))]
+    if name == "Rectangle":
+        return [_Curves(shape, _frame())]
+    positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    edges = welded_edges(positions, np.array(shape.faces_buffer()).reshape(-1, 3))
+    return [_Mesh(shape, [own_memory(mi.UInt32, np.ascontiguousarray(column)) for column in edges.T])]
+
+
+def _joined(parts: list[_Rows]) -> _Rows:
+    def joined(name: str) -> Any:
+        columns = [getattr(part, name) for part in parts]
+        if name in "abcd":
+            return mi.Point3f(*(dr.concat([column[axis] for column in columns]) for axis in range(3)))
+        return dr.concat(columns)
+
+    return _Rows(**{name: joined(name) for name in vars(parts[0])})
+
+
+def _ball(parts: list[_Rows]) -> Ball:
+    rows = _joined(parts)
+    a, b = rows.a, dr.select(rows.kind == SPHERE, rows.a, rows.b)
+    points = mi.Point3f(*(dr.concat([a[axis], b[axis]]) for axis in range(3)))
+    return Ball.around(points, dr.concat([rows.radius, rows.radius]))
+
+
+def _open_rows(rows: _Rows, scene: mi.Scene) -> mi.UInt32:
+    """Return the numbers of the rows that can hide a surface from another surface or from a sensor.
+
+    At a corner of a room, for example, all rays beside the edge of a wall soon hit the other wall. Rays in `PROBES`
+    random directions decide. Edges of parallel faces never hide anything.
+    """
+    n = dr.width(rows.a)
+    a, b, c, d = rows.a, rows.b, rows.c, rows.d
+    open_ = (rows.kind != SEGMENT) | (n > MOST_PROBED)
+    if n <= MOST_PROBED:
+        lane = dr.arange(mi.UInt32, n * PROBES)
+        row = lane // PROBES
+        a, b, c, d = (dr.gather(mi.Point3f, corner, row) for corner in (a, b, c, d))
+        numbers = mi.PCG32(dr.width(lane))
+        p = dr.lerp(a, b, numbers.next_float32())
+        along = dr.normalize(b - a)
+        to_y, _ = outline_direction(along, c - p, d - p, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
+        passes = _passes(scene, p, along, c - p, to_y, None)
+        for sensor in scene.sensors():
+            here = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
+            here.p = p
+            ds, _ = sensor.sample_direction(here, mi.Point2f(0.5))
+            raw = dr.cross(along, ds.d)
+            seen = (ds.pdf > 0) & (dr.dot(raw, c - p) * dr.dot(raw, d - p) > 0)
+            passes |= seen & _passes(scene, p, along, c - p, ds.d, ds.dist)
+        open_ |= dr.block_reduce(dr.ReduceOp.Max, dr.select(passes, mi.UInt32(1), 0), PROBES) != 0
+    parallel = turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a) > dr.pi * (1 - FLAT)
+    return dr.compress(open_ & ((rows.kind != SEGMENT) | ~parallel))
+
+
+def _passes(
+    scene: mi.Scene, p: mi.Point3f, along: mi.Vector3f, corner: mi.Vector3f, to_y: mi.Vector3f, distance: Any
+) -> mi.Bool:  # fmt: skip
+    """True if a ray beside the point `p` of an edge passes. It must hit surfaces on both sides, or reach a sensor at
+    `distance` on one side.
+    """
+    raw = dr.cross(along, -to_y)
+    offset = BESIDE * (1 + dr.max(dr.abs(p)))
+    start = p - dr.mulsign(raw, dr.dot(raw, corner)) * (offset / dr.norm(raw))
+    ahead, back = (scene.ray_intersect_preliminary(mi.Ray3f(start, way), False, mi.Bool(True)) for way in (to_y, -to_y))
+    reaches = ahead.is_valid() & (ahead.t > SOON * offset) if distance is None else ahead.t > 0.999 * distance
+    return reaches & back.is_valid() & (back.t > SOON * offset)
 
 
 def has_edges(shape: mi.Shape) -> bool:
-    """True if this module knows the edges of this kind of shape. The edges of lamps are left out."""
-    known = shape.is_mesh() or shape.class_name() in ("Rectangle", "Disk", "Sphere", "Cylinder")
-    return known and not shape.is_emitter()
+    """True if this module knows the edges of this kind of shape."""
+    return shape.is_mesh() or shape.class_name() in ("Rectangle", "Disk", "Sphere", "Cylinder")
 
 
 def edge_kinds(shapes: Iterable[mi.Shape]) -> frozenset[int]:
@@ -109,61 +253,44 @@ def edge_kinds(shapes: Iterable[mi.Shape]) -> frozenset[int]:
 
 
 class EdgeSet:
-    """Edges of the given shapes of a scene. Shapes without known edges are ignored.
+    """Edges of `moving` shapes, and of the scene's other shapes if they can hide a moving shape (`occluders`).
 
-    The topology of meshes is read once. `now` returns a table of the current places.
+    The topology of meshes and the edges of occluders are read once. `now` returns a table of the current places.
     """
 
-    def __init__(self, shapes: Iterable[mi.Shape]) -> None:
-        self._parts: list[_Mesh | _Curves] = []
-        self._round: list[tuple[int, mi.Shape]] = []
-        for shape in shapes:
-            name = shape.class_name()
-            if name == "Sphere":
-                self._round.append((SPHERE, shape))
-            elif name == "Cylinder":
-                self._round.append((TUBE, shape))
-                self._parts += [_Curves(shape, _rim(z, 1.0, 0.5)) for z in (0.0, 1.0)]
-            elif name == "Disk":
-                self._parts.append(_Curves(shape, _rim(0.0, 0.0, 0.0)))
-            elif name == "Rectangle":
-                self._parts.append(_Curves(shape, _frame()))
-            elif shape.is_mesh():
-                positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-                edges = welded_edges(positions, np.array(shape.faces_buffer()).reshape(-1, 3))
-                self._parts.append(_Mesh(shape, [own_memory(mi.UInt32, np.ascontiguousarray(e)) for e in edges.T]))
+    def __init__(self, moving: Iterable[mi.Shape], scene: mi.Scene) -> None:
+        self._moving = [_edges_of(shape) for shape in moving]
+        still = [shape for shape in scene.shapes() if shape not in moving and has_edges(shape)]
+        self._still: list[_Rows] = []
+        self.occluders: tuple[mi.Shape, ...] = ()
+        if not still:
+            return
+        with dr.suspend_grad():
+            rows = _joined([part.rows() for shape in still for part in _edges_of(shape)])
+            kept = _open_rows(rows, scene)
+            if dr.width(kept) > 0:
+                rows = dr.gather(_Rows, rows, kept)
+                dr.make_opaque(rows)
+                self._still = [rows]
+                present = set(np.array(rows.shape).tolist())
+                self.occluders = tuple(shape for shape in still if _number(shape) in present)
 
     def now(self) -> EdgeTable:
         """Return the current edges. All their sampling weights are lengths, and not cumulative."""
         with dr.suspend_grad():
-            corners: list[list[mi.Point3f]] = []
-            kinds, radii, shapes, creases = [], [], [], []
-            for part in self._parts:
-                rows = part.rows()
-                n = dr.width(rows[0])
-                corners.append(rows)
-                creases.append(part.creases(rows) if isinstance(part, _Mesh) else dr.zeros(mi.Float, n))
-                kinds.append(dr.full(mi.UInt32, SEGMENT, n))
-                radii.append(dr.zeros(mi.Float, n))
-                shapes.append(dr.full(mi.UInt32, _index(part.shape), n))
-            for kind, shape in self._round:
-                to_world = dr.detach(mi.traverse(shape)["to_world"])
-                a, b = to_world @ mi.Point3f(0), to_world @ mi.Point3f(0, 0, 1)
-                corners.append([a, b, a, a])
-                creases.append(mi.Float(0))
-                kinds.append(dr.full(mi.UInt32, kind, 1))
-                radii.append(dr.norm(to_world @ mi.Vector3f(1, 0, 0)))
-                shapes.append(dr.full(mi.UInt32, _index(shape), 1))
-            a, b, c, d = (mi.Point3f(*(dr.concat([p[axis] for p in points]) for axis in range(3)))
-                          for points in zip(*corners, strict=True))  # fmt: skip
-            kind, radius = dr.concat(kinds), dr.concat(radii)
-            length = dr.select(kind == SPHERE, dr.two_pi * radius, 2 * dr.norm(b - a))
-            length = dr.select(kind == SEGMENT, dr.norm(b - a), length)
-            return EdgeTable(kind, a, b, c, d, radius, dr.concat(shapes), dr.concat(creases), length, length, length)
-
-
-def _index(shape: mi.Shape) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+            moving = [[part.rows() for part in parts] for parts in self._moving]
+            balls = [_ball(rows) for rows in moving]
+            if len(balls) > MOST_BALLS:
+                centers = mi.Point3f(*(dr.concat([ball.center[axis] for ball in balls]) for axis in range(3)))
+                balls = [Ball.around(centers, dr.concat([ball.radius for ball in balls]))]
+            parts = [rows for each in moving for rows in each]
+            moves = [dr.full(mi.Bool, True, dr.width(rows.a)) for rows in parts]
+            moves += [dr.full(mi.Bool, False, dr.width(rows.a)) for rows in self._still]
+            rows = _joined(parts + self._still)
+            length = dr.select(rows.kind == SPHERE, dr.two_pi * rows.radius, 2 * dr.norm(rows.b - rows.a))
+            length = dr.select(rows.kind == SEGMENT, dr.norm(rows.b - rows.a), length)
+            return EdgeTable(**vars(rows), moves=dr.concat(moves), lamp=length, sensor=length, anywhere=length,
+                             balls=balls)  # fmt: skip
 
 
 def across(along: mi.Vector3f, corner: mi.Vector3f) -> mi.Vector3f:
@@ -179,6 +306,24 @@ def turned(along: mi.Vector3f, c: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
 def angle_between(first: mi.Vector3f, second: mi.Vector3f) -> mi.Float:
     """Return the angle between unit vectors."""
     return 2 * dr.atan2(dr.norm(first - second), dr.norm(first + second))
+
+
+def outline_direction(
+    along: mi.Vector3f, c: mi.Vector3f, d: mi.Vector3f, numbers: mi.Point2f
+) -> tuple[mi.Vector3f, mi.Float]:  # fmt: skip
+    """Return a random direction that sees a point of a segment as an outline, and its density per solid angle.
+
+    `along` is the direction of the segment. `c` and `d` lead from the point to the third corners of the two faces.
+    """
+    angle, x = turned(along, c, d), across(along, c)
+    y = dr.cross(along, x)
+    y = dr.mulsign(y, dr.dot(y, d))  # the second face is on this side
+    rest = dr.pi - angle
+    turn = 2 * rest * numbers.y
+    turn += dr.select(turn < rest, angle, 2 * angle)
+    cos = 2 * numbers.x - 1
+    sin, (s, t) = dr.safe_sqrt(1 - dr.square(cos)), dr.sincos(turn)
+    return along * cos + sin * (x * t + y * s), dr.rcp(4 * rest)
 
 
 def welded_edges(positions: Array, faces: Array) -> Array:

@@ -14,15 +14,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.edges import SEGMENT, SPHERE, TUBE, EdgeTable, across, edge_kinds, turned
+from reslrb_cli.scene.edges import FLAT, SEGMENT, SPHERE, TUBE, Ball, EdgeTable, edge_kinds, outline_direction, turned
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect
 from reslrb_cli.transport.samples import Samples
 
 #: Sampling weight of an edge that no probe sees as an outline, relative to an outline of the same length.
 UNLIKELY = 0.02
-#: An edge is a crease if the angle between the normals of its faces, divided by pi, exceeds this value.
-FLAT = 1e-4
 #: Number of points on the lamps that probe whether an edge is an outline.
 PROBES = 4
 #: Stream of random numbers, mixed into the seed.
@@ -130,10 +128,11 @@ def sample_outline(
     """Return a random point on an outline for each lane. `weights` are cumulative sampling weights of the edges.
 
     If `view` is None, each outline is seen from a random direction. If `creases` is true, points may also lie on
-    creases, where `normal` points away from the first face of the edge. Code for spheres and cylinders is compiled only
-    if the moving shapes contain any.
+    creases, where `normal` points away from the first face of the edge, and only edges of moving shapes are sampled.
+    Code for spheres and cylinders is compiled only if there are any.
     """
-    table, kinds = samples.edges, edge_kinds(samples.plan.edged)
+    plan = samples.plan
+    table, kinds = samples.edges, edge_kinds(plan.edged if creases else plan.edged + plan.occluders)
     assert table is not None
     row_number, place = chances.edge, chances.place
     rows = dr.width(weights)
@@ -153,7 +152,10 @@ def sample_outline(
     if SPHERE in kinds or TUBE in kinds:
         is_round = kind != SEGMENT
         p = dr.select(kind == SPHERE, a, dr.select(kind == TUBE, dr.lerp(a, b, 0.5), p))
-    view = _view_from_anywhere(table, kinds, row, kind, along, p, chances) if view is None else view
+    if view is None:
+        view = _view_from_anywhere(table, kinds, row, kind, along, p, chances)
+        if plan.occluders:
+            view = _towards_balls(table.balls, view, dr.gather(mi.Bool, table.moves, row), chances)
     seen = view(p, active)
     normal = mi.Vector3f(0)
     if SPHERE in kinds or TUBE in kinds:
@@ -235,19 +237,48 @@ def weigh_edges(samples: Samples, table: EdgeTable) -> EdgeTable:
     """Return the edges with cumulative sampling weights for the lamps and the sensor of `samples`.
 
     A weight is the length of the edge, times a factor. The factor favours edges that probes see as outlines. For all
-    directions, it is the solid angle of the directions that see the edge as an outline.
+    directions, it is the solid angle of the directions that see the edge as an outline. The edge of a shape that does
+    not move must have a moving shape behind it. Lamps that do not move see no changes at its edges.
     """
     with dr.suspend_grad():
         free = 4 * (dr.pi - turned(table.b - table.a, table.c - table.a, table.d - table.a))
         free = dr.select(table.kind == SEGMENT, free, 4 * dr.pi)
+        lamp, sensor = _seen_from_lamps(samples, table), _seen_from_sensor(samples, table)
+        if samples.plan.occluders:
+            middle = dr.lerp(table.a, table.b, dr.select(table.kind == SPHERE, 0, 0.5))
+            towards = sum(4 * dr.pi * (1 - _cosine(ball, middle)) for ball in table.balls)
+            free = dr.select(table.moves, free, dr.minimum(towards, 4 * dr.pi))
+            lamp = dr.select(table.moves, lamp, 0)
+            sensor *= dr.select(table.moves | _hides_ball(samples, table, middle), 1, 0)
         table = replace(
             table,
-            lamp=dr.cumsum(table.lamp * _seen_from_lamps(samples, table)),
-            sensor=dr.cumsum(table.sensor * _seen_from_sensor(samples, table)),
+            lamp=dr.cumsum(table.lamp * lamp),
+            sensor=dr.cumsum(table.sensor * sensor),
             anywhere=dr.cumsum(dr.select(dr.isfinite(free), table.anywhere * free, 0)),
         )
         dr.make_opaque(table)
         return table
+
+
+def _cosine(ball: Ball, p: mi.Point3f) -> mi.Float:
+    """Return the cosine of half the opening angle of the cone that contains the ball, seen from `p`. It is -1 inside
+    of the ball.
+    """
+    ratio = dr.square(ball.radius) / dr.squared_norm(ball.center - p)
+    return dr.select(ratio < 1, dr.sqrt(1 - ratio), -1)
+
+
+def _hides_ball(samples: Samples, table: EdgeTable, middle: mi.Point3f) -> mi.Bool:
+    """True if the sensor may see a ball behind the edge. Edges of the same size as their distance are never left out."""
+    view = view_from_sensor(samples, mi.Point2f(0.5))(middle, mi.Bool(True))
+    d, reach = -view.to_y, 0.5 * dr.norm(table.b - table.a) + table.radius
+    found = mi.Bool(samples.plan.needs.thin_lens) | (reach > 0.5 * view.distance)
+    for ball in table.balls:
+        behind = dr.dot(ball.center - middle, d)
+        beside = dr.norm(ball.center - middle - d * behind)
+        spread = 1 + 2 * dr.maximum(behind + ball.radius, 0) / view.distance
+        found |= (behind > -ball.radius - reach) & (beside < ball.radius + reach * spread)
+    return found
 
 
 def _view_from_anywhere(
@@ -257,26 +288,45 @@ def _view_from_anywhere(
     """Return the view of an edge from a random direction, uniform in solid angle. For a segment, the directions are
     limited to those that see the segment as an outline.
     """
-    first, second = chances.viewpoint
     to_y, density = mi.warp.square_to_uniform_sphere(chances.viewpoint), mi.Float(dr.inv_four_pi)
     if SEGMENT in kinds:
         c, d = dr.gather(mi.Point3f, table.c, row) - p, dr.gather(mi.Point3f, table.d, row) - p
-        angle, x = turned(along, c, d), across(along, c)
-        y = dr.cross(along, x)
-        y = dr.mulsign(y, dr.dot(y, d))  # the second face is on this side
-        rest = dr.pi - angle
-        turn = 2 * rest * second
-        turn += dr.select(turn < rest, angle, 2 * angle)
-        cos = 2 * first - 1
-        sin, (s, t) = dr.safe_sqrt(1 - dr.square(cos)), dr.sincos(turn)
+        own_to_y, own_density = outline_direction(along, c, d, chances.viewpoint)
         here = kind == SEGMENT
-        to_y = dr.select(here, along * cos + sin * (x * t + y * s), to_y)
-        density = dr.select(here, dr.rcp(4 * rest), density)
+        to_y, density = dr.select(here, own_to_y, to_y), dr.select(here, own_density, density)
 
     def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
         seen = active & dr.isfinite(density)
         weight = mi.Spectrum(dr.select(seen, dr.rcp(density), 0))
         return EdgeView(p, to_y, mi.Float(1), mi.Bool(True), weight, mi.Normal3f(0), mi.Point2f(0), seen)
+
+    return view
+
+
+def _towards_balls(balls: list[Ball], other: Viewer, moves: mi.Bool, chances: Chances) -> Viewer:
+    """Return a view of the edges of shapes that do not move: from a random direction in which, or opposite to which,
+    there is a moving shape. Edges of moving shapes have the `other` view.
+    """
+    number = chances.viewpoint.x * len(balls)
+    place = mi.Point2f(number - dr.floor(number), 2 * chances.viewpoint.y)
+    place.y, backward = dr.select(place.y < 1, place.y, place.y - 1), place.y >= 1
+
+    def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
+        cones = [(dr.normalize(ball.center - p), _cosine(ball, p)) for ball in balls]
+        to_y = mi.Vector3f(0)
+        for index, (axis, cos) in enumerate(cones):
+            drawn = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(place, cos))
+            to_y = dr.select(mi.UInt32(number) == index, drawn, to_y)
+        to_y = dr.select(backward, -to_y, to_y)
+        density = mi.Float(0)
+        for axis, cos in cones:
+            inside = dr.select(dr.dot(axis, to_y) >= cos, 1, 0) + dr.select(-dr.dot(axis, to_y) >= cos, 1, 0)
+            density += inside / (2 * dr.two_pi * (1 - cos) * len(balls))
+        first = other(p, active)
+        weight = dr.select(moves, first.weight, mi.Spectrum(dr.select(density > 0, dr.rcp(density), 0)))
+        return replace(
+            first, to_y=dr.select(moves, first.to_y, to_y), weight=weight, active=active & (first.active | ~moves)
+        )
 
     return view
 

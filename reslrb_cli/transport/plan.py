@@ -134,6 +134,8 @@ class Plan:
     moving_emitters: tuple[mi.Emitter, ...] = ()
     # Moving shapes whose edges cover and uncover light, with a derivative.
     edged: tuple[mi.Shape, ...] = ()
+    # Shapes that do not move and that can hide a moving shape. They are empty if no shapes are edged.
+    occluders: tuple[mi.Shape, ...] = ()
     # Distance of two vertices below which the derivative of the light between them is damped, if shapes are edged.
     near: float = 0.0
     # Whether the normalisation of the reconstruction filter has a derivative and the correction for shading normals has

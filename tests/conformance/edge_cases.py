@@ -1,7 +1,7 @@
 """Cases of test_edges.py: moving shapes, a lamp, and surfaces on which the shapes' shadows fall. z is up.
 
-`PYTHONPATH=tests python -m conformance.edge_cases` writes edge_values.json, with the finite differences of all
-`RECORDED` cases. Names as arguments restrict it to these cases. A case takes a minute or more.
+`PYTHONPATH=tests python -c "import reslrb_cli, conformance.edge_cases as e; e.main()"` writes edge_values.json, with the
+finite differences of all `RECORDED` cases. Names as arguments restrict it to these cases. A case takes a minute or more.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ SIZE = 24
 #: angle is `TURN` degrees, so that all derivatives have a similar size.
 MOTION = ("x", "y", "z", "turn")
 TURN = 60.0
-#: Step of the finite differences, and a smaller one for hard shadows on other moving shapes.
-STEP, SMALLER = 0.03, 0.01
+#: Step of the finite differences, a smaller one for hard shadows on other moving shapes, and one for small shapes that
+#: hide a moving one.
+STEP, SMALLER, SMALLEST = 0.03, 0.01, 0.005
 OWN = diffuse(0.6, 0.6, 0.8)
 TWO_SIDED = {"type": "twosided", "bsdf": OWN}
 
@@ -76,7 +77,8 @@ class EdgeCase:
                     params[key] = dr.ravel(motion @ dr.unravel(mi.Point3f, first[key]))
 
         start = {f"{name}.{part}": 0.0 for name in shapes for part in self.motion}
-        moving = Moving((_room(self.lamp) if self.lamp in ROOMS else _open(self.lamp)) | shapes, start, place)
+        scene = (_room(self.lamp) if self.lamp in ROOMS else _open(self.lamp)) | STILL.get(self.occluder, dict)()
+        moving = Moving(scene | shapes, start, place)
         moving.weigh(smooth_weights(SIZE, SIZE))
         return moving
 
@@ -192,8 +194,21 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
     # The camera sees the plate far behind the box.
     "two": lambda: {"shape": _box(0.2, -1.6, 1.35, 0.4),
                     "plate": rectangle(TWO_SIDED, transform(translate=[0.1, 0, 0.5], scale=0.7))},
+    "hidden": lambda: {"shape": _box(0.1, -0.1, 0.9)},
+    "reflector": lambda: {"shape": rectangle(TWO_SIDED, transform(translate=[0, 0, 2.6], scale=0.5))},
     "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
                      for n, name in enumerate(FLAT)},
+}  # fmt: skip
+
+#: Shapes that do not move. The camera sees the box behind the first three, and the reflector lights the floor past the
+#: sheet.
+STILL: dict[str, Callable[[], dict[str, Any]]] = {
+    "hidden": lambda: {
+        "sheet": rectangle(TWO_SIDED, transform(translate=[0.4, -0.9, 1.1], rotate=([1, 0, 0], 70), scale=[0.15, 0.3, 1])),
+        "ball": {"type": "sphere", "center": [0.05, -0.9, 1.0], "radius": 0.12, "bsdf": OWN},
+        "tube": {"type": "cylinder", "p0": [-0.1, -0.9, 0.4], "p1": [-0.2, -0.9, 1.6], "radius": 0.05, "bsdf": TWO_SIDED},
+    },
+    "reflector": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.1, 0.1, 1.2], scale=0.4))},
 }  # fmt: skip
 
 # ---- Lamps, and surfaces that do not move ----
@@ -215,6 +230,8 @@ LAMPS: dict[str, Callable[[], dict[str, Any]]] = {
                             "emitter": {"type": "area", "radiance": rgb(10, 10, 10)}},
     "point": lambda: {"type": "point", "position": ABOVE, "intensity": rgb(10, 10, 10)},
     "spot": lambda: {"type": "spot", "to_world": _towards(), "cutoff_angle": 40, "intensity": rgb(10, 10, 10)},
+    "upward": lambda: {"type": "spot", "to_world": look_at([0.1, 0, 1.6], [0.1, 0, 3], [0, 1, 0]), "cutoff_angle": 40,
+                       "intensity": rgb(20, 20, 20)},
     "directional": lambda: {"type": "directional", "direction": [-0.4, -0.15, -1], "irradiance": rgb(3, 3, 3)},
     "constant": lambda: {"type": "constant", "radiance": rgb(1, 1, 1)},
 }  # fmt: skip
@@ -276,6 +293,8 @@ RECORDED = [
     EdgeCase("sphere", "point", spp=1024), EdgeCase("rectangle", "spot"), EdgeCase("cylinder", "directional", spp=2048),
     standing("front", 2, spp=1024), standing("room", 3, spp=1024), EdgeCase("two", "area", 3),
     EdgeCase("box", "indirect", 3, spp=512, reference_spp=8192), EdgeCase("sphere", "room", 5),
+    EdgeCase("hidden", "point", spp=1024, reference_spp=8192, step=SMALLEST),
+    EdgeCase("reflector", "upward", 3, spp=512, reference_spp=8192),
 ]  # fmt: skip
 CASES = [
     *RECORDED,
@@ -288,8 +307,6 @@ CASES = [
 
 def main() -> None:
     """Write the finite differences."""
-    import reslrb_cli  # noqa: F401
-
     mi.set_variant("llvm_ad_rgb")
     values = json.loads(VALUES.read_text()) if VALUES.exists() else {}
     for case in RECORDED:

@@ -29,7 +29,7 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.step import StepResult, gradient_step
 from reslrb_cli.measure.gradients import integrator, relative, seeds
-from reslrb_cli.scene.edges import welded_edges
+from reslrb_cli.scene.edges import EdgeSet, welded_edges
 from reslrb_cli.transport.edges import Chances, sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.samples import Samples
 
@@ -90,6 +90,10 @@ FAULTS = [
           "slid * L.n_x + rest * n", "(slid + rest) * n"),
     Fault("first_depth_between_surfaces", "depth", "estimators.edges:_between",
           "found.segments + 1", "found.segments"),
+    Fault("still_shapes_hide_nothing", "hidden-point-2", "transport.edges:weigh_edges",
+          "dr.select(table.moves | _hides_ball(samples, table, middle), 1, 0)", "dr.select(table.moves, 1, 0)"),
+    Fault("light_comes_from_one_side_only", "reflector-upward-3", "transport.edges:_towards_balls",
+          "dr.select(backward, -to_y, to_y)", "to_y"),
     Fault("solid_angle_of_a_lamp_left_out", "sphere-near-2", "transport.edges:_from",
           "first.weight * solid", "first.weight"),
 ]  # fmt: skip
@@ -242,6 +246,15 @@ def test_only_moving_shapes_have_edges(value: str, moves: bool):
     has = value == "on" and moves
     assert [shape.id() for shape in parts[0].plan.edged] == (["shape"] if has else [])
     assert all((part.edges is not None) == has for part in parts)
+
+
+@pytest.mark.parametrize(("occluder", "lamp", "names"), [("box", "room", set()), ("box", "area", set()),
+                                                         ("hidden", "point", {"sheet", "ball", "tube"})])  # fmt: skip
+def test_only_shapes_that_can_hide_something_are_occluders(occluder: str, lamp: str, names: set[str]):
+    """No light passes the edges of a room's walls, of the floor, or of the lamp above everything."""
+    scene = EdgeCase(occluder, lamp).moving().loaded
+    [moving] = [shape for shape in scene.shapes() if shape.id() == "shape"]
+    assert {shape.id() for shape in EdgeSet((moving,), scene).occluders} == names
 
 
 def test_an_image_has_no_edges():
