@@ -107,7 +107,8 @@ def _number(shape: mi.Shape) -> int:
 def _rows(shape: mi.Shape, corners: list[mi.Point3f], kind: int = SEGMENT, radius: Any = 0, crease: Any = 0) -> _Rows:
     n, wide = dr.width(corners[0]), dr.zeros(mi.Float, dr.width(corners[0]))
     shapes = dr.full(mi.UInt32, _number(shape), n)
-    return _Rows(dr.full(mi.UInt32, kind, n), *corners, wide + radius, shapes, wide + crease)
+    a, b, c, d = corners
+    return _Rows(dr.full(mi.UInt32, kind, n), a, b, c, d, wide + radius, shapes, wide + crease)
 
 
 @dataclass

@@ -1,7 +1,8 @@
 """Cases of test_edges.py: moving shapes, a lamp, and surfaces on which the shapes' shadows fall. z is up.
 
-`PYTHONPATH=tests python -c "import reslrb_cli, conformance.edge_cases as e; e.main()"` writes edge_values.json, with the
-finite differences of all `RECORDED` cases. Names as arguments restrict it to these cases. A case takes a minute or more.
+`PYTHONPATH=tests python -c "import reslrb_cli, conformance.edge_cases as e; e.main()"` writes edge_values.json, with
+the finite differences of all `RECORDED` cases. Names as arguments restrict it to these cases. A case takes a minute or
+more.
 """
 
 from __future__ import annotations
@@ -204,9 +205,11 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
 #: sheet.
 STILL: dict[str, Callable[[], dict[str, Any]]] = {
     "hidden": lambda: {
-        "sheet": rectangle(TWO_SIDED, transform(translate=[0.4, -0.9, 1.1], rotate=([1, 0, 0], 70), scale=[0.15, 0.3, 1])),
+        "sheet": rectangle(TWO_SIDED, transform(translate=[0.4, -0.9, 1.1], rotate=([1, 0, 0], 70),
+                                                scale=[0.15, 0.3, 1])),
         "ball": {"type": "sphere", "center": [0.05, -0.9, 1.0], "radius": 0.12, "bsdf": OWN},
-        "tube": {"type": "cylinder", "p0": [-0.1, -0.9, 0.4], "p1": [-0.2, -0.9, 1.6], "radius": 0.05, "bsdf": TWO_SIDED},
+        "tube": {"type": "cylinder", "p0": [-0.1, -0.9, 0.4], "p1": [-0.2, -0.9, 1.6], "radius": 0.05,
+                 "bsdf": TWO_SIDED},
     },
     "reflector": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.1, 0.1, 1.2], scale=0.4))},
 }  # fmt: skip

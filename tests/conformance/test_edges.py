@@ -248,7 +248,7 @@ def test_only_moving_shapes_have_edges(value: str, moves: bool):
     assert all((part.edges is not None) == has for part in parts)
 
 
-@pytest.mark.parametrize(("occluder", "lamp", "names"), [("box", "room", set()), ("box", "area", set()),
+@pytest.mark.parametrize(("occluder", "lamp", "names"), [("box", "indirect", set()), ("box", "area", set()),
                                                          ("hidden", "point", {"sheet", "ball", "tube"})])  # fmt: skip
 def test_only_shapes_that_can_hide_something_are_occluders(occluder: str, lamp: str, names: set[str]):
     """No light passes the edges of a room's walls, of the floor, or of the lamp above everything."""
