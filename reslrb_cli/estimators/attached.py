@@ -27,9 +27,10 @@ previous vertex's data for the derivative of s_{i-1} at vertex i.
 
 The surface-integral form comes from Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry". With the
 surface-integral form, edges that do not move contribute no error. The derivative of s_{i-1} grows as 1 / r for two
-vertices at a distance r. Its variance is infinite where a moving shape touches another surface. With derivatives of
-edges, it is therefore multiplied by r^2 / (r^2 + near^2) (`Plan.near`). Neither form has the derivative of visibility,
-which `edges.py` adds for the edges of moving shapes.
+vertices at a distance r. Its variance is infinite where a moving shape touches another surface, and in the corners over
+which light slides. With derivatives of edges, the light between two vertices is therefore the sum of two parts. The
+part near^2 / (r^2 + near^2) is differentiated with fixed directions, the other part with `stay` (`Plan.near`). Neither
+form has the derivative of visibility, which `edges.py` adds for the edges of moving shapes.
 
 The stack starts with the first vertex that moves or whose BSDF has a parameter. Earlier vertices depend only on
 parameters of the emitter. The stack works as in `stack.py`. Here, T behind the last pushed vertex equals the roulette
@@ -124,7 +125,7 @@ def reach(
     if not before:
         return find_vertex(ray, pi, active), mi.Spectrum(1)
     stays = active & is_staying(before)
-    slid = find_vertex(ray, pi, active & ~stays).si
+    slid = find_vertex(ray, pi, active if plan.near > 0 else active & ~stays).si
     stayed, reaching, factor = find_following_vertex(ray, pi, stays)
     with dr.suspend_grad():
         other, other_bsdf = before[0].point.interaction(plan, stays)
@@ -133,13 +134,33 @@ def reach(
     with dr.suspend_grad(when=parameters), dr.resume_grad(reaching.d, when=parameters):
         f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
     changed = dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1) * factor
+    if plan.near > 0:
+        shares = [nearness(plan, dr.squared_norm(place - ray.o)) for place in (stayed.p, slid.p)]
+        share = dr.detach(shares[0])
+        changed = 1 + (changed - 1) * (1 - share) + (shares[1] - shares[0])
+        stayed = _blend(stayed, slid, share)
+        reaching.d = dr.lerp(reaching.d, ray.d, share)
     si = dr.select(stays, stayed, slid)
     there = mi.Ray3f(ray)
     there.d = dr.select(stays, reaching.d, ray.d)
-    if plan.near > 0:
-        distance = dr.squared_norm(dr.detach(stayed.p - ray.o))
-        changed = 1 + (changed - 1) * (distance / (distance + plan.near**2))
     return Hit(si, si.bsdf(), there), dr.select(stays, changed, 1)
+
+
+def nearness(plan: Plan, squared_distance: mi.Float) -> mi.Float:
+    """Return the share of the light between two vertices that is differentiated along directions."""
+    return plan.near**2 / (squared_distance + plan.near**2)
+
+
+def _blend(stayed: mi.SurfaceInteraction3f, slid: mi.SurfaceInteraction3f, share: mi.Float) -> mi.SurfaceInteraction3f:
+    """Return a vertex whose derivatives are a weighted sum of the derivatives of both. `share` is the weight of
+    `slid`. The values are equal.
+    """
+    si = mi.SurfaceInteraction3f(stayed)
+    for name in ("t", "p", "n", "uv", "wi", "dp_du", "dp_dv", "dn_du", "dn_dv"):
+        setattr(si, name, dr.lerp(getattr(stayed, name), getattr(slid, name), share))
+    axes = (dr.lerp(getattr(stayed.sh_frame, axis), getattr(slid.sh_frame, axis), share) for axis in "stn")
+    si.sh_frame = mi.Frame3f(*axes)
+    return si
 
 
 def segment_again(

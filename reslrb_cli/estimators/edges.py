@@ -6,10 +6,11 @@ is a point on an outline, seen from a viewpoint y. x is the point behind p on th
 outline, and points away from the shape. v_p is the velocity of p, and w is the weight of the sample: the light or the
 importance that the edge covers per unit of <v_p, n>, divided by the density.
 
-At the start of a light path, y is a place on a lamp, and rays from y keep their direction. W_p and W_x are the
-contributions to the objective of light that continues from p and from x. A light walk estimates them.
+At the start of a light path, y is a place on a lamp, and rays from y keep their direction relative to the lamp. W_p and
+W_x are the contributions to the objective of light that continues from p and from x. A light walk estimates them. u_p
+is the velocity of the ray at p. It is 0 unless the lamp moves.
 
-    dL/dtheta  +=  w (W_p - W_x) <v_p, n>
+    dL/dtheta  +=  w (W_p - W_x) <v_p - u_p, n>
 
 Creases need this term, too. A crease is an edge between two flat-shaded faces that are both lit. The contribution of
 the light jumps there, because the faces have different normals. At a crease, x is a point on the second face.
@@ -26,15 +27,15 @@ estimates W_x.
 
     dL/dtheta  -=  w W_x <v_p - s v_x - (1 - s) v_y, n>
 
-A point that light reaches directly from a lamp slides along the direction l of this light. Other points move with their
-surface. v is the velocity of the surface, and n_x its normal.
+A point that light reaches directly from a lamp slides along the direction l of this light, and moves with the ray.
+Other points move with their surface. v is the velocity of the surface, and n_x its normal.
 
-    v_x = l <v, n_x> / <l, n_x>   if light arrives directly from a lamp,   otherwise   v_x = v
+    v_x = u_x + l <v - u_x, n_x> / <l, n_x>   if light arrives directly from a lamp,   otherwise   v_x = v
 
 v_y is defined in the same way. x in the last formula always moves with its surface.
 
 If a shape touches the surface behind it, lamps and the sensor lose x at the same time. This light counts once, as seen
-from the lamps.
+from the lamps. If both surfaces end there, as at the corner of a room, each has an edge, and each edge counts half.
 
 Sources: Zhang et al. 2020, "Path-Space Differentiable Rendering"; Li et al. 2018, "Differentiable Monte Carlo Ray
 Tracing through Edge Sampling".
@@ -86,9 +87,9 @@ def _samples(samples: Samples, stream: int) -> Samples:
     differentiated.
     """
     plan = replace(
-        samples.plan, attached=False, stays=False, glossy_follows=False, moving_shapes=(), moving_emitters=(),
-        grid=None, aims=False, sequence=None, differentiate_bsdfs=False, differentiate_emission=False,
-        track_zeros=False, only_bsdfs=(), differentiate_delta=False, differentiate_null=False, evened_lamps=(),
+        samples.plan, attached=False, stays=False, glossy_follows=False, moving_shapes=(), grid=None,
+        aims=False, sequence=None, differentiate_bsdfs=False, differentiate_emission=False, track_zeros=False,
+        only_bsdfs=(), differentiate_delta=False, differentiate_null=False, evened_lamps=(),
     )  # fmt: skip
     width = max(samples.width // PATHS_PER_OUTLINE, 1)
     seed = mi.sample_tea_32(samples.seed, mi.UInt32(stream))[0]
@@ -148,12 +149,67 @@ def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside
     return Beside(over, past, pi, active)
 
 
+def _share(samples: Samples, outline: Outline, beside: Beside) -> mi.Float:
+    """Return 1/2 where the shape touches another shape that also ends there, otherwise 1."""
+    plan, scene = samples.plan, samples.scene
+    if len(plan.edged) < 2 and not plan.moving_emission:
+        return mi.Float(1)
+    x, offset = scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active), _offset(outline)
+    touches = beside.active & x.is_valid() & (x.t < 2 * AROUND * offset) & (x.shape != outline.shape)
+    n, n_x = (
+        mi.Vector3f(hit.compute_surface_interaction(ray, mi.RayFlags.All, touches).n)
+        for hit, ray in ((beside.pi, beside.over), (x, beside.past))
+    )
+    n, n_x = (dr.mulsign(normal, dr.dot(normal, outline.view.to_y)) for normal in (n, n_x))
+    # The other shape goes on if it has a point behind the first shape.
+    along = n_x * dr.dot(n, n_x) - n
+    there = outline.p + along * (8 * offset / dr.norm(along)) + n_x * (2 * offset)
+    ray = mi.Ray3f(there, -n_x)
+    ray.maxt = 4 * offset
+    behind = scene.ray_intersect_preliminary(ray, coherent=False, active=touches)
+    return dr.select(touches & ~(behind.is_valid() & (behind.shape == x.shape)), 0.5, 1)
+
+
 def _moved(
     pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, adjoint: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:  # fmt: skip
     """Return <p, `adjoint`> with the derivative of the intersection p of `ray`. p moves with its surface."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     return dr.select(active, dr.dot(si.p, adjoint), 0)
+
+
+def _carried(
+    samples: Samples, emitter: mi.EmitterPtr, to_lamp: mi.Ray3f, adjoint: mi.Vector3f, active: mi.Bool
+) -> mi.Float:  # fmt: skip
+    """Return <q, `adjoint`>. The point q of a light ray moves with the ray, as the ray's lamp moves. `to_lamp` leads
+    from q to the lamp. Call the function under `dr.resume_grad()`.
+    """
+    p, plan = to_lamp.o, samples.plan
+    q = p
+    shapes = {lamp.emitter: lamp.shape for lamp in plan.needs.lamps}
+    for moving in plan.moving_emitters:
+        here = active & (emitter == mi.EmitterPtr(moving))
+        if (shape := shapes.get(moving)) is not None:
+            with dr.suspend_grad():
+                pi = samples.scene.ray_intersect_preliminary(to_lamp, coherent=False, active=here)
+                here &= pi.is_valid() & (pi.shape == mi.ShapePtr(shape))
+            si = pi.compute_surface_interaction(to_lamp, mi.RayFlags.All | mi.RayFlags.FollowShape, here)
+            n = mi.Vector3f(si.sh_frame.n if interpolates_normals(shape) else si.n)
+            d = mi.Frame3f(n).to_world(mi.Frame3f(dr.detach(n)).to_local(-to_lamp.d))
+            there = si.p + d * dr.detach(si.t)
+        elif moving.class_name() == "PointLight":
+            place = mi.traverse(moving)["position"]
+            there = p + (place - dr.detach(place))
+        else:
+            to_world = mi.traverse(moving)["to_world"]
+            if moving.class_name() == "DirectionalEmitter":
+                assert plan.horizon is not None
+                center = mi.Point3f(*plan.horizon.center)
+                there = center + to_world @ (dr.detach(to_world).inverse() @ mi.Vector3f(p - center))
+            else:
+                there = to_world @ (dr.detach(to_world).inverse() @ p)
+        q = dr.select(here, there, q)
+    return dr.select(active, dr.dot(q, adjoint), 0)
 
 
 # ---- Seen from lamps ----
@@ -205,14 +261,21 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     outline = sample_outline(samples, samples.edges.lamp, view, chances, creases=True)
     beside = _beside(samples, outline, creases=True)
     ray = dr.select(over, beside.over, beside.past)
-    emission = Emission(ray, 2 * outline.weight, dr.zeros(mi.EmitterPtr))
-    smooth = [shape for shape in samples.plan.edged if interpolates_normals(shape)]
+    share = _share(samples, outline, beside)
+    emission = Emission(ray, (2 * share) * outline.weight, dr.zeros(mi.EmitterPtr))
+    moves = samples.plan.moving_emission
+    shapes = samples.plan.edged + (samples.plan.occluders if moves else ())
+    smooth = [shape for shape in shapes if interpolates_normals(shape)]
     on_smooth = reduce(or_, (outline.shape == mi.ShapePtr(shape) for shape in smooth)) & over if smooth else None
     W = walk(samples, Contribution(p, on_smooth), beside.active, emission)[0] * p.scale
     weight = showing(W) * dr.select(over, 1, -1)
     with dr.resume_grad(), dr.isolate_grad():
         adjoint, active = weight * outline.normal, beside.active & (weight != 0)
-        dr.backward_from(_moved(beside.pi, beside.over, adjoint, active), flags=_MAY_LACK)
+        moved = _moved(beside.pi, beside.over, adjoint, active)
+        if moves:
+            to_lamp = mi.Ray3f(beside.past.o, outline.view.to_y)  # not from p, which may lie behind a surface
+            moved -= _carried(samples, outline.view.emitter, to_lamp, adjoint, active)
+        dr.backward_from(moved, flags=_MAY_LACK)
 
 
 #: The result depends on no parameter if, for example, no lane is active.
@@ -223,12 +286,71 @@ _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 @dataclass
+class Pick:
+    """One contribution to the radiance from y, selected in proportion to its size (the largest channel).
+
+    `L` (C,) is the radiance of the contribution divided by its size, and `total` is the sum of all sizes. `segments` is
+    the number of segments from the lamp to y. `direct` is 1 if the light arrives at y directly from a lamp; its
+    direction is then `towards`, and its lamp `emitter`. `n_y` is the normal at y. `counts` is 0 if y is specular.
+    """
+
+    L: mi.Spectrum
+    total: mi.Float
+    segments: mi.UInt32
+    direct: mi.Float
+    towards: mi.Vector3f
+    emitter: mi.EmitterPtr
+    n_y: mi.Vector3f
+    counts: mi.Float
+    numbers: mi.PCG32
+
+    @staticmethod
+    def start(numbers: mi.PCG32) -> Pick:
+        """Return a selection among no contributions."""
+        none, no = mi.Vector3f, dr.zeros(mi.EmitterPtr)
+        zero = mi.Float(0)
+        return Pick(mi.Spectrum(0), zero, mi.UInt32(0), mi.Float(0), none(0), no, none(0), mi.Float(1), numbers)
+
+    def offered(
+        self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, direct: mi.Bool, towards: mi.Vector3f,
+        emitter: mi.EmitterPtr,
+    ) -> Pick:  # fmt: skip
+        """Return the selection after another contribution."""
+        size = dr.select(active, dr.max(L), 0)
+        total, number = self.total + size, self.numbers.next_float32()
+        takes = active & (size > 0) & (number * total < size)
+        return replace(
+            self,
+            L=dr.select(takes, L / size, self.L),
+            total=total,
+            segments=dr.select(takes, segments, self.segments),
+            direct=dr.select(takes, dr.select(direct, mi.Float(1), 0), self.direct),
+            towards=dr.select(takes, towards, self.towards),
+            emitter=dr.select(takes, emitter, self.emitter),
+        )
+
+
+def _carried_to(
+    samples: Samples, light: Pick, p: mi.Point3f, n: mi.Vector3f, adjoint: mi.Vector3f, active: mi.Bool
+) -> mi.Float:  # fmt: skip
+    """Return <p, `adjoint`>. p is the point of a surface with the normal `n` where `light` arrives. It moves with the
+    light's ray, and along the ray so that it stays in the surface.
+    """
+    towards = light.towards
+    offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
+    cos = dr.dot(n, towards)
+    adjoint = adjoint - n * dr.select(cos != 0, dr.dot(adjoint, towards) / cos, 0)
+    return _carried(samples, light.emitter, mi.Ray3f(p + dr.mulsign(n, cos) * offset, towards), adjoint, active)
+
+
+@dataclass
 class Arrived:
     """Radiance from x (C,), in three sums.
 
     `all` is the whole radiance. `slid` is the radiance of light that arrives at x directly from a lamp, times
     <v_x, n> / <v, n_x>. `rest` is the radiance of other light. `counts` is 0 if x is specular, because light paths do
-    not connect from specular surfaces. `n_x` is the normal at x.
+    not connect from specular surfaces. `n_x` is the normal at x. If a lamp moves, `direct` is one contribution of light
+    that arrives at x directly.
     """
 
     all: mi.Spectrum
@@ -236,23 +358,25 @@ class Arrived:
     rest: mi.Spectrum
     counts: mi.Float
     n_x: mi.Vector3f
+    direct: list[Pick]
 
 
 class Behind(CameraHooks):
-    """Hooks that sum the radiance from x. `normal` is the normal of the outline."""
+    """Hooks that sum the radiance from x. `normal` is the normal of the outline. `numbers` is None if no lamp moves."""
 
-    def __init__(self, normal: mi.Vector3f) -> None:
-        self.normal = normal
+    def __init__(self, normal: mi.Vector3f, numbers: mi.PCG32 | None) -> None:
+        self.normal, self.numbers = normal, numbers
 
     def start(self, first: FilmRay) -> Arrived:
-        return Arrived(mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Vector3f(0))
+        direct = [] if self.numbers is None else [Pick.start(self.numbers)]
+        return Arrived(mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Vector3f(0), direct)
 
     def vertex(
         self, state: Arrived, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
     ) -> Arrived:  # fmt: skip
         P, first = vertex.product.value() * state.counts, vertex.depth == 1
         n_x = dr.select(first, mi.Vector3f(vertex.si.n), state.n_x)
-        total, slid, rest = state.all, state.slid, state.rest
+        total, slid, rest, picked = state.all, state.slid, state.rest, state.direct
 
         def slope(towards: mi.Vector3f) -> mi.Float:
             cos = dr.dot(n_x, towards)
@@ -264,13 +388,16 @@ class Behind(CameraHooks):
             total = total + L
             slid = slid + dr.select(direct, L * slope(vertex.ray.d), 0)
             rest = rest + dr.select(direct, 0, L)
+            picked = [one.offered(L, direct, vertex.depth, direct, vertex.ray.d, met.emitter) for one in picked]
         if event is not None:
             L = dr.select(event.active, P * event.c, 0)
             total = total + L
             slid = slid + dr.select(first, L * slope(event.ds.d), 0)
             rest = rest + dr.select(first, 0, L)
+            emitter = event.ds.emitter
+            picked = [one.offered(L, first, vertex.depth, first, event.ds.d, emitter) for one in picked]
         counts = dr.select(first & scattering.is_delta, 0, state.counts)
-        return Arrived(total, slid, rest, counts, n_x)
+        return Arrived(total, slid, rest, counts, n_x, picked)
 
 
 def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
@@ -287,7 +414,8 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     # once, as seen from the lamps.
     touches = x.is_valid() & (x.t < 2 * AROUND * _offset(outline))
     beside.active = beside.active & ~touches
-    _, L = camera_walk(samples, Behind(n), beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
+    behind = Behind(n, numbers if samples.plan.moving_emission else None)
+    _, L = camera_walk(samples, behind, beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
     weight = p.delta(outline.view.u, beside.active) * outline.weight * p.scale
     still, slid, rest = (showing(dr.dot(weight, part)) for part in (L.all, L.slid, L.rest))
     active = beside.active & (still != 0)
@@ -296,45 +424,13 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     at_x = dr.select(moves, s * (slid * L.n_x + rest * n), 0)  # s is NaN if the ray leaves the scene
     with dr.resume_grad(), dr.isolate_grad():
         moved = _moved(beside.pi, beside.over, -still * n, active) + _moved(x, beside.past, at_x, moves)
+        for one in L.direct:
+            size = dr.select(moves, s * showing(dr.dot(weight, one.L) * one.total), 0)
+            moved += _carried_to(samples, one, beside.past(x.t), L.n_x, size * n, moves)
         dr.backward_from(moved, flags=_MAY_LACK)
 
 
 # ---- Between two surfaces ----
-
-
-@dataclass
-class Pick:
-    """One contribution to the radiance from y, selected in proportion to its size (the largest channel).
-
-    `L` (C,) is the radiance of the contribution divided by its size, and `total` is the sum of all sizes. `segments` is
-    the number of segments from the lamp to y. `direct` is 1 if the light arrives at y directly from a lamp; its
-    direction is then `towards`. `n_y` is the normal at y. `counts` is 0 if y is specular.
-    """
-
-    L: mi.Spectrum
-    total: mi.Float
-    segments: mi.UInt32
-    direct: mi.Float
-    towards: mi.Vector3f
-    n_y: mi.Vector3f
-    counts: mi.Float
-    numbers: mi.PCG32
-
-    def offered(
-        self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, direct: mi.Bool, towards: mi.Vector3f
-    ) -> Pick:  # fmt: skip
-        """Return the selection after another contribution."""
-        size = dr.select(active, dr.max(L), 0)
-        total, number = self.total + size, self.numbers.next_float32()
-        takes = active & (size > 0) & (number * total < size)
-        return replace(
-            self,
-            L=dr.select(takes, L / size, self.L),
-            total=total,
-            segments=dr.select(takes, segments, self.segments),
-            direct=dr.select(takes, dr.select(direct, mi.Float(1), 0), self.direct),
-            towards=dr.select(takes, towards, self.towards),
-        )
 
 
 class PickLight(CameraHooks):
@@ -344,8 +440,7 @@ class PickLight(CameraHooks):
         self.numbers = numbers
 
     def start(self, first: FilmRay) -> Pick:
-        none = mi.Vector3f
-        return Pick(mi.Spectrum(0), mi.Float(0), mi.UInt32(0), mi.Float(0), none(0), none(0), mi.Float(1), self.numbers)
+        return Pick.start(self.numbers)
 
     def vertex(
         self, state: Pick, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
@@ -354,9 +449,10 @@ class PickLight(CameraHooks):
         state = replace(state, n_y=dr.select(first, mi.Vector3f(vertex.si.n), state.n_y))
         if met is not None:
             L, active = P * met.Le * met.weight, met.active & ~first
-            state = state.offered(L, active, vertex.depth - 1, vertex.depth == 2, vertex.ray.d)
+            direct = vertex.depth == 2
+            state = state.offered(L, active, vertex.depth - 1, direct, vertex.ray.d, met.emitter)
         if event is not None:
-            state = state.offered(P * event.c, event.active, vertex.depth, first, event.ds.d)
+            state = state.offered(P * event.c, event.active, vertex.depth, first, event.ds.d, event.ds.emitter)
         return replace(state, counts=dr.select(first & scattering.is_delta, 0, state.counts))
 
 
@@ -378,7 +474,7 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
         _from_camera(samples), PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
     )
     total = showing(found.total)
-    weight = outline.weight * found.L * total
+    weight = outline.weight * found.L * (total * _share(samples, outline, beside))
     emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
     W = walk(samples, Contribution(p), active & (total > 0), emission, found.segments + 1)[0] * p.scale
     W = showing(W)
@@ -390,4 +486,7 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     with dr.resume_grad(), dr.isolate_grad():
         moved = _moved(beside.pi, beside.over, -W * n, active)
         moved += _moved(x, beside.past, at_x, active) + _moved(y, back, at_y, active)
+        if samples.plan.moving_emission:
+            direct = active & (found.direct != 0)
+            moved += _carried_to(samples, found, back(y.t), found.n_y, (W * (1 - s)) * n, direct)
         dr.backward_from(moved, flags=_MAY_LACK)

@@ -146,7 +146,7 @@ class AboutScene:
     emitters: dict[tuple[Any, ...], EmitterDensities] = field(default_factory=dict)
     recordings: Recordings = field(default_factory=Recordings)
     #: By the shapes that have them.
-    edges: dict[tuple[mi.Shape, ...], EdgeSet] = field(default_factory=dict)
+    edges: dict[tuple[Any, ...], EdgeSet] = field(default_factory=dict)
     #: By density and number of paths.
     shares: dict[tuple[int, int], PixelShares | None] = field(default_factory=dict)
     #: Samples per pixel for which the cells of guided emission are made.
@@ -209,17 +209,17 @@ class Preparation:
         drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
         plan = replace(plan, evened_lamps=drawn)
         if moves:
-            edged, motion = (), self._motion
-            if self.sampling.edges:
-                edged = tuple(shape for shape in which.shapes if has_edges(shape) and not shape.is_emitter())
-            if edged and motion.sampling == "auto":
-                motion = replace(motion, sampling="stay")  # as in the terms of the edges
-            if edged and not about.near:  # once, because another number would recompile kernels
-                about.near = NEAR * min(float(dr.norm(shape.bbox().extents())) for shape in edged)
-            occluders = self.edges(edged, scene).occluders if edged else ()
+            edged, motion = self._edges(which, scene) if self.sampling.edges else None, self._motion
+            if edged is not None:
+                if motion.sampling == "auto":
+                    motion = replace(motion, sampling="stay")  # as in the terms of the edges
+                if not about.near:  # once, because another number would recompile kernels
+                    near = edged.moving or edged.occluders
+                    about.near = NEAR * min(float(dr.norm(shape.bbox().extents())) for shape in near)
             plan = attach(plan, which, motion, scene, sensor)
-            plan = replace(plan, edged=edged, occluders=occluders, near=about.near)
-        if plan.stays and self._motion.sampling == "auto" and not plan.edged:
+            if edged is not None:
+                plan = replace(plan, edged=edged.moving, occluders=edged.occluders, near=about.near)
+        if plan.stays and self._motion.sampling == "auto" and not plan.has_edges:
             if sensor not in about.stays:  # once, because another answer would recompile kernels
                 about.stays[sensor] = bounces(plan, scene, sensor)
             if not about.stays[sensor]:
@@ -250,12 +250,19 @@ class Preparation:
         nodes += [list(which.emission_nodes)] if plan.differentiate_emission else []
         return [sum(which.entries[node] for node in each) for each in nodes]
 
-    def edges(self, moving: tuple[mi.Shape, ...], scene: mi.Scene) -> EdgeSet:
-        """Return the edges of the moving shapes, and of shapes that can hide them."""
-        made = self._found.edges
-        if moving not in made:
-            made[moving] = EdgeSet(moving, scene)
-        return made[moving]
+    def edges(self, plan: Plan) -> EdgeSet:
+        """Return the edges of a plan."""
+        return self._found.edges[plan.edged, plan.moving_emitters]
+
+    def _edges(self, which: Differentiated, scene: mi.Scene) -> EdgeSet | None:
+        """Return the edges that matter if `which` parameters change. Return None if there are none."""
+        moving = tuple(shape for shape in which.shapes if has_edges(shape))
+        if not moving and not which.emitters:
+            return None
+        made, key = self._found.edges, (moving, which.emitters)
+        if key not in made:
+            made[key] = EdgeSet(moving, scene, lamps_move=bool(which.emitters))
+        return made[key] if moving or made[key].occluders else None
 
     def emitters(self, plan: Plan, scene: mi.Scene) -> EmitterDensities:
         """Return the current densities of the scene's emitters, for a plan of the scene."""

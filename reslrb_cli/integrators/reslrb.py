@@ -145,9 +145,9 @@ class LightTracer(StepIntegrator):
             table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
         given = job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table
         parts = passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
-        if not plan.edged or purpose is Purpose.IMAGE:
+        if not plan.has_edges or purpose is Purpose.IMAGE:
             return parts
-        edges = weigh_edges(parts[0], self.preparation.edges(plan.edged, job.scene).now())
+        edges = weigh_edges(parts[0], self.preparation.edges(plan).now())
         return [replace(part, edges=edges) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:

@@ -294,7 +294,7 @@ def check_missing(
     """
     config, found = problem.config, measure_missing(problem)
     moving = where_moved(problem.selection.params, problem.selection.scene_keys)
-    edged = [item for item in moving if item.is_shape and has_edges(item.node) and not item.node.is_emitter()]
+    edged = [item for item in moving if not item.is_shape or has_edges(item.node)]
     tracer = problem.integrator if edged and isinstance(problem.integrator, LightTracer) else None
     if tracer is not None and is_auto(config, "edges") and found:
         lacking = [record for record in found if record.is_incomplete]

@@ -198,34 +198,36 @@ def _ball(parts: list[_Rows]) -> Ball:
     return Ball.around(points, dr.concat([rows.radius, rows.radius]))
 
 
-def _open_rows(rows: _Rows, scene: mi.Scene) -> mi.UInt32:
-    """Return the numbers of the rows that can hide a surface from another surface or from a sensor.
+def _kept(rows: _Rows, wanted: mi.Bool) -> mi.UInt32:
+    """Return the numbers of the wanted rows, without edges of parallel faces."""
+    parallel = turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a) > dr.pi * (1 - FLAT)
+    return dr.compress(wanted & ((rows.kind != SEGMENT) | ~parallel))
+
+
+def _are_open(rows: _Rows, scene: mi.Scene) -> mi.Bool:
+    """True if an edge can hide a surface from another surface or from a sensor.
 
     At a corner of a room, for example, all rays beside the edge of a wall soon hit the other wall. Rays in `PROBES`
-    random directions decide. Edges of parallel faces never hide anything.
+    random directions decide.
     """
-    n = dr.width(rows.a)
-    a, b, c, d = rows.a, rows.b, rows.c, rows.d
-    open_ = (rows.kind != SEGMENT) | (n > MOST_PROBED)
-    if n <= MOST_PROBED:
-        lane = dr.arange(mi.UInt32, n * PROBES)
-        row = lane // PROBES
-        a, b, c, d = (dr.gather(mi.Point3f, corner, row) for corner in (a, b, c, d))
-        numbers = mi.PCG32(dr.width(lane))
-        p = dr.lerp(a, b, numbers.next_float32())
-        along = dr.normalize(b - a)
-        to_y, _ = outline_direction(along, c - p, d - p, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
-        passes = _passes(scene, p, along, c - p, to_y, None)
-        for sensor in scene.sensors():
-            here = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
-            here.p = p
-            ds, _ = sensor.sample_direction(here, mi.Point2f(0.5))
-            raw = dr.cross(along, ds.d)
-            seen = (ds.pdf > 0) & (dr.dot(raw, c - p) * dr.dot(raw, d - p) > 0)
-            passes |= seen & _passes(scene, p, along, c - p, ds.d, ds.dist)
-        open_ |= dr.block_reduce(dr.ReduceOp.Max, dr.select(passes, mi.UInt32(1), 0), PROBES) != 0
-    parallel = turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a) > dr.pi * (1 - FLAT)
-    return dr.compress(open_ & ((rows.kind != SEGMENT) | ~parallel))
+    if dr.width(rows.a) > MOST_PROBED:
+        return mi.Bool(True)
+    lane = dr.arange(mi.UInt32, dr.width(rows.a) * PROBES)
+    a, b, c, d = (dr.gather(mi.Point3f, corner, lane // PROBES) for corner in (rows.a, rows.b, rows.c, rows.d))
+    numbers = mi.PCG32(dr.width(lane))
+    p = dr.lerp(a, b, numbers.next_float32())
+    along = dr.normalize(b - a)
+    to_y, _ = outline_direction(along, c - p, d - p, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
+    passes = _passes(scene, p, along, c - p, to_y, None)
+    for sensor in scene.sensors():
+        here = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
+        here.p = p
+        ds, _ = sensor.sample_direction(here, mi.Point2f(0.5))
+        raw = dr.cross(along, ds.d)
+        seen = (ds.pdf > 0) & (dr.dot(raw, c - p) * dr.dot(raw, d - p) > 0)
+        passes |= seen & _passes(scene, p, along, c - p, ds.d, ds.dist)
+    found = dr.block_reduce(dr.ReduceOp.Max, dr.select(passes, mi.UInt32(1), 0), PROBES) != 0
+    return found | (rows.kind != SEGMENT)
 
 
 def _passes(
@@ -256,10 +258,12 @@ def edge_kinds(shapes: Iterable[mi.Shape]) -> frozenset[int]:
 class EdgeSet:
     """Edges of `moving` shapes, and of the scene's other shapes if they can hide a moving shape (`occluders`).
 
-    The topology of meshes and the edges of occluders are read once. `now` returns a table of the current places.
+    If `lamps_move` is true, all other shapes with edges are occluders, because their shadows move. The topology of
+    meshes and the edges of occluders are read once. `now` returns a table of the current places.
     """
 
-    def __init__(self, moving: Iterable[mi.Shape], scene: mi.Scene) -> None:
+    def __init__(self, moving: tuple[mi.Shape, ...], scene: mi.Scene, lamps_move: bool = False) -> None:
+        self.moving = moving
         self._moving = [_edges_of(shape) for shape in moving]
         still = [shape for shape in scene.shapes() if shape not in moving and has_edges(shape)]
         self._still: list[_Rows] = []
@@ -268,7 +272,7 @@ class EdgeSet:
             return
         with dr.suspend_grad():
             rows = _joined([part.rows() for shape in still for part in _edges_of(shape)])
-            kept = _open_rows(rows, scene)
+            kept = _kept(rows, mi.Bool(True) if lamps_move else _are_open(rows, scene))
             if dr.width(kept) > 0:
                 rows = dr.gather(_Rows, rows, kept)
                 dr.make_opaque(rows)

@@ -34,7 +34,8 @@ class EdgeView:
     `weight` (C,) is the radiance or the importance that arrives at the point, divided by the density of the viewpoint.
     Occlusion is not included. `to_y` is the unit vector to the viewpoint, and `distance` is the distance of the
     viewpoint. If `parallel` is true, the viewpoint is infinitely far away. `surface` is the lamp's normal if the
-    viewpoint lies on a surface, otherwise zero. `u` is the film position if the viewpoint is the sensor.
+    viewpoint lies on a surface, otherwise zero. `u` is the film position if the viewpoint is the sensor. `emitter` is
+    the lamp if there is one.
     """
 
     y: mi.Point3f
@@ -45,6 +46,7 @@ class EdgeView:
     surface: mi.Normal3f
     u: mi.Point2f
     active: mi.Bool
+    emitter: mi.EmitterPtr
 
 
 @dataclass
@@ -81,7 +83,7 @@ def view_from_lamps(samples: Samples, numbers: mi.Point2f) -> Viewer:
         parallel = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         surface = dr.select(ds.delta | parallel, mi.Normal3f(0), ds.n)
         seen = active & (ds.pdf > 0) & dr.isfinite(ds.pdf) & dr.any(weight > 0)
-        return EdgeView(ds.p, ds.d, ds.dist, parallel, weight, surface, mi.Point2f(0), seen)
+        return EdgeView(ds.p, ds.d, ds.dist, parallel, weight, surface, mi.Point2f(0), seen, ds.emitter)
 
     return view
 
@@ -95,7 +97,9 @@ def view_from_sensor(samples: Samples, aperture: mi.Point2f) -> Viewer:
         seen = connect(samples.plan, samples.sensor, here, None, aperture, active)
         ds, _ = samples.sensor.sample_direction(here, aperture, active)
         none = mi.Normal3f(0)
-        return EdgeView(ds.p, ds.d, ds.dist, mi.Bool(False), seen.weight, none, seen.u, active & seen.active)
+        seen.active &= active
+        no = dr.zeros(mi.EmitterPtr)
+        return EdgeView(ds.p, ds.d, ds.dist, mi.Bool(False), seen.weight, none, seen.u, seen.active, no)
 
     return view
 
@@ -128,11 +132,12 @@ def sample_outline(
     """Return a random point on an outline for each lane. `weights` are cumulative sampling weights of the edges.
 
     If `view` is None, each outline is seen from a random direction. If `creases` is true, points may also lie on
-    creases, where `normal` points away from the first face of the edge, and only edges of moving shapes are sampled.
-    Code for spheres and cylinders is compiled only if there are any.
+    creases, where `normal` points away from the first face of the edge. Code for spheres and cylinders is compiled only
+    if there are any.
     """
     plan = samples.plan
-    table, kinds = samples.edges, edge_kinds(plan.edged if creases else plan.edged + plan.occluders)
+    only_moving = creases and not plan.moving_emission  # as in `weigh_edges`
+    table, kinds = samples.edges, edge_kinds(plan.edged if only_moving else plan.edged + plan.occluders)
     assert table is not None
     row_number, place = chances.edge, chances.place
     rows = dr.width(weights)
@@ -154,7 +159,7 @@ def sample_outline(
         p = dr.select(kind == SPHERE, a, dr.select(kind == TUBE, dr.lerp(a, b, 0.5), p))
     if view is None:
         view = _view_from_anywhere(table, kinds, row, kind, along, p, chances)
-        if plan.occluders:
+        if plan.occluders and not plan.moving_emission:
             view = _towards_balls(table.balls, view, dr.gather(mi.Bool, table.moves, row), chances)
     seen = view(p, active)
     normal = mi.Vector3f(0)
@@ -227,6 +232,7 @@ def _from(first: EdgeView, p: mi.Point3f, again: EdgeView, moved: mi.Bool) -> Ed
         surface=first.surface,
         u=dr.select(moved, again.u, first.u),
         active=first.active & (~moved | on_surface | again.active),
+        emitter=dr.select(moved & ~on_surface, again.emitter, first.emitter),
     )
 
 
@@ -237,14 +243,14 @@ def weigh_edges(samples: Samples, table: EdgeTable) -> EdgeTable:
     """Return the edges with cumulative sampling weights for the lamps and the sensor of `samples`.
 
     A weight is the length of the edge, times a factor. The factor favours edges that probes see as outlines. For all
-    directions, it is the solid angle of the directions that see the edge as an outline. The edge of a shape that does
-    not move must have a moving shape behind it. Lamps that do not move see no changes at its edges.
+    directions, it is the solid angle of the directions that see the edge as an outline. If no lamp moves, the edge of a
+    shape that does not move must have a moving shape behind it, and has no weight for lamps.
     """
     with dr.suspend_grad():
         free = 4 * (dr.pi - turned(table.b - table.a, table.c - table.a, table.d - table.a))
         free = dr.select(table.kind == SEGMENT, free, 4 * dr.pi)
         lamp, sensor = _seen_from_lamps(samples, table), _seen_from_sensor(samples, table)
-        if samples.plan.occluders:
+        if samples.plan.occluders and not samples.plan.moving_emission:
             middle = dr.lerp(table.a, table.b, dr.select(table.kind == SPHERE, 0, 0.5))
             towards = sum(4 * dr.pi * (1 - _cosine(ball, middle)) for ball in table.balls)
             free = dr.select(table.moves, free, dr.minimum(towards, 4 * dr.pi))
@@ -269,7 +275,7 @@ def _cosine(ball: Ball, p: mi.Point3f) -> mi.Float:
 
 
 def _hides_ball(samples: Samples, table: EdgeTable, middle: mi.Point3f) -> mi.Bool:
-    """True if the sensor may see a ball behind the edge. Edges of the same size as their distance are never left out."""
+    """True if the sensor may see a ball behind the edge. Edges as long as half of their distance are never left out."""
     view = view_from_sensor(samples, mi.Point2f(0.5))(middle, mi.Bool(True))
     d, reach = -view.to_y, 0.5 * dr.norm(table.b - table.a) + table.radius
     found = mi.Bool(samples.plan.needs.thin_lens) | (reach > 0.5 * view.distance)
@@ -298,7 +304,8 @@ def _view_from_anywhere(
     def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
         seen = active & dr.isfinite(density)
         weight = mi.Spectrum(dr.select(seen, dr.rcp(density), 0))
-        return EdgeView(p, to_y, mi.Float(1), mi.Bool(True), weight, mi.Normal3f(0), mi.Point2f(0), seen)
+        none, no = mi.Normal3f(0), dr.zeros(mi.EmitterPtr)
+        return EdgeView(p, to_y, mi.Float(1), mi.Bool(True), weight, none, mi.Point2f(0), seen, no)
 
     return view
 

@@ -132,11 +132,11 @@ class Plan:
     glossy_follows: bool = False
     moving_shapes: tuple[mi.Shape, ...] = ()
     moving_emitters: tuple[mi.Emitter, ...] = ()
-    # Moving shapes whose edges cover and uncover light, with a derivative.
+    # Moving shapes whose edges cover and uncover light, with a derivative. `occluders` do the same and do not move.
     edged: tuple[mi.Shape, ...] = ()
-    # Shapes that do not move and that can hide a moving shape. They are empty if no shapes are edged.
     occluders: tuple[mi.Shape, ...] = ()
-    # Distance of two vertices below which the derivative of the light between them is damped, if shapes are edged.
+    # Distance of two vertices below which most of the light between them is differentiated with fixed directions. It
+    # is 0 without edges.
     near: float = 0.0
     # Whether the normalisation of the reconstruction filter has a derivative and the correction for shading normals has
     # none, as in finite differences; otherwise as in `ptracer`.
@@ -181,6 +181,11 @@ class Plan:
     def has_light_at_points(self) -> bool:
         """True if any emitter is not a shape. Lights at points and in one direction count, and so do environments."""
         return any(name not in ("AreaLight", "DirectionalArea") for name in self.needs.emitters)
+
+    @property
+    def has_edges(self) -> bool:
+        """Whether the derivative includes light that edges cover and uncover."""
+        return bool(self.edged or self.occluders)
 
     @property
     def moving_emission(self) -> bool:

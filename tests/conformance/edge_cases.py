@@ -1,4 +1,4 @@
-"""Cases of test_edges.py: moving shapes, a lamp, and surfaces on which the shapes' shadows fall. z is up.
+"""Cases of test_edges.py: shapes, a lamp, and surfaces on which the shapes' shadows fall. z is up.
 
 `PYTHONPATH=tests python -c "import reslrb_cli, conformance.edge_cases as e; e.main()"` writes edge_values.json, with
 the finite differences of all `RECORDED` cases. Names as arguments restrict it to these cases. A case takes a minute or
@@ -29,6 +29,7 @@ SIZE = 24
 #: angle is `TURN` degrees, so that all derivatives have a similar size.
 MOTION = ("x", "y", "z", "turn")
 TURN = 60.0
+PLACES = ("to_world", "position", "vertex_positions")
 #: Step of the finite differences, a smaller one for hard shadows on other moving shapes, and one for small shapes that
 #: hide a moving one.
 STEP, SMALLER, SMALLEST = 0.03, 0.01, 0.005
@@ -38,9 +39,10 @@ TWO_SIDED = {"type": "twosided", "bsdf": OWN}
 
 @dataclass(frozen=True)
 class EdgeCase:
-    """Moving shapes of `OCCLUDERS`, and a lamp of `LAMPS`, or of `ROOMS` in a room.
+    """Shapes of `OCCLUDERS`, and a lamp of `LAMPS`, or of `ROOMS` in a room. The shapes move, or the lamp moves if
+    `lamp_moves` is true.
 
-    The derivatives are those of each shape's `motion`, which has components of `MOTION`. `axis` is the axis of the
+    The derivatives are those of each object's `motion`, which has components of `MOTION`. `axis` is the axis of the
     rotation. The gradient of each seed uses `spp` samples per pixel. Finite differences have the `step`, and use
     `reference_spp`. `options` are options of `reslrb`.
     """
@@ -53,31 +55,35 @@ class EdgeCase:
     spp: int = 256
     reference_spp: int = 2048
     step: float = STEP
+    lamp_moves: bool = False
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """The name of the test."""
-        return f"{self.occluder}-{self.lamp}-{self.depth}"
+        return f"{self.occluder}-{'moving_' if self.lamp_moves else ''}{self.lamp}-{self.depth}"
 
     def moving(self) -> Moving:
-        """Load the scene. Each of its moving shapes has its own motion."""
+        """Load the scene. Each moving object has its own motion."""
         shapes = OCCLUDERS[self.occluder]()
+        names = ["lamp"] if self.lamp_moves else [*shapes]
         first: dict[str, Any] = {}
 
         def place(params: mi.SceneParameters, latents: Latents) -> None:
-            for name in shapes:
+            for name in names:
                 x, y, z, turn = (latents.get(f"{name}.{part}", mi.Float(0)) for part in MOTION)
                 motion = turned(TURN * turn, list(self.axis), [x, y, z])
-                key = next(key for key in (f"{name}.to_world", f"{name}.vertex_positions") if key in params)
+                key = next(f"{name}.{part}" for part in PLACES if f"{name}.{part}" in params)
                 if key not in first:
                     first[key] = type(params[key])(params[key])
                 if key.endswith("to_world"):
                     params[key] = motion @ mi.AffineTransform4f(first[key].matrix)
+                elif key.endswith("position"):
+                    params[key] = motion @ mi.Point3f(first[key])
                 else:
                     params[key] = dr.ravel(motion @ dr.unravel(mi.Point3f, first[key]))
 
-        start = {f"{name}.{part}": 0.0 for name in shapes for part in self.motion}
+        start = {f"{name}.{part}": 0.0 for name in names for part in self.motion}
         scene = (_room(self.lamp) if self.lamp in ROOMS else _open(self.lamp)) | STILL.get(self.occluder, dict)()
         moving = Moving(scene | shapes, start, place)
         moving.weigh(smooth_weights(SIZE, SIZE))
@@ -190,6 +196,7 @@ SHAPES: dict[str, Callable[..., Any]] = {
 #: `flat` has one shape of each kind without a round side. They cast shadows on each other.
 FLAT = ("box", "rectangle", "disk", "ball")
 OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
+    "none": dict,
     **{name: lambda make=make: {"shape": make(0.1, -0.1, 0.9)} for name, make in SHAPES.items()},
     "standing": lambda: {"shape": _box(0.1, -0.1, 0.3)},
     # The camera sees the plate far behind the box.
@@ -298,12 +305,17 @@ RECORDED = [
     EdgeCase("box", "indirect", 3, spp=512, reference_spp=8192), EdgeCase("sphere", "room", 5),
     EdgeCase("hidden", "point", spp=1024, reference_spp=8192, step=SMALLEST),
     EdgeCase("reflector", "upward", 3, spp=512, reference_spp=8192),
+    *(EdgeCase("box", lamp, lamp_moves=True, spp=1024) for lamp in ("area", "spot")),
+    EdgeCase("none", "room", 3, lamp_moves=True, spp=1024),
 ]  # fmt: skip
 CASES = [
     *RECORDED,
     *(EdgeCase("flat", lamp, spp=512) for lamp in ("sphere_lamp", "directional")),
     EdgeCase("flat", "point", spp=512, step=SMALLER),
     *(EdgeCase("sphere", lamp) for lamp in ("area", "sphere_lamp", "spot")),
+    *(EdgeCase("hidden", lamp, lamp_moves=True, spp=1024, step=SMALLER) for lamp in ("point", "sphere_lamp")),
+    EdgeCase("hidden", "directional", motion=("turn",), lamp_moves=True, spp=1024, step=SMALLER),
+    EdgeCase("box", "room", 3, lamp_moves=True, spp=1024, reference_spp=8192),
     *(EdgeCase("cylinder", lamp, spp=2048) for lamp in ("area", "sphere_lamp")), EdgeCase("box", "room", 3, spp=1024),
 ]  # fmt: skip
 

@@ -94,6 +94,13 @@ FAULTS = [
           "dr.select(table.moves | _hides_ball(samples, table, middle), 1, 0)", "dr.select(table.moves, 1, 0)"),
     Fault("light_comes_from_one_side_only", "reflector-upward-3", "transport.edges:_towards_balls",
           "dr.select(backward, -to_y, to_y)", "to_y"),
+    Fault("rays_of_a_moving_lamp_stay", "box-moving_area-2", "estimators.edges:_from_lamps",
+          "moved -= _carried(", "_carried("),
+    Fault("light_does_not_slide_with_a_lamp", "box-moving_spot-2", "estimators.edges:_from_sensor",
+          "for one in L.direct:", "for one in []:"),
+    Fault("corners_counted_twice", "none-moving_room-3", "estimators.edges:_share", "touches & ~(", "mi.Bool(False) & ~("),
+    Fault("share_of_near_light_is_constant", "none-moving_room-3", "estimators.attached:reach",
+          " + (shares[1] - shares[0])", ""),
     Fault("solid_angle_of_a_lamp_left_out", "sphere-near-2", "transport.edges:_from",
           "first.weight * solid", "first.weight"),
 ]  # fmt: skip
