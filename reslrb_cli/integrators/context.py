@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.guiding.collect import bsdf_groups
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.freezing import Recordings
@@ -211,6 +212,9 @@ class Preparation:
         if moves:
             edged, motion = self._edges(which, scene) if self.sampling.edges else None, self._motion
             if edged is not None:
+                if motion.sampling == "follow":
+                    why = "follow has no derivatives of edges between two surfaces; use auto, or edges: off"
+                    raise UnsupportedScene(f"attached_sampling: {why}", "attached_sampling")
                 if motion.sampling == "auto":
                     motion = replace(motion, sampling="stay")  # as in the terms of the edges
                 if not about.near:  # once, because another number would recompile kernels

@@ -180,7 +180,11 @@ def tangent_of_scattering(scattering: Scattering, df: mi.Spectrum) -> mi.Spectru
 
 
 def tangent_of(parts: list[Samples]) -> mi.TensorXf:
-    """Return the derivative (H, W, C) of the image of all passes. Raises UnsupportedScene if emitters move."""
+    """Return the derivative (H, W, C) of the image of all passes. Raises UnsupportedScene if emitters move, or if the
+    derivative includes edges.
+    """
+    if parts[0].plan.has_edges:
+        raise UnsupportedScene("forward mode has no derivatives of edges; use reverse mode, or edges: off", "edges")
     if parts[0].plan.moving_emission:
         raise UnsupportedScene("forward mode has no derivatives of moving emitters; use reverse mode")
     film = parts[0].film

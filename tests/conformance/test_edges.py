@@ -22,6 +22,7 @@ from measure.faults import Fault, plant, planted
 from scipy.spatial.transform import Rotation
 
 from reslrb_cli import register
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import edges
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.integrators import reslrb
@@ -276,6 +277,16 @@ def test_the_plugin_takes_the_option():
     chosen = mi.load_dict({"type": "reslrb", "estimator": "stack", "edges": "on"})
     assert chosen.tracer.preparation.sampling.edges
     assert not mi.load_dict({"type": "reslrb"}).tracer.preparation.sampling.edges
+
+
+def test_forward_mode_and_follow_refuse_edges():
+    moving = SMALL.moving()
+    dr.enable_grad(moving.params["shape.vertex_positions"])
+    job = Job(moving.loaded, moving.loaded.sensors()[0], dr.opaque(mi.UInt32, 1), 4, moving.params)
+    with pytest.raises(UnsupportedScene, match="forward mode has no derivatives of edges; use reverse mode"):
+        tracer().tangent(job)
+    with pytest.raises(UnsupportedScene, match="attached_sampling: follow has no derivatives of edges"):
+        moving.gradient(tracer(attached_sampling="follow"), 1, 4)
 
 
 @pytest.mark.parametrize("value", ["auto", "maybe", True])
