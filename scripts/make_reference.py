@@ -231,6 +231,7 @@ The signatures use these types:
 - `Array`: a NumPy array of float32
 - `Loss`: a function as described at `optimize`
 - `Objective`: a function of an image
+- `Scene`: a dictionary as for `mi.load_dict`, or an `mi.Scene`
 
 `GradcheckRecord` and `Line` have one attribute for each field of a `--json` line. Their method `to_json()` returns
 that line.

@@ -13,9 +13,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import drjit as dr
 import numpy as np
 
-from reslrb_cli.api.experiment import Experiment, called, held, load_with
+from reslrb_cli.api.experiment import Experiment, Scene, called, held, load_with
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config.files import as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override, overrides_of
@@ -29,6 +30,7 @@ from reslrb_cli.records.run_folder import check_output
 from reslrb_cli.runs.prepare import PreparedRun, begin
 from reslrb_cli.runs.recorder import Recording
 from reslrb_cli.runs.resume import open_earlier
+from reslrb_cli.scene.in_memory import SceneInMemory
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -67,6 +69,7 @@ class Run:
         self._stopped = False
         self._failure: BaseException | None = None
         self._loop: weakref.ref[Generator[Record, None, None]] | None = None
+        self._uses = self._scene_uses()
 
     # --- iterating ----------------------------------------------------------------------------------------------------
 
@@ -82,6 +85,9 @@ class Run:
         made = self._made()
         try:
             while True:
+                if self._scene_uses() != self._uses:
+                    reason = "has been used by another run or call since; load it once for each run"
+                    raise ConfigError("scene", "", reason)
                 with held():
                     record = next(made, None)
                 if record is None:
@@ -99,14 +105,27 @@ class Run:
         finally:
             with held():
                 made.close()
+                if self.config.own_scene is not None:
+                    self._leave_values()
+
+    def _scene_uses(self) -> int:
+        own = self.config.own_scene
+        return 0 if own is None else int(own.uses)
+
+    def _leave_values(self) -> None:
+        """Give the caller's scene the current values without derivatives."""
+        problem = self._begun.course.problem
+        problem.selection.hand_over({key: dr.detach(problem.optimizer[key]) for key in problem.selection.keys})
+        problem.optimizer.stands_at = None  # so that another loop hands its values over again
 
     def _made(self) -> Generator[Record, None, None]:
         """Yield the records of the remaining iterations, and write them if the run has a folder."""
         if self._stopped and self._writes and self._folder is not None:
             with called():
-                self._stack, self._begun, self._writes = _reopened(
-                    self._folder, (), self.config.own_loss, self.config.allows_code
+                self._stack, self._begun, self._writes = _reopened(  # also restores a scene in memory
+                    self._folder, (), self.config.own_loss, self.config.allows_code, self.config.own_scene
                 )
+                self._uses = self._scene_uses()
         self._stopped, self._status, self._failure = True, Status.RUNNING, None
         course = self._begun.course
         with self._stack:
@@ -268,6 +287,7 @@ def optimize(
     overrides: Mapping[str, object] | None = None,
     loss: Loss | None = None,
     allow_code: bool = False,
+    scene: Scene | None = None,
 ) -> Run:
     """Recover the parameters of an experiment; returns a `Run`, which computes one iteration at a time.
 
@@ -291,6 +311,10 @@ def optimize(
     width 1 or a tensor with one entry. Pass it again with `resume`. `allow_code` permits running the code files that
     the experiment names (`loss.file`, `integrator.file`).
 
+    `scene` replaces the scene of the experiment: a dictionary as for `mi.load_dict`, or an `mi.Scene` (see `load`). At
+    the end of a loop, an `mi.Scene` has the recovered values, without derivatives. Only one run at a time can use it,
+    and the run cannot be resumed from its folder.
+
     Before returning, `optimize` sets the experiment's Mitsuba variant if none is set. `optimize` loads and checks all
     files and makes the target. `optimize` also chooses the settings that the experiment leaves to measurement. Raises
     ConfigError (located by file and key), UnsupportedScene, BackendError and MachineError. Iterating can also raise
@@ -312,13 +336,15 @@ def optimize(
                 raise ConfigError("folder", "", "cannot be given with resume; copy the folder, and resume the copy")
             if experiment is not None:
                 raise ConfigError("experiment", "", "cannot be given with resume, which uses that of the run")
+            if scene is not None:
+                raise ConfigError("scene", "", "cannot be given with resume, which uses that of the run")
             earlier = as_path(resume, "resume", "the folder of a run")
             run = Run(*_reopened(earlier, put_in, loss, allow_code))
             run._folder = earlier
             return run
         if experiment is None:
             raise ConfigError("experiment", "", "is missing; give a configuration, or resume=RUN")
-        config = _with_own(load_with(experiment, [*put_in, *named]), loss, allow_code)
+        config = _with_own(load_with(experiment, [*put_in, *named], scene=scene), loss, allow_code)
         if folder is not None:
             try:
                 check_output(config.source, config.run.output)
@@ -339,14 +365,14 @@ def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
 
 
 def _reopened(
-    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool
+    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool, scene: SceneInMemory | None = None
 ) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
     """Return the lock stack, the prepared run to resume, and True if iterations are left. The stack holds the lock of
     the run folder.
     """
     with contextlib.ExitStack() as stack:
         earlier = stack.enter_context(open_earlier(folder, put_in))
-        earlier.config = _with_own(earlier.config, loss, allow_code)
+        earlier.config = _with_own(earlier.config, loss, allow_code).with_scene(scene)
         variant = keep_variant(earlier.settled.variant, earlier.config.source)
         begun = earlier.begin(variant, logger.info, logger.warning)
         if earlier.is_done:
