@@ -29,7 +29,6 @@ from reslrb_cli.config.files import as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override
 from reslrb_cli.config.schema import IN_MEMORY, Config
 from reslrb_cli.errors import ConfigError, one_line
-from reslrb_cli.records.decisions import cache_folder
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
@@ -157,8 +156,7 @@ def load_with(
     if isinstance(scene, Mapping):
         from reslrb_cli.scene.xml.dictionary import write_dictionary
 
-        folder = Path.cwd() if base is None else Path(base).absolute()
-        file = write_dictionary(scene, cache_folder() / "scenes", source, folder)
+        file = write_dictionary(scene, source, Path.cwd() if base is None else Path(base).absolute())
         return loader.changed(config, [Override("scene", ("scene", "file"), str(file))])
     if not isinstance(scene, mi.Scene):
         what = "one of another variant" if type(scene).__name__ == "Scene" else one_line(repr(scene), 60)

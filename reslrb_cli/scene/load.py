@@ -118,9 +118,7 @@ def load_for_script(
     check_variant(mi.variant())
     wanted = [keys] if isinstance(keys, str) else keys
     if isinstance(file, Mapping):
-        with tempfile.TemporaryDirectory(prefix="reslrb-") as folder:
-            path = write_dictionary(file, Path(folder), DICTIONARY, Path.cwd())
-            return load_scene(path, options, keys=wanted)
+        return load_scene(write_dictionary(file, DICTIONARY, Path.cwd()), options, keys=wanted)
     path = as_path(file, "file", "the path of a scene file, or a Mitsuba dictionary")
     return load_scene(path, options, keys=wanted)
 

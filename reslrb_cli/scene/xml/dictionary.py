@@ -18,6 +18,7 @@ import numpy as np
 from reslrb_cli.backend.installation import is_known, nearest_plugin, plugin_type
 from reslrb_cli.errors import ConfigError, MachineError, one_line
 from reslrb_cli.records.atomic import unfinished_folder
+from reslrb_cli.records.decisions import cache_folder
 from reslrb_cli.records.images import write_file
 from reslrb_cli.scene.xml.read import Element, quoted, tag_lines
 
@@ -28,10 +29,10 @@ _INSTEAD = "or load the scene with `mi.load_dict(..., optimize=False)` and pass 
 _TAGS = {"PhaseFunction": "phase", "ReconstructionFilter": "rfilter"}
 
 
-def write_dictionary(scene: Mapping[str, Any], folder: Path, source: object, base: Path) -> Path:
+def write_dictionary(scene: Mapping[str, Any], source: object, base: Path) -> Path:
     """Write a Mitsuba dictionary as a scene file, with its bitmaps beside it, and return the file.
 
-    The file is `folder/DIGEST/scene.xml`, so that equal dictionaries share a file. File names in the dictionary are
+    The file is `scenes/DIGEST/scene.xml` in the cache, so that equal dictionaries share a file. File names in the dictionary are
     relative to `base`, or to a folder of `mi.file_resolver()`. A variant must be set. Raises a ConfigError that names
     `source` and the place in the dictionary for a value that a scene file cannot express, and MachineError if the file
     cannot be written.
@@ -47,6 +48,7 @@ def write_dictionary(scene: Mapping[str, Any], folder: Path, source: object, bas
     digest = hashlib.blake2b(text, digest_size=16)
     for image in writer.images.values():
         digest.update(image.tobytes())
+    folder = cache_folder() / "scenes"
     place = folder / digest.hexdigest()
     if (place / SCENE_FILE).is_file():
         return place / SCENE_FILE
