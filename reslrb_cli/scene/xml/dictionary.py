@@ -32,10 +32,10 @@ _TAGS = {"PhaseFunction": "phase", "ReconstructionFilter": "rfilter"}
 def write_dictionary(scene: Mapping[str, Any], source: object, base: Path) -> Path:
     """Write a Mitsuba dictionary as a scene file, with its bitmaps beside it, and return the file.
 
-    The file is `scenes/DIGEST/scene.xml` in the cache, so that equal dictionaries share a file. File names in the dictionary are
-    relative to `base`, or to a folder of `mi.file_resolver()`. A variant must be set. Raises a ConfigError that names
-    `source` and the place in the dictionary for a value that a scene file cannot express, and MachineError if the file
-    cannot be written.
+    The file is `scenes/DIGEST/scene.xml` in the cache, so that equal dictionaries share a file. File names in the
+    dictionary are relative to `base`, or to a folder of `mi.file_resolver()`. A variant must be set. Raises a
+    ConfigError that names `source` and the place in the dictionary for a value that a scene file cannot express, and
+    MachineError if the file cannot be written.
     """
     writer = _Writer(source, [base, *(Path(str(path)) for path in mi.file_resolver())])
     try:
