@@ -27,6 +27,8 @@ from reslrb_cli.optimization.problem import progress_spp
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import check_output
+from reslrb_cli.runs.callbacks import Callback, Calls
+from reslrb_cli.runs.loggers import Callbacks, made
 from reslrb_cli.runs.prepare import PreparedRun, begin
 from reslrb_cli.runs.recorder import Recording
 from reslrb_cli.runs.resume import open_earlier
@@ -60,8 +62,10 @@ class Run:
     Runs in one process share only the device. You can alternate between them: `zip(run_a, run_b)`.
     """
 
-    def __init__(self, stack: contextlib.ExitStack, begun: PreparedRun, writes: bool) -> None:
-        self._begun, self._writes, self._stack = begun, writes, stack
+    def __init__(
+        self, stack: contextlib.ExitStack, begun: PreparedRun, writes: bool, callbacks: Sequence[Callback] = ()
+    ) -> None:
+        self._begun, self._writes, self._stack, self._callbacks = begun, writes, stack, callbacks
         self._records: list[Record] = []
         self._folder: Path | None = None
         done = begun.course.done >= self.config.run.iterations and not writes
@@ -134,7 +138,8 @@ class Run:
                 return
             with self._begun.place() as place:
                 self._folder = place.path
-                recording = Recording(course, place, self._begun.manifest)
+                calls = self._begun.calls(self._callbacks, place.path)
+                recording = Recording(course, place, self._begun.manifest, calls, self._begun.said)
                 try:
                     yield from recording.records()
                 finally:
@@ -142,18 +147,38 @@ class Run:
 
     def _unwritten(self) -> Generator[Record, None, None]:
         course, self._status = self._begun.course, Status.FAILED
+        calls = self._begun.calls(self._callbacks, None)
         try:
+            calls.begin()
+            if calls and not course.done:
+                self._show(calls, "target", self.targets)
+                self._show(calls, "initial", self.images)
             told = functools.partial(logger.warning, "%s")
             for state, record in iterate(course.problem, course.state, told, watch=course.watch):
                 course.add(state, record)
+                calls.iteration(record)
                 yield record
+            if calls:
+                self._show(calls, "final", self.images)
+            self._status = Status.FINISHED
         except (GeneratorExit, KeyboardInterrupt):
             self._status = Status.INTERRUPTED
             raise
         finally:
             course.stand()
-            if course.done >= self.config.run.iterations or course.state.stopped:
+            is_done = course.done >= self.config.run.iterations or bool(course.state.stopped)
+            if is_done and self._status is Status.INTERRUPTED:
                 self._status = Status.FINISHED
+            try:
+                calls.end(self._status.value)
+            except Exception:
+                self._status = Status.FAILED
+                raise
+
+    def _show(self, calls: Calls, name: str, images: Mapping[int, Array]) -> None:
+        """Report an image of each view to the callbacks."""
+        for sensor, image in images.items():
+            calls.image(name, "" if len(images) == 1 else f"-{sensor}", image)
 
     def live(self, figure: bool = True) -> Iterator[Record]:
         """Iterate with a progress bar. In a notebook, `figure` also shows a live plot of the loss, the errors, and one
@@ -288,6 +313,7 @@ def optimize(
     loss: Loss | None = None,
     allow_code: bool = False,
     scene: Scene | None = None,
+    callbacks: Callbacks = (),
 ) -> Run:
     """Recover the parameters of an experiment; returns a `Run`, which computes one iteration at a time.
 
@@ -315,6 +341,9 @@ def optimize(
     the end of a loop, an `mi.Scene` has the recovered values, without derivatives. Only one run at a time can use it,
     and the run cannot be resumed from its folder.
 
+    `callbacks` receive the progress of the run (`Callback`). The names `"tensorboard"`, `"mlflow"` and `"wandb"` stand
+    for `TensorBoard()`, `MLflow()` and `WandB()`.
+
     Before returning, `optimize` sets the experiment's Mitsuba variant if none is set. `optimize` loads and checks all
     files and makes the target. `optimize` also chooses the settings that the experiment leaves to measurement. Raises
     ConfigError (located by file and key), UnsupportedScene, BackendError and MachineError. Iterating can also raise
@@ -331,6 +360,7 @@ def optimize(
             Override("folder", ("run", "name"), path.name),
         ]
     with called():
+        listeners = made(callbacks, "callbacks")
         if resume is not None:
             if folder is not None:
                 raise ConfigError("folder", "", "cannot be given with resume; copy the folder, and resume the copy")
@@ -339,7 +369,7 @@ def optimize(
             if scene is not None:
                 raise ConfigError("scene", "", "cannot be given with resume, which uses that of the run")
             earlier = as_path(resume, "resume", "the folder of a run")
-            run = Run(*_reopened(earlier, put_in, loss, allow_code))
+            run = Run(*_reopened(earlier, put_in, loss, allow_code), listeners)
             run._folder = earlier
             return run
         if experiment is None:
@@ -352,7 +382,7 @@ def optimize(
                 raise ConfigError("folder", "", error.message) from None
         variant = keep_variant(config.variant, config.source)
         begun = begin(config, variant, logger.info, logger.warning)
-        return Run(contextlib.ExitStack(), begun, folder is not None)
+        return Run(contextlib.ExitStack(), begun, folder is not None, listeners)
 
 
 def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
