@@ -106,7 +106,7 @@ class Recording:
         records = self._records(stop)
         advance: Callable[[], Record] = records.__next__
         left = f"{self.problem.config.run.iterations - self.done} iterations of {self.manifest.config}"
-        append_log(self.folder.path, [*self.said, log_line(f"begins {left}")])
+        append_log(self.folder, [*self.said, log_line(f"begins {left}")])
         while True:
             with collected() as lines:  # and not while other runs have their turn
                 try:
@@ -118,7 +118,7 @@ class Recording:
                     lines.append(log_line(describe(error), "ERROR"))
                     raise
                 finally:
-                    append_log(self.folder.path, lines)
+                    append_log(self.folder, lines)
             try:
                 yield record
             except BaseException as error:

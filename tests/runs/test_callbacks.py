@@ -17,7 +17,7 @@ from runs.going_on import begin_alone
 
 import reslrb_cli as rl
 from reslrb_cli.records.images import as_bytes
-from reslrb_cli.runs import loggers
+from reslrb_cli.runs import log, loggers
 
 SET = {"run.certainty": False, "run.iterations": 3}
 POSTER, LAMP = "poster.reflectance.data", "lamp.emitter.radiance.value"
@@ -190,6 +190,17 @@ def test_the_log_file_has_the_lines_of_its_run(experiment: Path, caplog: pytest.
     list(rl.optimize(resume="runs/a", overrides={"run.iterations": 4}))
     assert Path("runs/a/run.log").read_text().startswith(texts[0])
     assert Path("runs/a/run.log").read_text().count("rendering the final image") == 2
+
+
+def test_warnings_are_printed_without_any_logging(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    logger = logging.getLogger("reslrb_cli")
+    for each in (logger, logging.getLogger()):
+        monkeypatch.setattr(each, "handlers", [])
+    with log.collected() as lines:
+        logger.warning("seen once")
+        logger.info("not printed")
+    assert capsys.readouterr().err == "seen once\n"
+    assert lines[0].endswith(" WARNING seen once")
 
 
 def test_the_manifest_names_the_commit_of_the_configuration(experiment: Path) -> None:
