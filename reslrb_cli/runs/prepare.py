@@ -132,8 +132,7 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgr
     """
     problem = assemble(config, say, DecisionCache(), to_run=True)
     problem, missing = check_missing(problem, say, warn)
-    # The check moves geometry, possibly beyond the bounding sphere of the lamps at infinity, or in the caller's scene.
-    if missing or config.own_scene is not None:
+    if missing:  # the check moves geometry, possibly beyond the bounding sphere of the lamps at infinity
         problem = problem.afresh(problem.values())
     manifest = manifest_of(problem, variant, config.source)
     manifest.incomplete = [asdict(record) for record in missing]

@@ -133,6 +133,17 @@ def test_a_file_a_dictionary_and_a_scene_give_equal_results(folder: Path) -> Non
     assert not dr.grad_enabled(params[TEXTURE])
 
 
+def test_moving_parameters_of_a_scene_in_memory(folder: Path) -> None:
+    """The check of the missing share moves the object before the run, and so does the rendering of the target."""
+    box = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0.4, 0.3, 0.3]).scale(0.2)}
+    moving = experiment(iterations=30, measuring=1.0, spp=16) | {"parameters": [BOX | MOVED]}
+    runs = [rl.optimize(moving, scene=each) for each in (room(box=box), rl.load_scene(room(box=box)))]
+    expected, found = (losses(run) for run in runs)
+    assert found == expected
+    np.testing.assert_array_equal(runs[1].parameters["box.translation"], runs[0].parameters["box.translation"])
+    np.testing.assert_array_equal(runs[1].truth["box.translation"], np.zeros(3))
+
+
 def test_single_calls_leave_the_scene_as_it_was(folder: Path) -> None:
     scene = rl.load_scene(room())
     before = {key: np.array(mi.traverse(scene)[key]) for key in (TEXTURE, BALL, "camera.film.size")}
@@ -179,6 +190,7 @@ def test_load_scene_takes_a_dictionary(folder: Path) -> None:
 
 # --- errors -----------------------------------------------------------------------------------------------------------
 
+MOVED = {"initial": {"translation": [0.1, 0, 0]}}
 BOX = {"motion": {"of": "box", "free": ["translation"]}}
 FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: rl.load({**experiment(), "scene": {"type": "sphere"}}), '<dict>: scene: has type `sphere`; it must be "s'),
