@@ -16,8 +16,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from reslrb_cli.config.code import guarded
+from reslrb_cli.config.parameters import HEIGHTMAP
 from reslrb_cli.errors import ConfigError, one_line
-from reslrb_cli.records.images import as_bytes
+from reslrb_cli.records.images import as_bytes, finite_range, in_range
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.runs.callbacks import Array, Callback, RunInfo
 
@@ -34,7 +35,16 @@ def _package(name: str, extra: str) -> Any:
 
 
 class _Logger(Callback):
-    """Common part of the loggers."""
+    """Common part of the loggers. `_done` is the number of finished iterations, the place of an image."""
+
+    _done = 0
+
+    def begin(self, run: RunInfo) -> None:
+        self._done = run.done
+        self._open(run)
+
+    def _open(self, run: RunInfo) -> None:
+        raise NotImplementedError
 
     def _scalars(self, values: dict[str, float], iteration: int) -> None:
         raise NotImplementedError
@@ -56,16 +66,17 @@ class _Logger(Callback):
                 names = [f"value/{key}"] if len(entries) == 1 else [f"value/{key}/{n}" for n in range(len(entries))]
                 values |= dict(zip(names, entries, strict=True))
         self._scalars(values, record.iteration)
+        self._done = record.iteration + 1
 
     def image(self, run: RunInfo, name: str, image: Array, exposure: float) -> None:
-        self._image(
-            f"image/{name}", as_bytes(image * np.float32(exposure)), run.iterations if name[:5] == "final" else 0
-        )
+        self._image(f"image/{name}", as_bytes(image * np.float32(exposure)), self._done)
 
     def end(self, run: RunInfo, status: str) -> None:
         for key, shape in run.shapes.items():
             if len(shape) == 3:
-                self._image(f"value/{key}", as_bytes(run.value(key)), run.iterations)
+                value = run.value(key)
+                shown = in_range(value, *finite_range([value])) if key.endswith(f".{HEIGHTMAP}") else value
+                self._image(f"value/{key}", as_bytes(shown), self._done)
 
 
 class TensorBoard(_Logger):
@@ -80,7 +91,7 @@ class TensorBoard(_Logger):
         self._folder = folder
         self._writer: Any = None
 
-    def begin(self, run: RunInfo) -> None:
+    def _open(self, run: RunInfo) -> None:
         place = run.folder if self._folder is None else Path(self._folder)
         if place is None:
             raise ConfigError("callbacks", "TensorBoard", "needs a folder: give the run one, or TensorBoard(FOLDER)")
@@ -112,11 +123,13 @@ class MLflow(_Logger):
         self._mlflow = _package("mlflow", "mlflow")
         self._owns = self._runs = False
 
-    def begin(self, run: RunInfo) -> None:
+    def _open(self, run: RunInfo) -> None:
         self._owns = self._mlflow.active_run() is None
         if self._owns:
             self._mlflow.start_run(run_name=run.name if run.folder is None else run.folder.name)
         self._runs = True
+        if run.done and not self._owns:
+            return  # MLflow refuses to change a parameter
         # MLflow allows some characters only in names, and 6000 in values.
         self._mlflow.log_params({_plain(key): str(value)[:6000] for key, value in run.settings.items()})
 
@@ -147,7 +160,7 @@ class WandB(_Logger):
         self._owns = False
         self._run: Any = None
 
-    def begin(self, run: RunInfo) -> None:
+    def _open(self, run: RunInfo) -> None:
         self._owns = self._wandb.run is None
         if self._owns:
             place = {} if run.folder is None else {"dir": str(run.folder)}

@@ -150,7 +150,7 @@ def test_single_calls_leave_the_scene_as_it_was(folder: Path) -> None:
     by_scene, by_file = rl.load(experiment(), scene=scene), rl.load({**experiment(), "scene": room()})
     for initial in (True, False):
         np.testing.assert_array_equal(rl.render(by_scene, initial=initial)[0], rl.render(by_file, initial=initial)[0])
-    (loss, gradient), (expected, its) = rl.gradient(by_scene), rl.gradient(by_file)
+    (loss, gradient), (expected, its) = (rl.gradient(each, spp=8, seed=3) for each in (by_scene, by_file))
     assert loss == expected
     for key in its:
         np.testing.assert_array_equal(gradient[key], its[key])
@@ -182,6 +182,19 @@ def test_runs_of_a_dictionary_are_resumed_and_exported(folder: Path) -> None:
     made = mi.traverse(mi.load_file(str(rl.export("runs/a", "made"))))
     assert {TEXTURE, BALL} <= set(made.properties)
     assert load("runs/a/config.yaml").scene.file.is_file()
+
+
+def test_a_scene_completes_or_replaces_that_of_a_file(folder: Path) -> None:
+    Path("room.yaml").write_text("parameters: [{key: ball.bsdf.reflectance.value}]\ntarget: {render: {spp: 4}}\n")
+    expected = rl.render({"scene": room(), **experiment(), "parameters": [{"key": BALL}]}, spp=4)[0].shape
+    for scene in (room(), loaded()):
+        config = rl.load("room.yaml", scene=scene)
+        assert rl.render(config, spp=4)[0].shape == expected
+        assert rl.render(rl.load(config, {"run.spp": 8}), spp=4)[0].shape == expected
+        assert rl.load(rl.load("room.yaml", scene=loaded()), scene=scene).scene.file == config.scene.file
+    assert rl.render(rl.load("room.yaml", {"scene.size": [6, 5]}, scene=room()), spp=4)[0].shape == (5, 6, 3)
+    with pytest.raises(rl.ConfigError, match=r"room\.yaml: scene: missing"):
+        rl.load("room.yaml")
 
 
 def test_load_scene_takes_a_dictionary(folder: Path) -> None:
