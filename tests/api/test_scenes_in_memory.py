@@ -217,6 +217,15 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
      "`no.ply`: no such file; searched in "),
     (lambda: rl.load(experiment(), scene=room(a={"type": "sphere", "to_world": np.eye(4)})), "scene: scene.a.to_world: "
      "is array("),
+    (lambda: rl.load(experiment(), scene=room(a={"type": "sphere", "center": [1, [2, 3]]})), "scene: scene.a.center: "
+     "is [1, [2, 3]], which a scene file cannot express"),
+    (lambda: rl.load(experiment(), scene=paint({"type": "rgb", "colour": 1})), "scene: scene.a.reflectance.colour: rgb "
+     "has only `value` or `filename`"),
+    (lambda: rl.load(experiment(), scene=paint({"type": "rgb", "value": [1, 2]})), "scene: scene.a.reflectance.value: "
+     "is [1, 2]; rgb needs one number or three"),
+    (lambda: rl.load(experiment(), scene=paint({"type": "bitmap", "raw": True, "data": np.zeros(3)})), "scene: scene.a."
+     "reflectance.data: has shape (3,); it must be (height, width, channels)"),
+    (lambda: rl.load(experiment(), scene=room(a=room())), "scene: scene.a: is a scene within a scene"),
     (lambda: rl.load(experiment(), scene=3), "scene: must be a Mitsuba dictionary or an mi.Scene, not 3"),
     (lambda: rl.load(experiment(), {"scene.file": "x.xml"}, scene=room()), "overrides: scene.file: is given besides"),
     (lambda: rl.render({**experiment(), "scene": dark()}), "scene.xml: the scene has no emitters"),
@@ -237,6 +246,10 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
 ]  # fmt: skip
 
 
+def paint(reflectance: dict[str, Any]) -> dict[str, Any]:
+    return room(a={"type": "diffuse", "reflectance": reflectance})
+
+
 def dark() -> dict[str, Any]:
     return {name: item for name, item in room().items() if name != "lamp"}
 
@@ -251,6 +264,13 @@ def test_what_cannot_be_used_is_refused_in_one_line(folder: Path, call: Callable
         call()
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_cache_that_cannot_be_written_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("taken").write_text("")
+    monkeypatch.setenv("RESLRB_CACHE", str(folder / "taken"))
+    with pytest.raises(rl.ReslrbError, match=r"taken/scenes/.*: cannot write the scene: .*; set RESLRB_CACHE"):
+        rl.load(experiment(), scene=room())
 
 
 def test_folders_of_a_scene_in_memory_are_refused_later(folder: Path) -> None:

@@ -48,11 +48,12 @@ def write_dictionary(scene: Mapping[str, Any], source: object, base: Path) -> Pa
     digest = hashlib.blake2b(text, digest_size=16)
     for image in writer.images.values():
         digest.update(image.tobytes())
-    folder = cache_folder() / "scenes"
-    place = folder / digest.hexdigest()
-    if (place / SCENE_FILE).is_file():
-        return place / SCENE_FILE
+    place: object = "the cache"
     try:
+        folder = cache_folder() / "scenes"
+        place = folder / digest.hexdigest()
+        if (place / SCENE_FILE).is_file():
+            return place / SCENE_FILE
         folder.mkdir(parents=True, exist_ok=True)
         with unfinished_folder(folder) as unfinished:
             for name, image in writer.images.items():
@@ -60,8 +61,9 @@ def write_dictionary(scene: Mapping[str, Any], source: object, base: Path) -> Pa
             (unfinished / SCENE_FILE).write_bytes(text)
             if not (place / SCENE_FILE).is_file():  # another process may write the same
                 unfinished.rename(place)
-    except OSError as error:
-        raise MachineError(f"{place}: cannot write the scene: {error.strerror}; set RESLRB_CACHE") from None
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
+        reason = getattr(error, "strerror", None) or error
+        raise MachineError(f"{place}: cannot write the scene: {reason}; set RESLRB_CACHE to a folder") from None
     return place / SCENE_FILE
 
 
@@ -84,7 +86,7 @@ class _Writer:
             wrong = "is a scene within a scene" if parent else f'has type {quoted(type)}; it must be "scene"'
             raise self._fail(key, wrong)
         attributes = {"name": name} if parent is not None and parent.tag != "scene" else {}
-        if type in ("rgb", "spectrum") and set(value) <= {"type", "value", "filename", "id"}:
+        if type in ("rgb", "spectrum"):
             return self._colour(type, value, attributes, key)
         own = value.get("id", name if parent is not None and parent.tag == "scene" else "")
         if type == "ref":
@@ -105,7 +107,7 @@ class _Writer:
         if isinstance(item, Mapping):
             return self.object(item, name, key, element)
         if element.tag == "texture" and name == "data":
-            return self._image(name, np.array(item, dtype=np.float32), key)
+            return self._image(name, _array(item, np.float32), key)
         if isinstance(item, mi.Bitmap):
             encoded = owner.get("raw", False) and item.srgb_gamma()  # raw values are not decoded
             plain = item.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=bool(encoded))
@@ -128,7 +130,7 @@ class _Writer:
             raise self._fail(key, "is None; leave it out")
         if isinstance(item, mi.Object):
             raise self._fail(key, f"is an object of Mitsuba ({kind}); give its dictionary, {_INSTEAD}")
-        array = np.array(item)
+        array = _array(item)
         if array.dtype == bool and array.size == 1:
             return "boolean", {"value": str(bool(array.item())).lower()}
         if array.dtype.kind in "iuf" and array.size == 1 and array.ndim < 2:
@@ -140,13 +142,12 @@ class _Writer:
         raise self._fail(key, f"is {one_line(repr(item), 60)}, which a scene file cannot express; {_INSTEAD[3:]}")
 
     def _colour(self, type: str, value: Mapping[str, Any], attributes: dict[str, str], key: str) -> Element:
+        if more := sorted(set(map(str, value)) - {"type", "value", "filename", "id"}):
+            raise self._fail(f"{key}.{more[0]}", f"{type} has only `value` or `filename`")
         if "filename" in value:
             return Element(type, {**attributes, "filename": self._file(value["filename"], key)}, Path(), 0)
         given = value.get("value")
-        try:
-            array = np.array(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            array = np.zeros(0)
+        array = _array(given, np.float64)
         if type == "spectrum" and array.ndim == 2 and array.shape[1] == 2:
             text = ", ".join(f"{wavelength!r}:{number!r}" for wavelength, number in array.tolist())
         elif isinstance(given, str):
@@ -189,6 +190,14 @@ class _Writer:
 
     def _fail(self, key: str, message: str) -> ConfigError:
         return ConfigError(self._source, key, message)
+
+
+def _array(item: Any, dtype: Any = None) -> np.ndarray[Any, Any]:
+    """Return a value as an array. It is empty if the value is no array."""
+    try:
+        return np.array(item, dtype=dtype)
+    except (TypeError, ValueError):
+        return np.zeros(0)
 
 
 def _numbers(array: np.ndarray[Any, Any]) -> str:
