@@ -6,6 +6,7 @@ chooses the libLLVM that Dr.Jit loads.
 - `load` reads an experiment.
 - `optimize` recovers parameters in your own loop.
 - `render`, `gradient`, `gradcheck`, `convergence` and `export` run the commands of the same name on an experiment.
+- `Callback` receives the progress of a run; `TensorBoard`, `MLflow` and `WandB` log it.
 - `register` registers the plugins with Mitsuba.
 - `load_scene` loads a scene whose parameters have the same names as on the command line.
 - `step` computes one gradient step.
@@ -38,14 +39,21 @@ if TYPE_CHECKING:
     from reslrb_cli.integrators.plugin import register
     from reslrb_cli.integrators.step import gradient_step as step
     from reslrb_cli.records.metrics import Record
+    from reslrb_cli.runs.callbacks import Callback, RunInfo
+    from reslrb_cli.runs.loggers import MLflow, TensorBoard, WandB
     from reslrb_cli.scene.load import load_for_script as load_scene
 
 __all__ = [
+    "Callback",
     "Config",
     "ConfigError",
+    "MLflow",
     "Record",
     "ReslrbError",
     "Run",
+    "RunInfo",
+    "TensorBoard",
+    "WandB",
     "__version__",
     "convergence",
     "export",
@@ -65,6 +73,8 @@ _llvm.prepare()
 _LAZY = {
     **{name: ("reslrb_cli.api.experiment", name)
        for name in ("convergence", "export", "gradcheck", "gradient", "load", "render")},
+    **{name: ("reslrb_cli.runs.loggers", name) for name in ("MLflow", "TensorBoard", "WandB")},
+    **{name: ("reslrb_cli.runs.callbacks", name) for name in ("Callback", "RunInfo")},
     "Config": ("reslrb_cli.config.schema", "Config"),
     "ConfigError": ("reslrb_cli.errors", "ConfigError"),
     "Record": ("reslrb_cli.records.metrics", "Record"),

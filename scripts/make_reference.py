@@ -231,6 +231,7 @@ The signatures use these types:
 - `Array`: a NumPy array of float32
 - `Loss`: a function as described at `optimize`
 - `Objective`: a function of an image
+- `Scene`: a dictionary as for `mi.load_dict`, or an `mi.Scene`
 
 `GradcheckRecord` and `Line` have one attribute for each field of a `--json` line. Their method `to_json()` returns
 that line.
@@ -261,6 +262,8 @@ def _described(name: str, thing: Any) -> Iterator[str]:
             if member.startswith("_") or not (inspect.isfunction(value) or isinstance(value, property)):
                 continue
             function = value.fget if isinstance(value, property) else value
+            if function.__doc__ is None:  # its base class describes it
+                continue
             shown = _signature(member, function, method=True)
             if isinstance(value, property):
                 shown = f"{member}: {function.__annotations__['return']}"
@@ -272,7 +275,11 @@ def _described(name: str, thing: Any) -> Iterator[str]:
 def _fields(thing: Any) -> dict[str, str]:
     """Return the names of a dataclass's fields and their types in words."""
     found = getattr(thing, "__dataclass_fields__", {})
-    return {name: str(each.type).replace("Figure", "float") for name, each in found.items() if not name.isupper()}
+    return {
+        name: str(each.type).replace("Figure", "float")
+        for name, each in found.items()
+        if not (name.isupper() or name[0] == "_")
+    }
 
 
 def _signature(name: str, function: Any, method: bool = False) -> str:

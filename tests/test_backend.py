@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -286,6 +287,28 @@ def test_an_old_libllvm_chosen_by_dr_jit_is_refused(llvm: str, monkeypatch: pyte
     monkeypatch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 6))
     with pytest.raises(BackendError, match="loaded libLLVM 15"):
         variant.set_variant("llvm_ad_rgb")
+
+
+def test_an_old_libllvm_is_told_at_import_and_refused_before_it_aborts(
+    llvm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import drjit as dr
+
+    import reslrb_cli as rl
+    from reslrb_cli.backend import llvm as choice
+
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 6))
+    advice = "loaded libLLVM 15, which can end the process; import reslrb_cli before mitsuba and drjit, or set "
+    with pytest.warns(UserWarning, match=advice):
+        choice.prepare()
+    variant.check_variant.cache_clear()
+    for call in (rl.register, lambda: rl.load_scene("scene.xml")):
+        with pytest.raises(BackendError, match=advice):
+            call()
+    monkeypatch.setattr("mitsuba.variant", lambda: "cuda_ad_rgb")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        choice.prepare()
 
 
 def test_an_unknown_variant_is_refused(llvm: str) -> None:

@@ -19,23 +19,29 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config import loader
 from reslrb_cli.config.files import as_path
-from reslrb_cli.config.loader import Override
-from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.config.loader import OVERRIDDEN, Override
+from reslrb_cli.config.schema import IN_MEMORY, Config
+from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 Array: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 #: Description of an experiment: a configuration file, a run folder, a mapping with the content of YAML, or a `Config`.
 Experiment: TypeAlias = "Config | str | os.PathLike[str] | Mapping[str, Any]"
+
+#: A dictionary as for `mi.load_dict`, or an `mi.Scene`.
+Scene: TypeAlias = "Mapping[str, Any] | mi.Scene"
 
 #: Name in error messages of an experiment that is not a file.
 NAMELESS = "<dict>"
@@ -98,6 +104,7 @@ def load(
     experiment: Experiment,
     overrides: Mapping[str, object] | None = None,
     base: str | os.PathLike[str] | None = None,
+    scene: Scene | None = None,
 ) -> Config:
     """Load and check an experiment, and fill in the defaults.
 
@@ -112,14 +119,55 @@ def load(
     Paths in a file are relative to the file. Paths in a mapping are relative to `base`, by default the working
     directory. `load` does not open the files that the experiment names, and sets no Mitsuba variant.
 
+    `scene` replaces the section `scene` of the experiment. It is a dictionary as for `mi.load_dict`, or an `mi.Scene`.
+    In a mapping, the section `scene` may be one of these, too. Both need a variant: `load` sets the experiment's
+    variant if none is set. `load` writes a dictionary as a scene file into the cache (`~/.cache/reslrb/scenes`), so
+    that it can be used as any scene file. File names in a dictionary are relative to `base`. An `mi.Scene` must be
+    loaded with `optimize=False`. It exists only in this process, so its runs can be neither resumed nor exported later.
+
     Raises ConfigError if a key is unknown or missing or a value has a wrong type. The error names the file and the key,
     or `overrides`.
     """
-    return load_with(experiment, loader.overrides_of(overrides), base)
+    return load_with(experiment, loader.overrides_of(overrides), base, scene)
 
 
-def load_with(experiment: Experiment, put_in: Sequence[Override], base: str | os.PathLike[str] | None = None) -> Config:
+def load_with(
+    experiment: Experiment,
+    put_in: Sequence[Override],
+    base: str | os.PathLike[str] | None = None,
+    scene: Scene | None = None,
+) -> Config:
     """Do the same as `load`, with overrides that are already parsed."""
+    source: object = "scene"
+    if scene is None and isinstance(experiment, Mapping):
+        given = experiment.get("scene")
+        if (isinstance(given, Mapping) and "type" in given) or type(given).__module__.startswith("mitsuba"):
+            scene, source = given, NAMELESS
+            experiment = {name: value for name, value in experiment.items() if name != "scene"}
+    if scene is None:
+        return _load_from_file(experiment, put_in, base)
+    stand_in = Override("scene", ("scene",), {"file": str(Path(IN_MEMORY).absolute())})
+    config = _load_from_file(experiment, [stand_in, *put_in], base)
+    if config.scene.file.name != IN_MEMORY:
+        raise ConfigError(OVERRIDDEN, "scene.file", "is given besides scene; leave one of them out")
+    keep_variant(config.variant, config.source)
+    import mitsuba as mi
+
+    if isinstance(scene, Mapping):
+        from reslrb_cli.scene.xml.dictionary import write_dictionary
+
+        file = write_dictionary(scene, source, Path.cwd() if base is None else Path(base).absolute())
+        return loader.changed(config, [Override("scene", ("scene", "file"), str(file))])
+    if not isinstance(scene, mi.Scene):
+        what = "one of another variant" if type(scene).__name__ == "Scene" else one_line(repr(scene), 60)
+        raise ConfigError(source, "", f"must be a Mitsuba dictionary or an mi.Scene, not {what}")
+    from reslrb_cli.scene.in_memory import SceneInMemory
+
+    return config.with_scene(SceneInMemory(scene, source))
+
+
+def _load_from_file(experiment: Experiment, put_in: Sequence[Override], base: str | os.PathLike[str] | None) -> Config:
+    """Load an experiment whose scene is a file."""
     if isinstance(experiment, Config):
         return loader.changed(experiment, put_in)
     if isinstance(experiment, Mapping):
@@ -164,10 +212,13 @@ def render(
         scene, sensors, integrator, multiple = load_for_rendering(config, initial, values)
         samples = config.run.spp if spp is None else spp
         check_passes("spp", samples, multiple)
-        return {
-            sensor: render_in_passes(integrator, scene, sensor, samples, config.run.seed, 0, "render", multiple)
-            for sensor in sensors
-        }
+        try:
+            return {
+                sensor: render_in_passes(integrator, scene, sensor, samples, config.run.seed, 0, "render", multiple)
+                for sensor in sensors
+            }
+        finally:
+            _give_back(config)
 
 
 def gradient(
@@ -203,7 +254,15 @@ def gradient(
         problem = replace(problem, config=reseeded)
         loss = step_gradient(problem, 0)[0]
         found = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
-        return float(loss[0]), {key: problem.selection.shown(key, value) for key, value in found.items()}
+        shown = {key: problem.selection.shown(key, value) for key, value in found.items()}
+        _give_back(config)
+        return float(loss[0]), shown
+
+
+def _give_back(config: Config) -> None:
+    """Give a scene in memory its first values again."""
+    if config.own_scene is not None:
+        config.own_scene.restore()
 
 
 def gradcheck(
@@ -246,9 +305,12 @@ def gradcheck(
         gc.collect()  # earlier scenes and the gradients of their parameters would otherwise take part in the check
         checked = settings_of(config, integrators, budget, seeds, spp, time.monotonic() - began)
         check = Gradcheck(checked)
-        records = list(check.run(stop, logger.info))
-        for line in look_into(check, records, stop, logger.debug):
-            logger.info(line)
+        try:
+            records = list(check.run(stop, logger.info))
+            for line in look_into(check, records, stop, logger.debug):
+                logger.info(line)
+        finally:
+            _give_back(config)
         return records
 
 
@@ -280,6 +342,9 @@ def convergence(
     with called() as stop:
         config = load(experiment)
         config = config.with_code(allow_code or config.allows_code)
+        if config.own_scene is not None:
+            reason = "is an mi.Scene, which the processes of this measurement do not have; give a file or a dictionary"
+            raise ConfigError(config.source, "scene", reason)
         from reslrb_cli.measure.convergence import Session
         from reslrb_cli.measure.judgement import Judgement
         from reslrb_cli.measure.methods import Plan

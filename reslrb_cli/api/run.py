@@ -13,9 +13,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import drjit as dr
 import numpy as np
 
-from reslrb_cli.api.experiment import Experiment, called, held, load_with
+from reslrb_cli.api.experiment import Experiment, Scene, called, held, load_with
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config.files import as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override, overrides_of
@@ -26,9 +27,12 @@ from reslrb_cli.optimization.problem import progress_spp
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import check_output
+from reslrb_cli.runs.callbacks import Callback, Calls
+from reslrb_cli.runs.loggers import Callbacks, made
 from reslrb_cli.runs.prepare import PreparedRun, begin
 from reslrb_cli.runs.recorder import Recording
 from reslrb_cli.runs.resume import open_earlier
+from reslrb_cli.scene.in_memory import SceneInMemory
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -58,8 +62,10 @@ class Run:
     Runs in one process share only the device. You can alternate between them: `zip(run_a, run_b)`.
     """
 
-    def __init__(self, stack: contextlib.ExitStack, begun: PreparedRun, writes: bool) -> None:
-        self._begun, self._writes, self._stack = begun, writes, stack
+    def __init__(
+        self, stack: contextlib.ExitStack, begun: PreparedRun, writes: bool, callbacks: Sequence[Callback] = ()
+    ) -> None:
+        self._begun, self._writes, self._stack, self._callbacks = begun, writes, stack, callbacks
         self._records: list[Record] = []
         self._folder: Path | None = None
         done = begun.course.done >= self.config.run.iterations and not writes
@@ -67,6 +73,7 @@ class Run:
         self._stopped = False
         self._failure: BaseException | None = None
         self._loop: weakref.ref[Generator[Record, None, None]] | None = None
+        self._uses = self._scene_uses()
 
     # --- iterating ----------------------------------------------------------------------------------------------------
 
@@ -82,6 +89,9 @@ class Run:
         made = self._made()
         try:
             while True:
+                if self._scene_uses() != self._uses:
+                    reason = "has been used by another run or call since; load it once for each run"
+                    raise ConfigError("scene", "", reason)
                 with held():
                     record = next(made, None)
                 if record is None:
@@ -99,14 +109,27 @@ class Run:
         finally:
             with held():
                 made.close()
+                if self.config.own_scene is not None:
+                    self._leave_values()
+
+    def _scene_uses(self) -> int:
+        own = self.config.own_scene
+        return 0 if own is None else int(own.uses)
+
+    def _leave_values(self) -> None:
+        """Give the caller's scene the current values without derivatives."""
+        problem = self._begun.course.problem
+        problem.selection.hand_over({key: dr.detach(problem.optimizer[key]) for key in problem.selection.keys})
+        problem.optimizer.stands_at = None  # so that another loop hands its values over again
 
     def _made(self) -> Generator[Record, None, None]:
         """Yield the records of the remaining iterations, and write them if the run has a folder."""
         if self._stopped and self._writes and self._folder is not None:
             with called():
-                self._stack, self._begun, self._writes = _reopened(
-                    self._folder, (), self.config.own_loss, self.config.allows_code
+                self._stack, self._begun, self._writes = _reopened(  # also restores a scene in memory
+                    self._folder, (), self.config.own_loss, self.config.allows_code, self.config.own_scene
                 )
+                self._uses = self._scene_uses()
         self._stopped, self._status, self._failure = True, Status.RUNNING, None
         course = self._begun.course
         with self._stack:
@@ -115,7 +138,8 @@ class Run:
                 return
             with self._begun.place() as place:
                 self._folder = place.path
-                recording = Recording(course, place, self._begun.manifest)
+                calls = self._begun.calls(self._callbacks, place.path)
+                recording = Recording(course, place, self._begun.manifest, calls, self._begun.said)
                 try:
                     yield from recording.records()
                 finally:
@@ -123,18 +147,38 @@ class Run:
 
     def _unwritten(self) -> Generator[Record, None, None]:
         course, self._status = self._begun.course, Status.FAILED
+        calls = self._begun.calls(self._callbacks, None)
         try:
+            calls.begin()
+            if calls and not course.done:
+                self._show(calls, "target", self.targets)
+                self._show(calls, "initial", self.images)
             told = functools.partial(logger.warning, "%s")
             for state, record in iterate(course.problem, course.state, told, watch=course.watch):
                 course.add(state, record)
+                calls.iteration(record)
                 yield record
+            if calls:
+                self._show(calls, "final", self.images)
+            self._status = Status.FINISHED
         except (GeneratorExit, KeyboardInterrupt):
             self._status = Status.INTERRUPTED
             raise
         finally:
             course.stand()
-            if course.done >= self.config.run.iterations or course.state.stopped:
+            is_done = course.done >= self.config.run.iterations or bool(course.state.stopped)
+            if is_done and self._status is Status.INTERRUPTED:
                 self._status = Status.FINISHED
+            try:
+                calls.end(self._status.value)
+            except Exception:
+                self._status = Status.FAILED
+                raise
+
+    def _show(self, calls: Calls, name: str, images: Mapping[int, Array]) -> None:
+        """Report an image of each view to the callbacks."""
+        for sensor, image in images.items():
+            calls.image(name, "" if len(images) == 1 else f"-{sensor}", image)
 
     def live(self, figure: bool = True) -> Iterator[Record]:
         """Iterate with a progress bar. In a notebook, `figure` also shows a live plot of the loss, the errors, and one
@@ -268,6 +312,8 @@ def optimize(
     overrides: Mapping[str, object] | None = None,
     loss: Loss | None = None,
     allow_code: bool = False,
+    scene: Scene | None = None,
+    callbacks: Callbacks = (),
 ) -> Run:
     """Recover the parameters of an experiment; returns a `Run`, which computes one iteration at a time.
 
@@ -291,6 +337,13 @@ def optimize(
     width 1 or a tensor with one entry. Pass it again with `resume`. `allow_code` permits running the code files that
     the experiment names (`loss.file`, `integrator.file`).
 
+    `scene` replaces the scene of the experiment: a dictionary as for `mi.load_dict`, or an `mi.Scene` (see `load`). At
+    the end of a loop, an `mi.Scene` has the recovered values, without derivatives. Only one run at a time can use it,
+    and the run cannot be resumed from its folder.
+
+    `callbacks` receive the progress of the run (`Callback`). The names `"tensorboard"`, `"mlflow"` and `"wandb"` stand
+    for `TensorBoard()`, `MLflow()` and `WandB()`.
+
     Before returning, `optimize` sets the experiment's Mitsuba variant if none is set. `optimize` loads and checks all
     files and makes the target. `optimize` also chooses the settings that the experiment leaves to measurement. Raises
     ConfigError (located by file and key), UnsupportedScene, BackendError and MachineError. Iterating can also raise
@@ -307,18 +360,21 @@ def optimize(
             Override("folder", ("run", "name"), path.name),
         ]
     with called():
+        listeners = made(callbacks, "callbacks")
         if resume is not None:
             if folder is not None:
                 raise ConfigError("folder", "", "cannot be given with resume; copy the folder, and resume the copy")
             if experiment is not None:
                 raise ConfigError("experiment", "", "cannot be given with resume, which uses that of the run")
+            if scene is not None:
+                raise ConfigError("scene", "", "cannot be given with resume, which uses that of the run")
             earlier = as_path(resume, "resume", "the folder of a run")
-            run = Run(*_reopened(earlier, put_in, loss, allow_code))
+            run = Run(*_reopened(earlier, put_in, loss, allow_code), listeners)
             run._folder = earlier
             return run
         if experiment is None:
             raise ConfigError("experiment", "", "is missing; give a configuration, or resume=RUN")
-        config = _with_own(load_with(experiment, [*put_in, *named]), loss, allow_code)
+        config = _with_own(load_with(experiment, [*put_in, *named], scene=scene), loss, allow_code)
         if folder is not None:
             try:
                 check_output(config.source, config.run.output)
@@ -326,7 +382,7 @@ def optimize(
                 raise ConfigError("folder", "", error.message) from None
         variant = keep_variant(config.variant, config.source)
         begun = begin(config, variant, logger.info, logger.warning)
-        return Run(contextlib.ExitStack(), begun, folder is not None)
+        return Run(contextlib.ExitStack(), begun, folder is not None, listeners)
 
 
 def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
@@ -339,14 +395,14 @@ def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
 
 
 def _reopened(
-    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool
+    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool, scene: SceneInMemory | None = None
 ) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
     """Return the lock stack, the prepared run to resume, and True if iterations are left. The stack holds the lock of
     the run folder.
     """
     with contextlib.ExitStack() as stack:
         earlier = stack.enter_context(open_earlier(folder, put_in))
-        earlier.config = _with_own(earlier.config, loss, allow_code)
+        earlier.config = _with_own(earlier.config, loss, allow_code).with_scene(scene)
         variant = keep_variant(earlier.settled.variant, earlier.config.source)
         begun = earlier.begin(variant, logger.info, logger.warning)
         if earlier.is_done:

@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -42,8 +43,13 @@ class Library:
 def prepare() -> None:
     """Choose libLLVM, unless the user has chosen one or Dr.Jit is already loaded. Also load missing dependencies.
 
-    Never raises; `require` reports failures if LLVM is needed.
+    Never raises; `require` reports failures if LLVM is needed. Warns if Dr.Jit is already loaded and has a libLLVM that
+    would end the process.
     """
+    mi = sys.modules.get("mitsuba")
+    uses_cuda = mi is not None and str(getattr(mi, "variant", str)()).startswith("cuda")
+    if not uses_cuda and (fault := loaded_fault()):
+        warnings.warn(fault, stacklevel=3)
     if not os.environ.get(VARIABLE) and "drjit" not in sys.modules:
         library, _ = choose()
         if library is not None:
@@ -53,6 +59,26 @@ def prepare() -> None:
     for path in [*unpacked, *([chosen] if chosen.parent == UNPACKED else [])]:
         with suppress(OSError):
             shared_library.load(path)
+
+
+def loaded_fault() -> str:
+    """Return why the libLLVM that Dr.Jit has loaded is unusable, and what to do, or "". Dr.Jit keeps its first libLLVM.
+
+    The result is "" if Dr.Jit is not loaded, or has no libLLVM.
+    """
+    dr = sys.modules.get("drjit")
+    try:
+        major = dr.detail.llvm_version()[0] if dr and dr.has_backend(dr.JitBackend.LLVM) else MIN_VERSION
+    except AttributeError:  # Dr.Jit is being imported
+        return ""
+    if major >= MIN_VERSION:
+        return ""
+    best, _ = choose()
+    remedy = _what_to_install() if best is None else f"set {VARIABLE}={best.path}"
+    return (
+        f"Dr.Jit was imported before reslrb_cli and loaded libLLVM {major}, which can end the process; "
+        f"import reslrb_cli before mitsuba and drjit, or {remedy}"
+    )
 
 
 def require() -> Library:

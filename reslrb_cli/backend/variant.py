@@ -102,13 +102,15 @@ def works_under(variant: str) -> bool:
 
 @functools.cache
 def check_variant(variant: str | None) -> None:
-    """Raise BackendError if the current variant is not supported, or none is set."""
+    """Raise BackendError if the current variant is not supported, none is set, or its libLLVM would end the process."""
     import mitsuba as mi
 
     if variant is None or not works_under(variant):
         is_set = "no variant is set" if variant is None else f"variant {variant} is set, which reslrb does not support"
         works = ", ".join(sorted(filter(works_under, mi.variants()), key=lambda name: not name.endswith("_rgb")))
         raise BackendError(f"{is_set}; call mitsuba.set_variant(...) with one of {works}")
+    if variant.startswith("llvm") and (fault := llvm.loaded_fault()):
+        raise BackendError(fault)
 
 
 def missing_cuda(variant: str = "cuda_ad_rgb") -> str:
@@ -169,15 +171,13 @@ def _have_two_threads(dr: ModuleType) -> None:
 
 
 def _check_loaded_llvm(dr: ModuleType) -> None:
-    """Raise BackendError if Dr.Jit has no usable libLLVM, or a libLLVM older than `MIN_VERSION`.
+    """Raise BackendError if Dr.Jit has no usable libLLVM, or a libLLVM that would end the process.
 
     Both can happen only if Dr.Jit was imported before reslrb_cli, and chose its libLLVM itself.
     """
-    fault = ""
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        fault = "found no usable libLLVM"
-    elif (major := dr.detail.llvm_version()[0]) < llvm.MIN_VERSION:
-        fault = f"loaded libLLVM {major}, which would end the process"
+    fault = llvm.loaded_fault()
+    if not fault and not dr.has_backend(dr.JitBackend.LLVM):
+        fault = "Dr.Jit was imported before reslrb_cli and found no usable libLLVM; import reslrb_cli first, or set "
+        fault += llvm.VARIABLE
     if fault:
-        advice = f"import reslrb_cli first, or set {llvm.VARIABLE}"
-        raise BackendError(f"Dr.Jit was imported before reslrb_cli and {fault}; {advice}")
+        raise BackendError(fault)

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
     from reslrb_cli.optimization.problem import ErrorMeter
     from reslrb_cli.records.metrics import Record
+    from reslrb_cli.runs.callbacks import Callback
     from reslrb_cli.runs.prepare import PreparedRun
 
 
@@ -75,6 +76,7 @@ class OptimizeOptions(ExperimentOptions):
     dry_run: bool
     resumed: Path | None
     cluster: str | None
+    log: tuple[str, ...]
     quiet: bool
 
 
@@ -97,6 +99,11 @@ class OptimizeOptions(ExperimentOptions):
               "Distribute the shards of each step (run.shards) to workers: local:N, N processes on this machine, or "
               "tls://HOST:PORT, the workers of a dask scheduler; the result is that of one process. Needs `pip install "
               "reslrb[cluster]`.")  # fmt: skip
+@click.option(
+    "--log", multiple=True, metavar="NAME",
+    help="Also log the run to tensorboard, mlflow or wandb (`pip install 'reslrb[tensorboard]'`, ...), or to a "
+    "callback that another package offers under this name. May be repeated.",
+)  # fmt: skip
 @click.option("--quiet", is_flag=True, help="Print only the last line.")
 def command(**given: Any) -> int:
     """Recover the parameters of CONFIG from its target images.
@@ -137,6 +144,7 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -
     check_output(config_file, config.run.output)
     if workers is not None:
         workers.check()
+    callbacks = _callbacks(options)
     variant = start_variant(config)
     if options.dry_run:
         show_forecast(config)
@@ -144,7 +152,16 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -
 
     from reslrb_cli.runs.prepare import begin
 
-    return _run(begin(config, variant, logger.info, logger.warning), workers, options.quiet)
+    return _run(begin(config, variant, logger.info, logger.warning), workers, callbacks, options.quiet)
+
+
+def _callbacks(options: OptimizeOptions) -> list[Callback]:
+    """Return the callbacks of `--log`. Raises ConfigError."""
+    if not options.log:
+        return []
+    from reslrb_cli.runs.loggers import made
+
+    return made(options.log, "--log")
 
 
 def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
@@ -158,13 +175,14 @@ def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
         _check_shards(config, workers)
         if workers is not None:
             workers.check()
+        callbacks = _callbacks(options)
         variant = start_variant(config.model_copy(update={"variant": earlier.settled.variant}))
         begun = earlier.begin(variant, logger.info, logger.warning)
         logger.info(f"continuing {run} after {earlier.iteration} of {config.run.iterations} iterations")
-        return _run(begun, workers, options.quiet)
+        return _run(begun, workers, callbacks, options.quiet)
 
 
-def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
+def _run(begun: PreparedRun, workers: Place | None, callbacks: list[Callback], quiet: bool) -> int:
     """Run in the folder. Signals are handled before the folder is created, so the folder always records how the run
     ended.
     """
@@ -173,7 +191,7 @@ def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
 
         with engine_at(begun.course, workers) as engine:
             begun.course.compute_with(engine)
-            return _run(begun, None, quiet)
+            return _run(begun, None, callbacks, quiet)
     from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.records.manifest import Status
     from reslrb_cli.report.run_summary import last_line, parameter_lines, terminal_width
@@ -182,7 +200,7 @@ def _run(begun: PreparedRun, workers: Place | None, quiet: bool) -> int:
     course, manifest = begun.course, begun.manifest
     iterations = course.problem.config.run.iterations
     with Interrupts(notice=None if quiet else NOTICE) as interrupts, begun.place() as place:
-        recording = Recording(course, place, manifest)
+        recording = Recording(course, place, manifest, begun.calls(callbacks, place.path), begun.said)
         interrupts.last_act = recording.abandon
         with Progress(iterations, quiet, course.results.meter, course.done) as progress:
             status = recording.run(progress.show, lambda: interrupts.requested)

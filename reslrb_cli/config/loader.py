@@ -167,15 +167,15 @@ def plain(value: Any, source: object, key: str = "") -> Any:
 
 
 def changed(config: Config, overrides: Sequence[str | Override]) -> Config:
-    """Return the experiment with overrides applied. The returned experiment keeps the loss function of `config` and the
-    permission to run code.
+    """Return the experiment with overrides applied. The returned experiment keeps the loss function of `config`, its
+    scene in memory, and the permission to run code.
 
     Raises ConfigError.
     """
     if not overrides:
         return config
     parsed = [parse_override(each) if isinstance(each, str) else each for each in overrides]
-    return resolve(config.model_dump(mode="json", exclude_none=True), config.source, parsed).with_code_as(config)
+    return resolve(config.model_dump(mode="json", exclude_none=True), config.source, parsed).with_own_of(config)
 
 
 def resolve(data: Any, path: Path | str, parsed: Sequence[Override] = ()) -> Config:
@@ -245,7 +245,7 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
     changed, found = _validate(data, config.source)
     if changed is None:
         raise ConfigError(blame, found[0].key, found[0].explain())
-    return changed.with_code_as(config)
+    return changed.with_own_of(config)
 
 
 def dump(config: Config) -> str:

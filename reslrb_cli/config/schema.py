@@ -50,6 +50,10 @@ def _scalar(value: Any) -> Any:
     return value
 
 
+#: Name of `scene.file` if the scene is an `mi.Scene` in the memory of the process.
+IN_MEMORY = "<mi.Scene>"
+
+
 class SceneConfig(Section):
     """The scene and its cameras."""
 
@@ -114,6 +118,7 @@ class Config(Section):
     _source: Path = PrivateAttr(default=Path("config.yaml"))
     _allows_code: bool = PrivateAttr(default=False)
     _own_loss: Callable[..., Any] | None = PrivateAttr(default=None)
+    _own_scene: Any = PrivateAttr(default=None)
 
     @property
     def adjoint(self) -> Literal["correlated", "independent", "batched"]:
@@ -196,10 +201,21 @@ class Config(Section):
         config._allows_code = allowed
         return config
 
-    def with_code_as(self, other: Config) -> Config:
-        """Return this experiment with the loss function and the code permission of `other`."""
+    @property
+    def own_scene(self) -> Any:
+        """The `SceneInMemory` that was passed instead of a scene file, or None."""
+        return self._own_scene
+
+    def with_own_of(self, other: Config) -> Config:
+        """Return this experiment with the loss function, the scene in memory and the code permission of `other`."""
         config = self.with_code(other._allows_code)
         config._own_loss = other._own_loss
+        return config.with_scene(other._own_scene) if config.scene.file.name == IN_MEMORY else config
+
+    def with_scene(self, scene: Any) -> Config:
+        """Return the same experiment with a `SceneInMemory`, for a `scene.file` of the name `IN_MEMORY`."""
+        config = self.model_copy()
+        config._own_scene = scene
         return config
 
     def with_loss(self, loss: Callable[..., Any]) -> Config:

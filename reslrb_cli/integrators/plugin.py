@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+import traceback
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mitsuba as mi
 
+from reslrb_cli.backend.llvm import loaded_fault
 from reslrb_cli.backend.variant import check_variant, works_under
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import one_of
@@ -44,6 +47,9 @@ OPTIONS: dict[str, Any] = {
 
 def register() -> None:
     """Register the integrators with Mitsuba, for the current variant and for variants that are set later.
+
+    Dr.Jit replaces each error in `mi.render` by a `RuntimeError` without its reason. `register` therefore also replaces
+    `mi.render` by a function that raises the errors of these integrators themselves, such as UnsupportedScene.
 
     Raises BackendError, which lists the supported variants, if the current variant is not supported. If an unsupported
     variant is set later, loading one of the integrators raises an error.
@@ -137,9 +143,32 @@ def make_reslrb(**given: Any) -> Reslrb:
 
 def _on_variant(old: str | None, new: str) -> None:
     # `check_variant` raises: Mitsuba's own message, "no such plugin", would not help.
-    plugin = _plugin_class() if works_under(new) else lambda name, props: check_variant(mi.variant())
+    usable = works_under(new) and not (new.startswith("llvm") and loaded_fault())
+    plugin = _plugin_class() if usable else lambda name, props: check_variant(mi.variant())
+    if usable and not hasattr(mi.render, "_reslrb"):
+        mi.render = _with_reasons(mi.render)
     for name in TRACERS:
         mi.register_integrator(name, lambda props, name=name: plugin(name, props))
+
+
+def _with_reasons(render: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `mi.render` with errors of our integrators in place of the `RuntimeError` that Dr.Jit makes of them."""
+
+    @functools.wraps(render)
+    def call(*args: Any, **options: Any) -> Any:
+        try:
+            return render(*args, **options)
+        except RuntimeError as error:
+            cause = error.__cause__
+            frames = traceback.walk_tb(cause.__traceback__) if cause is not None else ()
+            if not any(frame.f_code.co_filename == __file__ for frame, _ in frames):
+                raise
+            assert cause is not None
+            reason = cause
+        raise reason from None
+
+    call._reslrb = True  # type: ignore[attr-defined]
+    return call
 
 
 def _plugin_class() -> type[mi.CppADIntegrator]:

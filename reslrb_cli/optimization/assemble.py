@@ -101,7 +101,7 @@ def assemble(
             own.attempt(view.target, view.weights)
     if settled is not None:
         return reach_as(decide_as(problem, settled), settled)
-    problem = settle(problem, say, cache)
+    problem = settle(problem, say, None if config.own_scene is not None else cache)  # the cache compares files
     if to_run:
         check_exposures(problem)
         problem = find_reached(problem)

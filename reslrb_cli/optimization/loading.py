@@ -5,7 +5,7 @@ A pass is small enough to fit into memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import drjit as dr
@@ -15,7 +15,8 @@ import numpy as np
 from reslrb_cli.config.base import size_of
 from reslrb_cli.config.integrators import Integrator, Own, WalkAdConfig
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
-from reslrb_cli.config.schema import Config
+from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.config.schema import IN_MEMORY, Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.context import sensors_in_words
 from reslrb_cli.integrators.freezing import MOST_PATHS_APART
@@ -24,6 +25,7 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.in_memory import INSTEAD
 from reslrb_cli.scene.load import load_scene, make_grid, warn_once
 from reslrb_cli.scene.needs import (
     camera_finds_nothing,
@@ -103,6 +105,8 @@ def load_configured(
     """
     scene = config.scene
     keys = selected_keys(config) if selects else []
+    if scene.file.name == IN_MEMORY:
+        return _lent_scene(config, keys, config.parameters if selects else [])
 
     def see(description: Description) -> None:
         for number, spec in enumerate(config.parameters if selects else ()):
@@ -114,6 +118,24 @@ def load_configured(
             look(description)
 
     return load_scene(scene.file, scene.options, scene.size, scene.cameras, see, keys)
+
+
+def _lent_scene(config: Config, keys: list[str], specs: Sequence[ParameterSpec]) -> mi.Scene:
+    """Return the caller's scene with its first values. Raises ConfigError for settings that need a scene file."""
+    scene, own = config.scene, config.own_scene
+    if own is None:
+        reason = f"was an mi.Scene in the memory of another process; {INSTEAD}"
+        raise ConfigError(config.source, "scene.file", reason)
+    changed = next((name for name in ("options", "size", "cameras") if getattr(scene, name)), None)
+    if changed is not None:
+        raise ConfigError(config.source, f"scene.{changed}", f"cannot change an mi.Scene; {INSTEAD}")
+    for number, spec in enumerate(specs):
+        if spec.heightmap is not None and spec.heightmap.grid is not None:
+            reason = f"cannot replace a shape of an mi.Scene; {INSTEAD}"
+            raise ConfigError(config.source, f"parameters[{number}].heightmap.grid", reason)
+    moved = [name for spec in specs for _, _, name in spec.objects()]
+    own.check_merged([key for key in keys if key.rpartition(".")[0] not in moved], moved, config.source)
+    return own.restore()
 
 
 def selected_keys(config: Config) -> list[str]:

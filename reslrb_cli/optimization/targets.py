@@ -122,6 +122,9 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
         )
         del true_scene
         gc.collect()
+    if problem.config.own_scene is not None:  # the scene of the true values
+        problem.config.own_scene.restore()
+        problem.apply()
     _check_light(problem, say)
     return problem
 

@@ -87,10 +87,20 @@ def write_file(path: Path, image: Array, linear: bool) -> None:
     if linear:
         write_bitmap(path, mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)))
         return
+    write_bitmap(path, _as_srgb(image))
+
+
+def as_bytes(image: Array) -> Array:
+    """Return an (H, W, C) image of linear values as sRGB bytes, (H, W, 3) or (H, W, 1), as `write_file` writes it."""
+    pixels = np.array(_as_srgb(image))
+    return pixels if pixels.ndim == 3 else pixels[:, :, None]
+
+
+def _as_srgb(image: Array) -> mi.Bitmap:
     channels = 3 if image.shape[2] >= 3 else 1
     shown = np.clip(np.nan_to_num(image[:, :, :channels], nan=0.0), 0.0, 1.0).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
-    write_bitmap(path, bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True))
+    return bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
 
 
 def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:

@@ -11,6 +11,7 @@ import enum
 import json
 import os
 import platform
+import subprocess
 import sys
 import threading
 from collections.abc import Mapping
@@ -44,6 +45,21 @@ def versions() -> dict[str, str]:
     return {"reslrb": __version__, "python": platform.python_version()} | found
 
 
+def commit_of(folder: Path) -> str | None:
+    """Return the commit that is checked out in the git repository around `folder`, or None if there is none.
+
+    The question runs no code of the repository, whose settings could name programs.
+    """
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), "rev-parse", "--verify", "HEAD"],
+            capture_output=True, text=True, timeout=10, check=False, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
 class Status(str, enum.Enum):
     """Status of a run."""
 
@@ -58,6 +74,7 @@ class Manifest:
     """Provenance and outcome of one run.
 
     - `process`: the process that uses the folder.
+    - `commit`: the commit of the git repository that the configuration lies in.
     - `plan`: the parts of a step.
     - `decisions`: settings of the integrator that were `auto` (`Decision`).
     - `incomplete`: the missing share of the derivative, for each parameter that moves light (`MissingRecord`).
@@ -84,6 +101,7 @@ class Manifest:
     started: str = field(default_factory=now)
     ended: str | None = None
     error: str | None = None
+    commit: str | None = None
     plan: dict[str, Any] | None = None
     decisions: list[dict[str, Any]] = field(default_factory=list)
     scaling: list[dict[str, Any]] | None = None

@@ -37,11 +37,13 @@ from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
 from reslrb_cli.records.decisions import DecisionCache
-from reslrb_cli.records.manifest import Manifest
+from reslrb_cli.records.manifest import Manifest, commit_of
 from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
+from reslrb_cli.runs.callbacks import Callback, Calls, RunInfo
+from reslrb_cli.runs.log import collected
 from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.scene.needs import unsupported_part
 from reslrb_cli.scene.visibility import sees_lamps
@@ -140,7 +142,11 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgr
 def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
     """Return the manifest of a run of `problem`, with the entries that the problem determines."""
     manifest = Manifest(
-        variant=variant, device=device_name(variant), seed=problem.config.run.seed, config=printable(config_file)
+        variant=variant,
+        device=device_name(variant),
+        seed=problem.config.run.seed,
+        config=printable(config_file),
+        commit=commit_of(config_file.absolute().parent),
     )
     manifest.plan = plan_record(problem)
     manifest.views = view_records(problem.views)
@@ -308,12 +314,26 @@ class RunProgress:
 class PreparedRun:
     """Run that is ready to start or to resume.
 
-    `place` creates the run folder or takes it over, and locks it while the block runs.
+    `place` creates the run folder or takes it over, and locks it while the block runs. `said` has the log lines of the
+    preparation.
     """
 
     course: RunProgress
     manifest: Manifest
     place: Callable[[], contextlib.AbstractContextManager[RunFolder]]
+    said: list[str] = field(default_factory=list)
+
+    def calls(self, callbacks: Sequence[Callback], folder: Path | None) -> Calls:
+        """Return the calls of the run's callbacks."""
+        course, config = self.course, self.course.problem.config
+        keys = course.problem.selection.keys
+
+        def value(key: str) -> Array:
+            return course.shown({key: course.state.values[key]})[key]
+
+        shapes = {key: course.problem.selection.array(key).shape for key in keys}
+        run = RunInfo(config.run.name, folder, flat(config), config.run.iterations, course.done, shapes, value)
+        return Calls(callbacks, run, self.manifest)
 
 
 def begin(config: Config, variant: str, say: Say, warn: Say) -> PreparedRun:
@@ -321,10 +341,12 @@ def begin(config: Config, variant: str, say: Say, warn: Say) -> PreparedRun:
 
     Call `check_output` first, to check that the folder can be made. Raises ConfigError and UnsupportedScene.
     """
-    course, manifest = prepare(config, variant, say, warn)
+    with collected() as said:
+        course, manifest = prepare(config, variant, say, warn)
     run = config.run
     return PreparedRun(
         course,
         manifest,
         lambda: RunFolder.create(config.source, run.output, run.folder_name, dump(config), manifest),
+        said,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import shlex
@@ -38,6 +39,8 @@ from reslrb_cli.report.page import write_report
 from reslrb_cli.report.perceptual import seen_errors
 from reslrb_cli.report.run_summary import warnings
 from reslrb_cli.report.tonemap import shown_exposures, write_error_map
+from reslrb_cli.runs.callbacks import Calls
+from reslrb_cli.runs.log import append_log, collected, log_line
 from reslrb_cli.runs.prepare import RunProgress
 
 logger = logging.getLogger(__name__)
@@ -50,6 +53,9 @@ class Recording:
     course: RunProgress
     folder: RunFolder
     manifest: Manifest
+    calls: Calls
+    #: Lines for the log file.
+    said: list[str] = field(default_factory=list)
     page: LivePage = field(init=False)
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
@@ -90,13 +96,37 @@ class Recording:
         return self.status
 
     def records(self, stop: Callable[[], bool] = lambda: False) -> Generator[Record, None, None]:
-        """Yield the record of each iteration, then complete the folder and set `status`.
+        """Yield the record of each iteration, then complete the folder and set `status`. Write the log file.
 
         Iteration stops at the last iteration, when `stop()` is true, or when the generator is closed. In all cases, the
         folder finally has a checkpoint, the parameters, the report, and a manifest with the outcome. If the run did not
         fail, the folder also has the final images. Raises the error that ended the run. The error is a MachineError if
         the run could not write to the folder.
         """
+        records = self._records(stop)
+        advance: Callable[[], Record] = records.__next__
+        left = f"{self.problem.config.run.iterations - self.done} iterations of {self.manifest.config}"
+        append_log(self.folder, [*self.said, log_line(f"begins {left}")])
+        while True:
+            with collected() as lines:  # and not while other runs have their turn
+                try:
+                    record = advance()
+                except StopIteration:
+                    lines.append(log_line(f"{self.status.value} after {self.done} iterations"))
+                    return
+                except BaseException as error:
+                    lines.append(log_line(describe(error), "ERROR"))
+                    raise
+                finally:
+                    append_log(self.folder, lines)
+            try:
+                yield record
+            except BaseException as error:
+                advance = functools.partial(records.throw, error)
+            else:
+                advance = records.__next__
+
+    def _records(self, stop: Callable[[], bool]) -> Generator[Record, None, None]:
         self._stop = stop
         status: Status = Status.FAILED
         failure: BaseException | None = None
@@ -104,7 +134,8 @@ class Recording:
             self.page.refresh()
             if self.done:  # a run with iterations has already written the files of `_begin`
                 self._saved = self.done
-            else:
+            self.calls.begin()
+            if not self.done:
                 self._begin()
             (self.folder.path / FABRICATION_FILE).unlink(missing_ok=True)  # outdated once the run goes on
             with contextlib.suppress(GeneratorExit):
@@ -153,6 +184,7 @@ class Recording:
                 told = state.scaling
                 metrics.write(record)  # first, because a checkpoint needs the lines of its iterations
                 self.course.add(state, record)
+                self.calls.iteration(record)
                 yield record
                 if (fault := self.folder.fault) is not None:  # the folder may have been removed or replaced
                     raise fault
@@ -196,6 +228,8 @@ class Recording:
         """Complete the folder, starting with the state, and return how the run ended. Raises the first error."""
         if (fault := self.folder.fault) is not None:
             failure = failure or fault
+            with contextlib.suppress(Exception):
+                self.calls.end(Status.FAILED.value)
             raise MachineError(describe(failure)) if isinstance(failure, OSError) else failure
         parts = [self._save_last_checkpoint, self._write_parameters, self._note_results]
         for part in parts if failure is not None else [*parts, self._write_final_images]:
@@ -203,6 +237,10 @@ class Recording:
                 part()
             except Exception as error:
                 failure = failure or error
+        try:
+            self.calls.end((status if failure is None else Status.FAILED).value)
+        except Exception as error:
+            failure = failure or error
         if failure is not None:
             status = Status.FAILED
         elif status is Status.FINISHED:  # an interrupt must not wait
@@ -355,6 +393,7 @@ class Recording:
         """Write an image of a sensor. The PNG file uses the exposure that suits the sensor's target."""
         exposure = shown_exposures(self.manifest.views).get(self._image_name("", sensor), 1.0)
         write_image(self.folder.images / self._image_name(name, sensor), image, image * np.float32(exposure))
+        self.calls.image(name, self._image_name("", sensor), image)
 
     def _image_name(self, name: str, sensor: int) -> str:
         return name if len(self.problem.views) == 1 else f"{name}-{sensor}"

@@ -22,6 +22,7 @@ from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
 from reslrb_cli.records.run_folder import RunFolder, check_writable, opened, write_beginning
 from reslrb_cli.records.tree import Stored
+from reslrb_cli.runs.log import collected
 from reslrb_cli.runs.prepare import (
     PLACE,
     Change,
@@ -89,7 +90,8 @@ class OpenedRun:
 
         Raises ConfigError and UnsupportedScene.
         """
-        problem = assemble(self.config, say, to_run=True, settled=self.stored)
+        with collected() as said:
+            problem = assemble(self.config, say, to_run=True, settled=self.stored)
         manifest = self._manifest(manifest_of(problem, variant, self.config.source))
         course = RunProgress(problem, variant)
         course.restore(self.stored, self.records)
@@ -99,11 +101,12 @@ class OpenedRun:
         manifest.scaling = None if measured is None else [row.to_json() for row in measured]
         for line in self.said:
             warn(line)
-        return PreparedRun(course, manifest, lambda: self._take_over(manifest))
+        return PreparedRun(course, manifest, lambda: self._take_over(manifest), said)
 
     def _manifest(self, manifest: Manifest) -> Manifest:
         before, here = self.manifest, versions()
         manifest.started = before.get("started", manifest.started)
+        manifest.commit = before.get("commit")  # the configuration is now that of the run folder
         manifest.resumed = list(before.get("resumed", []))
         manifest.incomplete = list(before.get("incomplete", []))
         earlier = before.get("versions", {})

@@ -22,13 +22,16 @@ from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.graph import bounds
 from reslrb_cli.scene.values import Place
 from reslrb_cli.scene.xml.build import Owners, build, resize_films
-from reslrb_cli.scene.xml.mend import mend, warnings
+from reslrb_cli.scene.xml.dictionary import write_dictionary
+from reslrb_cli.scene.xml.mend import Note, mend, warnings
 from reslrb_cli.scene.xml.read import Description, quoted, read_description
 
 logger = logging.getLogger(__name__)
 #: Largest ray offset, as a fraction of the scene's size, without visible loss of light: that of a room of size 3 at
 #: about 150 from the origin, or of a room a fiftieth in size.
 _LARGEST_OFFSET = 5e-3
+#: Source in error messages about a dictionary.
+DICTIONARY = "<dict>"
 
 
 def load_scene(
@@ -69,18 +72,7 @@ def load_scene(
     scene, unused = build(description)
     if not isinstance(scene, mi.Scene):
         raise ConfigError(file, "", "its root is a single object instead of a <scene>")
-    for objects, wrong in (
-        (scene.shapes(), "the scene is empty: it has no shapes"),
-        (scene.emitters(), "the scene has no emitters: no light path can start"),
-        (scene.sensors(), "the scene has no sensor"),
-    ):
-        if len(objects) == 0:
-            raise ConfigError(file, "", wrong)
-    _check_meshes(file, scene)
-    for line in warnings([*found, *unused]):
-        warn_once(line)
-    if (problem := _lost_light(scene)) is not None:
-        warn_once(f"{file}: {problem}")
+    check_scene(file, scene, [*found, *unused])
     for note in unused:
         if note.owner is not None:
             note.owner.children.remove(note.element)
@@ -90,10 +82,31 @@ def load_scene(
     return scene
 
 
-def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, **options: Any) -> mi.Scene:
-    """Load a Mitsuba scene file as the command line does. The parameters have the names that `reslrb inspect` lists.
+def check_scene(source: object, scene: mi.Scene, notes: Iterable[Note] = ()) -> None:
+    """Raise ConfigError for a scene without shapes, light or sensor, or with a broken mesh. Log `notes`, and warn of a
+    scene that is too far from the origin or too small.
+    """
+    for objects, wrong in (
+        (scene.shapes(), "the scene is empty: it has no shapes"),
+        (scene.emitters(), "the scene has no emitters: no light path can start"),
+        (scene.sensors(), "the scene has no sensor"),
+    ):
+        if len(objects) == 0:
+            raise ConfigError(source, "", wrong)
+    _check_meshes(source, scene)
+    for line in warnings(notes):
+        warn_once(line)
+    if (problem := _lost_light(scene)) is not None:
+        warn_once(f"{source}: {problem}")
 
-    `load_for_script` replaces `mi.load_file(file, optimize=False, **options)`. `mi.load_file` refuses files of other
+
+def load_for_script(
+    file: str | os.PathLike[str] | Mapping[str, Any], keys: Iterable[str] = (), /, **options: Any
+) -> mi.Scene:
+    """Load a Mitsuba scene as the command line does. The parameters have the names that `reslrb inspect` lists.
+
+    `file` is a scene file, or a dictionary as for `mi.load_dict`. `load_for_script` replaces
+    `mi.load_file(file, optimize=False, **options)`. `mi.load_file` refuses files of other
     versions and exporters, and names objects without an id differently. `options` are the values of the file's `$name`
     variables. Messages call these variables `scene.options.NAME`. `keys` are parameters, or globs, that need gradients.
     Textures of 8 or 16 bits among `keys` are read as floating point. A variant must be set. The function does not load
@@ -103,8 +116,11 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
     under an unsupported variant.
     """
     check_variant(mi.variant())
-    path = as_path(file, "file", "the path of a scene file")
-    return load_scene(path, options, keys=[keys] if isinstance(keys, str) else keys)
+    wanted = [keys] if isinstance(keys, str) else keys
+    if isinstance(file, Mapping):
+        return load_scene(write_dictionary(file, DICTIONARY, Path.cwd()), options, keys=wanted)
+    path = as_path(file, "file", "the path of a scene file, or a Mitsuba dictionary")
+    return load_scene(path, options, keys=wanted)
 
 
 def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
@@ -166,7 +182,7 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
     return changed
 
 
-def _check_meshes(file: Path, scene: mi.Scene) -> None:
+def _check_meshes(source: object, scene: mi.Scene) -> None:
     """Raise ConfigError for a mesh whose faces refer to missing vertices. Mitsuba would read out of bounds for such a
     mesh.
     """
@@ -175,7 +191,7 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
             last = int(np.array(shape.faces_buffer()).max())
             if last >= shape.vertex_count():
                 has = f"has a face with vertex {last}, but only {shape.vertex_count()} vertices"
-                raise ConfigError(file, "", f"the mesh {quoted(shape.id())} {has}; write it again")
+                raise ConfigError(source, "", f"the mesh {quoted(shape.id())} {has}; write it again")
 
 
 def _lost_light(scene: Any) -> str | None:

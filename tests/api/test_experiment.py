@@ -99,7 +99,7 @@ def test_paths_of_a_mapping_are_relative_to_base(folder: Path, monkeypatch: pyte
             "overrides: run: replaces what run.spp sets; give it first",
         ),
         (lambda: rl.load(experiment(), base=3), "base: is 3, not the path of a folder"),  # type: ignore[arg-type]
-        (lambda: rl.load_scene({"type": "scene"}), "file: is {'type': 'scene'}, not the path of a scene file"),  # type: ignore[arg-type]
+        (lambda: rl.load_scene(3), "file: is 3, not the path of a scene file, or a Mitsuba dictionary"),  # type: ignore[arg-type]
         (lambda: rl.load(None), "experiment: is None, not a file, a mapping or a run's folder"),  # type: ignore[arg-type]
         (lambda: rl.export(None, "made"), "run: is None, not the folder of a run, which `optimize"),  # type: ignore[arg-type]
         (lambda: rl.optimize("tiny.yaml", folder=3), "folder: is 3, not the path of a folder"),  # type: ignore[arg-type]

@@ -36,6 +36,7 @@ run: {iterations: 25, spp: 16}
 
 FOLDER = [
     "checkpoint", "config.yaml", "images", "manifest.json", "metrics.jsonl", "parameters", "report.html",
+    "run.log",
 ]  # fmt: skip
 KEY = "poster.reflectance.data"
 

@@ -196,9 +196,8 @@ def test_a_step_accepts_numpy_numbers(case: Case):
 
 
 def test_mi_render_with_samples_out_of_range_raises(case: Case):
-    with pytest.raises(RuntimeError) as error:
+    with pytest.raises(ValueError, match=r'^"spp" must be 0 \(the sensor\'s own sample count\) or more, not -1'):
         mi.render(case.scene, integrator=plugin("reslrb"), spp=-1)
-    assert '"spp" must be 0 (the sensor\'s own sample count) or more, not -1' in str(error.value.__cause__)
     with pytest.raises(ValueError, match="are more than 65536 passes"):
         render_image(integrator("reslrb", samples_per_pass=1), case.scene, 0, 1, 10**6)
 
@@ -268,6 +267,54 @@ def test_moving_scenes_are_refused_with_a_reason(name: str, options: dict[str, s
     reason = "not of the sensor" if "camera" in key else reasons[options.get("estimator", name)]
     with pytest.raises(UnsupportedScene, match=reason):
         gradient_step(integrator(name, **options), case.scene, 0, case.objective, seed=1, spp=4)
+
+
+MEDIUM = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.5}}
+ORTHOGRAPHIC = {"type": "orthographic", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
+    ({"fog": MEDIUM}, {}, "", "shape fog bounds a participating medium; no integrator here supports media"),
+    ({"fog": MEDIUM}, {}, FLOOR, "shape fog bounds a participating medium"),
+    ({"camera": ORTHOGRAPHIC}, {}, "", "sensor camera is a OrthographicCamera; light paths connect to"),
+    ({}, {}, "camera.to_world", "camera.to_world: light tracing has derivatives of surfaces and emitters, not of the"),
+    ({}, {"estimator": "event"}, "lamp.to_world", "estimator event has no derivatives of moving light: it would need"),
+    ({}, {"estimator": "stack"}, "floor_shape.to_world", "sensor camera has a box filter"),
+]
+
+
+@pytest.mark.parametrize("mode", [dr.ADMode.Backward, dr.ADMode.Forward], ids=["backward", "forward"])
+@pytest.mark.parametrize(("more", "options", "key", "reason"), REFUSED, ids=[row[3][:30] for row in REFUSED])
+def test_the_reason_of_a_refusal_is_the_message_under_mi_render(
+    more: dict[str, Any], options: dict[str, str], key: str, reason: str, mode: dr.ADMode
+):
+    scene = mi.load_dict({"type": "scene", **_textured(), **more}, optimize=False)
+    params, tracer = mi.traverse(scene), plugin("reslrb", **options)
+    if key:
+        dr.enable_grad(params[key])
+        params.update()
+
+    def differentiate() -> None:
+        image = mi.render(scene, params, integrator=tracer, spp=1)
+        assert key, "an image is refused at once"
+        if mode == dr.ADMode.Backward:
+            dr.backward(dr.mean(image, axis=None))
+        else:
+            dr.set_grad(params[key], params[key])
+            dr.forward_to(image)
+
+    with pytest.raises(UnsupportedScene) as error:
+        differentiate()
+    assert str(error.value).startswith(reason)
+    assert error.value.__cause__ is None
+
+
+def test_other_integrators_keep_their_errors(case: Case):
+    class Failing(mi.CppADIntegrator):
+        def render(self, *args: Any, **options: Any) -> mi.TensorXf:
+            raise ValueError("of its own")
+
+    with pytest.raises(RuntimeError) as error:
+        mi.render(case.scene, integrator=Failing(mi.Properties("failing")), spp=1)
+    assert str(error.value.__cause__) == "of its own"
 
 
 def test_an_emitter_without_samples_is_refused():

@@ -1,0 +1,301 @@
+"""Callbacks are told of a run with and without a folder, and their errors end it in one line with a complete folder."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli.tiny import manifest, outcome, settings
+from runs.going_on import begin_alone
+
+import reslrb_cli as rl
+from reslrb_cli.records.images import as_bytes
+from reslrb_cli.runs import log, loggers
+
+SET = {"run.certainty": False, "run.iterations": 3}
+POSTER, LAMP = "poster.reflectance.data", "lamp.emitter.radiance.value"
+
+
+class Listener(rl.Callback):
+    """Keeps the calls. `fails` names the method that raises an error."""
+
+    def __init__(self, fails: str = "") -> None:
+        self.calls: list[Any] = []
+        self.values: list[dict[str, Any]] = []
+        self.images: dict[str, np.ndarray[Any, Any]] = {}
+        self.fails = fails
+        self.run: rl.RunInfo | None = None
+
+    def _told(self, name: str, *of: Any) -> None:
+        self.calls.append((name, *of))
+        if name == self.fails:
+            raise ValueError("no room")
+
+    def begin(self, run: rl.RunInfo) -> None:
+        self.run = run
+        self._told("begin", run.done)
+
+    def iteration(self, run: rl.RunInfo, record: rl.Record) -> None:
+        self.values.append({key: run.value(key) for key in run.shapes})
+        self._told("iteration", record.iteration)
+
+    def image(self, run: rl.RunInfo, name: str, image: Any, exposure: float) -> None:
+        self.images[name] = image
+        assert exposure > 0
+        self._told("image", name)
+
+    def end(self, run: rl.RunInfo, status: str) -> None:
+        self._told("end", status)
+
+
+#: The calls of a whole run.
+WHOLE = [("begin", 0), ("image", "target"), ("image", "initial"), *(("iteration", n) for n in range(3)),
+         ("image", "final"), ("end", "finished")]  # fmt: skip
+
+
+@pytest.fixture
+def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    begin_alone(tmp_path, monkeypatch)
+    return tmp_path
+
+
+@pytest.mark.parametrize("folder", [None, "runs/a"])
+def test_a_callback_is_told_of_a_whole_run(experiment: Path, folder: str | None) -> None:
+    quiet, heard = rl.optimize("tiny.yaml", overrides=SET), Listener()
+    run = rl.optimize("tiny.yaml", folder, overrides=SET, callbacks=[heard])
+    expected = list(quiet)
+    for number, record in enumerate(run):
+        assert record.loss == expected[number].loss
+        for key, value in run.parameters.items():
+            np.testing.assert_array_equal(heard.values[-1][key], value)
+    assert heard.calls == WHOLE
+    for key, value in quiet.parameters.items():  # looking has changed nothing
+        np.testing.assert_array_equal(run.parameters[key], value)
+    np.testing.assert_array_equal(heard.images["target"], run.targets[0])
+    told = heard.run
+    assert told is not None
+    assert (told.name, told.iterations, told.folder) == (
+        (folder and "a") or "tiny",
+        3,
+        folder and Path(folder).absolute(),
+    )
+    assert told.shapes == {POSTER: (4, 4, 3), LAMP: (3,)}
+    assert told.settings["run.iterations"] == 3
+
+
+def test_a_loop_that_is_left_and_continued(experiment: Path) -> None:
+    heard = Listener()
+    run = rl.optimize("tiny.yaml", "runs/a", overrides=SET, callbacks=[heard])
+    for _ in run:
+        break
+    assert heard.calls[-2:] == [("image", "final"), ("end", "interrupted")]
+    heard.calls.clear()
+    list(run)
+    assert heard.calls == [("begin", 1), *WHOLE[4:]]
+    later = Listener()
+    list(rl.optimize(resume="runs/a", overrides={"run.iterations": 4}, callbacks=[later]))
+    assert later.calls == [("begin", 3), ("iteration", 3), *WHOLE[-2:]]
+
+
+@pytest.mark.parametrize("folder", [None, "runs/a"])
+@pytest.mark.parametrize("method", ["begin", "image", "iteration", "end"])
+def test_an_error_of_a_callback_ends_the_run(experiment: Path, method: str, folder: str | None) -> None:
+    bad, good = Listener(method), Listener()
+    run = rl.optimize("tiny.yaml", folder, overrides=SET, callbacks=[bad, good])
+    with pytest.raises(rl.ConfigError) as caught:
+        list(run)
+    said = str(caught.value)
+    assert said.startswith(f"callbacks: Listener: `{method}` raises in line ")
+    assert said.endswith(" ValueError: no room")
+    line = Path(__file__).read_text().splitlines()[int(said.split()[6]) - 1]
+    assert "raise ValueError" in line
+    assert run.status == "failed"
+    assert good.calls[-1] == ("end", "finished" if method == "end" else "failed")
+    if folder is not None:
+        content = manifest(folder)
+        assert (content["status"], content["error"]) == ("failed", said)
+        assert {"report.html", "config.yaml", "run.log"} <= {path.name for path in Path(folder).iterdir()}
+        assert (Path(folder) / "checkpoint" / "state.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["wand"], "callbacks: there is no `wand`; there are mlflow, tensorboard, wandb"),
+        ([Listener], "callbacks: has <class "),
+        ([print], "callbacks: has <built-in function print>, which is no reslrb_cli.Callback"),
+        ("wandb", "callbacks: is 'wandb', not a list of callbacks"),
+    ],
+)
+def test_wrong_callbacks_are_refused(experiment: Path, given: Any, message: str) -> None:
+    with pytest.raises(rl.ConfigError) as caught:
+        rl.optimize("tiny.yaml", callbacks=given)
+    assert str(caught.value).startswith(message)
+    assert str(caught.value).endswith("; call it") == (given == [Listener])
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_a_callback_of_another_package_has_a_name(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[Listener] = []
+    monkeypatch.setattr(
+        sys.modules[__name__], "made_here", lambda: heard.append(Listener()) or heard[-1], raising=False
+    )
+    point = EntryPoint("own", f"{__name__}:made_here", loggers.GROUP)
+    monkeypatch.setattr(loggers, "entry_points", lambda group: [point] if group == loggers.GROUP else [])
+    assert (
+        outcome("optimize", "tiny.yaml", "--log", "own", *settings("run.certainty=false", "run.iterations=3"))[0] == 0
+    )
+    assert heard[0].calls == WHOLE
+    code, _, err = outcome("optimize", "tiny.yaml", "--log", "other")
+    assert code == 2
+    assert "--log: there is no `other`; there are mlflow, own, tensorboard, wandb" in err
+
+
+@pytest.mark.parametrize(
+    ("name", "package"), [("tensorboard", "tensorboardX"), ("mlflow", "mlflow"), ("wandb", "wandb")]
+)
+def test_a_missing_package_is_named(experiment: Path, name: str, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    code, _, err = outcome("optimize", "tiny.yaml", "--log", name)
+    assert code == 2
+    assert f"{name}: needs the package {package} (" in err
+    assert f"; `pip install 'reslrb[{name}]'` installs it" in err
+    assert not Path("runs").exists()
+
+
+# --- the folder -------------------------------------------------------------------------------------------------------
+
+
+def test_the_log_file_has_the_lines_of_its_run(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "reslrb_cli")
+    runs = [rl.optimize("tiny.yaml", f"runs/{name}", overrides=SET) for name in "ab"]
+    for one, _ in zip(*runs, strict=True):
+        logging.getLogger("reslrb_cli").info("said between iterations %s", one.iteration)
+    texts = [Path(f"runs/{name}/run.log").read_text() for name in "ab"]
+    for text in texts:
+        assert text.count("rendering the final image") == 1
+        assert "rendering the target image" in text  # before the folder existed
+        assert "between iterations" not in text
+        assert all(line[:2] == "20" for line in text.splitlines())
+    caplog.clear()
+    list(rl.optimize(resume="runs/a", overrides={"run.iterations": 4}))
+    assert Path("runs/a/run.log").read_text().startswith(texts[0])
+    assert Path("runs/a/run.log").read_text().count("rendering the final image") == 2
+
+
+def test_warnings_are_printed_without_any_logging(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    logger = logging.getLogger("reslrb_cli")
+    for each in (logger, logging.getLogger()):
+        monkeypatch.setattr(each, "handlers", [])
+    with log.collected() as lines:
+        logger.warning("seen once")
+        logger.info("not printed")
+    assert capsys.readouterr().err == "seen once\n"
+    assert lines[0].endswith(" WARNING seen once")
+
+
+def test_the_manifest_names_the_commit_of_the_configuration(experiment: Path) -> None:
+    list(rl.optimize("tiny.yaml", "runs/a", overrides=SET))
+    assert manifest("runs/a")["commit"] is None
+    for words in (
+        ["init", "-q"],
+        ["add", "tiny.yaml"],
+        ["-c", "user.name=a", "-c", "user.email=b", "commit", "-qm", "c"],
+    ):
+        subprocess.run(["git", *words], check=True)
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout.strip()
+    list(rl.optimize("tiny.yaml", "runs/b", overrides=SET))
+    assert manifest("runs/b")["commit"] == commit
+    list(rl.optimize(resume="runs/b", overrides={"run.iterations": 4}))
+    assert manifest("runs/b")["commit"] == commit
+
+
+# --- the packages -----------------------------------------------------------------------------------------------------
+
+
+def log_a_run(name: str) -> rl.Run:
+    run = rl.optimize("tiny.yaml", "runs/a", overrides=SET, callbacks=[name])
+    list(run)
+    return run
+
+
+@pytest.mark.long
+def test_tensorboard_reads_the_events(experiment: Path) -> None:
+    pytest.importorskip("tensorboardX")
+    from tensorboardX.proto.event_pb2 import Event
+    from tensorboardX.record_writer import masked_crc32c  # noqa: F401  # the format below is TFRecord
+
+    run = log_a_run("tensorboard")
+    (file,) = Path("runs/a").glob("events.out.tfevents.*")
+    scalars: dict[str, list[float]] = {}
+    images: dict[str, bytes] = {}
+    for content in tf_records(file.read_bytes()):
+        for value in Event.FromString(content).summary.value:
+            if value.HasField("image"):
+                images[value.tag] = value.image.encoded_image_string
+            elif value.HasField("simple_value"):
+                scalars.setdefault(value.tag, []).append(value.simple_value)
+    np.testing.assert_allclose(scalars["loss"], [record.loss for record in run.records], rtol=1e-6)
+    assert scalars[f"value/{LAMP}/1"][-1] == run.parameters[LAMP][1]
+    assert set(images) == {"image/target", "image/initial", "image/final", f"value/{POSTER}"}
+    np.testing.assert_array_equal(pixels(images[f"value/{POSTER}"]), as_bytes(run.parameters[POSTER]))
+
+
+def tf_records(data: bytes) -> Iterator[bytes]:
+    """Yield the contents of the records of a TFRecord file: length, its checksum, content, its checksum."""
+    at = 0
+    while at < len(data):
+        length = int.from_bytes(data[at : at + 8], "little")
+        yield data[at + 12 : at + 12 + length]
+        at += length + 16
+
+
+def pixels(png: bytes) -> Any:
+    import io
+
+    from PIL import Image
+
+    return np.array(Image.open(io.BytesIO(png)))
+
+
+@pytest.mark.long
+def test_mlflow_has_the_run(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mlflow = pytest.importorskip("mlflow")
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")  # its database needs more packages
+    mlflow.set_tracking_uri((experiment / "mlruns").as_uri())
+    run = log_a_run("mlflow")
+    assert mlflow.active_run() is None
+    (found,) = mlflow.search_runs(output_format="list", search_all_experiments=True)
+    assert (found.info.status, found.info.run_name) == ("FINISHED", "a")
+    assert found.data.params["run.iterations"] == "3"
+    history = mlflow.MlflowClient().get_metric_history(found.info.run_id, "loss")
+    assert [(each.step, each.value) for each in history] == [(each.iteration, each.loss) for each in run.records]
+    images = {path.name for path in (experiment / "mlruns").rglob("*.png")}
+    assert images == {"target.png", "initial.png", "final.png", f"{POSTER}.png"}
+
+
+@pytest.mark.long
+def test_wandb_has_the_run(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wandb = pytest.importorskip("wandb")
+    for name, value in {"MODE": "offline", "SILENT": "true", "CONSOLE": "off"}.items():
+        monkeypatch.setenv(f"WANDB_{name}", value)
+    kept: dict[str, Any] = {}
+    finish = wandb.sdk.wandb_run.Run.finish
+    monkeypatch.setattr(wandb.sdk.wandb_run.Run, "finish",
+                        lambda self, *code: (kept.update(dict(self.summary)), finish(self, *code))[1])  # fmt: skip
+    run = log_a_run("wandb")
+    assert wandb.run is None
+    assert kept["loss"] == run.records[-1].loss
+    assert kept[f"value/{LAMP}/0"] == pytest.approx(float(run.parameters[LAMP][0]))
+    (written,) = Path("runs/a/wandb").glob("offline-run-*/*.wandb")
+    images = {path.name.partition("_")[0] for path in written.parent.rglob("*.png")}
+    assert images == {"target", "initial", "final", POSTER}
