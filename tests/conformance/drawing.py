@@ -183,7 +183,7 @@ WAYS = {
     "roulette": Way(with_roulette, (*EVERY, "mask_texture_in_view"), ("two_emitters",), "two_emitters",
                     {"freeze": True},
                     lambda scene, ours, number: harsh(scene, ours, (1.0, 0.3, 3.0)[number]) and None),
-    "aimed": Way(aimed, (*EVERY, *GLOSSY), ("crop", "plastic_beside_mask"), "roughplastic", {"freeze": True},
+    "aimed": Way(aimed, (*EVERY, *GLOSSY), ("crop",), "roughplastic", {"freeze": True},
                  _changed_aim),
     "aimed_sequence": Way(lambda name, **options: aimed(name, **LOW_DISCREPANCY, **options), ("roughplastic",),
                           ("roughplastic",), "roughplastic", {"freeze": True}, _changed_aim),

@@ -107,8 +107,7 @@ def test_means_over_many_seeds_agree(name: str, guiding: str) -> None:
 
 
 #: The kinds of steps that the default suite runs.
-STEPS = {"guided-stack-batched", "roulette-reservoir-correlated", "roulette-event-correlated", "aimed-stack-batched",
-         "sequence-reservoir-batched"}  # fmt: skip
+STEPS = {"guided-stack-batched", "roulette-reservoir-correlated", "sequence-reservoir-batched"}
 
 
 @pytest.mark.parametrize(

@@ -141,7 +141,7 @@ def test_images(name: str, llvm: str):
         assert result.relative_error < 0.02
 
 
-@taking_turns("name", list(SCENES), "estimator", ["reservoir", "gather"])
+@taking_turns("name", list(SCENES), "estimator", ["reservoir", "gather"], ["furnace", "slab"])
 def test_gradients(name: str, estimator: str, llvm: str):
     make, spp, _ = SCENES[name]
     known: KnownScene = make()

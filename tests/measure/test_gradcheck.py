@@ -73,13 +73,13 @@ def failures(records: list[GradcheckRecord]) -> set[tuple[str | None, str]]:
 
 
 def test_it_holds():
-    records = check("integrator.rr_depth=2", *SMALLER)
+    records = check("integrator.rr_depth=1", *SMALLER, estimators="event,gather")
     assert failures(records) == set()
     assert [record.kind for record in records].count(Kind.IMAGE) == 1
-    for name in ("reservoir", "event", "gather", "stack"):
+    for name in ("event", "gather"):
         of = {record.reference: record for record in records if record.estimator == name}
         assert list(of) == [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE, Reference.WALK_AD, Reference.PTRACER]
-        exact = name in ("gather", "stack")
+        exact = name == "gather"
         assert (of[Reference.WALK_AD].kind is Kind.EQUAL_SEEDS) is exact
         assert of[Reference.WALK_AD].relative_l2 < (1e-5 if exact else 0.5)
         assert of[Reference.FINITE_DIFFERENCE].relative_l2 < (1e-3 if exact else 0.5)
@@ -183,7 +183,7 @@ def test_rows_are_printed_as_they_are_measured():
 
 
 def test_unmeasured_comparisons_are_named():
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *SMALLER])
     ticks = iter(range(10_000))
     made = Gradcheck(CheckSettings(config, estimators_of("stack,event"), 40), now=lambda: next(ticks))
     records = list(made.run(lambda: False, lambda line: None))
@@ -198,7 +198,7 @@ def test_unmeasured_comparisons_are_named():
 
 
 def test_an_interrupt_compares_the_finished_samples():
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *SMALLER])
     asked = iter(range(10_000))
     made = Gradcheck(CheckSettings(config, estimators_of("stack"), 0, 8))
     records = list(made.run(lambda: next(asked) > 32, lambda line: None))
@@ -226,7 +226,7 @@ def test_estimators_have_the_options_of_the_configuration():
             estimators_of(text)
 
 
-@pytest.mark.parametrize("case", a_few(CASES, IN_EXPECTATION))
+@pytest.mark.parametrize("case", a_few(CASES, [*IN_EXPECTATION, "plastic", "envmap"]))
 def test_references_match_the_conformance_tests(case):
     """The rules permit the reference of each case. Where a case has only differences, the rules refuse `ptracer`, and
     also `prb` except for keys of `floor.brdf`.

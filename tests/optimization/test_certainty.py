@@ -77,7 +77,7 @@ FAIL = [
     Toy("a texture's noise", {POSTER: COLOR}, {POSTER: NOISE}, ("run.spp=4",)),
 ]  # fmt: skip
 #: Runs among the long ones that every change is tested with.
-SHORT = [FAIL[0], FAIL[3], FAIL[6]]
+SHORT = [FAIL[0], FAIL[6]]
 
 
 @pytest.fixture(scope="module")
