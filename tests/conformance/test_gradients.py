@@ -149,7 +149,7 @@ SAME_PATHS = ("texture", "gaussian", "crop", "rgba", "thin_lens", "twosided", "m
 
 @pytest.mark.parametrize(
     "name",
-    a_few(SAME_PATHS, ("crop", "thin_lens", "projector")),
+    a_few(SAME_PATHS, ("crop", "projector")),
 )
 def test_walk_ad_equals_ptracer(name: str):
     case = BY_NAME[name]

@@ -163,7 +163,7 @@ BSDFS = [
 #: floor, it takes glass, and one normal map.
 #: The other BSDFs have `ptracer` as their reference, or their parts are listed here.
 FEW = (
-    *(f"ball of {name}" for name in ("blend", "mask", "bumpmap")),
+    *(f"ball of {name}" for name in ("mask", "bumpmap")),
     *(f"sheet of {name}" for name in ("roughdielectric", "principledthin", "mask of glass")),
     *(f"light of {name}" for name in ("dielectric", "normalmap of dielectric")),
     "thin glass before the sensor",
@@ -267,9 +267,9 @@ LIT = [
 ]  # fmt: skip
 #: The cases that need `-m long`: each resembles another case. test_image_paths.py has a lamp in view, and
 #: test_camera_paths.py a sphere.
-SIMILAR = ("area", "visible area", "sphere", "point", "spot", "projector", "sunsky", "envmap", "envmap, one axis",
-           "hidden envmap", "hidden envmap, one axis", "hidden envmap, two axes", "hidden sunsky",
-           "hidden sunsky, turned", "several with a constant", "several with a map")  # fmt: skip
+SIMILAR = ("area", "visible area", "sphere", "point", "spot", "textured spot", "projector", "sunsky", "envmap",
+           "envmap, one axis", "hidden envmap", "hidden envmap, one axis", "hidden envmap, two axes",
+           "hidden sunsky", "hidden sunsky, turned", "several with a constant", "several with a map")  # fmt: skip
 
 
 @pytest.mark.usefixtures("samples")

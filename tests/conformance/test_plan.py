@@ -122,8 +122,8 @@ OMISSIONS = [
 
 #: The default suite runs one estimator per row: the next one of those whose kernels shrink.
 QUICK = [(shrinks or STEADY)[number % len(shrinks or STEADY)] for number, (*_, shrinks) in enumerate(OMISSIONS)]
-#: Features that need `-m long`: Dr.Jit drops them by itself, or they are numbers of the sensor, as `lens_clip` is.
-SIMILAR = ("has_delta_lobes", "thin_lens", "principal_point", "near_clip", "has_instances")
+#: Features that need `-m long`: Dr.Jit drops them by itself, or they are numbers of the sensor.
+SIMILAR = ("has_delta_lobes", "thin_lens", "principal_point", "near_clip", "lens_clip", "has_instances")
 
 
 @pytest.mark.parametrize(
