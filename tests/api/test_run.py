@@ -174,7 +174,7 @@ def test_leaving_a_loop_leaves_a_complete_folder(experiment: Path, leave: Callab
     assert len(records_of(run.folder)) == 2
 
 
-@pytest.mark.parametrize("folder", ["mine", None])
+@pytest.mark.parametrize("folder", [pytest.param("mine", marks=pytest.mark.long), None])
 def test_a_second_loop_continues(experiment: Path, folder: str | None) -> None:
     whole = rl.optimize("tiny.yaml", folder=folder and "whole", overrides=SET)
     expected = [as_json(record) for record in whole]

@@ -151,6 +151,7 @@ def test_a_target_file_gives_no_parameter_error(experiment):
     assert manifest_of("runs/file")["results"]["parameter_rmse"] == {}
 
 
+@pytest.mark.long  # test_kernels.py counts the kernels of later steps
 def test_later_iterations_compile_nothing(experiment):
     import drjit as dr
 

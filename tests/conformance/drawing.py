@@ -178,7 +178,7 @@ GLOSSY = ("roughconductor", "roughplastic", "plastic", "blend", "roughdielectric
           "plastic_beside_mask", "twosided")  # fmt: skip
 WAYS = {
     "guided": Way(lambda name, **options: guided(name, 4, **options), (*EVERY, "gaussian", "area_texture", "rgba"),
-                  ("two_emitters",), "two_emitters", {"freeze": True},
+                  (), "two_emitters", {"freeze": True},
                   lambda scene, ours, number: learn(scene, ours, number)),
     "roulette": Way(with_roulette, (*EVERY, "mask_texture_in_view"), ("two_emitters",), "two_emitters",
                     {"freeze": True},
@@ -186,7 +186,7 @@ WAYS = {
     "aimed": Way(aimed, (*EVERY, *GLOSSY), ("crop",), "roughplastic", {"freeze": True},
                  _changed_aim),
     "aimed_sequence": Way(lambda name, **options: aimed(name, **LOW_DISCREPANCY, **options), ("roughplastic",),
-                          ("roughplastic",), "roughplastic", {"freeze": True}, _changed_aim),
+                          (), "roughplastic", {"freeze": True}, _changed_aim),
     "sequence": Way(both, (*EVERY, "area_texture", "point", "plastic"), ("glass",), "texture", {"freeze": True},
                     lambda scene, ours, number: None),
 }  # fmt: skip

@@ -304,8 +304,7 @@ STEPS: dict[str, tuple[dict[str, Any], bool]] = {
 
 #: The default suite: each case with one kind of paths. Each kind of paths has every way.
 SOME = {
-    "texture": ("camera", ("correlated", "recorded")), "mask_texture_in_view": ("camera", ("known", "beyond")),
-    "visible_lamp": ("both", tuple(STEPS)),
+    "texture": ("camera", tuple(STEPS)), "visible_lamp": ("both", tuple(STEPS)),
 }  # fmt: skip
 
 

@@ -72,6 +72,7 @@ def failures(records: list[GradcheckRecord]) -> set[tuple[str | None, str]]:
     return {(one.estimator, one.reference.value) for one in records if one.verdict is not Verdict.HOLDS}
 
 
+@pytest.mark.long  # tests of faults show that it holds without them
 def test_it_holds():
     records = check("integrator.rr_depth=1", *SMALLER, estimators="event,gather")
     assert failures(records) == set()

@@ -85,7 +85,7 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", a_few(WAYS, ["2 in rounds", "2 in batches", "guided"]))
+@pytest.mark.parametrize("way", a_few(WAYS, ["2 in rounds", "guided"]))
 def test_gradients_are_unbiased(folder, way):
     """The reference consists of steps of 256 samples with a second set for dL/dI. Each shard has one or two samples per
     pixel.
