@@ -74,13 +74,13 @@ def failures(records: list[GradcheckRecord]) -> set[tuple[str | None, str]]:
 
 @pytest.mark.long  # tests of faults show that it holds without them
 def test_it_holds():
-    records = check("integrator.rr_depth=1", *SMALLER, estimators="event,gather")
+    records = check("integrator.rr_depth=2", *SMALLER)
     assert failures(records) == set()
     assert [record.kind for record in records].count(Kind.IMAGE) == 1
-    for name in ("event", "gather"):
+    for name in ("reservoir", "event", "gather", "stack"):
         of = {record.reference: record for record in records if record.estimator == name}
         assert list(of) == [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE, Reference.WALK_AD, Reference.PTRACER]
-        exact = name == "gather"
+        exact = name in ("gather", "stack")
         assert (of[Reference.WALK_AD].kind is Kind.EQUAL_SEEDS) is exact
         assert of[Reference.WALK_AD].relative_l2 < (1e-5 if exact else 0.5)
         assert of[Reference.FINITE_DIFFERENCE].relative_l2 < (1e-3 if exact else 0.5)
