@@ -9,14 +9,15 @@ from pathlib import Path
 from reslrb_cli.backend import llvm, shared_library
 
 # The default suite compiles kernels without LLVM's optimisations, because optimisation took most of its time.  LLVM
-# gets the same kernels. The documented option `-opt-bisect-limit=0` leaves out its optional passes. No pass may
-# reassociate or approximate, so the values are the same. The kernels run slower, which is negligible for small kernels.
+# gets the same kernels. The documented option `-opt-bisect-limit=0` leaves out its optional passes, and
+# `-optimize-regalloc=false` allocates registers quickly. No pass may reassociate or approximate, so the values are the
+# same. The kernels run slower, which is negligible for small kernels.
 # `-m long` has kernels that run for minutes, so it uses LLVM as users do.
 
 #: Dr.Jit identifies a cached kernel by its computation, so the kernels of the tests need a folder apart from those of
 #: users.
 CACHE = Path("~/.drjit-tests")
-OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0")
+OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0", "-optimize-regalloc=false")
 #: Folder with the code that Python runs first in each process that a test starts.
 STARTED = Path(__file__).parent / "started"
 #: First LLVM version that does not print the name of each pass that it leaves out.

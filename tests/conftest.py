@@ -106,10 +106,11 @@ def llvm(pytestconfig: pytest.Config) -> str:
 @pytest.fixture(autouse=True, scope="module")
 def _release_jit_memory() -> Iterator[None]:
     """Free the JIT's cached memory after each module, so that the memory peaks of one module do not affect the next
-    module.
+    module. Exclude what is left from later garbage collections, as `pytest_collection_finish` does.
     """
     yield
     gc.collect()
+    gc.freeze()
     if "drjit" in sys.modules:
         sys.modules["drjit"].flush_malloc_cache()
 

@@ -54,7 +54,7 @@ def status_of(folder: Path) -> str:
     return str(json.loads((folder / "manifest.json").read_text())["status"])
 
 
-@pytest.mark.parametrize("settings", [{}, {"optimizer.scale": "auto"}])
+@pytest.mark.parametrize("settings", [pytest.param({}, marks=pytest.mark.long), {"optimizer.scale": "auto"}])
 def test_a_loop_gives_the_results_of_the_command(experiment: Path, settings: dict[str, Any]) -> None:
     """All results match bit by bit. The loop is tested with and without a folder."""
     sets = [word for key, value in (SET | settings).items() for word in ("--set", f"{key}={json.dumps(value)}")]
@@ -174,7 +174,7 @@ def test_leaving_a_loop_leaves_a_complete_folder(experiment: Path, leave: Callab
     assert len(records_of(run.folder)) == 2
 
 
-@pytest.mark.parametrize("folder", ["mine", None])
+@pytest.mark.parametrize("folder", [pytest.param("mine", marks=pytest.mark.long), None])
 def test_a_second_loop_continues(experiment: Path, folder: str | None) -> None:
     whole = rl.optimize("tiny.yaml", folder=folder and "whole", overrides=SET)
     expected = [as_json(record) for record in whole]
@@ -308,6 +308,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.long  # in this process: test_leaving_a_loop_leaves_a_complete_folder
 def test_an_interrupt_from_outside_keeps_the_result(experiment: Path) -> None:
     """SIGINT, as from a terminal or a notebook, may arrive at any moment of an iteration."""
     environment = {**os.environ, "PYTHONPATH": search_path(), "RESLRB_CACHE": str(experiment / "cache")}

@@ -13,8 +13,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from cli.test_optimize import CONFIG, KEY, SCENE
-from cli.tiny import read_metrics
-from turns import a_few, taking_turns
+from turns import taking_turns
 
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
@@ -52,14 +51,6 @@ def optimize(capsys, *settings: str, verbose: bool = False) -> tuple[int, str]:
     with pytest.raises(SystemExit) as end:
         main([*(["--debug"] if verbose else []), "optimize", "box.yaml", *sets])
     return int(end.value.code or 0), capsys.readouterr().err
-
-
-def wide(*settings: str) -> list[str]:
-    """Enlarge the film to 32x32, so that paths dominate the memory."""
-    text = Path("scene.xml").read_text()
-    Path("scene.xml").write_text(text.replace('name="width" value="16"', 'name="width" value="32"').replace(
-        'name="height" value="16"', 'name="height" value="32"'))  # fmt: skip
-    return ["target.render.spp=16", *settings]
 
 
 def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatch):
@@ -150,18 +141,6 @@ def test_measuring_has_its_own_seeds(experiment, monkeypatch):
     assert drawn == [(7, 0, 0, "pilot"), (7, 1, 0, "pilot"), (7, 0, 0, "pilot")]
 
 
-@pytest.mark.parametrize("estimator", a_few(["reservoir", "event"], ["event"]))
-def test_paths_use_no_memory_if_the_adjoint_is_known(experiment, capsys, estimator):
-    peaks = []
-    for adjoint in ("batched", "correlated"):
-        settings = wide(f"integrator={{max_depth: 4, estimator: {estimator}}}", "run.spp=256", f"run.adjoint={adjoint}")
-        code, err = optimize(capsys, *settings)
-        assert code == 0, err
-        peaks.append(max(record["peak_mib"] for record in read_metrics(Path("runs/box"))))
-    assert peaks[0] < 1
-    assert peaks[1] > 3
-
-
 def test_a_weight_with_the_adjoint_works_in_a_whole_run(experiment, capsys):
     """Renderings and derivatives outside the steps, for example for the mask or saved images, must also support
     `weight: adjoint`.
@@ -192,7 +171,9 @@ def test_counted_memory_of_a_path_matches_its_stored_state(experiment, monkeypat
         assert kept == counted if estimator in ("reservoir", "event") else kept <= counted <= kept + 128
 
 
-@taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "adjoint", ["batched", "correlated"])
+@taking_turns(
+    "estimator", ["reservoir", "gather", "event", "stack"], "adjoint", ["batched", "correlated"], ["event", "stack"]
+)
 def test_all_sample_counts_share_kernels(experiment, estimator, adjoint):
     """Otherwise, a measurement would compile kernels that the run does not use."""
     settings = [f"integrator={{max_depth: 4, estimator: {estimator}}}", f"run.adjoint={adjoint}"]

@@ -68,7 +68,7 @@ def test_work_before_the_iterations_is_measured_once(experiment: Path, monkeypat
     """A dry run measures the decisions and stores them for the run that follows."""
     monkeypatch.setenv("RESLRB_CACHE", str(experiment / "cache"))
     auto = ["--set", "integrator={type: reslrb, max_depth: 3, paths: light}", "--set", "run.certainty=false"]
-    auto += ["--set", "run.measuring=1000"]
+    auto += ["--set", "run.measuring=1000", "--set", "scene.size=[16, 16]"]
     printed = call("--dry-run", *auto)
     assert re.search(r"^ +[\d.]+ m?s, done now and stored  choosing the sampling$", printed, re.MULTILINE), printed
     call(*auto)

@@ -431,7 +431,7 @@ def differences(monkeypatch: pytest.MonkeyPatch, made: tuple[Path, str, Drawn]) 
     return found
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", a_few(WAYS, ["correlated"]))
 def test_it_is_the_step_of_the_run(guided, monkeypatch, way):
     assert differences(monkeypatch, guided(way)) == []
 

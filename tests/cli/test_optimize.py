@@ -13,6 +13,7 @@ from cli.tiny import done, outcome, read_metrics, reslrb, settings, write_experi
 from cli.tiny import manifest as manifest_of
 from kit import POSTER_BSDF, area, diffuse, ref, scene, sensor, shape
 from optimization import glass
+from turns import a_few
 
 # `reslrb optimize`, `render` and `inspect` on a scene of three surfaces, from the command line to the run folder.
 
@@ -89,6 +90,7 @@ def test_a_texture_is_recovered(experiment):
     assert np.array(mi.Bitmap("runs/box/images/final.exr")).shape == (16, 16, 3)
 
 
+@pytest.mark.long  # test_going_on.py has runs with scale and transform
 def test_a_texture_is_recovered_with_a_transform(experiment):
     sets = ["run.iterations=40", "run.adjoint=independent", "optimizer={scale: auto, learning_rate: 0.1}"]
     sets += ["parameters[0].transform=sigmoid", "integrator={type: reslrb, max_depth: 3, estimator: stack}"]
@@ -150,6 +152,7 @@ def test_a_target_file_gives_no_parameter_error(experiment):
     assert manifest_of("runs/file")["results"]["parameter_rmse"] == {}
 
 
+@pytest.mark.long  # test_kernels.py counts the kernels of later steps
 def test_later_iterations_compile_nothing(experiment):
     import drjit as dr
 
@@ -229,7 +232,7 @@ def test_scenes_that_cannot_work_are_refused_before_rendering(experiment, name):
     assert not Path("runs").exists()
 
 
-@pytest.mark.parametrize("name", ["orthographic", "glass alone"])
+@pytest.mark.parametrize("name", a_few(["orthographic", "glass alone"], ["orthographic"]))
 def test_camera_paths_render_scenes_that_light_paths_cannot(experiment, name):
     """The default `paths: auto` then selects `camera` or `both`."""
     part, other, *_ = BAD_SCENES[name]

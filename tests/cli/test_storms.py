@@ -281,10 +281,9 @@ def repeats(file: Path) -> set[int]:
 
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
+@pytest.mark.long
 @pytest.mark.parametrize(
-    ("command", "words", "steps"),
-    [("bench", BENCH, 1), pytest.param("convergence", CONVERGENCE, 2, marks=pytest.mark.long)],
-    ids=["bench", "convergence"],
+    ("command", "words", "steps"), [("bench", BENCH, 1), ("convergence", CONVERGENCE, 2)], ids=["bench", "convergence"]
 )
 def test_a_killed_measurement_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, words: list[str], steps: int

@@ -362,6 +362,7 @@ def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
     assert not Path(kernels).exists()
 
 
+@pytest.mark.long  # test_runs_of_equal_time_use_no_earlier_results pretends the runs
 def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
     asked = []
 

@@ -127,7 +127,7 @@ CASES = [
                  SLAB | {"receiver.bsdf.reflectance.data": None, "lamp.emitter.radiance.value": None,
                          "shell.bsdf.reflectance.value": None}, depth=7),
     AttachedCase("bounces_4", enclosed, SLAB, depth=4),
-    AttachedCase("normal_map", lambda: enclosed(receiver=mapped()), SLAB, depth=6, stock=False, quick=True),
+    AttachedCase("normal_map", lambda: enclosed(receiver=mapped()), SLAB, depth=6, stock=False),
     AttachedCase("two_lenses", two_lenses, SLAB | {"x": 0.0, "size": 1.0}, move_ball, depth=9),
     AttachedCase("roulette", lambda: enclosed(albedo=0.9), SLAB, depth=10, stock=False, both={"rr_depth": 2}),
     AttachedCase("stack_of_2", lambda: enclosed(albedo=0.9), SLAB, depth=6, stock=False, ours={"stack_size": 2},

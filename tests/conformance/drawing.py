@@ -178,15 +178,15 @@ GLOSSY = ("roughconductor", "roughplastic", "plastic", "blend", "roughdielectric
           "plastic_beside_mask", "twosided")  # fmt: skip
 WAYS = {
     "guided": Way(lambda name, **options: guided(name, 4, **options), (*EVERY, "gaussian", "area_texture", "rgba"),
-                  ("two_emitters",), "two_emitters", {"freeze": True},
+                  (), "two_emitters", {"freeze": True},
                   lambda scene, ours, number: learn(scene, ours, number)),
     "roulette": Way(with_roulette, (*EVERY, "mask_texture_in_view"), ("two_emitters",), "two_emitters",
                     {"freeze": True},
                     lambda scene, ours, number: harsh(scene, ours, (1.0, 0.3, 3.0)[number]) and None),
-    "aimed": Way(aimed, (*EVERY, *GLOSSY), ("crop", "plastic_beside_mask"), "roughplastic", {"freeze": True},
+    "aimed": Way(aimed, (*EVERY, *GLOSSY), ("crop",), "roughplastic", {"freeze": True},
                  _changed_aim),
     "aimed_sequence": Way(lambda name, **options: aimed(name, **LOW_DISCREPANCY, **options), ("roughplastic",),
-                          ("roughplastic",), "roughplastic", {"freeze": True}, _changed_aim),
+                          (), "roughplastic", {"freeze": True}, _changed_aim),
     "sequence": Way(both, (*EVERY, "area_texture", "point", "plastic"), ("glass",), "texture", {"freeze": True},
                     lambda scene, ours, number: None),
 }  # fmt: skip

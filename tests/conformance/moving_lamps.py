@@ -154,7 +154,7 @@ CASES = [
     LampCase("textured_sphere", lambda: over_floor(surface("sphere", radiance=texture())), ALL, PLACE),
     LampCase("mesh", lambda: over_floor(mesh()), ALL, VERTICES, quick=True),
     LampCase("textured_mesh", lambda: over_floor(mesh(radiance=texture())), ALL, VERTICES),
-    LampCase("parallel", lambda: over_floor(surface("rectangle", "directionalarea")), ALL, PLACE, quick=True),
+    LampCase("parallel", lambda: over_floor(surface("rectangle", "directionalarea")), ALL, PLACE),
     LampCase("parallel_disk", lambda: over_floor(surface("disk", "directionalarea")), ALL, PLACE),
     LampCase("parallel_mesh", lambda: over_floor(mesh("directionalarea")), ALL, VERTICES),
     LampCase("beside_others", lambda: over_floor(

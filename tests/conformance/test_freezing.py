@@ -81,8 +81,7 @@ TEXTURES = {
 }
 
 
-@pytest.mark.parametrize("paths", ["light", "both"])
-@pytest.mark.parametrize("name", TEXTURES)
+@taking_turns("name", list(TEXTURES), "paths", ["both", "light"])
 def test_recordings_of_scenes_with_textures(name: str, paths: str) -> None:
     case = TEXTURES[name]
     expected, _ = gradients(case, "batched", freeze=False, paths=paths)

@@ -149,7 +149,7 @@ SAME_PATHS = ("texture", "gaussian", "crop", "rgba", "thin_lens", "twosided", "m
 
 @pytest.mark.parametrize(
     "name",
-    a_few(SAME_PATHS, ("crop", "thin_lens", "projector")),
+    a_few(SAME_PATHS, ("crop", "projector")),
 )
 def test_walk_ad_equals_ptracer(name: str):
     case = BY_NAME[name]
@@ -172,9 +172,9 @@ def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
 
 
 #: Forward mode in the default suite: everything that it does along a path (emission, factors, delta lobes, masks,
-#: visible emitters), with films and sensors. The other cases have other BSDFs and emitters, which do not change forward
+#: visible emitters). The other cases have other BSDFs and emitters, which do not change forward
 #: mode.
-QUICK = ("roulette", "thin_lens", "glass", "mask_texture_in_view", "visible_lamp")
+QUICK = ("roulette", "glass", "mask_texture_in_view", "visible_lamp")
 
 
 @pytest.mark.parametrize("name", a_few([n for n in BY_NAME if n != "texture_prb"], QUICK))
@@ -305,8 +305,8 @@ def differences(case: ZeroCase, scene: Case, along: np.ndarray, count: int, bloc
     ])  # fmt: skip
 
 
-#: The cases of the default suite: zeros of texels, lamps and mirrors once.
-QUICK_ZERO = ("texel_zero_in_one_channel", "lamp_texture_zero_in_all", "mirror_zero")
+#: The cases of the default suite: zeros of texels and lamps once.
+QUICK_ZERO = ("texel_zero_in_one_channel", "lamp_texture_zero_in_all")
 
 
 def parameters() -> list:

@@ -192,11 +192,13 @@ SENSORS = [
 ]  # fmt: skip
 #: The cases that need `-m long`: each resembles another case.
 SIMILAR = (
-    "shading_normals_diffuse", "depth_2", "depth_3", "roulette_diffuse_1", "roulette_diffuse_2",
-    "roulette_roughdielectric_2", "mask_before_the_camera", "mask_between_2", "mask_between_3", "filter_box",
-    "filter_tent", "filter_mitchell", "filter_catmullrom", "filter_gaussian", "crop_box", "format_rgba",
-    "format_luminance", "format_xyza", "thin_lens_through_a_mask", "near_clip", "near_clip_of_a_pinhole",
-    "far_clip_of_a_lens", "focus_30.0", "focus_2.0", "principal_point_of_a_whole_film",
+    "shading_normals_diffuse", "shading_normals_roughplastic", "roulette_roughdielectric_1", "depth_2", "depth_3",
+    "roulette_diffuse_1", "roulette_diffuse_2", "roulette_roughdielectric_2", "mask_before_the_camera",
+    "mask_between_2", "mask_between_3", "mask_between_5", "filter_box", "filter_tent", "filter_mitchell",
+    "filter_catmullrom", "filter_gaussian", "crop_box", "format_rgba", "format_xyz", "depth_-1", "focus_default",
+    "mask_between_1", "shapes", "format_luminance", "format_xyza", "thin_lens_through_a_mask", "near_clip",
+    "near_clip_of_a_pinhole", "far_clip_of_a_lens", "focus_0.9", "focus_30.0", "focus_2.0",
+    "principal_point_of_a_whole_film", "thin_lens", "masks_before_a_hidden_sky",
 )  # fmt: skip
 
 

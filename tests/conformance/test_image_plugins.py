@@ -160,12 +160,12 @@ BSDFS = [
 ]  # fmt: skip
 #: The default suite. A ball refracts light in and out again, which can hide a fault of one of the two, so that glass is
 #: a sheet here, and a ball in test_image_paths.py (shading normals, roulette). Of the BSDFs that throw light on the
-#: floor, it takes one of each kind of lobe, and one normal map.
+#: floor, it takes glass, and one normal map.
 #: The other BSDFs have `ptracer` as their reference, or their parts are listed here.
 FEW = (
-    *(f"ball of {name}" for name in ("blend", "mask", "null", "bumpmap")),
+    *(f"ball of {name}" for name in ("mask", "bumpmap")),
     *(f"sheet of {name}" for name in ("roughdielectric", "principledthin", "mask of glass")),
-    *(f"light of {name}" for name in ("conductor", "dielectric", "plastic", "normalmap of dielectric")),
+    *(f"light of {name}" for name in ("dielectric", "normalmap of dielectric")),
     "thin glass before the sensor",
 )  # fmt: skip
 #: The BSDFs that the default suite compares with `ptracer` alone.
@@ -267,9 +267,9 @@ LIT = [
 ]  # fmt: skip
 #: The cases that need `-m long`: each resembles another case. test_image_paths.py has a lamp in view, and
 #: test_camera_paths.py a sphere.
-SIMILAR = ("area", "visible area", "sphere", "point", "spot", "sunsky", "envmap", "envmap, one axis", "hidden envmap",
-           "hidden envmap, one axis", "hidden envmap, two axes", "hidden sunsky", "hidden sunsky, turned",
-           "several with a constant")  # fmt: skip
+SIMILAR = ("area", "visible area", "sphere", "point", "spot", "textured spot", "projector", "sunsky", "envmap",
+           "envmap, one axis", "hidden envmap", "hidden envmap, one axis", "hidden envmap, two axes",
+           "hidden sunsky", "hidden sunsky, turned", "several with a constant", "several with a map")  # fmt: skip
 
 
 @pytest.mark.usefixtures("samples")

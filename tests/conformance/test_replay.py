@@ -155,9 +155,15 @@ ADJOINTS = {
     "batched": {"adjoint": "batched", "batches": 2},
 }
 #: Each integrator appears once, and each choice of samples with several integrators.
-REFUSED = [(name, "independent") for name in INTEGRATORS]
-REFUSED += [(name, "correlated") for name in ("stack", "ptracer")]
-REFUSED += [(name, adjoint) for name in ("stack", "ptracer") for adjoint in ("batched",)]
+REFUSED = [
+    pytest.param(name, adjoint, marks=() if quick else pytest.mark.long)
+    for names, adjoint, quick in (
+        (("reservoir", "stack", "walk_ad", "ptracer"), "independent", True),
+        (("reservoir adjoint", "gather", "event", "event adjoint", "prb", "trajectory"), "independent", False),
+        (("stack",), "correlated", True), (("ptracer",), "correlated", False),
+        (("stack",), "batched", True), (("ptracer",), "batched", False),
+    ) for name in names
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")

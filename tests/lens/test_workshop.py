@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cli.tiny import done
 from lens.test_experiment import picture
+from turns import a_few
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.lens.solid import SCALLOP, cutter, stepover
@@ -66,7 +67,7 @@ SETUPS = {
 }
 
 
-@pytest.mark.parametrize("name", SETUPS)
+@pytest.mark.parametrize("name", a_few(SETUPS, ["lens", "mirror"]))
 def test_a_set_up_matches_the_options_of_the_command(name: str, tmp_path: Path, llvm: str) -> None:
     options, side, light, through, words = SETUPS[name]
     write_file(tmp_path / "p.exr", np.repeat(picture(24, 16)[:, :, None], 3, 2).astype(np.float32), linear=True)

@@ -258,7 +258,7 @@ def test_own_integrators_need_permission_and_unchanged_files(capsys: pytest.Capt
 @pytest.mark.parametrize(
     "words",
     [
-        ("bench", "--values", "3", "--rounds", "2"),
+        pytest.param(("bench", "--values", "3", "--rounds", "2"), marks=pytest.mark.long),
         pytest.param(("convergence", "--rounds", "4", "--set", "run.spp=8"), marks=pytest.mark.long),
     ],
     ids=lambda words: words[0],

@@ -77,7 +77,7 @@ FAIL = [
     Toy("a texture's noise", {POSTER: COLOR}, {POSTER: NOISE}, ("run.spp=4",)),
 ]  # fmt: skip
 #: Runs among the long ones that every change is tested with.
-SHORT = [FAIL[0], FAIL[3], FAIL[6]]
+SHORT = [FAIL[6]]
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +211,7 @@ def noisy(name: str, loss: str) -> Toy:
     return Toy(name, parameters, {}, settings)
 
 
+@pytest.mark.long
 def test_noise_of_a_rendered_target_is_part_of_the_spread(folder):
     """With 16 times as many target samples, the target's part of the spread falls to about a quarter."""
     found = {}

@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from optimization.deciding import SIZES, SMALL, World, begin, decision, fix_times, inspected, is_even, operations
-from runs.going_on import begin_alone, differences, left_over, optimize, run_and_kill
-from turns import a_few
+from runs.going_on import optimize
+from turns import a_few, taking_turns
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.measure.methods import parse_cases
-from reslrb_cli.optimization import assemble as assembling
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.race import (
@@ -276,29 +275,6 @@ def test_a_run_reports_remembers_and_records_the_decision(
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_resumed_run_keeps_the_decision_bit_by_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Guiding and the sequence are decided once, and a resumed run restores both decisions."""
-    begin_alone(tmp_path, monkeypatch)
-    fix_times(monkeypatch, {"guiding": 0.2})
-    settings = [
-        *AUTO[:3],
-        "run.measuring=1000",
-        "integrator.sequence=auto",
-        "run.iterations=8",
-        "run.checkpoint_every={iterations: 3}",
-        "run.certainty=false",
-    ]
-    whole, left = run_and_kill(monkeypatch, 7, *(word for text in settings for word in ("--set", text)))
-    monkeypatch.setattr(assembling, "settle", lambda *args: pytest.fail("measured again"))
-    (tmp_path / "cache" / "decisions.json").unlink()
-    assert optimize("--resume", str(left), "--quiet") == 0
-    values = {each["setting"]: each["value"] for each in read_manifest(left)["decisions"]}
-    assert values == {"sequence": "independent", "guiding": "on"}
-    assert differences(whole, left) == []
-    assert left_over(left) == []
-
-
-@pytest.mark.usefixtures("llvm")
 def test_a_damaged_decision_is_measured_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """This also holds for a file that a person has edited."""
     cache = DecisionCache()
@@ -381,8 +357,7 @@ def test_it_is_on_if_it_pays(world: World, on: bool) -> None:
     assert ("the image, of the same samples" in found.why()) == (not on and low > 1)
 
 
-@pytest.mark.parametrize("entries", [3, 200])
-@pytest.mark.parametrize("sparse", [False, True])
+@taking_turns("entries", [3, 200], "sparse", [False, True])
 def test_the_interval_of_the_gain_has_its_coverage(entries: int, sparse: bool) -> None:
     """Without the allowance for timing errors, the interval has its nominal level. The gain includes the cost of
     learning.
@@ -570,13 +545,12 @@ def test_learning_walks_come_before_all_guided_steps() -> None:
 # Share of learning in a run, by the run's length.
 
 
-@pytest.mark.parametrize("iterations", [1, 3, 23])
-@pytest.mark.parametrize("how", [["run.adjoint=correlated"], ["run.spp=8"]], ids=str)
+@taking_turns("iterations", [1, 3, 23], "how", ["run.adjoint=correlated", "run.spp=8"])
 def test_a_run_learns_as_often_as_planned(
-    how: list[str], iterations: int, llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    how: str, iterations: int, llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begin(tmp_path, monkeypatch)
-    settings = [*how, f"run.iterations={iterations}", "integrator.guiding=on", "integrator.estimator=stack"]
+    settings = [how, f"run.iterations={iterations}", "integrator.guiding=on", "integrator.estimator=stack"]
     problem, learned = assemble(load("tiny.yaml", ["run.adjoint=batched", *settings])), []
     right = Guiding.due
 

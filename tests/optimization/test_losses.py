@@ -11,6 +11,7 @@ import pytest
 from agreement import compare
 from cli.tiny import KEY, write_experiment
 from skimage.metrics import structural_similarity
+from turns import taking_turns
 
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
@@ -281,8 +282,7 @@ def set_exposure(problem, values):
     dr.enable_grad(problem.optimizer["exposure"])
 
 
-@pytest.mark.parametrize("kind", AT)
-@pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
+@taking_turns("adjoint", ["batched", "independent", "correlated"], "kind", list(AT))
 def test_the_gradient_equals_that_of_the_mean_image(folder, kind, adjoint):
     """dL/dE of `l2` is the sum of 2 (E I - T) I over all entries, divided by their number. I is the mean image.
 

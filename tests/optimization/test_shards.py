@@ -85,7 +85,7 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", a_few(WAYS, [way for way in WAYS if way not in ("4 in rounds", "16 in rounds")]))
+@pytest.mark.parametrize("way", a_few(WAYS, ["2 in rounds", "guided"]))
 def test_gradients_are_unbiased(folder, way):
     """The reference consists of steps of 256 samples with a second set for dL/dI. Each shard has one or two samples per
     pixel.
@@ -128,7 +128,7 @@ def shuffled(problem: Problem, function: Callable[..., Any], work: Any) -> Itera
 @pytest.mark.parametrize(
     "sets",
     [
-        ["run.spp=8", "run.shards=4", ROUNDS, "target.exposure=1.5"],
+        pytest.param(["run.spp=8", "run.shards=4", ROUNDS, "target.exposure=1.5"], marks=pytest.mark.long),
         ["run.spp=16", "run.shards=4", "run.adjoint=batched", "integrator.guiding=on"],
         ["run.spp=4", "run.shards=2", "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]", "integrator.guiding=on"],
         ["run.spp=8", "run.shards=4", ROUNDS, TWO_VIEWS.replace("auto", "2")],

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from turns import taking_turns
+from turns import a_few, taking_turns
 
 from reslrb_cli.optimization.results import got_worse
 from reslrb_cli.optimization.trend import Change, find_trend, window
@@ -397,14 +397,18 @@ def fireflies(curve):
     return make
 
 
-@pytest.mark.parametrize("iterations", [20, 100, 1000])
+@pytest.mark.parametrize("iterations", a_few([20, 100, 1000], ["20", "100"]))
 def test_pure_noise_is_flat(iterations):
     found = shares_of_verdicts(noisy(lambda i: np.ones(len(i))), iterations)
     assert found[Change.FLAT] > (0.75 if iterations == 20 else 0.95)
     assert max(found[Change.FELL], found[Change.ROSE]) < 0.04
 
 
-@taking_turns("iterations", [20, 100, 1000], "decay", [8, 3, 1])
+@pytest.mark.parametrize(
+    ("iterations", "decay"),
+    [pytest.param(i, d, marks=() if (i, d) in ((20, 8), (100, 3)) else pytest.mark.long)
+     for i in (20, 100, 1000) for d in (8, 3, 1)],
+)  # fmt: skip
 def test_a_fall_within_a_few_iterations_is_found(iterations, decay):
     """Up to nine tenths of the run's first tenth may be as low as its end."""
     found = shares_of_verdicts(noisy(lambda i: 1 + 5 * np.exp(-i / decay)), iterations)
@@ -426,7 +430,7 @@ def test_a_firefly_near_the_end_does_not_hide_a_fall():
     assert find_trend(values).change is Change.FELL
 
 
-@pytest.mark.parametrize("iterations", [50, 200, 1000])
+@pytest.mark.parametrize("iterations", a_few([50, 200, 1000], ["50", "200"]))
 def test_fireflies_do_not_count_as_a_rise(iterations):
     assert shares_of_verdicts(fireflies(lambda i: np.ones(len(i))), iterations)[Change.ROSE] < 0.04
 

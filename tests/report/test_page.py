@@ -263,6 +263,7 @@ def test_an_almost_empty_folder_has_a_page(tmp_path):
     assert "end" not in [alt for alt, _ in page.pictures]
 
 
+@pytest.mark.long
 def test_a_page_of_a_long_run_with_large_pictures_is_small(tmp_path):
     folder = make_run(tmp_path / "long", iterations=1200, size=(500, 700))
     page = write_report(folder)

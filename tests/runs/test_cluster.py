@@ -79,7 +79,7 @@ def end(course: RunProgress, after: Callable[[int], object] = lambda iteration: 
 
 
 def test_workers_give_the_results_of_one_process(experiment: Path) -> None:
-    check(experiment, "guided, scaled", 2)
+    check(experiment, "guided, scaled", 1)
 
 
 @pytest.mark.long
