@@ -125,7 +125,8 @@ class Watch:
         return f"the {kind} has stopped falling: over the last {count * span} iterations it fell by {share} in {span}"
 
 
-#: Fraction to which a large first loss falls before the moments are set to zero.
+#: Fraction to which a large first loss falls before the moments are set to zero. Such a loss falls to this fraction for
+#: black images.
 FALL = 0.1
 
 
@@ -155,9 +156,9 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     `optimizer.scale: auto` measures before the first iteration. `elapsed_s` includes the measurement time. The schedule
     follows either the iteration count or the elapsed time (`run.max_seconds`), whichever has progressed further.
 
-    If the first loss is larger than that of a black image, the optimiser's moments are set to zero whenever the loss
-    has fallen to a tenth since the last time. The large gradients of such a start would otherwise shorten the steps for
-    a hundred iterations or more.
+    If the first loss is more than ten times that of a black image, the optimiser's moments are set to zero whenever the
+    loss has fallen to a tenth since the last time. The large gradients of such a start would otherwise shorten the
+    steps for a hundred iterations or more.
     """
     config, optimizer, iteration, level = problem.config, problem.optimizer, state.iteration, state.level
     if optimizer.stands_at is not state:
@@ -187,7 +188,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
             on_nonfinite(found)
         held = held_back(config.run.on_nonfinite, found, optimizer.keys())
         if iteration == 0:
-            level = value if value > black_loss(problem) else 0.0
+            level = value if FALL * value > black_loss(problem) else 0.0
         elif value < FALL * state.level:
             level = value
             optimizer.forget()

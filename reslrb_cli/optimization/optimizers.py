@@ -258,7 +258,7 @@ class Optimizer:
 
     def balance(self, exposure: str, colours: Sequence[str]) -> None:
         """From now on, divide `colours` by the change of `exposure`, a single number, in each step. The arguments are
-        keys.
+        keys. Entries without a gradient stay, because no image shows them.
         """
         self._balanced = exposure, list(colours)
 
@@ -283,6 +283,7 @@ class Optimizer:
         """
         self.stands_at = None
         exposure, colours = self._moving(skip)
+        reached = {key: self.gradient(key) != 0 for key in colours}
         if colours:
             old = dr.detach(self[exposure])
             products = [dr.sum(flat(dr.detach(self[key]) * self.gradient(key))) for key in colours]
@@ -309,7 +310,9 @@ class Optimizer:
         for key in (*skip, *overflowed):
             self.clear_gradient(key)
         for key in colours if exposure not in overflowed else ():
-            self.set_value(key, clamp(dr.detach(self[key]) * (old / dr.detach(self[exposure])), self._bounds[key]))
+            value = dr.detach(self[key])
+            moved = clamp(value * (old / dr.detach(self[exposure])), self._bounds[key])
+            self.set_value(key, dr.select(reached[key], moved, value))
         return overflowed
 
     def _moving(self, skip: Collection[str]) -> tuple[str, list[str]]:
