@@ -173,10 +173,11 @@ def test_a_dark_room_beside_an_unknown_exposure_is_recovered(tmp_path: Path) -> 
     fall.
     """
     write_room(tmp_path, ROOMS["dark"], (24, 15), 4096)
-    errors, exposure = recover(tmp_path, ROOMS["dark"], "run.final_spp=16")
+    quick = ("integrator.paths=both", "integrator.guiding=off", "integrator.pixels=even", "run.final_spp=16")
+    errors, exposure = recover(tmp_path, ROOMS["dark"], *quick)
     assert len(errors) == len(PARTS)
-    assert max(errors.values()) < 0.03, errors
-    assert exposure == pytest.approx(0.6, rel=0.1)
+    assert max(errors.values()) < 0.015, errors
+    assert exposure == pytest.approx(0.6, rel=0.03)
 
 
 @pytest.mark.long
