@@ -22,6 +22,8 @@ Colour = tuple[float, float, float]
 GREY: Colour = (0.8, 0.8, 0.8)
 #: Name of a floor whose colour is a texture, and of a table of rough metal.
 WOOD, METAL = "wood", "metal"
+#: Texels of the floor in full view, in front of the furniture.
+SHOWN = np.s_[4:7, 2:14]
 
 
 @dataclass(frozen=True)
@@ -158,8 +160,8 @@ def recover(folder: Path, room: Room, *sets: str) -> tuple[dict[str, float], flo
         [value] = [values[key] for key in values.files if key.startswith(f"mat-{part}.")] or [None]
         if value is None or colour == METAL:
             continue
-        true = wood().mean((0, 1)) if isinstance(colour, str) else np.array(colour)
-        errors[part] = float(np.abs(value.reshape(-1, 3).mean(0) - true).max())
+        off = value[SHOWN] - wood()[SHOWN] if colour == WOOD else value - colour
+        errors[part] = float(np.abs(off.reshape(-1, 3).mean(0)).max())
     return errors, float(values["exposure"].ravel()[0])
 
 
