@@ -125,6 +125,17 @@ class Watch:
         return f"the {kind} has stopped falling: over the last {count * span} iterations it fell by {share} in {span}"
 
 
+#: Fraction to which a large first loss falls before the moments are set to zero. Such a loss falls to this fraction for
+#: black images.
+FALL = 0.1
+
+
+def black_loss(problem: Problem) -> float:
+    """Return the loss of black images in the first iteration."""
+    views = problem.drawn(0)
+    return sum(scale * float(view.objective(dr.zeros(mi.TensorXf, view.target.shape))[0]) for view, scale in views)
+
+
 #: Iterations between two evaluations of held-out views.
 HELD_OUT_EVERY = 10
 
@@ -144,8 +155,12 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     and when a run ends (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged.
     `optimizer.scale: auto` measures before the first iteration. `elapsed_s` includes the measurement time. The schedule
     follows either the iteration count or the elapsed time (`run.max_seconds`), whichever has progressed further.
+
+    If the first loss is more than ten times that of a black image, the optimiser's moments are set to zero whenever the
+    loss has fallen to a tenth since the last time. The large gradients of such a start would otherwise shorten the
+    steps for a hundred iterations or more.
     """
-    config, optimizer, iteration = problem.config, problem.optimizer, state.iteration
+    config, optimizer, iteration, level = problem.config, problem.optimizer, state.iteration, state.level
     if optimizer.stands_at is not state:
         put(problem, state)
     clock = StepClock(state.elapsed_s)
@@ -172,6 +187,11 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         if found:
             on_nonfinite(found)
         held = held_back(config.run.on_nonfinite, found, optimizer.keys())
+        if iteration == 0:
+            level = value if FALL * value > black_loss(problem) else 0.0
+        elif value < FALL * state.level:
+            level = value
+            optimizer.forget()
         for key in found.gradients if config.run.on_nonfinite == "zero" else ():
             zero_nonfinite(optimizer[key])
         found.updates = optimizer.step(factor, skip=held)
@@ -185,6 +205,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         peak_mib=max(state.peak_mib, peak_mib(dr.backend_v(loss))),
         standstill=standstill,
         scaling=scaling,
+        level=level,
         end=why_end(config.run.on_nonfinite, found, standstill),
         gradients=gradients,
     )

@@ -24,13 +24,19 @@ its moments and its number of steps.
     adam      m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)    Kingma and Ba 2015
     sgd       v = momentum · v + g; p -= lr · v
 
+Exposure (`balance`): an image hardly changes if an exposure E rises and the colours c of the surfaces fall by the same
+factor. Separate steps in E and c would cross this valley of the loss again and again. Therefore a step of E divides the
+colours by the change of E, and E moves by the derivative along the valley.
+
+    dL/dE with constant E c  =  dL/dE - sum of c dL/dc / E
+
 Parameters must be finite and within their bounds (`clamp`, `count_nonfinite`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -215,6 +221,7 @@ class Optimizer:
         self._scene: dict[str, Any] = {}
         #: The state of the run that it holds; None during a step, and if no state was requested.
         self.stands_at: object = None
+        self._balanced: tuple[str, list[str]] | None = None
         for key, value in values.items():
             self._own[key][key] = value
             transform, smoother = (transforms or {}).get(key), (smoothers or {}).get(key)
@@ -234,7 +241,7 @@ class Optimizer:
         return self._variables.get(key) or Variable(None, self._bounds[key])
 
     def set_value(self, key: str, value: Any) -> None:
-        """Set another initial value of the scene. Call this before the first step."""
+        """Set another value of the scene. The moments stay."""
         self.stands_at = None
         variable = self._variables.get(key)
         if variable is None:
@@ -248,6 +255,17 @@ class Optimizer:
         self.stands_at, value = None, dr.detach(self[key])
         self._variables[key], self._scene[key] = variable, _leaf(value)
         self._own[key][key] = variable.from_scene(value)
+
+    def balance(self, exposure: str, colours: Sequence[str]) -> None:
+        """From now on, divide `colours` by the change of `exposure`, a single number, in each step. The arguments are
+        keys. Entries without a gradient stay, because no image shows them.
+        """
+        self._balanced = exposure, list(colours)
+
+    def forget(self) -> None:
+        """Set the moments of all parameters to zero."""
+        for own in self._own.values():
+            own.reset()
 
     def gradient(self, key: str) -> Any:
         """Return the gradient that has been accumulated into `self[key]`."""
@@ -264,6 +282,12 @@ class Optimizer:
         its old optimiser state. Returns the number of non-finite entries of updates by key.
         """
         self.stands_at = None
+        exposure, colours = self._moving(skip)
+        reached = {key: self.gradient(key) != 0 for key in colours}
+        if colours:
+            old = dr.detach(self[exposure])
+            products = [dr.sum(flat(dr.detach(self[key]) * self.gradient(key))) for key in colours]
+            dr.set_grad(self[exposure], self.gradient(exposure) - sum(products) / old)
         # Dr.Jit makes the rate opaque, so a changing rate compiles no new kernel.
         moved, before, counts = [key for key in self._own if key not in skip], {}, {}
         for key in moved:
@@ -285,7 +309,16 @@ class Optimizer:
                 self._scene[key] = value
         for key in (*skip, *overflowed):
             self.clear_gradient(key)
+        for key in colours if exposure not in overflowed else ():
+            value = dr.detach(self[key])
+            moved = clamp(value * (old / dr.detach(self[exposure])), self._bounds[key])
+            self.set_value(key, dr.select(reached[key], moved, value))
         return overflowed
+
+    def _moving(self, skip: Collection[str]) -> tuple[str, list[str]]:
+        """Return the exposure and the colours that move together in this step, or no colours."""
+        exposure, colours = self._balanced or ("", [])
+        return exposure, [] if exposure in skip else [key for key in colours if key not in skip]
 
     def _step_variable(self, key: str) -> None:
         own, variable = self._own[key], self._variables[key]
@@ -318,8 +351,10 @@ class Optimizer:
 
     def squares(self, key: str) -> tuple[Any, float] | None:
         """Return the running mean of the squared gradients as the optimiser stores the mean. Also return the mean's
-        decay. Return None if the optimiser stores no such mean.
+        decay. Return None if the optimiser stores no such mean, or a mean of other derivatives (`balance`).
         """
+        if self._balanced is not None and key == self._balanced[0]:
+            return None
         own, extra = self._own[key], self._own[key].state[key][3]
         return (extra[2], own.beta_2) if isinstance(own, dropt.Adam) else None
 

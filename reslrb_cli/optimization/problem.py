@@ -18,8 +18,9 @@ from reslrb_cli.integrators.step import OnSamples
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, Smoother, make_transform
 from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
-from reslrb_cli.optimization.views import View, slope, to_tensor
+from reslrb_cli.optimization.views import SHARED, View, slope, to_tensor
 from reslrb_cli.records.decisions import Decision
+from reslrb_cli.scene.catalog import COLOUR
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms
@@ -271,7 +272,7 @@ class Problem:
 def make_optimizer(config: Config, selection: Selection) -> Optimizer:
     """Return a new optimiser for the current values of the parameters."""
     specs = {key: selection.specs[key] for key in selection.keys}
-    return Optimizer(
+    optimizer = Optimizer(
         config.optimizer.type,
         config.optimizer.learning_rate,
         config.optimizer.own_options(),
@@ -285,6 +286,11 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
             if spec.smoothing is not None
         },
     )
+    # Images with an exposure of their own would fix the colours. Only Adam's steps are long where gradients are small.
+    is_shared = config.target.exposure == "auto" and all(view.exposure is None for view in config.views or ())
+    if is_shared and SHARED in selection.factors and config.optimizer.type == "adam":
+        optimizer.balance(SHARED, [key for key in selection.keys if COLOUR.search(key)])
+    return optimizer
 
 
 def _handed(value: Any, array: Array) -> Any:

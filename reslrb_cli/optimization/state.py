@@ -44,6 +44,7 @@ class State:
     - `stopped` is the reason why the run ends as finished. `end` is the reason why the run fails. Without a reason, the
         field is "".
     - `first_s` is `elapsed_s` after the first iteration.
+    - `level` is the loss at which the moments were last zero, or 0 if the first loss was not large (`loop.step`).
     - `gradients` are the gradients of the previous step, in the form of `values`.
     """
 
@@ -56,6 +57,7 @@ class State:
     guiding: dict[str, int] | None = None
     stopped: str = ""
     first_s: float = 0.0
+    level: float = 0.0
     values: Arrays = field(default_factory=dict, metadata=entry("parameter"))
     halo: Arrays = field(default_factory=dict, metadata=entry("parameter with halo"))
     moments: Arrays = field(default_factory=dict, metadata=entry("optimizer"))

@@ -28,6 +28,8 @@ from reslrb_cli.scene.needs import (
 _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
 #: Parameters of a mesh besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
+#: Colours of materials, in which a photograph usually differs most from a scene.
+COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
 #: Maximum number of printed values; larger arrays show mean and range.
 _FEW = 4
 

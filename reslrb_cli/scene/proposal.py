@@ -17,7 +17,7 @@ import numpy as np
 
 from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
-from reslrb_cli.scene.catalog import ParameterInfo, list_parameters
+from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters
 from reslrb_cli.scene.export import LOBES
 from reslrb_cli.scene.graph import SceneGraph, grid, sensor_rays
 from reslrb_cli.scene.images import decode_srgb, read_bitmap
@@ -84,8 +84,6 @@ def _means(image: Image, size: tuple[int, int]) -> Image:
     return np.asarray(resized(values, size[::-1]))
 
 
-#: Colours of materials, in which a photograph usually differs most from a scene.
-_COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
 #: A rough surface without a diffuse lobe shows its material's colour; users do not choose its specular factor of 1 as a
 #: colour.
 _ROUGHNESS, _FACTOR = re.compile(r"\balpha(_u|_v)?\.value$"), re.compile(r"\bspecular_\w+\.value$")
@@ -174,7 +172,7 @@ def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
         return True
     if is_glossy and _FACTOR.search(info.key) and info.value is not None and info.value.low == info.value.high == 1:
         return False
-    return bool(_COLOUR.search(info.key)) and (info.value is None or info.value.high > 0)  # a lamp's material is black
+    return bool(COLOUR.search(info.key)) and (info.value is None or info.value.high > 0)  # a lamp's material is black
 
 
 def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:

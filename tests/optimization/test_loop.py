@@ -69,6 +69,25 @@ def test_the_time_limit_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch
     assert (last[1].lr, last[0].stopped) == (pytest.approx(0.02), "")
 
 
+@pytest.mark.parametrize(("target", "is_large"), [(0.05, True), (0.8, False)])
+def test_moments_of_a_large_first_loss_are_dropped_as_the_loss_falls(tmp_path, steps, target, is_large):
+    """The value starts at 0.5. For a target of 0.05, the image is worse than a black one. Adam's moments then contain
+    only the steps since the loss last fell to a tenth.
+    """
+    problem = steps.problem = make_problem(tmp_path, sets=["optimizer={type: adam, learning_rate: 0.02}"])
+    problem.views[0].made = dr.full(mi.TensorXf, target, (2, 2, 3))
+    found = list(loop.iterate(problem, standing(problem)))
+    losses = [record.loss for _, record in found]
+    assert losses[-1] < 0.1 * losses[0]
+    level, since, expected = losses[0] if is_large else 0, 0, []
+    for loss in losses:
+        level, since = (loss, 1) if loss < 0.1 * level else (level, since + 1)
+        expected.append((level, since))
+    steps_since = [int(np.array(state.moments["albedo"]["0"]).item()) for state, _ in found]
+    assert [(state.level, count) for (state, _), count in zip(found, steps_since, strict=True)] == expected
+    assert (steps_since[-1] < len(losses)) is is_large
+
+
 def test_time_between_records_is_not_counted(tmp_path, steps):
     import time
 

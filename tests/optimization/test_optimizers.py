@@ -83,6 +83,49 @@ def test_adam_as_configured_soon_forgets_a_large_first_gradient():
     assert abs(float(np.array(optimizer["p"])[0]) - 0.2) < 0.01
 
 
+@pytest.mark.parametrize("transform", ["none", "sigmoid"])
+def test_an_exposure_moves_along_the_valley_of_equal_products(transform):
+    """The loss is a function f of the products of an exposure and two colours, plus a function h of the exposure. The
+    exposure follows h alone, and the products stay the same. The second colour reaches its bound. Its other entry has
+    no effect on the loss.
+    """
+    values = {"exposure": mi.Float(0.5), "one": mi.Color3f(0.2, 0.4, 0.6), "two": mi.TensorXf(np.float32([0.95, 0.7]))}
+    bounds = {"exposure": None, "one": (0.0, 1.0), "two": (0.0, 1.0)}
+    transforms = {"exposure": make_transform("log", None)}
+    transforms |= {key: make_transform(transform, bounds[key]) for key in ("one", "two")}
+    rates = {"exposure": 0.1, "one": 1e-9, "two": 1e-9}
+    optimizer = Optimizer("adam", RATE, {}, values, rates, bounds, transforms)
+    optimizer.balance("exposure", ["one", "two"])
+    exposure = 0.5
+    for slope in (-0.2, 5.0, 5.0):  # the first one is weaker than the derivative of f, and of opposite sign
+        one, two, before = np.array(optimizer["one"]).ravel(), float(optimizer["two"].array[0]), exposure
+        e, a, b = optimizer["exposure"], optimizer["one"], optimizer["two"].array
+        f = dr.sum(dr.square(e * a - mi.Color3f(0.7, 0.1, 0.35))) + dr.square(e * dr.gather(mi.Float, b, 0))
+        dr.backward(f + slope * e)
+        np.testing.assert_array_equal(optimizer.step(1.0), {})
+        [exposure] = np.array(optimizer["exposure"]).ravel()
+        if slope < 0:  # the first step of Adam has the length of its rate
+            assert exposure == pytest.approx(before * np.exp(0.1), rel=1e-4)
+        np.testing.assert_allclose(exposure * np.array(optimizer["one"]).ravel(), before * one, rtol=1e-4)
+        assert float(optimizer["two"].array[0]) == pytest.approx(min(before * two / exposure, 1), rel=1e-4)
+    two, other = np.array(optimizer["two"].array)
+    assert two > 0.999
+    assert other == pytest.approx(0.7, rel=1e-5)
+    assert optimizer.squares("exposure") is None
+
+
+def test_a_skipped_colour_does_not_follow_the_exposure():
+    values = {"exposure": mi.Float(0.5), "one": mi.Float(0.2), "two": mi.Float(0.4)}
+    options = {"rates": dict.fromkeys(values), "bounds": dict.fromkeys(values)}
+    optimizer = Optimizer("sgd", RATE, {}, values, **options)
+    optimizer.balance("exposure", ["one", "two"])
+    dr.backward(optimizer["exposure"] + optimizer["two"] * 1e-20 + optimizer["one"] * 1e30 * 1e30)
+    optimizer.step(1.0, skip=["one"])
+    exposure, one, two = (float(optimizer[key][0]) for key in values)
+    assert (exposure, one) == (pytest.approx(0.45), pytest.approx(0.2))
+    assert two == pytest.approx(0.4 * 0.5 / 0.45)
+
+
 def test_a_parameter_has_its_own_rate_scaled_by_the_schedule():
     optimizer = make(rate=0.5)
     descend(optimizer, lambda p: np.ones_like(p))

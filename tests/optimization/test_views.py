@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -53,6 +54,27 @@ def test_settings_of_a_view_replace_common_ones(folder):
     assert float(first.compare(image)[0]) == pytest.approx(0.25)
     again = loads(dump(problem.config), str(folder / "tiny.yaml"))
     assert again == problem.config
+
+
+@pytest.mark.parametrize(
+    ("sets", "is_shared"),
+    [
+        (["target.exposure=auto", "optimizer.type=adam"], True),
+        (["target.exposure=auto", "optimizer.type=adam", "views=[{sensor: 0}, {sensor: 1}]"], True),
+        (["target.exposure=auto", "optimizer.type=adam", "views=[{sensor: 0}, {sensor: 1, exposure: 1}]"], False),
+        (["target.exposure=per_channel", "optimizer.type=adam"], False),
+        (["target.exposure=auto", "optimizer={type: sgd, learning_rate: 1}"], False),
+    ],
+)
+def test_colours_move_only_with_an_exposure_that_all_views_share(folder, sets, is_shared):
+    optimizer = make(folder, *sets).optimizer
+    colour, exposure = (np.array(optimizer[key]) for key in (KEY, "exposure"))
+    dr.backward(optimizer["exposure"][0] if exposure.size > 1 else optimizer["exposure"])
+    dr.accum_grad(optimizer[KEY], dr.ones(type(optimizer[KEY]), dr.shape(optimizer[KEY])) * 1e-20)
+    optimizer.step(1.0)
+    assert np.all(np.array(optimizer["exposure"]).ravel()[0] < exposure.ravel()[0])
+    products = np.array(optimizer[KEY]) * np.array(optimizer["exposure"]).ravel()[0]
+    assert np.allclose(products, colour * exposure.ravel()[0], rtol=1e-3) is is_shared
 
 
 BAD = [

@@ -95,6 +95,8 @@ class Certainty:
     def see(self, before: State, state: State) -> None:
         """Record data of the iteration that leads from `before` to `state`. This costs almost nothing."""
         planned, iterations = self.problem.config.run.iterations, state.iteration
+        if state.level != before.level:
+            self.squares = {}  # the running means start again
         if 0 < self._seen < iterations:
             for key, initial in self._initial.items():
                 if initial.size <= MOST_ENTRIES:
