@@ -170,6 +170,7 @@ def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.long
 def test_a_dark_room_beside_an_unknown_exposure_is_recovered(tmp_path: Path) -> None:
     """The first loss is 300 times that of a black image. The loss hardly changes if the exposure rises and all colours
     fall.
