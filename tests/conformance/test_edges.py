@@ -57,7 +57,14 @@ def check(case: EdgeCase, reference: np.ndarray) -> Agreement:
 
 
 #: Cases that need `-m long`: each resembles another case.
-SIMILAR = ("standing-room-3", "sphere-room-5", "cylinder-directional-2", "rectangle-spot-2")
+SIMILAR = (
+    "standing-room-3",
+    "sphere-room-5",
+    "cylinder-directional-2",
+    "rectangle-spot-2",
+    "box-moving_area-2",
+    "box-moving_spot-2",
+)
 
 
 @pytest.mark.parametrize("case", a_few(RECORDED, [case.name for case in RECORDED if case.name not in SIMILAR]))
