@@ -202,15 +202,16 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
     # The camera sees the plate far behind the box.
     "two": lambda: {"shape": _box(0.2, -1.6, 1.35, 0.4),
                     "plate": rectangle(TWO_SIDED, transform(translate=[0.1, 0, 0.5], scale=0.7))},
-    "hidden": lambda: {"shape": _box(0.1, -0.1, 0.9)},
+    **dict.fromkeys(("hidden", "behind"), lambda: {"shape": _box(0.1, -0.1, 0.9)}),
     "reflector": lambda: {"shape": rectangle(TWO_SIDED, transform(translate=[0, 0, 2.6], scale=0.5))},
     "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
                      for n, name in enumerate(FLAT)},
 }  # fmt: skip
 
-#: Shapes that do not move. The camera sees the box behind the first three, and the reflector lights the floor past the
-#: sheet.
+#: Shapes that do not move. The camera sees the box behind a sheet, or behind three shapes, and the reflector lights the
+#: floor past a sheet.
 STILL: dict[str, Callable[[], dict[str, Any]]] = {
+    "behind": lambda: {"sheet": STILL["hidden"]()["sheet"]},
     "hidden": lambda: {
         "sheet": rectangle(TWO_SIDED, transform(translate=[0.4, -0.9, 1.1], rotate=([1, 0, 0], 70),
                                                 scale=[0.15, 0.3, 1])),
@@ -313,7 +314,8 @@ CASES = [
     *(EdgeCase("flat", lamp, spp=512) for lamp in ("sphere_lamp", "directional")),
     EdgeCase("flat", "point", spp=512, step=SMALLER),
     *(EdgeCase("sphere", lamp) for lamp in ("area", "sphere_lamp", "spot")),
-    *(EdgeCase("hidden", lamp, lamp_moves=True, spp=1024, step=SMALLER) for lamp in ("point", "sphere_lamp")),
+    # Without round shapes at rest, on which the light of a moving lamp has noisy derivatives.
+    *(EdgeCase("behind", lamp, lamp_moves=True, spp=1024, step=SMALLER) for lamp in ("point", "sphere_lamp")),
     EdgeCase("hidden", "directional", motion=("turn",), lamp_moves=True, spp=1024, step=SMALLER),
     EdgeCase("box", "room", 3, lamp_moves=True, spp=1024, reference_spp=8192),
     *(EdgeCase("cylinder", lamp, spp=2048) for lamp in ("area", "sphere_lamp")), EdgeCase("box", "room", 3, spp=1024),
