@@ -135,7 +135,8 @@ def reach(
         f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
     changed = dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1) * factor
     if plan.near > 0:
-        shares = [nearness(plan, dr.squared_norm(place - ray.o)) for place in (stayed.p, slid.p)]
+        near = plan.near**2
+        shares = [near / (dr.squared_norm(place - ray.o) + near) for place in (stayed.p, slid.p)]
         share = dr.detach(shares[0])
         changed = 1 + (changed - 1) * (1 - share) + (shares[1] - shares[0])
         stayed = _blend(stayed, slid, share)
@@ -144,11 +145,6 @@ def reach(
     there = mi.Ray3f(ray)
     there.d = dr.select(stays, reaching.d, ray.d)
     return Hit(si, si.bsdf(), there), dr.select(stays, changed, 1)
-
-
-def nearness(plan: Plan, squared_distance: mi.Float) -> mi.Float:
-    """Return the share of the light between two vertices that is differentiated along directions."""
-    return plan.near**2 / (squared_distance + plan.near**2)
 
 
 def _blend(stayed: mi.SurfaceInteraction3f, slid: mi.SurfaceInteraction3f, share: mi.Float) -> mi.SurfaceInteraction3f:

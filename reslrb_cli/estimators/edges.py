@@ -111,12 +111,13 @@ def _chances(samples: Samples, numbers: mi.PCG32) -> Chances:
 @dataclass
 class Beside:
     """Two rays from the viewpoint beside an outline. `over` hits the shape, with intersection `pi`. `past` misses the
-    edge. Rays in `active` lanes reach the edge.
+    edge, and has the intersection `x`. Rays in `active` lanes reach the edge.
     """
 
     over: mi.Ray3f
     past: mi.Ray3f
     pi: mi.PreliminaryIntersection3f
+    x: mi.PreliminaryIntersection3f
     active: mi.Bool
 
 
@@ -126,7 +127,10 @@ def _offset(outline: Outline) -> mi.Float:
 
 
 def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside:
-    """Return the rays on both sides of an outline. Lanes are active if nothing hides the edge from the viewpoint."""
+    """Return the rays on both sides of an outline. Lanes are active if nothing hides the edge from the viewpoint.
+
+    With `creases`, `x` exists only where it is needed: at creases, and for `_share`.
+    """
     scene, view, d = samples.scene, outline.view, -outline.view.to_y
     offset = _offset(outline)
     back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset)
@@ -142,20 +146,30 @@ def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside
     before.maxt = back - AROUND * offset
     active = active & ~scene.ray_test(before, active)
     past.o = past.o + d * before.maxt
+    wanted = active & outline.crease if creases and not _shares_edges(samples) else active
+    x = scene.ray_intersect_preliminary(past, coherent=False, active=wanted)
     if creases:
         # Behind a crease lies the other face. It may be narrower than the offset if it is seen at a grazing angle.
-        other = scene.ray_intersect_preliminary(past, coherent=False, active=active & outline.crease)
-        active = active & (~outline.crease | (other.is_valid() & (other.shape == outline.shape)))
-    return Beside(over, past, pi, active)
+        active = active & (~outline.crease | (x.is_valid() & (x.shape == outline.shape)))
+    return Beside(over, past, pi, x, active)
+
+
+def _touches(outline: Outline, beside: Beside) -> mi.Bool:
+    """True if the shape touches the surface behind it."""
+    return beside.x.is_valid() & (beside.x.t < 2 * AROUND * _offset(outline))
+
+
+def _shares_edges(samples: Samples) -> bool:
+    """Whether two shapes with edges can end at the same place."""
+    return len(samples.plan.edged) > 1 or samples.plan.moving_emission
 
 
 def _share(samples: Samples, outline: Outline, beside: Beside) -> mi.Float:
     """Return 1/2 where the shape touches another shape that also ends there, otherwise 1."""
-    plan, scene = samples.plan, samples.scene
-    if len(plan.edged) < 2 and not plan.moving_emission:
+    if not _shares_edges(samples):
         return mi.Float(1)
-    x, offset = scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active), _offset(outline)
-    touches = beside.active & x.is_valid() & (x.t < 2 * AROUND * offset) & (x.shape != outline.shape)
+    x, offset = beside.x, _offset(outline)
+    touches = beside.active & _touches(outline, beside) & (x.shape != outline.shape)
     n, n_x = (
         mi.Vector3f(hit.compute_surface_interaction(ray, mi.RayFlags.All, touches).n)
         for hit, ray in ((beside.pi, beside.over), (x, beside.past))
@@ -166,13 +180,11 @@ def _share(samples: Samples, outline: Outline, beside: Beside) -> mi.Float:
     there = outline.p + along * (8 * offset / dr.norm(along)) + n_x * (2 * offset)
     ray = mi.Ray3f(there, -n_x)
     ray.maxt = 4 * offset
-    behind = scene.ray_intersect_preliminary(ray, coherent=False, active=touches)
+    behind = samples.scene.ray_intersect_preliminary(ray, coherent=False, active=touches)
     return dr.select(touches & ~(behind.is_valid() & (behind.shape == x.shape)), 0.5, 1)
 
 
-def _moved(
-    pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, adjoint: mi.Vector3f, active: mi.Bool
-) -> mi.Float:  # fmt: skip
+def _moved(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, adjoint: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """Return <p, `adjoint`> with the derivative of the intersection p of `ray`. p moves with its surface."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     return dr.select(active, dr.dot(si.p, adjoint), 0)
@@ -200,14 +212,13 @@ def _carried(
         elif moving.class_name() == "PointLight":
             place = mi.traverse(moving)["position"]
             there = p + (place - dr.detach(place))
+        elif moving.class_name() == "DirectionalEmitter":
+            assert plan.horizon is not None
+            to_world, center = mi.traverse(moving)["to_world"], mi.Point3f(*plan.horizon.center)
+            there = center + to_world @ (dr.detach(to_world).inverse() @ mi.Vector3f(p - center))
         else:
             to_world = mi.traverse(moving)["to_world"]
-            if moving.class_name() == "DirectionalEmitter":
-                assert plan.horizon is not None
-                center = mi.Point3f(*plan.horizon.center)
-                there = center + to_world @ (dr.detach(to_world).inverse() @ mi.Vector3f(p - center))
-            else:
-                there = to_world @ (dr.detach(to_world).inverse() @ p)
+            there = to_world @ (dr.detach(to_world).inverse() @ p)
         q = dr.select(here, there, q)
     return dr.select(active, dr.dot(q, adjoint), 0)
 
@@ -307,9 +318,10 @@ class Pick:
     @staticmethod
     def start(numbers: mi.PCG32) -> Pick:
         """Return a selection among no contributions."""
-        none, no = mi.Vector3f, dr.zeros(mi.EmitterPtr)
-        zero = mi.Float(0)
-        return Pick(mi.Spectrum(0), zero, mi.UInt32(0), mi.Float(0), none(0), no, none(0), mi.Float(1), numbers)
+        return Pick(
+            L=mi.Spectrum(0), total=mi.Float(0), segments=mi.UInt32(0), direct=mi.Float(0), towards=mi.Vector3f(0),
+            emitter=dr.zeros(mi.EmitterPtr), n_y=mi.Vector3f(0), counts=mi.Float(1), numbers=numbers,
+        )  # fmt: skip
 
     def offered(
         self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, direct: mi.Bool, towards: mi.Vector3f,
@@ -333,8 +345,8 @@ class Pick:
 def _carried_to(
     samples: Samples, light: Pick, p: mi.Point3f, n: mi.Vector3f, adjoint: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:  # fmt: skip
-    """Return <p, `adjoint`>. p is the point of a surface with the normal `n` where `light` arrives. It moves with the
-    light's ray, and along the ray so that it stays in the surface.
+    """Return <p, `adjoint`>. p is the point where `light` arrives at a surface with the normal `n`. p moves with the
+    light's ray. It also slides along the ray, so that it stays in the surface.
     """
     towards = light.towards
     offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
@@ -402,17 +414,15 @@ class Behind(CameraHooks):
 
 def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines seen from the sensor."""
-    samples = p.samples
-    samples = _from_camera(samples)
+    samples = _from_camera(p.samples)
     assert samples.edges is not None
     chances = _chances(samples, numbers)
     outline = sample_outline(samples, samples.edges.sensor, view_from_sensor(samples, chances.viewpoint), chances)
     beside = _beside(samples, outline)
-    x = samples.scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
-    n = outline.normal
+    x, n = beside.x, outline.normal
     # If the shape touches the surface behind it, lamps and the sensor lose the point x at the same time. It counts
     # once, as seen from the lamps.
-    touches = x.is_valid() & (x.t < 2 * AROUND * _offset(outline))
+    touches = _touches(outline, beside)
     beside.active = beside.active & ~touches
     behind = Behind(n, numbers if samples.plan.moving_emission else None)
     _, L = camera_walk(samples, behind, beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
@@ -468,16 +478,14 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     outline.active = outline.active & y.is_valid()
     outline.view.distance = y.t
     beside = _beside(samples, outline)
-    x = scene.ray_intersect_preliminary(beside.past, coherent=False, active=beside.active)
-    active = beside.active & x.is_valid()
+    x, active = beside.x, beside.active & beside.x.is_valid()
     _, found = camera_walk(
         _from_camera(samples), PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
     )
     total = showing(found.total)
     weight = outline.weight * found.L * (total * _share(samples, outline, beside))
     emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
-    W = walk(samples, Contribution(p), active & (total > 0), emission, found.segments + 1)[0] * p.scale
-    W = showing(W)
+    W = showing(walk(samples, Contribution(p), active & (total > 0), emission, found.segments + 1)[0] * p.scale)
     active = active & (W != 0)
     s = y.t / (y.t + x.t - AROUND * offset)
     slope = dr.select(found.direct != 0, dr.dot(n, found.towards) / dr.dot(found.n_y, found.towards), 0)

@@ -29,7 +29,7 @@ CHORDS = 512
 #: Vertices count as one vertex if their distance, divided by the size of the mesh, is below this value.
 WELD = 1e-6
 #: Number of random rays that test whether light passes an edge, and maximum number of edges that are tested.
-PROBES, MOST_PROBED = 64, 2**15
+RAYS, MOST_TESTED = 64, 2**15
 #: Distance of these rays from the edge, relative to the coordinates, and the length below which a ray hits something
 #: soon, in units of this distance.
 BESIDE, SOON = 3e-6, 300.0
@@ -52,23 +52,23 @@ class Ball:
         center = mi.Point3f(*(0.5 * (dr.min(axis) + dr.max(axis)) for axis in points))
         return Ball(center, 1.01 * dr.max(dr.norm(points - center) + radius))
 
+    def cosine(self, p: mi.Point3f) -> mi.Float:
+        """Return the cosine of half the opening angle of the cone from `p` around the ball, or -1 inside the ball."""
+        ratio = dr.square(self.radius) / dr.squared_norm(self.center - p)
+        return dr.select(ratio < 1, dr.sqrt(1 - ratio), -1)
+
 
 @dataclass
-class EdgeTable:
-    """Current edges, one per row. A recording takes the arrays as inputs.
+class _Rows:
+    """Edges, one per row.
 
     - `kind` is `SEGMENT`, `SPHERE` or `TUBE`.
     - `a` and `b` are the ends of a segment, or of a cylinder's axis. For a sphere, `a` is the centre.
     - `c` and `d` are the third corners of the two faces at a segment. They are equal if the segment has one face.
     - `radius` is the radius of a sphere or a cylinder, otherwise 0.
     - `shape` is the index of the shape's pointer.
-    - `crease` is the angle between the normals of the two faces, divided by pi. It is 0 if the edge has only one face,
-        or if the shape interpolates its normals across the edge.
-    - `moves` is true if the shape moves.
-    - `lamp`, `sensor` and `anywhere` are cumulative sampling weights: for outlines and creases seen from lamps, and for
-        outlines seen from the sensor and from all directions.
-
-    `balls` contain the moving shapes.
+    - `crease` is the angle between the normals of the two faces, divided by pi. It is 0 if it would be below `FLAT`, if
+        the edge has only one face, or if the shape interpolates its normals across the edge.
     """
 
     kind: mi.UInt32
@@ -79,25 +79,24 @@ class EdgeTable:
     radius: mi.Float
     shape: mi.UInt32
     crease: mi.Float
+
+
+@dataclass
+class EdgeTable(_Rows):
+    """Current edges with sampling weights. A recording takes the arrays as inputs.
+
+    - `moves` is true if the shape moves.
+    - `lamp`, `sensor` and `anywhere` are cumulative sampling weights: for outlines and creases seen from lamps, and for
+        outlines seen from the sensor and from all directions.
+
+    `balls` contain the moving shapes.
+    """
+
     moves: mi.Bool
     lamp: mi.Float
     sensor: mi.Float
     anywhere: mi.Float
     balls: list[Ball]
-
-
-@dataclass
-class _Rows:
-    """Rows of a table, without sampling weights."""
-
-    kind: mi.UInt32
-    a: mi.Point3f
-    b: mi.Point3f
-    c: mi.Point3f
-    d: mi.Point3f
-    radius: mi.Float
-    shape: mi.UInt32
-    crease: mi.Float
 
 
 def _number(shape: mi.Shape) -> int:
@@ -135,7 +134,7 @@ class _Mesh:
             i, j, _, _, i_2, j_2 = (dr.normalize(dr.gather(mi.Vector3f, buffer, index)) for index in self.corners)
             angle = dr.maximum(angle_between(i, i_2), angle_between(j, j_2))
         single = self.corners[2] == self.corners[3]
-        return dr.select(single | ~dr.isfinite(angle), 0, angle * dr.inv_pi)
+        return dr.select(single | ~(angle > FLAT * dr.pi), 0, angle * dr.inv_pi)
 
 
 @dataclass
@@ -166,7 +165,7 @@ class _Round:
 
 
 def _edges_of(shape: mi.Shape) -> list[_Mesh | _Curves | _Round]:
-    """Return the edges of a shape that `has_edges`."""
+    """Return the edges of a shape for which `has_edges` is true."""
     name = shape.class_name()
     if name == "Sphere":
         return [_Round(shape, SPHERE)]
@@ -181,39 +180,32 @@ def _edges_of(shape: mi.Shape) -> list[_Mesh | _Curves | _Round]:
     return [_Mesh(shape, [own_memory(mi.UInt32, np.ascontiguousarray(column)) for column in edges.T])]
 
 
-def _joined(parts: list[_Rows]) -> _Rows:
-    def joined(name: str) -> Any:
-        columns = [getattr(part, name) for part in parts]
-        if name in "abcd":
-            return mi.Point3f(*(dr.concat([column[axis] for column in columns]) for axis in range(3)))
-        return dr.concat(columns)
+def _points(arrays: list[mi.Point3f]) -> mi.Point3f:
+    """Return the points of all arrays in one array."""
+    return mi.Point3f(*(dr.concat([points[axis] for points in arrays]) for axis in range(3)))
 
-    return _Rows(**{name: joined(name) for name in vars(parts[0])})
+
+def _joined(parts: list[_Rows]) -> _Rows:
+    columns = {name: [getattr(part, name) for part in parts] for name in vars(parts[0])}
+    return _Rows(**{name: _points(each) if name in "abcd" else dr.concat(each) for name, each in columns.items()})
 
 
 def _ball(parts: list[_Rows]) -> Ball:
     rows = _joined(parts)
-    a, b = rows.a, dr.select(rows.kind == SPHERE, rows.a, rows.b)
-    points = mi.Point3f(*(dr.concat([a[axis], b[axis]]) for axis in range(3)))
-    return Ball.around(points, dr.concat([rows.radius, rows.radius]))
-
-
-def _kept(rows: _Rows, wanted: mi.Bool) -> mi.UInt32:
-    """Return the numbers of the wanted rows, without edges of parallel faces."""
-    parallel = turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a) > dr.pi * (1 - FLAT)
-    return dr.compress(wanted & ((rows.kind != SEGMENT) | ~parallel))
+    ends = [rows.a, dr.select(rows.kind == SPHERE, rows.a, rows.b)]
+    return Ball.around(_points(ends), dr.concat([rows.radius, rows.radius]))
 
 
 def _are_open(rows: _Rows, scene: mi.Scene) -> mi.Bool:
     """True if an edge can hide a surface from another surface or from a sensor.
 
-    At a corner of a room, for example, all rays beside the edge of a wall soon hit the other wall. Rays in `PROBES`
+    At a corner of a room, for example, all rays beside the edge of a wall soon hit the other wall. Rays in `RAYS`
     random directions decide.
     """
-    if dr.width(rows.a) > MOST_PROBED:
+    if dr.width(rows.a) > MOST_TESTED:
         return mi.Bool(True)
-    lane = dr.arange(mi.UInt32, dr.width(rows.a) * PROBES)
-    a, b, c, d = (dr.gather(mi.Point3f, corner, lane // PROBES) for corner in (rows.a, rows.b, rows.c, rows.d))
+    lane = dr.arange(mi.UInt32, dr.width(rows.a) * RAYS)
+    a, b, c, d = (dr.gather(mi.Point3f, corner, lane // RAYS) for corner in (rows.a, rows.b, rows.c, rows.d))
     numbers = mi.PCG32(dr.width(lane))
     p = dr.lerp(a, b, numbers.next_float32())
     along = dr.normalize(b - a)
@@ -226,7 +218,7 @@ def _are_open(rows: _Rows, scene: mi.Scene) -> mi.Bool:
         raw = dr.cross(along, ds.d)
         seen = (ds.pdf > 0) & (dr.dot(raw, c - p) * dr.dot(raw, d - p) > 0)
         passes |= seen & _passes(scene, p, along, c - p, ds.d, ds.dist)
-    found = dr.block_reduce(dr.ReduceOp.Max, dr.select(passes, mi.UInt32(1), 0), PROBES) != 0
+    found = dr.block_reduce(dr.ReduceOp.Max, dr.select(passes, mi.UInt32(1), 0), RAYS) != 0
     return found | (rows.kind != SEGMENT)
 
 
@@ -256,7 +248,7 @@ def edge_kinds(shapes: Iterable[mi.Shape]) -> frozenset[int]:
 
 
 class EdgeSet:
-    """Edges of `moving` shapes, and of the scene's other shapes if they can hide a moving shape (`occluders`).
+    """Edges of the `moving` shapes, and of other shapes that can hide a moving shape (`occluders`).
 
     If `lamps_move` is true, all other shapes with edges are occluders, because their shadows move. The topology of
     meshes and the edges of occluders are read once. `now` returns a table of the current places.
@@ -272,7 +264,9 @@ class EdgeSet:
             return
         with dr.suspend_grad():
             rows = _joined([part.rows() for shape in still for part in _edges_of(shape)])
-            kept = _kept(rows, mi.Bool(True) if lamps_move else _are_open(rows, scene))
+            wanted = mi.Bool(True) if lamps_move else _are_open(rows, scene)
+            parallel = turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a) > dr.pi * (1 - FLAT)
+            kept = dr.compress(wanted & ((rows.kind != SEGMENT) | ~parallel))
             if dr.width(kept) > 0:
                 rows = dr.gather(_Rows, rows, kept)
                 dr.make_opaque(rows)
@@ -281,12 +275,14 @@ class EdgeSet:
                 self.occluders = tuple(shape for shape in still if _number(shape) in present)
 
     def now(self) -> EdgeTable:
-        """Return the current edges. All their sampling weights are lengths, and not cumulative."""
+        """Return the current edges. The sampling weights are not cumulative yet. They are lengths for lamps and sensor.
+        For all directions, they are lengths times the solid angle of the directions that see the edge as an outline.
+        """
         with dr.suspend_grad():
             moving = [[part.rows() for part in parts] for parts in self._moving]
             balls = [_ball(rows) for rows in moving]
             if len(balls) > MOST_BALLS:
-                centers = mi.Point3f(*(dr.concat([ball.center[axis] for ball in balls]) for axis in range(3)))
+                centers = _points([ball.center for ball in balls])
                 balls = [Ball.around(centers, dr.concat([ball.radius for ball in balls]))]
             parts = [rows for each in moving for rows in each]
             moves = [dr.full(mi.Bool, True, dr.width(rows.a)) for rows in parts]
@@ -294,7 +290,9 @@ class EdgeSet:
             rows = _joined(parts + self._still)
             length = dr.select(rows.kind == SPHERE, dr.two_pi * rows.radius, 2 * dr.norm(rows.b - rows.a))
             length = dr.select(rows.kind == SEGMENT, dr.norm(rows.b - rows.a), length)
-            return EdgeTable(**vars(rows), moves=dr.concat(moves), lamp=length, sensor=length, anywhere=length,
+            free = 4 * (dr.pi - turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a))
+            free = dr.select(rows.kind == SEGMENT, dr.select(dr.isfinite(free), free, 0), 4 * dr.pi)
+            return EdgeTable(**vars(rows), moves=dr.concat(moves), lamp=length, sensor=length, anywhere=length * free,
                              balls=balls)  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.edges import FLAT, SEGMENT, SPHERE, TUBE, Ball, EdgeTable, edge_kinds, outline_direction, turned
+from reslrb_cli.scene.edges import SEGMENT, SPHERE, TUBE, EdgeTable, edge_kinds, outline_direction
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect
 from reslrb_cli.transport.samples import Samples
@@ -96,10 +96,10 @@ def view_from_sensor(samples: Samples, aperture: mi.Point2f) -> Viewer:
         here.p = p
         seen = connect(samples.plan, samples.sensor, here, None, aperture, active)
         ds, _ = samples.sensor.sample_direction(here, aperture, active)
-        none = mi.Normal3f(0)
-        seen.active &= active
-        no = dr.zeros(mi.EmitterPtr)
-        return EdgeView(ds.p, ds.d, ds.dist, mi.Bool(False), seen.weight, none, seen.u, seen.active, no)
+        return EdgeView(
+            ds.p, ds.d, ds.dist, parallel=mi.Bool(False), weight=seen.weight, surface=mi.Normal3f(0), u=seen.u,
+            active=active & seen.active, emitter=dr.zeros(mi.EmitterPtr),
+        )  # fmt: skip
 
     return view
 
@@ -135,9 +135,8 @@ def sample_outline(
     creases, where `normal` points away from the first face of the edge. Code for spheres and cylinders is compiled only
     if there are any.
     """
-    plan = samples.plan
-    only_moving = creases and not plan.moving_emission  # as in `weigh_edges`
-    table, kinds = samples.edges, edge_kinds(plan.edged if only_moving else plan.edged + plan.occluders)
+    table, only_hide = samples.edges, _occluders_only_hide(samples)
+    kinds = edge_kinds(samples.plan.edged + (() if creases and only_hide else samples.plan.occluders))
     assert table is not None
     row_number, place = chances.edge, chances.place
     rows = dr.width(weights)
@@ -159,8 +158,8 @@ def sample_outline(
         p = dr.select(kind == SPHERE, a, dr.select(kind == TUBE, dr.lerp(a, b, 0.5), p))
     if view is None:
         view = _view_from_anywhere(table, kinds, row, kind, along, p, chances)
-        if plan.occluders and not plan.moving_emission:
-            view = _towards_balls(table.balls, view, dr.gather(mi.Bool, table.moves, row), chances)
+        if only_hide:
+            view = _towards_balls(table, row, view, chances)
     seen = view(p, active)
     normal = mi.Vector3f(0)
     if SPHERE in kinds or TUBE in kinds:
@@ -198,7 +197,7 @@ def sample_outline(
         side, across_it = dr.dot(raw, c - p), dr.dot(raw, other - p)
         outlines = is_round | (side * across_it > 0)
         if creases:
-            is_crease = ~outlines & (dr.gather(mi.Float, table.crease, row) > FLAT)
+            is_crease = ~outlines & (dr.gather(mi.Float, table.crease, row) > 0)
         active &= outlines | is_crease
         normal = dr.select(is_round, normal, -dr.mulsign(raw, side) / dr.maximum(sine, 1e-30))
     if SPHERE in kinds:
@@ -247,31 +246,26 @@ def weigh_edges(samples: Samples, table: EdgeTable) -> EdgeTable:
     shape that does not move must have a moving shape behind it, and has no weight for lamps.
     """
     with dr.suspend_grad():
-        free = 4 * (dr.pi - turned(table.b - table.a, table.c - table.a, table.d - table.a))
-        free = dr.select(table.kind == SEGMENT, free, 4 * dr.pi)
-        lamp, sensor = _seen_from_lamps(samples, table), _seen_from_sensor(samples, table)
-        if samples.plan.occluders and not samples.plan.moving_emission:
+        lamp, sensor, anywhere = _seen_from_lamps(samples, table), _seen_from_sensor(samples, table), table.anywhere
+        if _occluders_only_hide(samples):
             middle = dr.lerp(table.a, table.b, dr.select(table.kind == SPHERE, 0, 0.5))
-            towards = sum(4 * dr.pi * (1 - _cosine(ball, middle)) for ball in table.balls)
-            free = dr.select(table.moves, free, dr.minimum(towards, 4 * dr.pi))
+            towards = sum(4 * dr.pi * (1 - ball.cosine(middle)) for ball in table.balls)
+            anywhere = dr.select(table.moves, anywhere, table.lamp * dr.minimum(towards, 4 * dr.pi))
             lamp = dr.select(table.moves, lamp, 0)
             sensor *= dr.select(table.moves | _hides_ball(samples, table, middle), 1, 0)
         table = replace(
             table,
             lamp=dr.cumsum(table.lamp * lamp),
             sensor=dr.cumsum(table.sensor * sensor),
-            anywhere=dr.cumsum(dr.select(dr.isfinite(free), table.anywhere * free, 0)),
+            anywhere=dr.cumsum(anywhere),
         )
         dr.make_opaque(table)
         return table
 
 
-def _cosine(ball: Ball, p: mi.Point3f) -> mi.Float:
-    """Return the cosine of half the opening angle of the cone that contains the ball, seen from `p`. It is -1 inside
-    of the ball.
-    """
-    ratio = dr.square(ball.radius) / dr.squared_norm(ball.center - p)
-    return dr.select(ratio < 1, dr.sqrt(1 - ratio), -1)
+def _occluders_only_hide(samples: Samples) -> bool:
+    """Whether shapes at rest matter only because they hide moving shapes. If a lamp moves, their shadows move."""
+    return bool(samples.plan.occluders) and not samples.plan.moving_emission
 
 
 def _hides_ball(samples: Samples, table: EdgeTable, middle: mi.Point3f) -> mi.Bool:
@@ -304,22 +298,25 @@ def _view_from_anywhere(
     def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
         seen = active & dr.isfinite(density)
         weight = mi.Spectrum(dr.select(seen, dr.rcp(density), 0))
-        none, no = mi.Normal3f(0), dr.zeros(mi.EmitterPtr)
-        return EdgeView(p, to_y, mi.Float(1), mi.Bool(True), weight, none, mi.Point2f(0), seen, no)
+        return EdgeView(
+            p, to_y, mi.Float(1), parallel=mi.Bool(True), weight=weight, surface=mi.Normal3f(0), u=mi.Point2f(0),
+            active=seen, emitter=dr.zeros(mi.EmitterPtr),
+        )  # fmt: skip
 
     return view
 
 
-def _towards_balls(balls: list[Ball], other: Viewer, moves: mi.Bool, chances: Chances) -> Viewer:
+def _towards_balls(table: EdgeTable, row: mi.UInt32, other: Viewer, chances: Chances) -> Viewer:
     """Return a view of the edges of shapes that do not move: from a random direction in which, or opposite to which,
     there is a moving shape. Edges of moving shapes have the `other` view.
     """
+    balls, moves = table.balls, dr.gather(mi.Bool, table.moves, row)
     number = chances.viewpoint.x * len(balls)
     place = mi.Point2f(number - dr.floor(number), 2 * chances.viewpoint.y)
     place.y, backward = dr.select(place.y < 1, place.y, place.y - 1), place.y >= 1
 
     def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
-        cones = [(dr.normalize(ball.center - p), _cosine(ball, p)) for ball in balls]
+        cones = [(dr.normalize(ball.center - p), ball.cosine(p)) for ball in balls]
         to_y = mi.Vector3f(0)
         for index, (axis, cos) in enumerate(cones):
             drawn = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(place, cos))

@@ -73,8 +73,7 @@ def _software_texture() -> dict:
     return gradient_cases.floor({"type": "diffuse", "reflectance": texture | {"accel": False}})
 
 
-#: Scenes with which a recording ended the process with CUDA: an environment map without derivatives, and a texture
-#: without a hardware texture.
+#: Scenes whose recordings ended the process with CUDA.
 TEXTURES = {
     "sky": GradientCase("sky", BY_NAME["envmap"].scene, ("floor.brdf_0.reflectance.value",), "prb"),
     "software": GradientCase("software", _software_texture, ("floor.reflectance.data",), "prb"),
