@@ -25,7 +25,7 @@ import numpy as np
 
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config import loader
-from reslrb_cli.config.files import as_path
+from reslrb_cli.config.files import NAMELESS, as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override
 from reslrb_cli.config.schema import IN_MEMORY, Config
 from reslrb_cli.errors import ConfigError, one_line
@@ -42,9 +42,6 @@ Experiment: TypeAlias = "Config | str | os.PathLike[str] | Mapping[str, Any]"
 
 #: A dictionary as for `mi.load_dict`, or an `mi.Scene`.
 Scene: TypeAlias = "Mapping[str, Any] | mi.Scene"
-
-#: Name in error messages of an experiment that is not a file.
-NAMELESS = "<dict>"
 
 #: Advice in error messages on the command line, and its replacement in a script.
 ARGUMENTS = {
@@ -209,16 +206,14 @@ def render(
         from reslrb_cli.optimization.assemble import check_passes, load_for_rendering
         from reslrb_cli.optimization.loading import render_in_passes
 
-        scene, sensors, integrator, multiple = load_for_rendering(config, initial, values)
-        samples = config.run.spp if spp is None else spp
-        check_passes("spp", samples, multiple)
-        try:
+        with _scene_given_back(config):
+            scene, sensors, integrator, multiple = load_for_rendering(config, initial, values)
+            samples = config.run.spp if spp is None else spp
+            check_passes("spp", samples, multiple)
             return {
                 sensor: render_in_passes(integrator, scene, sensor, samples, config.run.seed, 0, "render", multiple)
                 for sensor in sensors
             }
-        finally:
-            _give_back(config)
 
 
 def gradient(
@@ -248,21 +243,24 @@ def gradient(
         from reslrb_cli.optimization.loop import gradient as step_gradient
         from reslrb_cli.records.decisions import DecisionCache
 
-        problem = assemble(config, logger.info, DecisionCache())
-        if values is not None:
-            problem = set_values(problem, values)
-        problem = replace(problem, config=reseeded)
-        loss = step_gradient(problem, 0)[0]
-        found = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
-        shown = {key: problem.selection.shown(key, value) for key, value in found.items()}
-        _give_back(config)
-        return float(loss[0]), shown
+        with _scene_given_back(config):
+            problem = assemble(config, logger.info, DecisionCache())
+            if values is not None:
+                problem = set_values(problem, values)
+            problem = replace(problem, config=reseeded)
+            loss = step_gradient(problem, 0)[0]
+            found = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
+            return float(loss[0]), {key: problem.selection.shown(key, value) for key, value in found.items()}
 
 
-def _give_back(config: Config) -> None:
-    """Give a scene in memory its first values again."""
-    if config.own_scene is not None:
-        config.own_scene.restore()
+@contextlib.contextmanager
+def _scene_given_back(config: Config) -> Iterator[None]:
+    """At the end of the block, give a scene in memory its first values again."""
+    try:
+        yield
+    finally:
+        if config.own_scene is not None:
+            config.own_scene.restore()
 
 
 def gradcheck(
@@ -305,12 +303,10 @@ def gradcheck(
         gc.collect()  # earlier scenes and the gradients of their parameters would otherwise take part in the check
         checked = settings_of(config, integrators, budget, seeds, spp, time.monotonic() - began)
         check = Gradcheck(checked)
-        try:
+        with _scene_given_back(config):
             records = list(check.run(stop, logger.info))
             for line in look_into(check, records, stop, logger.debug):
                 logger.info(line)
-        finally:
-            _give_back(config)
         return records
 
 

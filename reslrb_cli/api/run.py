@@ -27,12 +27,11 @@ from reslrb_cli.optimization.problem import progress_spp
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import check_output
-from reslrb_cli.runs.callbacks import Callback, Calls
+from reslrb_cli.runs.callbacks import Callback
 from reslrb_cli.runs.loggers import Callbacks, made
 from reslrb_cli.runs.prepare import PreparedRun, begin
 from reslrb_cli.runs.recorder import Recording
 from reslrb_cli.runs.resume import open_earlier
-from reslrb_cli.scene.in_memory import SceneInMemory
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -151,15 +150,15 @@ class Run:
         try:
             calls.begin()
             if calls and not course.done:
-                self._show(calls, "target", self.targets)
-                self._show(calls, "initial", self.images)
+                calls.images("target", self.targets)
+                calls.images("initial", self.images)
             told = functools.partial(logger.warning, "%s")
             for state, record in iterate(course.problem, course.state, told, watch=course.watch):
                 course.add(state, record)
                 calls.iteration(record)
                 yield record
             if calls:
-                self._show(calls, "final", self.images)
+                calls.images("final", self.images)
             self._status = Status.FINISHED
         except (GeneratorExit, KeyboardInterrupt):
             self._status = Status.INTERRUPTED
@@ -174,11 +173,6 @@ class Run:
             except Exception:
                 self._status = Status.FAILED
                 raise
-
-    def _show(self, calls: Calls, name: str, images: Mapping[int, Array]) -> None:
-        """Report an image of each view to the callbacks."""
-        for sensor, image in images.items():
-            calls.image(name, "" if len(images) == 1 else f"-{sensor}", image)
 
     def live(self, figure: bool = True) -> Iterator[Record]:
         """Iterate with a progress bar. In a notebook, `figure` also shows a live plot of the loss, the errors, and one
@@ -395,7 +389,7 @@ def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
 
 
 def _reopened(
-    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool, scene: SceneInMemory | None = None
+    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool, scene: Any = None
 ) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
     """Return the lock stack, the prepared run to resume, and True if iterations are left. The stack holds the lock of
     the run folder.

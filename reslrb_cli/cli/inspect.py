@@ -10,7 +10,6 @@ import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from reslrb_cli.cli.options import overrides_option, start_variant
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import loads, parse_override, read_text
+from reslrb_cli.config.parameters import is_named
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
 from reslrb_cli.errors import ConfigError, ExitCode, UnsupportedScene
@@ -123,7 +123,7 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
     """
     usable = [info for info in infos if info.obstacle is None]
     others = [info for info in infos if info.obstacle is not None]
-    marked = {info.key for info in usable if any(info.key == key or fnmatchcase(info.key, key) for key in wanted)}
+    marked = {info.key for info in usable if is_named(info.key, wanted)}
     shown = usable if everything else sorted(usable, key=lambda info: info.key not in marked)[:_LISTED]
     rows = [("* " * (info.key in marked) + info.key, _noted(info)) for info in shown]
     note = " (* in `parameters`)" if marked else ""

@@ -9,6 +9,9 @@ from typing import BinaryIO
 
 from reslrb_cli.errors import ConfigError, one_line
 
+#: Name in error messages of a mapping or a dictionary that is not from a file.
+NAMELESS = "<dict>"
+
 #: Maximum length in bytes of the name of a run folder. File systems allow 255; the rest is for prefixes and suffixes.
 NAME_BYTES = 200
 

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 from pydantic import BeforeValidator, Discriminator, Field, WithJsonSchema, model_validator
@@ -48,6 +50,11 @@ HEIGHTMAP = "heightmap"
 
 
 Part = TypeVar("Part")
+
+
+def is_named(key: str, wanted: Sequence[str]) -> bool:
+    """True if `wanted` contains `key`, or a glob that matches `key`."""
+    return any(key == each or fnmatchcase(key, each) for each in wanted)
 
 
 class ByWord(Section, Generic[Part]):

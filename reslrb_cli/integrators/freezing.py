@@ -138,13 +138,12 @@ def has_software_textures(scene: mi.Scene) -> bool:
     if not mi.variant().startswith("cuda"):
         return False
     with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        for texture in SceneGraph.of(scene).of_type(mi.Texture):
-            if texture.class_name().startswith("BitmapTexture"):
-                dr.kernel_history_clear()
-                dr.eval(texture.eval(dr.zeros(mi.SurfaceInteraction3f)))
-                kernels = [kernel["ir"].getvalue() for kernel in dr.kernel_history([dr.KernelType.JIT])]
-                if not any("tex.2d" in code for code in kernels):
-                    return True
+        for texture in SceneGraph.of(scene).bitmaps():
+            dr.kernel_history_clear()
+            dr.eval(texture.eval(dr.zeros(mi.SurfaceInteraction3f)))
+            kernels = [kernel["ir"].getvalue() for kernel in dr.kernel_history([dr.KernelType.JIT])]
+            if not any("tex.2d" in code for code in kernels):
+                return True
     return False
 
 

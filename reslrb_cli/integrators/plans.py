@@ -162,9 +162,8 @@ def settle(scene: mi.Scene) -> None:
     kernels. Raises UnsupportedScene for an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
     """
     with dr.suspend_grad():
-        for texture in SceneGraph.of(scene).of_type(mi.Texture):
-            if texture.class_name().startswith("BitmapTexture"):
-                texture.eval(dr.zeros(mi.SurfaceInteraction3f))
+        for texture in SceneGraph.of(scene).bitmaps():
+            texture.eval(dr.zeros(mi.SurfaceInteraction3f))
         _, weight = emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
         dr.eval(weight)
 

@@ -1,8 +1,8 @@
 """Terms that attached gradients lack: silhouettes, shadow edges, and light that leaves the film.
 
-`integrator.edges` adds silhouettes and shadow edges of moving shapes (`estimators/edges.py`). Other edges are still
-missing. Finite differences of the image at common random numbers contain all of these terms (`Missing`). F_k is the
-finite difference along direction k, and g_k is the gradient along direction k. There are K directions.
+`integrator.edges` adds silhouettes and shadow edges (`estimators/edges.py`). Some terms are still missing. Finite
+differences of the image at common random numbers contain all of these terms (`Missing`). F_k is the finite difference
+along direction k, and g_k is the gradient along direction k. There are K directions.
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 

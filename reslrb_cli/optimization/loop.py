@@ -125,8 +125,8 @@ class Watch:
         return f"the {kind} has stopped falling: over the last {count * span} iterations it fell by {share} in {span}"
 
 
-#: Fraction to which a large first loss falls before the moments are set to zero. Such a loss falls to this fraction for
-#: black images.
+#: The moments are set to zero each time a large loss has fallen to this fraction. A first loss is large if the loss of
+#: a black image is below this fraction of it.
 FALL = 0.1
 
 
@@ -156,9 +156,9 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     `optimizer.scale: auto` measures before the first iteration. `elapsed_s` includes the measurement time. The schedule
     follows either the iteration count or the elapsed time (`run.max_seconds`), whichever has progressed further.
 
-    If the first loss is more than ten times that of a black image, the optimiser's moments are set to zero whenever the
-    loss has fallen to a tenth since the last time. The large gradients of such a start would otherwise shorten the
-    steps for a hundred iterations or more.
+    A first loss is large if it exceeds ten times the loss of a black image. After a large first loss, the step sets the
+    optimiser's moments to zero each time the loss has fallen by another factor of ten. Otherwise, the large first
+    gradients would shorten the steps for a hundred iterations or more.
     """
     config, optimizer, iteration, level = problem.config, problem.optimizer, state.iteration, state.level
     if optimizer.stands_at is not state:

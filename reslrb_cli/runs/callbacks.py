@@ -94,6 +94,11 @@ class Calls:
         for each in self._callbacks:
             self._call(each, "image", name + suffix, image, exposure)
 
+    def images(self, name: str, images: Mapping[int, Array]) -> None:
+        """Report an image of each view, by the index of its sensor."""
+        for sensor, image in images.items():
+            self.image(name, "" if len(images) == 1 else f"-{sensor}", image)
+
     def end(self, status: str) -> None:
         """Report the end of the run to every callback, then raise the first error."""
         failure: Exception | None = None

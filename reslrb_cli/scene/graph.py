@@ -56,6 +56,10 @@ class SceneGraph:
         """Return all objects that are instances of `kind`, such as `mi.BSDF`."""
         return [item for item in self.objects if isinstance(item, kind)]
 
+    def bitmaps(self) -> list[Any]:
+        """Return all bitmap textures."""
+        return [item for item in self.of_type(mi.Texture) if item.class_name().startswith("BitmapTexture")]
+
     def shapes(self) -> list[Any]:
         """Return all shapes that rays can hit, including those in instanced groups."""
         return [shape for shape in self.of_type(mi.Shape) if shape.class_name() not in ("Instance", "ShapeGroupPlugin")]

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from fnmatch import fnmatchcase
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.parameters import is_named
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.load import check_scene
 
 #: What to do where an experiment needs the description of its scene, or another process needs the scene.
 INSTEAD = "give the scene as a file or as a Mitsuba dictionary"
 _MERGED = "Mitsuba merges shapes and materials as it loads a scene, unless `optimize=False`"
-
 
 #: How often each scene, by its `id`, has got its first values again.
 _restored: Counter[int] = Counter()
@@ -55,26 +54,24 @@ class SceneInMemory:
         """Raise ConfigError if Mitsuba has merged an object of the parameters `keys` (or globs), or one of the moved
         `objects`, with other objects.
         """
-        params, shapes = mi.traverse(self.scene), self.scene.shapes()
+        params, shapes, keys = mi.traverse(self.scene), self.scene.shapes(), list(keys)
         if any(not shape.id() for shape in shapes):
             ids = {shape.id() for shape in shapes} | {emitter.id() for emitter in self.scene.emitters()}
             lost = [name for name in objects if name not in ids]
-            lost += [
-                each for each in keys if not any(key == each or fnmatchcase(key, each) for key in params.properties)
-            ]
+            lost += [each for each in keys if not any(is_named(key, [each]) for key in params.properties)]
             if lost:
                 raise ConfigError(source, "scene", f"has no `{lost[0]}`, but shapes without ids; {_MERGED}")
         users: dict[Any, list[str]] = {}
         for shape in shapes:
             if shape.bsdf() is not None:
                 users.setdefault(shape.bsdf(), []).append(shape.id())
-        for each in keys:
-            for key in params.properties:
+        for key in params.properties:
+            if is_named(key, keys):
                 node = params.properties[key][2]
                 while node is not None and node not in users:
                     node = params.hierarchy[node][0]
                 names = users.get(node, [])
-                if len(names) > 1 and key.partition(".")[0] in names and (key == each or fnmatchcase(key, each)):
+                if len(names) > 1 and key.partition(".")[0] in names:
                     raise ConfigError(source, "scene", f"has one material for {', '.join(names)}; {_MERGED}")
 
 

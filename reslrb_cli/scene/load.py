@@ -7,7 +7,6 @@ import logging
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.variant import check_variant
-from reslrb_cli.config.files import as_path
+from reslrb_cli.config.files import NAMELESS, as_path
+from reslrb_cli.config.parameters import is_named
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
@@ -30,8 +30,6 @@ logger = logging.getLogger(__name__)
 #: Largest ray offset, as a fraction of the scene's size, without visible loss of light: that of a room of size 3 at
 #: about 150 from the origin, or of a room a fiftieth in size.
 _LARGEST_OFFSET = 5e-3
-#: Source in error messages about a dictionary.
-DICTIONARY = "<dict>"
 
 
 def load_scene(
@@ -105,12 +103,11 @@ def load_for_script(
 ) -> mi.Scene:
     """Load a Mitsuba scene as the command line does. The parameters have the names that `reslrb inspect` lists.
 
-    `file` is a scene file, or a dictionary as for `mi.load_dict`. `load_for_script` replaces
-    `mi.load_file(file, optimize=False, **options)`. `mi.load_file` refuses files of other
-    versions and exporters, and names objects without an id differently. `options` are the values of the file's `$name`
-    variables. Messages call these variables `scene.options.NAME`. `keys` are parameters, or globs, that need gradients.
-    Textures of 8 or 16 bits among `keys` are read as floating point. A variant must be set. The function does not load
-    the scene's own integrator.
+    `file` is a scene file, or a dictionary as for `mi.load_dict`. `load_for_script` replaces `mi.load_file(file,
+    optimize=False, **options)`. `mi.load_file` refuses files of other versions and exporters, and names objects without
+    an id differently. `options` are the values of the file's `$name` variables. Messages call these variables
+    `scene.options.NAME`. `keys` are parameters, or globs, that need gradients. Textures of 8 or 16 bits among `keys`
+    are read as floating point. A variant must be set. The function does not load the scene's own integrator.
 
     Raises a one-line `reslrb_cli.errors.ConfigError` with a location if a file is missing or wrong. Raises BackendError
     under an unsupported variant.
@@ -118,7 +115,7 @@ def load_for_script(
     check_variant(mi.variant())
     wanted = [keys] if isinstance(keys, str) else keys
     if isinstance(file, Mapping):
-        return load_scene(write_dictionary(file, DICTIONARY, Path.cwd()), options, keys=wanted)
+        return load_scene(write_dictionary(file, NAMELESS, Path.cwd()), options, keys=wanted)
     path = as_path(file, "file", "the path of a scene file, or a Mitsuba dictionary")
     return load_scene(path, options, keys=wanted)
 
@@ -171,7 +168,7 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
         return False
     params, owners, changed = mi.traverse(scene), Owners(description.root), False
     for key in params.properties:
-        if coarse_bits(params, key) is None or not any(key == each or fnmatchcase(key, each) for each in keys):
+        if coarse_bits(params, key) is None or not is_named(key, keys):
             continue
         owner, names = owners.place(params, key) or (description.root, [])
         if owner.type == "bitmap" and names == ["data"]:  # otherwise the selection of the parameter reports the reason
