@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.estimators.attached_camera import differentiate_attached_camera_paths
 from reslrb_cli.estimators.base import STACK_SIZE, Pass, PathAdjoint, differentiate_passage
 from reslrb_cli.estimators.stack import Frame, Ring, StackState, push, walk_back
 from reslrb_cli.transport.bsdf import Scattering
@@ -124,6 +125,9 @@ class CameraSweep(CameraHooks):
 
 def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
     """Add the derivatives of a pass's camera paths with known dL/dI, and splat their image if there is one."""
+    if p.plan.attached:
+        differentiate_attached_camera_paths(p, stack_size)
+        return
     ring, again = Ring.of(p.plan, stack_size), Pass(p.samples, None, p.adjoint)
     first, state = camera_walk(p.samples, CameraSweep(p, ring))
     if p.block is not None:

@@ -78,11 +78,11 @@ def differentiate_edges(p: Pass) -> None:
     if p.plan.stays:
         sides[OTHER_EDGES] = _between
     for stream, side in sides.items():
-        samples = _samples(p.samples, stream)
+        samples = edge_samples(p.samples, stream)
         side(Pass(samples, None, p.adjoint), samples.stream(stream))
 
 
-def _samples(samples: Samples, stream: int) -> Samples:
+def edge_samples(samples: Samples, stream: int) -> Samples:
     """Return samples of outlines for the light paths `samples`. Nothing along the paths of the result is
     differentiated.
     """
@@ -97,12 +97,12 @@ def _samples(samples: Samples, stream: int) -> Samples:
     return replace(samples, plan=plan, seed=seed, spp=1, width=width, scale=scale, guide=None, net=None)
 
 
-def _from_camera(samples: Samples) -> Samples:
+def for_camera(samples: Samples) -> Samples:
     """Return the samples for camera paths."""
     return replace(samples, plan=replace(samples.plan, camera=True, paths="camera"))
 
 
-def _chances(samples: Samples, numbers: mi.PCG32) -> Chances:
+def chances_of(samples: Samples, numbers: mi.PCG32) -> Chances:
     """Return the random numbers of one outline per lane."""
     lane = dr.arange(mi.UInt32, samples.width)
     return Chances.spread(numbers, samples.seed, lane, dr.opaque(mi.UInt32, samples.width))
@@ -121,18 +121,18 @@ class Beside:
     active: mi.Bool
 
 
-def _offset(outline: Outline) -> mi.Float:
+def ray_offset(outline: Outline) -> mi.Float:
     """Return Mitsuba's ray offset at the outline."""
     return mi.math.RayEpsilon * (1 + dr.max(dr.abs(outline.p)))
 
 
-def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside:
+def both_sides(samples: Samples, outline: Outline, creases: bool = False) -> Beside:
     """Return the rays on both sides of an outline. Lanes are active if nothing hides the edge from the viewpoint.
 
-    With `creases`, `x` exists only where it is needed: at creases, and for `_share`.
+    With `creases`, `x` exists only where it is needed: at creases, and for `share_of`.
     """
     scene, view, d = samples.scene, outline.view, -outline.view.to_y
-    offset = _offset(outline)
+    offset = ray_offset(outline)
     back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset)
     active = outline.active & (back > 0)
 
@@ -154,9 +154,9 @@ def _beside(samples: Samples, outline: Outline, creases: bool = False) -> Beside
     return Beside(over, past, pi, x, active)
 
 
-def _touches(outline: Outline, beside: Beside) -> mi.Bool:
+def touches_behind(outline: Outline, beside: Beside) -> mi.Bool:
     """True if the shape touches the surface behind it."""
-    return beside.x.is_valid() & (beside.x.t < 2 * AROUND * _offset(outline))
+    return beside.x.is_valid() & (beside.x.t < 2 * AROUND * ray_offset(outline))
 
 
 def _shares_edges(samples: Samples) -> bool:
@@ -164,12 +164,12 @@ def _shares_edges(samples: Samples) -> bool:
     return len(samples.plan.edged) > 1 or samples.plan.moving_emission
 
 
-def _share(samples: Samples, outline: Outline, beside: Beside) -> mi.Float:
+def share_of(samples: Samples, outline: Outline, beside: Beside) -> mi.Float:
     """Return 1/2 where the shape touches another shape that also ends there, otherwise 1."""
     if not _shares_edges(samples):
         return mi.Float(1)
-    x, offset = beside.x, _offset(outline)
-    touches = beside.active & _touches(outline, beside) & (x.shape != outline.shape)
+    x, offset = beside.x, ray_offset(outline)
+    touches = beside.active & touches_behind(outline, beside) & (x.shape != outline.shape)
     n, n_x = (
         mi.Vector3f(hit.compute_surface_interaction(ray, mi.RayFlags.All, touches).n)
         for hit, ray in ((beside.pi, beside.over), (x, beside.past))
@@ -184,7 +184,7 @@ def _share(samples: Samples, outline: Outline, beside: Beside) -> mi.Float:
     return dr.select(touches & ~(behind.is_valid() & (behind.shape == x.shape)), 0.5, 1)
 
 
-def _moved(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, adjoint: mi.Vector3f, active: mi.Bool) -> mi.Float:
+def moved_by(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, adjoint: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """Return <p, `adjoint`> with the derivative of the intersection p of `ray`. p moves with its surface."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     return dr.select(active, dr.dot(si.p, adjoint), 0)
@@ -270,9 +270,9 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     chances = Chances.spread(numbers, samples.seed, lane // 2, dr.opaque(mi.UInt32, (samples.width + 1) // 2))
     view = view_from_lamps(samples, chances.viewpoint)
     outline = sample_outline(samples, samples.edges.lamp, view, chances, creases=True)
-    beside = _beside(samples, outline, creases=True)
+    beside = both_sides(samples, outline, creases=True)
     ray = dr.select(over, beside.over, beside.past)
-    share = _share(samples, outline, beside)
+    share = share_of(samples, outline, beside)
     emission = Emission(ray, (2 * share) * outline.weight, dr.zeros(mi.EmitterPtr))
     moves = samples.plan.moving_emission
     shapes = samples.plan.edged + (samples.plan.occluders if moves else ())
@@ -282,15 +282,15 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     weight = showing(W) * dr.select(over, 1, -1)
     with dr.resume_grad(), dr.isolate_grad():
         adjoint, active = weight * outline.normal, beside.active & (weight != 0)
-        moved = _moved(beside.pi, beside.over, adjoint, active)
+        moved = moved_by(beside.pi, beside.over, adjoint, active)
         if moves:
             to_lamp = mi.Ray3f(beside.past.o, outline.view.to_y)  # not from p, which may lie behind a surface
             moved -= _carried(samples, outline.view.emitter, to_lamp, adjoint, active)
-        dr.backward_from(moved, flags=_MAY_LACK)
+        dr.backward_from(moved, flags=MAY_LACK)
 
 
 #: The result depends on no parameter if, for example, no lane is active.
-_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 # ---- Seen from the sensor ----
@@ -414,15 +414,15 @@ class Behind(CameraHooks):
 
 def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines seen from the sensor."""
-    samples = _from_camera(p.samples)
+    samples = for_camera(p.samples)
     assert samples.edges is not None
-    chances = _chances(samples, numbers)
+    chances = chances_of(samples, numbers)
     outline = sample_outline(samples, samples.edges.sensor, view_from_sensor(samples, chances.viewpoint), chances)
-    beside = _beside(samples, outline)
+    beside = both_sides(samples, outline)
     x, n = beside.x, outline.normal
     # If the shape touches the surface behind it, lamps and the sensor lose the point x at the same time. It counts
     # once, as seen from the lamps.
-    touches = _touches(outline, beside)
+    touches = touches_behind(outline, beside)
     beside.active = beside.active & ~touches
     behind = Behind(n, numbers if samples.plan.moving_emission else None)
     _, L = camera_walk(samples, behind, beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
@@ -433,11 +433,11 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     moves = active & x.is_valid()
     at_x = dr.select(moves, s * (slid * L.n_x + rest * n), 0)  # s is NaN if the ray leaves the scene
     with dr.resume_grad(), dr.isolate_grad():
-        moved = _moved(beside.pi, beside.over, -still * n, active) + _moved(x, beside.past, at_x, moves)
+        moved = moved_by(beside.pi, beside.over, -still * n, active) + moved_by(x, beside.past, at_x, moves)
         for one in L.direct:
             size = dr.select(moves, s * showing(dr.dot(weight, one.L) * one.total), 0)
             moved += _carried_to(samples, one, beside.past(x.t), L.n_x, size * n, moves)
-        dr.backward_from(moved, flags=_MAY_LACK)
+        dr.backward_from(moved, flags=MAY_LACK)
 
 
 # ---- Between two surfaces ----
@@ -470,20 +470,20 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines on segments between two surfaces. The first surface is not specular."""
     samples, scene = p.samples, p.samples.scene
     assert samples.edges is not None
-    outline = sample_outline(samples, samples.edges.anywhere, None, _chances(samples, numbers))
+    outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
     n, to_y = outline.normal, outline.view.to_y
-    offset = _offset(outline)
+    offset = ray_offset(outline)
     back = mi.Ray3f(outline.p + n * offset, to_y)
     y = scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
     outline.active = outline.active & y.is_valid()
     outline.view.distance = y.t
-    beside = _beside(samples, outline)
+    beside = both_sides(samples, outline)
     x, active = beside.x, beside.active & beside.x.is_valid()
     _, found = camera_walk(
-        _from_camera(samples), PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
+        for_camera(samples), PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
     )
     total = showing(found.total)
-    weight = outline.weight * found.L * (total * _share(samples, outline, beside))
+    weight = outline.weight * found.L * (total * share_of(samples, outline, beside))
     emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
     W = showing(walk(samples, Contribution(p), active & (total > 0), emission, found.segments + 1)[0] * p.scale)
     active = active & (W != 0)
@@ -492,9 +492,9 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     at_y = dr.select(active, (W * (1 - s)) * dr.select(found.direct != 0, slope * found.n_y, n), 0)
     at_x = dr.select(active, (W * s) * n, 0)
     with dr.resume_grad(), dr.isolate_grad():
-        moved = _moved(beside.pi, beside.over, -W * n, active)
-        moved += _moved(x, beside.past, at_x, active) + _moved(y, back, at_y, active)
+        moved = moved_by(beside.pi, beside.over, -W * n, active)
+        moved += moved_by(x, beside.past, at_x, active) + moved_by(y, back, at_y, active)
         if samples.plan.moving_emission:
             direct = active & (found.direct != 0)
             moved += _carried_to(samples, found, back(y.t), found.n_y, (W * (1 - s)) * n, direct)
-        dr.backward_from(moved, flags=_MAY_LACK)
+        dr.backward_from(moved, flags=MAY_LACK)

@@ -120,10 +120,13 @@ class Ring:
     wraps: bool
 
     @staticmethod
-    def of(plan: Plan, stack_size: int) -> Ring:
-        """Return a ring of at most `stack_size` places, but at least one, for the paths of a plan."""
-        size = min(stack_size, max(vertices(plan), 1))
-        return Ring(size, vertices(plan) > size)
+    def of(plan: Plan, stack_size: int, last: int = 0) -> Ring:
+        """Return a ring of at most `stack_size` places, but at least one, for the paths of a plan. `last` is 1 if the
+        end of a path on an emitter counts as a vertex, otherwise 0.
+        """
+        count = vertices(plan) + last
+        size = min(stack_size, max(count, 1))
+        return Ring(size, count > size)
 
     def place(self, number: mi.UInt32) -> mi.UInt32:
         """Return the place of a vertex."""

@@ -196,7 +196,7 @@ class Preparation:
         about = None if params is None else self._look_through(params)
         moves = about is not None and bool(about.which.shapes or about.which.emitters or self._motion.attached is True)
         paths, whole = self.sampling.paths, self.sampling.whole
-        if moves:
+        if moves and (paths == "both" or about.which.emitters):
             paths, whole = "light", whole and paths == "light"
         if (sensor, paths) not in self._found.plans:
             self._found.plans[sensor, paths] = self._first_plan(scene, sensor, paths, whole)
@@ -223,7 +223,7 @@ class Preparation:
             plan = attach(plan, which, motion, scene, sensor)
             if edged is not None:
                 plan = replace(plan, edged=edged.moving, occluders=edged.occluders, near=about.near)
-        if plan.stays and self._motion.sampling == "auto" and not plan.has_edges:
+        if plan.stays and plan.paths == "light" and self._motion.sampling == "auto" and not plan.has_edges:
             if sensor not in about.stays:  # once, because another answer would recompile kernels
                 about.stays[sensor] = bounces(plan, scene, sensor)
             if not about.stays[sensor]:

@@ -172,6 +172,8 @@ def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bo
     """Return `Plan.stays` and `Plan.glossy_follows` for the BSDFs of a scene's surfaces."""
     smooth = [bsdf.flags() for bsdf in bsdfs if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
     glossy = [mi.has_flag(flags, mi.BSDFFlags.Glossy) for flags in smooth]
+    if plan.paths == "camera":
+        return bool(smooth), False
     if sampling == "follow" or plan.max_depth <= 2 or not glossy:
         return False, False  # no light continues behind a nonspecular vertex
     return (True, False) if sampling == "stay" else (not all(glossy), any(glossy))
@@ -192,7 +194,7 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, s
         raise UnsupportedScene(motion.obstacle, "estimator")
     if plan.needs.has_null:
         raise UnsupportedScene("attached derivatives do not support masks and other surfaces with null lobes")
-    if sensor.film().rfilter().is_box_filter():
+    if plan.paths == "light" and sensor.film().rfilter().is_box_filter():
         raise UnsupportedScene(
             f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a pixel; use a "
             "smooth filter, such as gaussian, for derivatives of moving light"

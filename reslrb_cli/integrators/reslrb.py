@@ -20,6 +20,7 @@ from typing_extensions import Self
 
 from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
+from reslrb_cli.estimators.camera_edges import differentiate_edges_of_camera_paths
 from reslrb_cli.estimators.edges import differentiate_edges
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
@@ -363,7 +364,8 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
         elif not done:
             differentiate_camera_paths(p, estimator.stack_size)
     if samples.edges is not None:
-        differentiate_edges(Pass(samples, None, adjoint))
+        terms = differentiate_edges_of_camera_paths if samples.plan.camera else differentiate_edges
+        terms(Pass(samples, None, adjoint))
 
 
 def replay_stored(estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any) -> None:

@@ -99,7 +99,7 @@ class NextEvent(Connection):
     """Connection of a camera path's vertex to a point on an emitter, or to a direction.
 
     `weight` (C,) is the contribution without BSDF and transmittance: Le w_N / density. `scale` is `weight` without the
-    radiance. `Le` (C,) is the detached radiance, `through` (C,) the transmittance, and `target` the point on the
+    radiance. `sample` holds the random numbers of the point on the emitter. `Le` (C,) is the detached radiance, `through` (C,) the transmittance, and `target` the point on the
     emitter.
     """
 
@@ -336,12 +336,38 @@ def _next_event(
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     ds, weight = sample_lamp(samples, si, numbers, active)
     active = active & (ds.pdf > 0) & dr.isfinite(ds.pdf)
-    weight, zero = dr.select(active, weight, 0), mi.Point2f(0)
+    weight = dr.select(active, weight, 0)
     return NextEvent(
-        weight, zero, ds.p, si.to_local(ds.d), active, zero,
+        weight, mi.Point2f(0), ds.p, si.to_local(ds.d), active, numbers,
         Le=dr.select(active, weight * ds.pdf, 0), scale=dr.select(active, dr.rcp(ds.pdf), 0), ds=ds,
         through=mi.Spectrum(1), unseen=_unseen(samples),
     )  # fmt: skip
+
+
+def next_event_again(
+    samples: Samples, si: mi.SurfaceInteraction3f, numbers: mi.Point2f, active: mi.Bool
+) -> NextEvent:  # fmt: skip
+    """Return the next event with the random `numbers`, with attached derivatives. A point on an emitter stays at its
+    place on the emitter. `weight` (C,) is the arriving radiance.
+
+    Call the function under `dr.resume_grad()`. The density is detached. In its place, `weight` has the derivative of
+    |cos| / distance^2 at the emitter.
+    """
+    with dr.suspend_grad():
+        ds, _ = sample_lamp(samples, dr.detach(si), numbers, active)
+        distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+    there = ds.p - si.p
+    distance = dr.norm(there)
+    ds.d = dr.select(distant, ds.d, there / distance)
+    ds.dist = dr.select(distant, ds.dist, distance)
+    measure = dr.abs(dr.dot(ds.n, ds.d)) / dr.square(distance)
+    on_surface = active & ~distant & ~ds.delta & (measure > 0)
+    event = NextEvent(
+        mi.Spectrum(0), mi.Point2f(0), ds.p, si.to_local(ds.d), active, numbers,
+        Le=mi.Spectrum(0), scale=mi.Float(0), ds=ds, through=mi.Spectrum(1), unseen=_unseen(samples),
+    )  # fmt: skip
+    event.weight = event.radiance(samples.scene, si) * dr.select(on_surface, measure / dr.detach(measure), 1)
+    return event
 
 
 def _unseen(samples: Samples) -> frozenset[mi.Emitter]:

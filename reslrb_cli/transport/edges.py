@@ -242,17 +242,29 @@ def weigh_edges(samples: Samples, table: EdgeTable) -> EdgeTable:
     """Return the edges with cumulative sampling weights for the lamps and the sensor of `samples`.
 
     A weight is the length of the edge, times a factor. The factor favours edges that probes see as outlines. For all
-    directions, it is the solid angle of the directions that see the edge as an outline. If no lamp moves, the edge of a
-    shape that does not move must have a moving shape behind it, and has no weight for lamps.
+    directions, it is the solid angle of the directions that see the edge as an outline. The rays that start a path keep
+    their directions, so creases count for lamps, or for the sensor if the paths are camera paths. If no lamp moves, the
+    edge of a shape that does not move must have a moving shape behind it, and has no weight for the rays that start a
+    path.
     """
+    camera = samples.plan.camera
     with dr.suspend_grad():
-        lamp, sensor, anywhere = _seen_from_lamps(samples, table), _seen_from_sensor(samples, table), table.anywhere
+        lamp, sensor = _seen_from_lamps(samples, table, not camera), _seen_from_sensor(samples, table, camera)
+        anywhere = table.anywhere
         if _occluders_only_hide(samples):
             middle = dr.lerp(table.a, table.b, dr.select(table.kind == SPHERE, 0, 0.5))
             towards = sum(4 * dr.pi * (1 - ball.cosine(middle)) for ball in table.balls)
             anywhere = dr.select(table.moves, anywhere, table.lamp * dr.minimum(towards, 4 * dr.pi))
-            lamp = dr.select(table.moves, lamp, 0)
-            sensor *= dr.select(table.moves | _hides_ball(samples, table, middle), 1, 0)
+            if camera:
+                hides = dr.zeros(mi.Bool, dr.width(table.moves))
+                for numbers in _probes():
+                    hides |= _hides_ball(samples, table, middle, view_from_lamps(samples, numbers))
+                lamp *= dr.select(table.moves | hides, 1, UNLIKELY)
+                sensor = dr.select(table.moves, sensor, 0)
+            else:
+                hides = _hides_ball(samples, table, middle, view_from_sensor(samples, mi.Point2f(0.5)))
+                lamp = dr.select(table.moves, lamp, 0)
+                sensor *= dr.select(table.moves | hides, 1, 0)
         table = replace(
             table,
             lamp=dr.cumsum(table.lamp * lamp),
@@ -268,9 +280,9 @@ def _occluders_only_hide(samples: Samples) -> bool:
     return bool(samples.plan.occluders) and not samples.plan.moving_emission
 
 
-def _hides_ball(samples: Samples, table: EdgeTable, middle: mi.Point3f) -> mi.Bool:
-    """True if the sensor may see a ball behind the edge. Edges as long as half of their distance are never left out."""
-    view = view_from_sensor(samples, mi.Point2f(0.5))(middle, mi.Bool(True))
+def _hides_ball(samples: Samples, table: EdgeTable, middle: mi.Point3f, viewer: Viewer) -> mi.Bool:
+    """True if there may be a ball behind the edge. Edges as long as half of their distance are never left out."""
+    view = viewer(middle, mi.Bool(True))
     d, reach = -view.to_y, 0.5 * dr.norm(table.b - table.a) + table.radius
     found = mi.Bool(samples.plan.needs.thin_lens) | (reach > 0.5 * view.distance)
     for ball in table.balls:
@@ -335,18 +347,28 @@ def _towards_balls(table: EdgeTable, row: mi.UInt32, other: Viewer, chances: Cha
     return view
 
 
-def _seen_from_lamps(samples: Samples, table: EdgeTable) -> mi.Float:
+def _probes() -> list[mi.Point2f]:
+    """Return the random numbers of the points on lamps that probe edges."""
+    return [mi.Point2f((number + 0.5) / PROBES, (0.5 + 0.618034 * number) % 1) for number in range(PROBES)]
+
+
+def _seen_from_lamps(samples: Samples, table: EdgeTable, creases: bool) -> mi.Float:
     found = mi.Bool(False)
-    for number in range(PROBES):
-        numbers = mi.Point2f((number + 0.5) / PROBES, (0.5 + 0.618034 * number) % 1)
+    for numbers in _probes():
         view = view_from_lamps(samples, numbers)(dr.lerp(table.a, table.b, 0.5), mi.Bool(True))
         found |= _is_outline(table, view) & view.active
-    return dr.select(found | (table.kind != SEGMENT), 1.0, dr.maximum(table.crease, UNLIKELY))
+    return _likely(table, found, creases)
 
 
-def _seen_from_sensor(samples: Samples, table: EdgeTable) -> mi.Float:
+def _seen_from_sensor(samples: Samples, table: EdgeTable, creases: bool) -> mi.Float:
     view = view_from_sensor(samples, mi.Point2f(0.5))(dr.lerp(table.a, table.b, 0.5), mi.Bool(True))
-    return dr.select(_is_outline(table, view) | (table.kind != SEGMENT), 1.0, UNLIKELY)
+    return _likely(table, _is_outline(table, view), creases)
+
+
+def _likely(table: EdgeTable, found: mi.Bool, creases: bool) -> mi.Float:
+    """Return the factor of a weight. `found` edges are outlines, and creases count if `creases` is true."""
+    other = dr.maximum(table.crease, UNLIKELY) if creases else mi.Float(UNLIKELY)
+    return dr.select(found | (table.kind != SEGMENT), 1.0, other)
 
 
 def _is_outline(table: EdgeTable, view: EdgeView) -> mi.Bool:

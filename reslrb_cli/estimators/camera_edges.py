@@ -1,0 +1,199 @@
+"""Derivatives of the light that moving edges cover and uncover, for camera paths.
+
+The terms and their symbols are those of `edges.py`, for the flow of `attached_camera.py`. The ray through a film
+position is fixed, and all other vertices keep their places on their surfaces. L_p and L_x are the radiance that leaves
+p and x.
+
+Seen from the sensor, creases count, too:
+
+    dL/dtheta  +=  w delta(u) (L_p - L_x) <v_p, n>
+
+Seen from a lamp at y, x moves with its surface. W_x is the contribution to the objective of light that continues from
+x. Nothing is lost at p, because p moves with its surface and sees the lamp until it turns away from the lamp:
+
+    dL/dtheta  -=  w W_x <v_p - s v_x - (1 - s) v_y, n>,    s = |p - y| / |x - y|
+
+Between two surfaces, y is the point nearer to the sensor, W_y the contribution of light that continues from y, and L_x
+the radiance from x:
+
+    dL/dtheta  -=  w W_y L_x <v_p - s v_x - (1 - s) v_y, n>
+
+A point that the sensor sees directly slides along the direction d of the film's ray, and does not move with its
+surface. v is the velocity of the surface, and m its normal at x. v_y is defined in the same way.
+
+    v_x = d <v, m> / <d, m>
+
+If a shape touches the surface behind it, the sensor's ray and the light's ray lose the same point at the same time. The
+light of this point counts once, as seen from the sensor's side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.estimators.base import Pass
+from reslrb_cli.estimators.camera import Radiance
+from reslrb_cli.estimators.edges import (
+    AROUND,
+    LAMP_EDGES,
+    MAY_LACK,
+    OTHER_EDGES,
+    SENSOR_EDGES,
+    PickLight,
+    both_sides,
+    chances_of,
+    edge_samples,
+    for_camera,
+    moved_by,
+    ray_offset,
+    share_of,
+    touches_behind,
+)
+from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.camera import FilmRay, camera_walk
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.edges import Chances, sample_outline, view_from_lamps, view_from_sensor
+from reslrb_cli.transport.emission import Emission
+from reslrb_cli.transport.factors import Product, showing
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.walk import Hooks, Vertex, walk
+
+
+def differentiate_edges_of_camera_paths(p: Pass) -> None:
+    """Add the derivatives of the light that edges of moving shapes cover and uncover. dL/dI must be known."""
+    for stream, side in ((SENSOR_EDGES, _from_sensor), (LAMP_EDGES, _from_lamps), (OTHER_EDGES, _between)):
+        samples = edge_samples(p.samples, stream)
+        samples.plan = replace(samples.plan, camera=False, paths="light")
+        side(Pass(samples, None, p.adjoint), samples.stream(stream))
+
+
+def _halves(samples: Samples, numbers: mi.PCG32) -> tuple[mi.Bool, Chances]:
+    """Return the lanes that continue from p, which are half of all, and the random numbers that pairs share."""
+    lane = dr.arange(mi.UInt32, samples.width)
+    count = dr.opaque(mi.UInt32, (samples.width + 1) // 2)
+    return lane % 2 == 0, Chances.spread(numbers, samples.seed, lane // 2, count)
+
+
+def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines and creases seen from the sensor."""
+    samples = for_camera(p.samples)
+    assert samples.edges is not None
+    over, chances = _halves(samples, numbers)
+    view = view_from_sensor(samples, chances.viewpoint)
+    outline = sample_outline(samples, samples.edges.sensor, view, chances, creases=True)
+    beside = both_sides(samples, outline, creases=True)
+    ray = dr.select(over, beside.over, beside.past)
+    first = FilmRay(ray, outline.view.u, mi.Spectrum(1))
+    _, L = camera_walk(samples, Radiance(tracked=False), beside.active, first)
+    weight = p.delta(outline.view.u, beside.active) * outline.weight * (2 * p.scale)
+    change = showing(dr.dot(weight, L)) * dr.select(over, 1, -1) * share_of(samples, outline, beside)
+    with dr.resume_grad(), dr.isolate_grad():
+        active = beside.active & (change != 0)
+        dr.backward_from(moved_by(beside.pi, beside.over, change * outline.normal, active), flags=MAY_LACK)
+
+
+@dataclass
+class Importance:
+    """Contribution to the objective of light that continues from a point, in two sums.
+
+    `slid` is the contribution of light that goes from the point directly to the sensor, times <v, n> / <v, m> for the
+    point's velocity v. m is the normal `normal`. `rest` is the contribution of other light, and `all` is the sum
+    of both contributions. `counts` is 0 behind a specular point.
+    """
+
+    all: mi.Float
+    slid: mi.Float
+    rest: mi.Float
+    normal: mi.Vector3f
+    counts: mi.Float
+
+
+class ImportanceHooks(Hooks):
+    """Hooks of a light path that starts with a ray to the point. `outline` is the normal n of the outline. `first` is
+    the number of the path's first vertex.
+    """
+
+    def __init__(self, p: Pass, outline: mi.Vector3f, first: mi.UInt32) -> None:
+        self.p, self.outline, self.first = p, outline, first
+
+    def start(self, product: Product) -> Importance:
+        return Importance(mi.Float(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Float(1))
+
+    def vertex(
+        self, state: Importance, vertex: Vertex, connection: Connection, scattering: Scattering,
+        numbers: list[mi.Float],
+    ) -> Importance:  # fmt: skip
+        C = vertex.product.times(connection.c, vertex.depth).value()
+        own = dr.dot(C, self.p.delta(connection.u, connection.active)) * state.counts
+        own = dr.select(connection.active, own, 0)
+        first, si = vertex.depth == self.first, vertex.si
+        normal = dr.select(first, mi.Vector3f(si.n), state.normal)
+        to_sensor = si.to_world(connection.wo)
+        cos = dr.dot(normal, to_sensor)
+        slope = dr.select(cos != 0, dr.dot(self.outline, to_sensor) / cos, 0)
+        return Importance(
+            all=state.all + own,
+            slid=state.slid + dr.select(first, own * slope, 0),
+            rest=state.rest + dr.select(first, 0, own),
+            normal=normal,
+            counts=dr.select(first & scattering.is_delta, 0, state.counts),
+        )
+
+    @staticmethod
+    def motion(W: Importance, outline: mi.Vector3f, part: mi.Float) -> mi.Vector3f:
+        """Return the adjoint of the position of the point. The point counts with the factor `part`."""
+        return part * (showing(W.slid) * W.normal + showing(W.rest) * outline)
+
+
+def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines seen from lamps."""
+    samples = p.samples
+    assert samples.edges is not None
+    chances = chances_of(samples, numbers)
+    outline = sample_outline(samples, samples.edges.lamp, view_from_lamps(samples, chances.viewpoint), chances)
+    n, view = outline.normal, outline.view
+    beside = both_sides(samples, outline)
+    x, active = beside.x, beside.active & beside.x.is_valid() & ~touches_behind(outline, beside)
+    emission = Emission(beside.past, outline.weight * share_of(samples, outline, beside), dr.zeros(mi.EmitterPtr))
+    W = walk(samples, ImportanceHooks(p, n, mi.UInt32(1)), active, emission)
+    size = showing(W.all) * p.scale
+    active = active & (size != 0)
+    behind = dr.norm(beside.past(x.t) - view.y)
+    s = dr.select(view.parallel, 1, view.distance / behind)
+    with dr.resume_grad(), dr.isolate_grad():
+        moved = moved_by(beside.pi, beside.over, -size * n, active)
+        moved += moved_by(x, beside.past, ImportanceHooks.motion(W, n, s * p.scale), active)
+        dr.backward_from(moved, flags=MAY_LACK)
+
+
+def _between(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines on segments between two surfaces. Both surfaces are not specular."""
+    samples, scene = p.samples, p.samples.scene
+    assert samples.edges is not None
+    outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
+    n, to_y = outline.normal, outline.view.to_y
+    offset = ray_offset(outline)
+    back = mi.Ray3f(outline.p + n * offset, to_y)
+    y = scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
+    outline.active = outline.active & y.is_valid()
+    outline.view.distance = y.t
+    beside = both_sides(samples, outline)
+    x, active = beside.x, beside.active & beside.x.is_valid()
+    first = FilmRay(beside.past, mi.Point2f(0), mi.Spectrum(1))
+    _, found = camera_walk(for_camera(samples), PickLight(numbers), active, first)
+    total = showing(found.total)
+    weight = outline.weight * found.L * (total * share_of(samples, outline, beside))
+    emission = Emission(back, weight, dr.zeros(mi.EmitterPtr))
+    depth = found.segments + 1
+    W = walk(samples, ImportanceHooks(p, n, depth), active & (total > 0), emission, depth)
+    size = showing(W.all) * p.scale
+    active = active & (size != 0)
+    s = y.t / (y.t + x.t - AROUND * offset)
+    with dr.resume_grad(), dr.isolate_grad():
+        moved = moved_by(beside.pi, beside.over, -size * n, active)
+        moved += moved_by(x, beside.past, (size * s) * n, active)
+        moved += moved_by(y, back, ImportanceHooks.motion(W, n, (1 - s) * p.scale), active)
+        dr.backward_from(moved, flags=MAY_LACK)
