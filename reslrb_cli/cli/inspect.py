@@ -374,7 +374,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
     from reslrb_cli.integrators.plan_report import plan_rows
     from reslrb_cli.integrators.reslrb import Reslrb
     from reslrb_cli.optimization.autotune.sampling import as_decided, decided, explained, open_settings
-    from reslrb_cli.optimization.loading import choose_sensors, make_configured, moves_anything, pass_spp, paths_of
+    from reslrb_cli.optimization.loading import choose_sensors, make_configured, pass_spp, paths_of, what_moves
     from reslrb_cli.records.decisions import Decision
 
     config = subject.config
@@ -388,7 +388,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
         raise ConfigError(config.source.parent / MANIFEST_FILE, "decisions", str(error)) from None
     try:
         [sensor, *_] = sensors = choose_sensors(config, scene)
-        paths = paths_of(config.integrator, scene, sensors, moves_anything(config, selection))
+        paths = paths_of(config.integrator, scene, sensors, what_moves(config, selection))
         integrator = as_decided(make_configured(config, config.integrator, paths), decisions)
         assert isinstance(integrator, Reslrb)
         integrator.expect(pass_spp(config))

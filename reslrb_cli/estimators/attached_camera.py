@@ -28,7 +28,7 @@ from reslrb_cli.estimators.stack import Ring, StackState, walk_back
 from reslrb_cli.transport.bsdf import EventNumbers, Scattering, scatter
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk, next_event_again
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.walk import Segment, Vertex
+from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass
@@ -91,7 +91,7 @@ class AttachedCameraFrame:
                 emitter = there.emitter(samples.scene, lit)
                 light = dr.select(lit, emitter.eval(there, lit) * weight * reached.emission, 0)
             later = dr.select(scattered, scattering.weight * B, 0)
-            following = Segment(hit.si, event, scattering).next_ray(attached=True)
+            following = hit.si.spawn_ray(scattering.d)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             objective = dr.dot(P, light + reached.factor * (own + later)) + dr.select(scattered, moved, 0)
             dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)

@@ -52,7 +52,7 @@ from reslrb_cli.estimators.edges import (
     share_of,
     touches_behind,
 )
-from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.bsdf import Scattering, begins_caustic
 from reslrb_cli.transport.camera import FilmRay, camera_walk
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.edges import Chances, sample_outline, view_from_lamps, view_from_sensor
@@ -68,6 +68,11 @@ def differentiate_edges_of_camera_paths(p: Pass) -> None:
         samples = edge_samples(p.samples, stream)
         samples.plan = replace(samples.plan, camera=False, paths="light")
         side(Pass(samples, None, p.adjoint), samples.stream(stream))
+
+
+def _of_all_classes(samples: Samples) -> Samples:
+    """Return the samples for light paths of all classes."""
+    return replace(samples, plan=replace(samples.plan, by_class=False))
 
 
 def _halves(samples: Samples, numbers: mi.PCG32) -> tuple[mi.Bool, Chances]:
@@ -113,11 +118,12 @@ class Importance:
 
 class ImportanceHooks(Hooks):
     """Hooks of a light path that starts with a ray to the point. `outline` is the normal n of the outline. `first` is
-    the number of the path's first vertex.
+    the number of the path's first vertex. `direct` is true if the light comes directly from a lamp.
     """
 
-    def __init__(self, p: Pass, outline: mi.Vector3f, first: mi.UInt32) -> None:
+    def __init__(self, p: Pass, outline: mi.Vector3f, first: mi.UInt32, direct: bool) -> None:
         self.p, self.outline, self.first = p, outline, first
+        self.ends_class = direct and p.plan.by_class
 
     def start(self, product: Product) -> Importance:
         return Importance(mi.Float(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Float(1))
@@ -130,6 +136,8 @@ class ImportanceHooks(Hooks):
         own = dr.dot(C, self.p.delta(connection.u, connection.active)) * state.counts
         own = dr.select(connection.active, own, 0)
         first, si = vertex.depth == self.first, vertex.si
+        # Behind a caustic's first surface, the light belongs to light paths.
+        ends = begins_caustic(vertex.bsdf, scattering.is_delta) if self.ends_class else scattering.is_delta
         normal = dr.select(first, mi.Vector3f(si.n), state.normal)
         to_sensor = si.to_world(connection.wo)
         cos = dr.dot(normal, to_sensor)
@@ -139,7 +147,7 @@ class ImportanceHooks(Hooks):
             slid=state.slid + dr.select(first, own * slope, 0),
             rest=state.rest + dr.select(first, 0, own),
             normal=normal,
-            counts=dr.select(first & scattering.is_delta, 0, state.counts),
+            counts=dr.select(first & ends, 0, state.counts),
         )
 
     @staticmethod
@@ -158,7 +166,7 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     beside = both_sides(samples, outline)
     x, active = beside.x, beside.active & beside.x.is_valid() & ~touches_behind(outline, beside)
     emission = Emission(beside.past, outline.weight * share_of(samples, outline, beside), dr.zeros(mi.EmitterPtr))
-    W = walk(samples, ImportanceHooks(p, n, mi.UInt32(1)), active, emission)
+    W = walk(_of_all_classes(samples), ImportanceHooks(p, n, mi.UInt32(1), direct=True), active, emission)
     size = showing(W.all) * p.scale
     active = active & (size != 0)
     behind = dr.norm(beside.past(x.t) - view.y)
@@ -182,13 +190,14 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     outline.view.distance = y.t
     beside = both_sides(samples, outline)
     x, active = beside.x, beside.active & beside.x.is_valid()
-    first = FilmRay(beside.past, mi.Point2f(0), mi.Spectrum(1))
+    first = FilmRay(beside.past, mi.Point2f(0), mi.Spectrum(1), continues=True)
     _, found = camera_walk(for_camera(samples), PickLight(numbers), active, first)
     total = showing(found.total)
     weight = outline.weight * found.L * (total * share_of(samples, outline, beside))
     emission = Emission(back, weight, dr.zeros(mi.EmitterPtr))
     depth = found.segments + 1
-    W = walk(samples, ImportanceHooks(p, n, depth), active & (total > 0), emission, depth)
+    hooks = ImportanceHooks(p, n, depth, direct=False)
+    W = walk(_of_all_classes(samples), hooks, active & (total > 0), emission, depth)
     size = showing(W.all) * p.scale
     active = active & (size != 0)
     s = y.t / (y.t + x.t - AROUND * offset)

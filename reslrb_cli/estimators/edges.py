@@ -74,8 +74,10 @@ LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
 
 def differentiate_edges(p: Pass) -> None:
     """Add the derivatives of the light that edges of moving shapes cover and uncover. dL/dI must be known."""
-    sides = {LAMP_EDGES: _from_lamps, SENSOR_EDGES: _from_sensor}
-    if p.plan.stays:
+    sides = {LAMP_EDGES: _from_lamps}
+    if not p.plan.by_class:
+        sides[SENSOR_EDGES] = _from_sensor
+    if p.plan.stays and not p.plan.by_class:
         sides[OTHER_EDGES] = _between
     for stream, side in sides.items():
         samples = edge_samples(p.samples, stream)
@@ -273,7 +275,7 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     beside = both_sides(samples, outline, creases=True)
     ray = dr.select(over, beside.over, beside.past)
     share = share_of(samples, outline, beside)
-    emission = Emission(ray, (2 * share) * outline.weight, dr.zeros(mi.EmitterPtr))
+    emission = Emission(ray, (2 * share) * outline.weight, outline.view.emitter)
     moves = samples.plan.moving_emission
     shapes = samples.plan.edged + (samples.plan.occluders if moves else ())
     smooth = [shape for shape in shapes if interpolates_normals(shape)]

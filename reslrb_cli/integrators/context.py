@@ -130,14 +130,19 @@ class AboutParameters:
     #: Distribution of camera paths over the pixels (H, W), by the number of the sensor.
     noted: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
+    @property
+    def only_shapes_move(self) -> bool:
+        """True if the parameters move shapes and no lamps."""
+        return bool(self.which.shapes) and not self.which.emitters
+
 
 @dataclass
 class AboutScene:
     """Facts of one scene. The object holds the sensors, so no other sensor gets the address of a freed sensor."""
 
     sensors: list[mi.Sensor]
-    #: Plans of images, by sensor and kind of paths.
-    plans: dict[tuple[mi.Sensor, str], Plan] = field(default_factory=dict)
+    #: Plans of images, by sensor, kind of paths, and whether something moves.
+    plans: dict[tuple[mi.Sensor, str, bool], Plan] = field(default_factory=dict)
     #: BSDFs of its surfaces that use a node; the entry None has all of them.
     owners: dict[mi.Object | None, list[mi.BSDF]] = field(default_factory=dict)
     #: By parameters and the objects that have them.
@@ -196,12 +201,13 @@ class Preparation:
         about = None if params is None else self._look_through(params)
         moves = about is not None and bool(about.which.shapes or about.which.emitters or self._motion.attached is True)
         paths, whole = self.sampling.paths, self.sampling.whole
-        if moves and (paths == "both" or about.which.emitters):
+        if about is not None and moves and (self._motion.sampling == "follow" or not about.only_shapes_move):
             paths, whole = "light", whole and paths == "light"
-        if (sensor, paths) not in self._found.plans:
-            self._found.plans[sensor, paths] = self._first_plan(scene, sensor, paths, whole)
+        key = sensor, paths, moves
+        if key not in self._found.plans:
+            self._found.plans[key] = self._first_plan(*key, scene, whole)
         assert self._found.renewal is not None
-        plan = self._found.renewal.renew(self._found.plans[sensor, paths], scene)
+        plan = self._found.renewal.renew(self._found.plans[key], scene)
         if about is None or image:
             return plan
         which = about.which
@@ -217,7 +223,7 @@ class Preparation:
                     raise UnsupportedScene(f"attached_sampling: {why}", "attached_sampling")
                 if motion.sampling == "auto":
                     motion = replace(motion, sampling="stay")  # as in the terms of the edges
-                if not about.near:  # once, because another number would recompile kernels
+                if paths != "camera" and not about.near:  # once, because another number would recompile kernels
                     near = edged.moving or edged.occluders
                     about.near = NEAR * min(float(dr.norm(shape.bbox().extents())) for shape in near)
             plan = attach(plan, which, motion, scene, sensor)
@@ -276,14 +282,15 @@ class Preparation:
             made[weights, plan.horizon] = EmitterDensities.of(plan, scene)
         return made[weights, plan.horizon]
 
-    def _first_plan(self, scene: mi.Scene, sensor: mi.Sensor, paths: str, whole: bool) -> Plan:
-        """Return the first image plan for a sensor and a kind of paths."""
+    def _first_plan(self, sensor: mi.Sensor, paths: str, moves: bool, scene: mi.Scene, whole: bool) -> Plan:
+        """Return the first image plan for a sensor and a kind of paths. `moves` is true if something moves."""
         check_paths(scene, sensor, paths, self._hide_emitters)
         needs = scene_needs(scene, sensor)
         renewal = self._found.renewal = self._found.renewal or Renewal(scene)
         settle(scene)
         plan = make_plan(needs, *self._depths, self._hide_emitters)
-        plan = replace(plan, paths=paths, whole=whole, shares_out=self.sampling.shares_out and paths != "light")
+        shares_out = self.sampling.shares_out and paths != "light" and not moves
+        plan = replace(plan, paths=paths, whole=whole, by_class=moves and paths == "both", shares_out=shares_out)
         if plan.weighs:
             plan = renewal.renew(plan, scene)  # the horizon
         if plan.paths == "camera" or (self.guiding is None and not self.sampling.low_discrepancy):

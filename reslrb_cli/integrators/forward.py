@@ -185,6 +185,8 @@ def tangent_of(parts: list[Samples]) -> mi.TensorXf:
     """
     if parts[0].plan.has_edges:
         raise UnsupportedScene("forward mode has no derivatives of edges; use reverse mode, or edges: off", "edges")
+    if parts[0].plan.attached and parts[0].plan.paths != "light":
+        raise UnsupportedScene("forward mode has no derivatives of moving shapes for camera paths; use paths: light")
     if parts[0].plan.moving_emission:
         raise UnsupportedScene("forward mode has no derivatives of moving emitters; use reverse mode")
     film = parts[0].film

@@ -148,8 +148,9 @@ class LightTracer(StepIntegrator):
         parts = passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
         if not plan.has_edges or purpose is Purpose.IMAGE:
             return parts
-        edges = weigh_edges(parts[0], self.preparation.edges(plan).now())
-        return [replace(part, edges=edges) for part in parts]
+        now = self.preparation.edges(plan).now()
+        tables = [weigh_edges(side, now) for side in parts[0].sides()]
+        return [part.with_edges(*tables) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
         """Return the share of light paths. Also return the emitters' densities if paths from both sides are
@@ -163,7 +164,7 @@ class LightTracer(StepIntegrator):
         The tracer measures an unknown distribution once, for the differentiated parameters.
         """
         preparation = self.preparation
-        if plan.paths == "light" or not preparation.sampling.shares_out:
+        if not plan.shares_out:
             return None
         number = sensor_number(job.scene, job.sensor)
         known = preparation.sampling.given
@@ -363,9 +364,9 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
             estimator.of(side.plan).backward(p, state)
         elif not done:
             differentiate_camera_paths(p, estimator.stack_size)
-    if samples.edges is not None:
-        terms = differentiate_edges_of_camera_paths if samples.plan.camera else differentiate_edges
-        terms(Pass(samples, None, adjoint))
+    for side in samples.sides() if samples.edges is not None else ():
+        terms = differentiate_edges_of_camera_paths if side.plan.camera else differentiate_edges
+        terms(Pass(side, None, adjoint))
 
 
 def replay_stored(estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any) -> None:

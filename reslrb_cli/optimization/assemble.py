@@ -25,10 +25,10 @@ from reslrb_cli.optimization.loading import (
     choose_sensors,
     load_configured,
     make_configured,
-    moves_anything,
     pass_spp,
     paths_of,
     samples_per_pass,
+    what_moves,
 )
 from reslrb_cli.optimization.memory import check_described, check_films, check_step, plans
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
@@ -171,7 +171,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     check_films(config, scene, [view.sensor for view in views])
     sensors = [view.sensor for view in views]
     selection = select_parameters(scene, config.parameters, config.source, values)
-    moves = moves_anything(config, selection)
+    moves = what_moves(config, selection)
     check_integrator(config, config.integrator, scene, sensors, moves)
     paths = paths_of(config.integrator, scene, sensors, moves)
     expose(views, scene, selection)

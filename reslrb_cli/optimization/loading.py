@@ -24,12 +24,14 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import render_image
-from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.deformation import Moves, where_moved
 from reslrb_cli.scene.in_memory import INSTEAD
 from reslrb_cli.scene.load import load_scene, make_grid, warn_once
 from reslrb_cli.scene.needs import (
+    camera_finds_all,
     camera_finds_nothing,
     check_paths,
+    light_finds_all,
     paths_obstacle,
     scaled_emitter,
     scene_needs,
@@ -166,15 +168,18 @@ def are_upright(config: Config) -> bool:
     return config.scene.cameras is None
 
 
-def moves_anything(config: Config, selection: Selection) -> bool:
-    """True if the selected parameters move surfaces or lights, or if the integrator option `attached` is true."""
-    attached = config.integrator.options().get("attached", "auto")
-    return attached is True or bool(where_moved(selection.params, selection.scene_keys))
+def what_moves(config: Config, selection: Selection) -> Moves:
+    """Return what the selected parameters move. With the integrator option `attached: true`, lamps count as moving."""
+    if config.integrator.options().get("attached", "auto") is True:
+        return Moves.LAMPS
+    return Moves.of(where_moved(selection.params, selection.scene_keys))
 
 
-def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False) -> str:
-    """Return the kind of paths that render the images of `integrator`: `light`, `camera`, or `both`. If anything
-    `moves`, it is `light`.
+def paths_of(
+    integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: Moves = Moves.NOTHING
+) -> str:  # fmt: skip
+    """Return the kind of paths that render the images of `integrator`: `light`, `camera`, or `both`. If a lamp moves,
+    it is `light`.
 
     If a measurement chooses the kind of paths, the result is `both`. If only one kind can render the scene, the result
     is the usable kind.
@@ -183,7 +188,7 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
         return integrator.paths
     if not isinstance(integrator, ReslrbConfig | WalkAdConfig):
         return "light" if integrator.type in LIGHT_TRACERS else "camera"
-    if moves:
+    if moves is Moves.LAMPS or (moves and (isinstance(integrator, WalkAdConfig) or _follows(integrator))):
         return "light"
     if integrator.paths == "both" and integrator.light_share in (0, 1):
         return "light" if integrator.light_share else "camera"
@@ -192,14 +197,24 @@ def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves:
     if camera_finds_nothing(scene) or scaled_emitter(scene) is not None:
         return "light"
     looked = [scene.sensors()[sensor] for sensor in sensors]
-    for kind in ("both", "camera"):
+    kinds = ["both", "camera"]
+    if moves and camera_finds_all(scene, integrator.max_depth):
+        kinds = ["camera"]
+    elif moves and light_finds_all(scene, looked, integrator.hide_emitters):
+        kinds = []
+    for kind in kinds:
         if all(paths_obstacle(scene, sensor, kind) is None for sensor in looked):
             return kind
     return "light"
 
 
+def _follows(integrator: ReslrbConfig) -> bool:
+    """Whether the options ask for directions that turn with moving surfaces. Camera paths do not have them."""
+    return integrator.attached_sampling == "follow"
+
+
 def check_integrator(
-    config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False
+    config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: Moves = Moves.NOTHING
 ) -> None:
     """Raise ConfigError at `scene.file` if `integrator` cannot render `scene` through `sensors`."""
     try:

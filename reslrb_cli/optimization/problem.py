@@ -21,6 +21,7 @@ from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
 from reslrb_cli.optimization.views import SHARED, View, slope, to_tensor
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.scene.catalog import COLOUR
+from reslrb_cli.scene.deformation import Moves
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms
@@ -101,8 +102,8 @@ class Problem:
     samples_per_pass: int | None = None
     #: Kinds of paths of the images: `light`, `camera`, or `both` (`loading.paths_of`).
     paths: str = "light"
-    #: Whether parameters move emitters or surfaces on light paths.
-    moves: bool = False
+    #: What the parameters move.
+    moves: Moves = Moves.NOTHING
     #: Decisions on settings of the integrator that are `auto` (`autotune/sampling.py`).
     decisions: list[Decision] = field(default_factory=list)
     #: Regularizers of the values, by key and type.

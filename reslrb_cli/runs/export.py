@@ -28,7 +28,7 @@ from reslrb_cli.lens.solid import (
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
 from reslrb_cli.measure.tolerance import OpticalBench
-from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, moves_anything, paths_of
+from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of, what_moves
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
@@ -91,7 +91,7 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
                 write_atomically(output, lambda file: file.write(content))
             tell_solid(output, measured(solid, sheet, plan), say)
             return
-    moves = moves_anything(config, selection)
+    moves = what_moves(config, selection)
     check_integrator(config, config.integrator, scene, sensors, moves)
     paths = paths_of(config.integrator, scene, sensors, moves)
     integrator, why = choose_integrator(config, scene, selection.params, paths)

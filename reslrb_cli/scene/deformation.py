@@ -23,6 +23,7 @@ passes. In forward mode, `push` propagates tangents from the recovered values to
 from __future__ import annotations
 
 import difflib
+import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -160,6 +161,24 @@ def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:
         if is_placed or name == "vertex_positions":
             found.append(Movable(id, key, node))
     return found
+
+
+class Moves(enum.Enum):
+    """What parameters move."""
+
+    NOTHING = "nothing"
+    SHAPES = "shapes"
+    LAMPS = "lamps"
+
+    def __bool__(self) -> bool:
+        return self is not Moves.NOTHING
+
+    @staticmethod
+    def of(moved: list[Movable]) -> Moves:
+        """Return what the `moved` objects are. Shapes that emit light are lamps."""
+        if any(not isinstance(each.node, mi.Shape) or each.node.is_emitter() for each in moved):
+            return Moves.LAMPS
+        return Moves.SHAPES if moved else Moves.NOTHING
 
 
 #: Margin of a sphere that has become too small, because each size compiles kernels.

@@ -366,6 +366,13 @@ def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: m
     )
 
 
+def begins_caustic(bsdf: mi.BSDFPtr, is_delta: mi.Bool | bool) -> mi.Bool:
+    """Return the lanes in which light from an emitter is bundled by its first scattering event: a delta event, or any
+    event at a BSDF without a diffuse lobe.
+    """
+    return mi.Bool(is_delta) | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
+
+
 def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
     """Return the lanes in which a perturbed BSDF does not sample the direction itself. Also returns the random number
     `sample_1`, rescaled for the lanes in which the BSDF samples the direction.

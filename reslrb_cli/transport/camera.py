@@ -13,8 +13,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.graph import sensor_rays
-from reslrb_cli.transport.bsdf import EventNumbers, Scattering, evaluate, scatter
+from reslrb_cli.scene.graph import Lamp, sensor_rays
+from reslrb_cli.transport.bsdf import EventNumbers, Scattering, begins_caustic, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import density_of_rays
 from reslrb_cli.transport.factors import Product, play
@@ -28,12 +28,14 @@ from reslrb_cli.transport.weights import Rivals, cosine
 class FilmRay:
     """Ray through film position `u` (pixels, relative to the crop window).
 
-    `weight` (C,) is the sensor's importance, normalised so that a sum over lanes gives an image.
+    `weight` (C,) is the sensor's importance, normalised so that a sum over lanes gives an image. If `continues` is
+    true, the ray is the later part of a path, and the sensor sees a surface that is not specular before it.
     """
 
     ray: mi.Ray3f
     u: mi.Point2f
     weight: mi.Spectrum
+    continues: bool = False
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
@@ -99,8 +101,8 @@ class NextEvent(Connection):
     """Connection of a camera path's vertex to a point on an emitter, or to a direction.
 
     `weight` (C,) is the contribution without BSDF and transmittance: Le w_N / density. `scale` is `weight` without the
-    radiance. `sample` holds the random numbers of the point on the emitter. `Le` (C,) is the detached radiance, `through` (C,) the transmittance, and `target` the point on the
-    emitter.
+    radiance. `Le` (C,) is the detached radiance, `through` (C,) the transmittance, and `target` the point on the
+    emitter. `sample` holds the random numbers of this point.
     """
 
     Le: mi.Spectrum
@@ -172,6 +174,31 @@ class CameraPath:
     events: mi.UInt32
     M: list[mi.Float]
     rivals: list[Rivals]
+    classes: list[Bundled]
+
+
+@dataclass
+class Bundled:
+    """Class of a camera path, if paths are divided by class. `before` is 1 if the sensor sees a surface before the
+    current vertex that is not specular. `last` is 1 if light that arrives at the current vertex from an emitter would
+    begin a caustic at the last vertex.
+    """
+
+    before: mi.UInt32
+    last: mi.UInt32
+
+    def excludes_hit(self) -> mi.Bool:
+        """Return the lanes in which an emitter that the path hits belongs to light paths."""
+        return (self.before & self.last) != 0
+
+    def past(self, depth: mi.UInt32, bsdf: mi.BSDFPtr, scattering: Scattering, continues: bool) -> Bundled:
+        """Return the class behind a vertex. The first vertex itself never begins the light of light paths, unless the
+        path `continues`.
+        """
+        first = (depth == 1) if not continues else mi.Bool(False)
+        before = dr.select(first, dr.select(scattering.is_delta, mi.UInt32(0), 1), self.before)
+        last = begins_caustic(bsdf, scattering.is_delta) & ~first
+        return Bundled(before, dr.select(last, mi.UInt32(1), 0))
 
 
 def camera_walk(
@@ -202,6 +229,7 @@ def camera_walk(
     path = CameraPath(
         active, mi.UInt32(1), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
         mi.Point3f(first.ray.o), mi.UInt32(0), M, rivals,
+        [Bundled(mi.UInt32(1 if first.continues else 0), mi.UInt32(0))] if plan.by_class else [],
     )  # fmt: skip
 
     def body(path: CameraPath, state: Any, sampler: mi.Sampler) -> tuple[CameraPath, Any, mi.Sampler]:
@@ -220,6 +248,9 @@ def camera_walk(
         bsdf_1d = sampler.next_1d(active)
         own = EventNumbers(sampler.next_2d(active), bsdf_1d)
         event = _next_event(samples, si, bsdf, numbers, active) if plan.samples_emitters else None
+        if event is not None:
+            for own_class in path.classes:
+                event.active = event.active & ~((own_class.before != 0) & begins_caustic(bsdf, False))
         scattered = active & goes_on & (path.depth + 1 <= plan.max_depth - int(not plan.needs.has_visible_emitters))
         scattering, f = scatter(plan, vertex, own, scattered, event)
         arrived = [own.arrive(si, path.ray) for own in path.rivals]
@@ -254,6 +285,7 @@ def camera_walk(
             product, state = product.scaled(weight), hooks.survived(state, weight)
 
         path = _behind(plan, path, arrived, si, scattering)
+        path.classes = [each.past(path.depth, bsdf, scattering, first.continues) for each in path.classes]
         ray = dr.detach(si.spawn_ray(scattering.d))
         pi, active = intersect(plan, scene, ray, active, surrounded)
         path = replace(
@@ -298,6 +330,8 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
     for lamp in plan.needs.lamps:
         if lamp.parallel:
             active &= emitter != mi.EmitterPtr(lamp.emitter)
+    for own_class in path.classes:
+        active &= ~own_class.excludes_hit()
     with dr.suspend_grad():
         Le = emitter.eval(si, active)
         reference = dr.zeros(mi.Interaction3f)
@@ -305,9 +339,13 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
         ds = mi.DirectionSample3f(scene, si, reference)
         indirect = active & ~direct
         p_D = scene.pdf_emitter_direction(reference, ds, indirect)
+        spheres = _spheres(samples)
         for lamp in plan.needs.lamps:
-            if lamp.surrounds:
-                even = dr.square(ds.dist) / (dr.abs(dr.dot(ds.n, ds.d)) * lamp.shape.surface_area())
+            if lamp.surrounds or lamp in spheres:
+                area = lamp.shape.surface_area()
+                if lamp in spheres:
+                    area = 0.5 * area * (1 - _sphere_seen_from(mi.traverse(lamp.shape)["to_world"], path.before)[3])
+                even = dr.square(ds.dist) / (dr.abs(dr.dot(ds.n, ds.d)) * area)
                 here = indirect & (emitter == mi.EmitterPtr(lamp.emitter))
                 p_D = dr.select(here, scene.pdf_emitter(mi.UInt32(lamp.index)) * even, p_D)
         # Points of a lamp with a black texture have no density: paths only hit them.
@@ -382,8 +420,9 @@ def sample_lamp(
     is not tested. Emitters that Mitsuba cannot sample have weight 0.
     """
     scene, unseen = samples.scene, _unseen(samples)
+    spheres = {lamp.emitter: lamp.shape for lamp in _spheres(samples)}
     with dr.suspend_grad():
-        if not unseen:
+        if not (unseen or spheres):
             return scene.sample_emitter_direction(si, numbers, False, active)
         index, weight, reused = scene.sample_emitter(numbers.x, active)
         emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
@@ -393,11 +432,59 @@ def sample_lamp(
         ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
             if self in unseen:
                 return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+            if self in spheres:
+                return _sample_sphere(self, spheres[self], si, sample, active)
             return self.sample_direction(si, sample, active)
 
         ds, radiance = dr.dispatch(emitter, sample, si, mi.Point2f(reused, numbers.y), active)
         ds.pdf /= weight
         return ds, radiance * weight
+
+
+def _spheres(samples: Samples) -> list[Lamp]:
+    """Return the lamps that are spheres, if directions have attached derivatives.
+
+    Mitsuba samples their directions evenly. The derivative of |cos| / distance^2 at the lamp would then have infinite
+    variance, because it is large near the sphere's outline. Camera paths therefore sample places on the sphere.
+    """
+    lamps = samples.plan.needs.lamps
+    return [lamp for lamp in lamps if lamp.is_sphere and not lamp.surrounds] if samples.plan.attached else []
+
+
+def _sphere_seen_from(
+    to_world: mi.AffineTransform4f, p: mi.Point3f
+) -> tuple[mi.Point3f, mi.Float, mi.Vector3f, mi.Float]:
+    """Return the centre and the radius of a sphere, the direction from the centre to `p`, and the cosine of half the
+    opening angle of the cap that `p` sees.
+    """
+    center = to_world @ mi.Point3f(0)
+    radius = dr.norm(to_world @ mi.Vector3f(1, 0, 0))
+    out = p - center
+    distance = dr.norm(out)
+    return center, radius, out / distance, dr.minimum(radius / distance, 1)
+
+
+def _sample_sphere(
+    emitter: mi.Emitter, shape: mi.Shape, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
+    """Return a place on the visible cap of a sphere, uniform by area, and radiance / density (C,)."""
+    to_world = mi.traverse(shape)["to_world"]
+    center, radius, axis, cos = _sphere_seen_from(to_world, si.p)
+    n = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(sample, cos))
+    p = center + radius * n
+    offset = p - si.p
+    distance = dr.norm(offset)
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.p, ds.n, ds.dist, ds.d, ds.time = p, n, distance, offset / distance, si.time
+    facing = -dr.dot(n, ds.d)
+    area = dr.two_pi * dr.square(radius) * (1 - cos)
+    ds.pdf = dr.select((facing > 0) & (cos < 1), dr.square(distance) / (facing * area), 0)
+    ds.emitter = mi.EmitterPtr(emitter)
+    local = to_world.inverse() @ p
+    longitude = dr.atan2(local.y, local.x) * dr.inv_two_pi
+    ds.uv = mi.Point2f(dr.select(longitude < 0, longitude + 1, longitude), dr.safe_acos(local.z) * dr.inv_pi)
+    radiance = emitter.eval_direction(si, ds, active)
+    return ds, dr.select(ds.pdf > 0, radiance / ds.pdf, 0)
 
 
 def _weigh(

@@ -150,6 +150,9 @@ class Plan:
     # Kinds of paths: `light`, `camera`, or `both`; and whether the paths of this walk start at the sensor.
     paths: str = "light"
     camera: bool = False
+    # Whether each path belongs to one side, by its class, if there are both kinds. Otherwise both sides are weighted.
+    # Light paths then have the light that begins at a specular or glossy surface (`begins_caustic`).
+    by_class: bool = False
     # Whether each pixel is divided by the part of its filter on the film, as always if camera paths may run.
     whole: bool = False
     # Whether guided paths may be aimed at visible surfaces (`aim.py`), if nothing moves.
@@ -165,12 +168,12 @@ class Plan:
     @property
     def weighs(self) -> bool:
         """True if contributions of light paths and camera paths are weighted against each other."""
-        return self.paths == "both"
+        return self.paths == "both" and not self.by_class
 
     @property
     def passes_lamps(self) -> bool:
         """Whether connections to the sensor pass through lamps, because lamps are hidden from the sensor's rays."""
-        return self.weighs and self.hide_emitters and not self.camera and bool(self.needs.lamps)
+        return self.paths == "both" and self.hide_emitters and not self.camera and bool(self.needs.lamps)
 
     @property
     def samples_emitters(self) -> bool:
@@ -288,6 +291,12 @@ class Plan:
         for other in self.moving_shapes:
             result |= shape == mi.ShapePtr(other)
         return result
+
+    def for_camera(self) -> Plan:
+        """Return the plan of the camera paths of a pass. Their vertices stay behind all surfaces that are not
+        specular.
+        """
+        return replace(self, camera=True, stays=self.attached, glossy_follows=False, near=0.0)
 
     def differentiating(
         self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[mi.BSDF, ...] = ()

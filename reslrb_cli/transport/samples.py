@@ -289,6 +289,11 @@ class Samples:
         """Return these samples, and the camera paths of the same pass."""
         return [self] if self.camera is None else [self, self.camera]
 
+    def with_edges(self, edges: EdgeTable, of_camera: EdgeTable | None = None) -> Samples:
+        """Return the same samples with edges. The camera paths of the same pass, next to light paths, have others."""
+        camera = self.camera if self.camera is None else replace(self.camera, edges=of_camera)
+        return replace(self, edges=edges, camera=camera)
+
     def stream(self, name: int) -> mi.PCG32:
         """Return a stream of random numbers independent of the sampler, so that light paths remain those of `ptracer`.
 
@@ -395,10 +400,10 @@ def passes(
         fraction, own_scale, ratio, camera = dr.opaque(mi.Float, size / spp), scale, None, None
         n_camera = size * crop
         width = n_camera if plan.paths == "camera" else size * pixels
-        if plan.weighs:
+        if plan.paths == "both":
             width = max(round(light_share * size * pixels), 1)
             n_camera = max(round((1 - light_share) * size * crop), 1)
-            ratio = dr.opaque(mi.Float, width / (n_camera / crop))
+            ratio = dr.opaque(mi.Float, width / (n_camera / crop)) if plan.weighs else None
             own_scale = dr.opaque(mi.Float, crop / width) * fraction
         most = max(width, n_camera)
         if most > PASS_PATHS:
@@ -409,7 +414,7 @@ def passes(
             dr.make_opaque(own_scale, camera_scale)
             own = None if shares is None else shares(n_camera)
             camera = Samples(*given, n_camera, camera_scale, fraction, None, None, ratio, emitters, own)
-            camera.plan = replace(plan, camera=True)
+            camera.plan = plan.for_camera()
             if plan.paths == "camera":
                 return camera
         guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.aim import Pending, aims_from, choose
-from reslrb_cli.transport.bsdf import Aimed, EventNumbers, Hit, Scattering, evaluate, scatter
+from reslrb_cli.transport.bsdf import Aimed, EventNumbers, Hit, Scattering, begins_caustic, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import Product, first_eta, play
@@ -186,8 +186,12 @@ def walk(
     aim = samples.guide.table.aim if samples.guide is not None and plan.aimed else None
 
     # ---- Leave the emitter ----
+    begins = mi.Bool(False)  # whether the path's light is its own class from the start
     loop_mode = "evaluated" if hooks.tracked and hooks.max_iterations is None else "symbolic"
     emission = sample_emission(samples, sampler) if emission is None else emission
+    for lamp in plan.needs.lamps if plan.by_class else ():
+        if lamp.parallel:  # no camera path finds its light
+            begins |= emission.emitter == mi.EmitterPtr(lamp.emitter)
     product, active, eta = Product.one(plan.track_zeros, hooks.tracked), mi.Bool(active), mi.Float(1)
     if not hooks.replaying:
         product = product.times(emission.weight, mi.Int32(0))
@@ -225,6 +229,8 @@ def walk(
 
         # ---- Connect to the sensor, and scatter ----
         connected = path.active & hooks.wants(state, vertex)
+        if plan.by_class:
+            connected &= begins | (path.depth > 1)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
         aimed = None
         if aim is not None:
@@ -267,6 +273,8 @@ def walk(
         product = path.product.times(scattering.weight, path.depth)
         eta = path.eta * dr.detach(scattering.eta)
         active = scattering.active & product.alive()
+        if plan.by_class:
+            active &= begins | (path.depth > 1) | begins_caustic(bsdf, scattering.is_delta)
 
         # ---- Russian roulette ----
         number = sampler.next_1d(active)

@@ -226,6 +226,9 @@ def _pixels(tuner: Tuner) -> None:
     With relative_l2, a mirror room had twice the variance in some colours (docs/notes/method.md).
     """
     problem = tuner.problem
+    if problem.moves:
+        tuner.take(Decision(setting="pixels", value="even", why="the noise of moving shapes is not measured"))
+        return
     even = Decision(setting="pixels", value="even", why="unchanged, because not every loss is l2")
     if any(loss.type != "l2" for loss in problem.config.losses):
         tuner.take(even)
@@ -245,7 +248,9 @@ def _measure_pixels(tuner: Tuner) -> None:
     distributes them.
     """
     problem, tracer = tuner.problem, tuner.problem.integrator
-    if not isinstance(tracer, Tracer) or not tracer.preparation.sampling.shares_out or tracer.paths == "light":
+    if problem.moves or not isinstance(tracer, Tracer) or tracer.paths == "light":
+        return
+    if not tracer.preparation.sampling.shares_out:
         return
     problem.apply()
     scene, params = problem.scene, problem.selection.params
