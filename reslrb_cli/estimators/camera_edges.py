@@ -41,6 +41,7 @@ from reslrb_cli.estimators.edges import (
     LAMP_EDGES,
     MAY_LACK,
     OTHER_EDGES,
+    PATHS_PER_OUTLINE,
     SENSOR_EDGES,
     PickLight,
     both_sides,
@@ -64,8 +65,14 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 def differentiate_edges_of_camera_paths(p: Pass) -> None:
     """Add the derivatives of the light that edges of moving shapes cover and uncover. dL/dI must be known."""
-    for stream, side in ((SENSOR_EDGES, _from_sensor), (LAMP_EDGES, _from_lamps), (OTHER_EDGES, _between)):
-        samples = edge_samples(p.samples, stream)
+    # The radiance on both sides of an outline is noisier than other terms, so that this term has more samples.
+    terms = (
+        (SENSOR_EDGES, _from_sensor, 1),
+        (LAMP_EDGES, _from_lamps, PATHS_PER_OUTLINE),
+        (OTHER_EDGES, _between, PATHS_PER_OUTLINE),
+    )
+    for stream, side, each in terms:
+        samples = edge_samples(p.samples, stream, each)
         samples.plan = replace(samples.plan, camera=False, paths="light")
         side(Pass(samples, None, p.adjoint), samples.stream(stream))
 

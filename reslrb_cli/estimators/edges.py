@@ -61,7 +61,7 @@ from reslrb_cli.transport.factors import Product, showing
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
-#: Light paths of a step per sampled point on an outline, for each of the three terms.
+#: Paths of a step per sampled point on an outline, for each of the three terms.
 PATHS_PER_OUTLINE = 4
 #: Distance between an edge and the ray that hits the shape, in units of Mitsuba's ray offset, on spheres and
 #: cylinders. The ray hits them before the edge, by the square root of this distance. On other shapes it is 1.
@@ -84,16 +84,16 @@ def differentiate_edges(p: Pass) -> None:
         side(Pass(samples, None, p.adjoint), samples.stream(stream))
 
 
-def edge_samples(samples: Samples, stream: int) -> Samples:
-    """Return samples of outlines for the light paths `samples`. Nothing along the paths of the result is
-    differentiated.
+def edge_samples(samples: Samples, stream: int, each: int = PATHS_PER_OUTLINE) -> Samples:
+    """Return samples of outlines for the paths `samples`, one for `each` paths. Nothing along the paths of the result
+    is differentiated.
     """
     plan = replace(
         samples.plan, attached=False, stays=False, glossy_follows=False, moving_shapes=(), grid=None,
         aims=False, sequence=None, differentiate_bsdfs=False, differentiate_emission=False, track_zeros=False,
         only_bsdfs=(), differentiate_delta=False, differentiate_null=False, evened_lamps=(),
     )  # fmt: skip
-    width = max(samples.width // PATHS_PER_OUTLINE, 1)
+    width = max(samples.width // each, 1)
     seed = mi.sample_tea_32(samples.seed, mi.UInt32(stream))[0]
     scale = samples.scale * (dr.opaque(mi.Float, samples.width) / dr.opaque(mi.Float, width))
     return replace(samples, plan=plan, seed=seed, spp=1, width=width, scale=scale, guide=None, net=None)

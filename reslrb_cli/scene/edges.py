@@ -197,7 +197,7 @@ def _ball(parts: list[_Rows]) -> Ball:
 
 
 def _are_open(rows: _Rows, scene: mi.Scene) -> mi.Bool:
-    """True if an edge can hide a surface from another surface or from a sensor.
+    """True if an edge can hide a surface from another surface, from a lamp, or from a sensor.
 
     At a corner of a room, for example, all rays beside the edge of a wall soon hit the other wall. Rays in `RAYS`
     random directions decide.
@@ -211,10 +211,13 @@ def _are_open(rows: _Rows, scene: mi.Scene) -> mi.Bool:
     along = dr.normalize(b - a)
     to_y, _ = outline_direction(along, c - p, d - p, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
     passes = _passes(scene, p, along, c - p, to_y, None)
-    for sensor in scene.sensors():
-        here = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
-        here.p = p
-        ds, _ = sensor.sample_direction(here, mi.Point2f(0.5))
+    here = dr.zeros(mi.SurfaceInteraction3f, dr.width(lane))
+    here.p = p
+    views = [sensor.sample_direction(here, mi.Point2f(0.5))[0] for sensor in scene.sensors()]
+    for emitter in scene.emitters():
+        if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):  # lamps with a surface count as surfaces
+            views.append(emitter.sample_direction(here, mi.Point2f(numbers.next_float32(), numbers.next_float32()))[0])
+    for ds in views:
         raw = dr.cross(along, ds.d)
         seen = (ds.pdf > 0) & (dr.dot(raw, c - p) * dr.dot(raw, d - p) > 0)
         passes |= seen & _passes(scene, p, along, c - p, ds.d, ds.dist)
@@ -225,8 +228,8 @@ def _are_open(rows: _Rows, scene: mi.Scene) -> mi.Bool:
 def _passes(
     scene: mi.Scene, p: mi.Point3f, along: mi.Vector3f, corner: mi.Vector3f, to_y: mi.Vector3f, distance: Any
 ) -> mi.Bool:  # fmt: skip
-    """True if a ray beside the point `p` of an edge passes. It must hit surfaces on both sides, or reach a sensor at
-    `distance` on one side.
+    """True if a ray beside the point `p` of an edge passes. It must hit surfaces on both sides, or reach a sensor or a
+    lamp at `distance` on one side.
     """
     raw = dr.cross(along, -to_y)
     offset = BESIDE * (1 + dr.max(dr.abs(p)))

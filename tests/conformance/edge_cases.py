@@ -202,7 +202,7 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
     # The camera sees the plate far behind the box.
     "two": lambda: {"shape": _box(0.2, -1.6, 1.35, 0.4),
                     "plate": rectangle(TWO_SIDED, transform(translate=[0.1, 0, 0.5], scale=0.7))},
-    **dict.fromkeys(("hidden", "behind"), lambda: {"shape": _box(0.1, -0.1, 0.9)}),
+    **dict.fromkeys(("hidden", "behind", "shaded"), lambda: {"shape": _box(0.1, -0.1, 0.9)}),
     "reflector": lambda: {"shape": rectangle(TWO_SIDED, transform(translate=[0, 0, 2.6], scale=0.5))},
     "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
                      for n, name in enumerate(FLAT)},
@@ -219,6 +219,8 @@ STILL: dict[str, Callable[[], dict[str, Any]]] = {
         "tube": {"type": "cylinder", "p0": [-0.1, -0.9, 0.4], "p1": [-0.2, -0.9, 1.6], "radius": 0.05,
                  "bsdf": TWO_SIDED},
     },
+    # The shadow of the sheet falls on the box.
+    "shaded": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.35, 0.05, 1.7], scale=0.2))},
     "reflector": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.1, 0.1, 1.2], scale=0.4))},
 }  # fmt: skip
 
@@ -306,6 +308,7 @@ RECORDED = [
     EdgeCase("box", "indirect", 3, spp=512, reference_spp=8192), EdgeCase("sphere", "room", 5),
     EdgeCase("hidden", "point", spp=1024, reference_spp=8192, step=SMALLEST),
     EdgeCase("reflector", "upward", 3, spp=512, reference_spp=8192),
+    EdgeCase("shaded", "point", step=SMALLEST, reference_spp=8192),
     *(EdgeCase("box", lamp, lamp_moves=True, spp=1024) for lamp in ("area", "spot")),
     EdgeCase("none", "room", 3, lamp_moves=True, spp=1024),
 ]  # fmt: skip

@@ -24,6 +24,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.decisions import Decision, DecisionCache
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.scene.deformation import Moves
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -247,9 +248,23 @@ def test_beams_and_scaled_emitters_are_left_to_light_paths():
     assert paths(sun=sun(2)) == "light"
 
 
-def test_moving_light_uses_light_paths():
-    problem = assemble_scene(load(ROOT / "configs" / "lens_pose.yaml", ["integrator.paths=both"]))
-    assert (problem.paths, problem.moves, problem.integrator.paths) == ("light", True, "light")
+@pytest.mark.parametrize(("name", "settings", "paths"), [
+    ("lens_pose", [], "light"), ("lens_pose", ["integrator.paths=both"], "both"),
+    ("lens_pose", ["integrator.attached_sampling=follow"], "light"),
+    ("moved_box", [], "camera"), ("moved_box", ["integrator.paths=light"], "light"),
+])  # fmt: skip
+def test_paths_of_runs_that_move_shapes(name: str, settings: list[str], paths: str):
+    problem = assemble_scene(load(ROOT / "configs" / f"{name}.yaml", settings))
+    assert (problem.paths, problem.moves, problem.integrator.paths) == (paths, Moves.SHAPES, paths)
+
+
+def test_moving_lamps_use_light_paths():
+    words = ["parameters=[{motion: {of: lamp}}]", "integrator.paths=both"]
+    problem = assemble_scene(load(ROOT / "configs" / "moved_box.yaml", [*words, "target={render: {}}"]))
+    assert (problem.paths, problem.moves, problem.integrator.paths) == ("light", Moves.LAMPS, "light")
+
+
+def test_naive_differentiation_of_moving_shapes_uses_light_paths():
     naive = assemble_scene(load(ROOT / "configs" / "lens_pose.yaml", ["integrator={type: walk_ad, paths: both}"]))
     assert (naive.paths, naive.integrator.paths) == ("light", "light")
 
