@@ -24,7 +24,11 @@ surface. v is the velocity of the surface, and m its normal at x. v_y is defined
     v_x = d <v, m> / <d, m>
 
 If a shape touches the surface behind it, the sensor's ray and the light's ray lose the same point at the same time. The
-light of this point counts once, as seen from the sensor's side.
+light of this point counts once, as seen from the sensor's side. If the shape moves into the surface, the edge is hidden,
+and the curve in which both surfaces meet takes its place. m is the normal of the surface behind, and f a direction in
+the face of the shape. The velocity of the curve replaces v_p:
+
+    v_p - f <v_p - v_x, m> / <f, m>
 """
 
 from __future__ import annotations
@@ -43,6 +47,7 @@ from reslrb_cli.estimators.edges import (
     OTHER_EDGES,
     PATHS_PER_OUTLINE,
     SENSOR_EDGES,
+    Beside,
     PickLight,
     both_sides,
     chances_of,
@@ -89,6 +94,20 @@ def _halves(samples: Samples, numbers: mi.PCG32) -> tuple[mi.Bool, Chances]:
     return lane % 2 == 0, Chances.spread(numbers, samples.seed, lane // 2, count)
 
 
+def _at_contact(beside: Beside, adjoint: mi.Vector3f, touches: mi.Bool) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Return the adjoints of p and x for the `adjoint` of the edge's position. In the lanes `touches`, the edge is the
+    curve in which both surfaces meet.
+    """
+    face, m = (
+        mi.Vector3f(hit.compute_surface_interaction(ray, mi.RayFlags.All, touches).n)
+        for hit, ray in ((beside.pi, beside.over), (beside.x, beside.past))
+    )
+    f = m - face * dr.dot(face, m)
+    slope = dr.dot(f, m)
+    at_x = dr.select(touches & (slope > 1e-4), m * (dr.dot(f, adjoint) / slope), 0)
+    return adjoint - at_x, at_x
+
+
 def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines and creases seen from the sensor."""
     samples = for_camera(p.samples)
@@ -96,15 +115,20 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     over, chances = _halves(samples, numbers)
     view = view_from_sensor(samples, chances.viewpoint)
     outline = sample_outline(samples, samples.edges.sensor, view, chances, creases=True)
-    beside = both_sides(samples, outline, creases=True)
+    beside = both_sides(samples, outline, creases=True, everywhere=True)
     ray = dr.select(over, beside.over, beside.past)
     first = FilmRay(ray, outline.view.u, mi.Spectrum(1))
     _, L = camera_walk(samples, Radiance(tracked=False), beside.active, first)
     weight = p.delta(outline.view.u, beside.active) * outline.weight * (2 * p.scale)
     change = showing(dr.dot(weight, L)) * dr.select(over, 1, -1) * share_of(samples, outline, beside)
+    active = beside.active & (change != 0)
+    # At a crease, x lies on the shape itself.
+    touches = active & touches_behind(outline, beside) & ~outline.crease
+    at_p, at_x = _at_contact(beside, change * outline.normal, touches)
     with dr.resume_grad(), dr.isolate_grad():
-        active = beside.active & (change != 0)
-        dr.backward_from(moved_by(beside.pi, beside.over, change * outline.normal, active), flags=MAY_LACK)
+        moved = moved_by(beside.pi, beside.over, at_p, active)
+        moved += moved_by(beside.x, beside.past, at_x, touches)
+        dr.backward_from(moved, flags=MAY_LACK)
 
 
 @dataclass
@@ -208,8 +232,9 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     size = showing(W.all) * p.scale
     active = active & (size != 0)
     s = y.t / (y.t + x.t - AROUND * offset)
+    at_p, at_x = _at_contact(beside, -size * n, active & touches_behind(outline, beside))
     with dr.resume_grad(), dr.isolate_grad():
-        moved = moved_by(beside.pi, beside.over, -size * n, active)
-        moved += moved_by(x, beside.past, (size * s) * n, active)
+        moved = moved_by(beside.pi, beside.over, at_p, active)
+        moved += moved_by(x, beside.past, (size * s) * n + at_x, active)
         moved += moved_by(y, back, ImportanceHooks.motion(W, n, (1 - s) * p.scale), active)
         dr.backward_from(moved, flags=MAY_LACK)

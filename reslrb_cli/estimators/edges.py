@@ -128,10 +128,13 @@ def ray_offset(outline: Outline) -> mi.Float:
     return mi.math.RayEpsilon * (1 + dr.max(dr.abs(outline.p)))
 
 
-def both_sides(samples: Samples, outline: Outline, creases: bool = False) -> Beside:
+def both_sides(
+    samples: Samples, outline: Outline, creases: bool = False, everywhere: bool = False
+) -> Beside:  # fmt: skip
     """Return the rays on both sides of an outline. Lanes are active if nothing hides the edge from the viewpoint.
 
-    With `creases`, `x` exists only where it is needed: at creases, and for `share_of`.
+    With `creases`, `x` exists only where it is needed: at creases, and for `share_of`. With `everywhere`, it exists in
+    all active lanes.
     """
     scene, view, d = samples.scene, outline.view, -outline.view.to_y
     offset = ray_offset(outline)
@@ -148,7 +151,8 @@ def both_sides(samples: Samples, outline: Outline, creases: bool = False) -> Bes
     before.maxt = back - AROUND * offset
     active = active & ~scene.ray_test(before, active)
     past.o = past.o + d * before.maxt
-    wanted = active & outline.crease if creases and not _shares_edges(samples) else active
+    everywhere = everywhere or not creases or _shares_edges(samples)
+    wanted = active if everywhere else active & outline.crease
     x = scene.ray_intersect_preliminary(past, coherent=False, active=wanted)
     if creases:
         # Behind a crease lies the other face. It may be narrower than the offset if it is seen at a grazing angle.

@@ -183,8 +183,9 @@ class MissingCheck:
     ) -> None:
         self._budget, self._count, self._start = budget_s, count, time.perf_counter()
         depth = config.integrator.max_depth
-        [listed] = parse_cases(ESTIMATOR)
-        problem = assemble(listed.at(config, depth, True).with_exposures_fixed())
+        own_paths = config.integrator.options().get("paths", "auto")
+        [listed] = parse_cases(ESTIMATOR + ("(paths=auto)" if own_paths == "auto" else ""))
+        problem = assemble(listed.at(config, depth, known=True, auto=True).with_exposures_fixed())
         self.source, sensor = str(config.source), problem.sensors[0]
         self.case = Case(problem.scene, problem.selection.keys, sensor, problem.selection)
         height, width, _ = self.case.weights.shape
@@ -192,9 +193,9 @@ class MissingCheck:
         if not _weigh(problem, problem.views[:1], [self.case], max(IMAGE_PATHS // (height * width), 1)):
             reason = "has no derivative at the initial values, which equal those of the target"
             raise ConfigError(self.source, "loss", reason)
-        options = problem.config.integrator.options()
+        options = problem.config.integrator.options() | {"paths": problem.paths}
         options["edges"] = "off" if config.integrator.options().get("edges") == "off" else "on"
-        shared = {name: options[name] for name in ("max_depth", "hide_emitters")}
+        shared = {name: options[name] for name in ("max_depth", "hide_emitters")} | {"paths": problem.paths}
         self._tracer = make_integrator("reslrb", **options, freeze=True)
         self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
         self._directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, MOVING_DIRECTIONS)
