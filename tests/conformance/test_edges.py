@@ -122,7 +122,7 @@ FAULTS = [
     Fault("first_depth_between_surfaces", "depth", "estimators.edges:_between",
           "found.segments + 1", "found.segments"),
     Fault("still_shapes_hide_nothing", "hidden-point-2", "transport.edges:weigh_edges",
-          "dr.select(table.moves | _hides_ball(samples, table, middle), 1, 0)", "dr.select(table.moves, 1, 0)"),
+          "sensor *= dr.select(table.moves | hides, 1, 0)", "sensor *= dr.select(table.moves, 1, 0)"),
     Fault("light_comes_from_one_side_only", "reflector-upward-3", "transport.edges:_towards_balls",
           "dr.select(backward, -to_y, to_y)", "to_y"),
     Fault("rays_of_a_moving_lamp_stay", "box-moving_area-2", "estimators.edges:_from_lamps",
