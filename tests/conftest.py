@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from compilation import compute_alone, leave_out_optimisations
+from compilation import combine, compute_alone, leave_out_optimisations
 from report.chromium import Chromium, find_chromium
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
@@ -101,6 +101,16 @@ def llvm(pytestconfig: pytest.Config) -> str:
     if variant.startswith("llvm") and is_quick(pytestconfig):
         compute_alone()
     return variant
+
+
+@pytest.fixture
+def combined(llvm: str, pytestconfig: pytest.Config) -> Iterator[None]:
+    """Compile the kernels of a test with LLVM's combiner, which comparisons of two masks need (compilation.py)."""
+    if is_quick(pytestconfig):
+        combine(True)
+    yield
+    if is_quick(pytestconfig):
+        combine(False)
 
 
 @pytest.fixture(autouse=True, scope="module")
