@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from compilation import combine, compute_alone, leave_out_optimisations
+from kit import work_in
 from report.chromium import Chromium, find_chromium
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
@@ -101,6 +102,13 @@ def llvm(pytestconfig: pytest.Config) -> str:
     if variant.startswith("llvm") and is_quick(pytestconfig):
         compute_alone()
     return variant
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of the test as the working directory, with a cache of its own."""
+    work_in(tmp_path, monkeypatch)
+    return tmp_path
 
 
 @pytest.fixture

@@ -87,12 +87,10 @@ def write_image(path: Path, size: int, seed: int) -> None:
 
 
 @pytest.fixture
-def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(llvm: str, workplace: Path) -> Path:
     """Folder with `photo.yaml` and `cameras.yaml`, which together read a file of every kind."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
     for name in ("parts", "shots", "data/ior"):
-        (tmp_path / name).mkdir(parents=True)
+        (workplace / name).mkdir(parents=True)
     scene = tiny.SCENE.replace('value="8, 8, 8"', 'value="$bright"')
     texts = {
         "scene.xml": scene.replace("</scene>", '<include filename="lights.xml"/><!-- 0.25 -->\n</scene>'),
@@ -116,7 +114,7 @@ def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_image(Path("shots/a.exr"), 8, 9)
     head = b"VOL\3" + struct.pack("<5i6f", 1, 2, 2, 2, 1, 0, 0, 0, 1, 1, 1)
     Path("parts/grid.vol").write_bytes(head + np.full(8, 0.25, np.float32).tobytes())
-    return tmp_path
+    return workplace
 
 
 def change(path: Path) -> Callable[[], object]:

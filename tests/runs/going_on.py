@@ -15,6 +15,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from cli import tiny
+from kit import work_in
 
 from reslrb_cli.cli import main
 from reslrb_cli.cli.optimize import Progress
@@ -90,8 +91,7 @@ def begin_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """
     write_experiment(folder)
     work_alone(monkeypatch)
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
+    work_in(folder, monkeypatch)
     monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
     monkeypatch.setattr(recording, "seen_errors", lambda folder, views: {})
 
