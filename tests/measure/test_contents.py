@@ -21,7 +21,7 @@ import reslrb_cli as rl
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.methods import Plan, Sweep, parse_cases
+from reslrb_cli.measure.methods import Plan, parse_cases
 from reslrb_cli.measure.methods import kept_settings as measured_as
 from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.sampling import settings as sampled_as
@@ -144,7 +144,6 @@ def measurements(config: Config, ours: str = "reslrb:stack", reference: str = "p
     return {
         "gradcheck": sampled_as(CheckSettings(config, cases, 0), "llvm_ad_rgb", ""),
         "gradcheck --missing": measured_as(config, {}, "llvm_ad_rgb", ""),
-        "bench": Sweep(**shared, values=[2]).settings(),
         "convergence": Plan(**shared, objective="fixed", reference=parse_cases(reference)[0], spps=(4,)).settings(),
     }
 
@@ -169,7 +168,7 @@ def test_each_file_is_another_experiment(folder: Path, name: str, files: dict[st
 def test_code_named_by_a_command_counts(folder: Path) -> None:
     config = load("photo.yaml", ["loss={type: l2}"])
     named: list[tuple[tuple[str, ...], set[str]]] = [
-        (("prb,own.py:A(x=1)",), {"gradcheck", "bench", "convergence"}), (("prb", "own.py:A(x=1)"), {"convergence"}),
+        (("prb,own.py:A(x=1)",), {"gradcheck", "convergence"}), (("prb", "own.py:A(x=1)"), {"convergence"}),
     ]  # fmt: skip
     for given, commands in named:
         before = measurements(config, *given)
