@@ -29,7 +29,6 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import explained
-from reslrb_cli.optimization.loop import Watch
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Best, Images, Least, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
@@ -66,7 +65,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
 
 #: Settings that do not affect the iterations done so far. A change of any other setting would make it another run.
 MAY_CHANGE = re.compile(
-    r"run\.(iterations|name|output|checkpoint_every|certainty|on_nonfinite|stop|max_seconds)(\..*)?"
+    r"run\.(iterations|name|output|checkpoint_every|certainty|on_nonfinite|max_seconds)(\..*)?"
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 
@@ -207,7 +206,6 @@ class RunProgress:
         self.best = Best(any(view.held_out for view in problem.views))
         self.nonfinite, self.regularized = NonFiniteTally(), RegularizedTally()
         self.last: Record | None = None
-        self.watch = Watch(problem.config)
 
     def compute_with(self, engine: Callable[..., Any]) -> None:
         """Let `engine` (`shards.Engine`) compute the shards of a step."""
@@ -303,7 +301,6 @@ class RunProgress:
         met = stored.fill(replace(met, best_values=wanted, squares=kept, last_steps=last))
         for record in records:
             self._take(record)
-            self.watch.add(record)
         self.best.recent.extend(record.loss for record in records)
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images

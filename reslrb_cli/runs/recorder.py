@@ -198,7 +198,7 @@ class Recording:
 
     def _iterations(self) -> Iterator[tuple[State, Record]]:
         course = self.course
-        yield from iterate(course.problem, course.state, self._on_nonfinite, watch=course.watch)
+        yield from iterate(course.problem, course.state, self._on_nonfinite)
         if course.state.stopped:
             logger.info(f"stopped after {self.done} iterations: {course.state.stopped}")
 
