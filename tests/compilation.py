@@ -72,6 +72,24 @@ def leave_out_optimisations() -> bool:
     return True
 
 
+#: Function of LLVM's type for a handler of fatal errors. LLVM needs the handler until the process ends.
+_Handler = ctypes.CFUNCTYPE(None, ctypes.c_char_p)
+_handlers: list[object] = []
+
+
+def show_fatal_errors(descriptor: int) -> None:
+    """Write LLVM's fatal errors to a file descriptor before they end the process. Pytest would lose them, because it
+    captures standard error.
+    """
+
+    def write(reason: bytes) -> None:
+        advice = b"\nA test with this kernel needs the fixture `combined` (tests/compilation.py).\n"
+        os.write(descriptor, b"LLVM ERROR: " + reason + advice * reason.startswith(b"Cannot select"))
+
+    _handlers.append(_Handler(write))
+    shared_library.load(Path(os.environ[llvm.VARIABLE])).LLVMInstallFatalErrorHandler(_handlers[-1])
+
+
 # In the default suite, the thread that launches a kernel also computes it.  After each kernel, Dr.Jit's other threads
 # look for work for 20 ms before they sleep. This is longer than most kernels of these tests take, and it occupies cores
 # that parallel tests need. `-m long` has large kernels and uses as many threads as users have. Processes that tests

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from compilation import combine, compute_alone, leave_out_optimisations
+from compilation import combine, compute_alone, leave_out_optimisations, show_fatal_errors
 from kit import work_in
 from report.chromium import Chromium, find_chromium
 
@@ -78,8 +78,8 @@ def pytest_configure(config: pytest.Config) -> None:
         # tests start would inherit this, but some of these runs must be interrupted.
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-    if is_quick(config):
-        leave_out_optimisations()
+    if is_quick(config) and leave_out_optimisations():
+        show_fatal_errors(os.dup(2))  # before pytest captures it
 
 
 def tested_variant() -> str:
