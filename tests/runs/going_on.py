@@ -164,11 +164,10 @@ def differences(first: Path, second: Path) -> list[str]:
     for what in (records_of, found_of, noted_by):
         if what(first) != what(second):
             found.append(what.__name__)
-    for name in ("", "best"):
-        values = [(run / "parameters" / name / "parameters.npz") for run in (first, second)]
-        if [path.exists() for path in values] == [True, True]:
-            arrays = [np.load(path) for path in values]
-            found += [f"{name} {key}" for key in arrays[0] if arrays[0][key].tobytes() != arrays[1][key].tobytes()]
+    values = [(run / "parameters/parameters.npz") for run in (first, second)]
+    if [path.exists() for path in values] == [True, True]:
+        arrays = [np.load(path) for path in values]
+        found += [key for key in arrays[0] if arrays[0][key].tobytes() != arrays[1][key].tobytes()]
     return found
 
 
