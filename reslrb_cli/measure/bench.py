@@ -1,16 +1,14 @@
-"""Time and memory of a step against path depth, or another quantity, for several integrators side by side.
+"""Time and memory of a step against path depth or the number of samples, for several integrators side by side.
 
-`sweep` selects the quantity: depth or number of samples. At each value, every case
-(`BenchRun`) has its own process, and all processes exist at once (`Bench`). Each process takes a cold step. Further
-steps follow until no new kernel is compiled. Then rounds follow. In each round, every process takes one step, and the
-order of the processes changes from round to round. The steps of a round share a seed. Ratios compare steps of the same
-round.
+`sweep` selects the quantity. At each value, every case (`BenchRun`) has its own process, and all processes exist at
+once (`Bench`). Each process takes a cold step. Further steps follow until no new kernel is compiled. Then rounds
+follow. In each round, every process takes one step, and the order of the processes changes from round to round. The
+steps of a round share a seed. Ratios compare steps of the same round.
 
-A case that runs out of memory is tried again at greater depths, so every record is an observation. A measurement
-begins anew each time, because times of two days are not comparable. A case of the
-default list that does not support the scene is left out, with the reason. The budget includes loading and compiling.
-Once the budget is spent, cases that still compile are left out, and the output names these cases. Each case that has
-compiled takes part in at least one round.
+A case that runs out of memory is tried again at greater depths, so every record is an observation. A measurement begins
+anew each time, because times of two days are not comparable. A case of the default list that does not support the scene
+is left out, with the reason. The budget includes loading and compiling. Once the budget is spent, cases that still
+compile are left out, and the output names these cases. Each case that has compiled takes part in at least one round.
 """
 
 from __future__ import annotations
