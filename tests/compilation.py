@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import ctypes
 import os
+import platform
 from pathlib import Path
 
 from reslrb_cli.backend import llvm, shared_library
 
 # The default suite compiles kernels without LLVM's optimisations, because optimisation took most of its time.  LLVM
-# gets the same kernels. The documented option `-opt-bisect-limit=0` leaves out its optional passes, and
-# `-optimize-regalloc=false` allocates registers quickly. No pass may reassociate or approximate, so the values are the
-# same. The kernels run slower, which is negligible for small kernels.
+# gets the same kernels. The documented option `-opt-bisect-limit=0` leaves out its optional passes,
+# `-optimize-regalloc=false` allocates registers quickly, and `-combiner-disabled` leaves out the combination of
+# operations, which took 29 % of the time. No pass may reassociate or approximate, so the values are the same. The
+# kernels run slower, which is negligible for small kernels. Without combination, LLVM ends the process (`Cannot
+# select`) at a comparison of two masks on CPUs with AVX-512. Mitsuba's `checkerboard` has one. Tests that compile such
+# kernels use the fixture `combined`.
 # `-m long` has kernels that run for minutes, so it uses LLVM as users do.
 
 #: Dr.Jit identifies a cached kernel by its computation, so the kernels of the tests need a folder apart from those of
@@ -22,6 +26,9 @@ OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0", "-optimize-regalloc=f
 STARTED = Path(__file__).parent / "started"
 #: First LLVM version that does not print the name of each pass that it leaves out.
 SILENT_SINCE = (20, 0, 0)
+#: Option that leaves out the combiner, and the first LLVM version that is known to have it. LLVM ends the process if it
+#: does not know an option. Only x86 was tried.
+COMBINER, HAS_COMBINER_SINCE = "-combiner-disabled", (22, 0, 0)
 
 
 def search_path(*first: Path) -> str:
@@ -31,10 +38,22 @@ def search_path(*first: Path) -> str:
     return os.pathsep.join([*map(str, first), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
-def is_silent(library: ctypes.CDLL) -> bool:
-    """Return whether this libLLVM leaves out passes without printing a message for each pass."""
-    version = shared_library.llvm_version(library)
-    return version is not None and version >= SILENT_SINCE
+def version_of(library: ctypes.CDLL) -> tuple[int, ...]:
+    """Return the version of this libLLVM, or () if it is unknown."""
+    return shared_library.llvm_version(library) or ()
+
+
+def set_options(library: ctypes.CDLL, *options: str) -> None:
+    """Set options of libLLVM for all kernels that it compiles from now on."""
+    arguments = [b"tests", *map(str.encode, options)]
+    library.LLVMParseCommandLineOptions(len(arguments), (ctypes.c_char_p * len(arguments))(*arguments), b"")
+
+
+def combine(on: bool) -> None:
+    """Turn LLVM's combiner on or off, if this libLLVM has an option for it."""
+    library = shared_library.load(Path(os.environ[llvm.VARIABLE]))
+    if version_of(library) >= HAS_COMBINER_SINCE and platform.machine() == "x86_64":
+        set_options(library, f"{COMBINER}={'false' if on else 'true'}")
 
 
 def leave_out_optimisations() -> bool:
@@ -42,15 +61,33 @@ def leave_out_optimisations() -> bool:
     inherit the environment. Return False if no libLLVM can leave them out silently.
     """
     path = Path(os.environ.get(llvm.VARIABLE, ""))
-    if not path.is_file() or not is_silent(library := shared_library.load(path)):
+    if not path.is_file() or version_of(library := shared_library.load(path)) < SILENT_SINCE:
         return False
     paths = [entry for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
     if str(STARTED) not in paths:
         os.environ["PYTHONPATH"] = os.pathsep.join([str(STARTED), *paths])
         os.environ["DRJIT_CACHE_DIR"] = str(CACHE.expanduser())
-    arguments = [b"tests", *map(str.encode, OPTIONS)]
-    library.LLVMParseCommandLineOptions(len(arguments), (ctypes.c_char_p * len(arguments))(*arguments), b"")
+    set_options(library, *OPTIONS)
+    combine(False)
     return True
+
+
+#: Function of LLVM's type for a handler of fatal errors. LLVM needs the handler until the process ends.
+_Handler = ctypes.CFUNCTYPE(None, ctypes.c_char_p)
+_handlers: list[object] = []
+
+
+def show_fatal_errors(descriptor: int) -> None:
+    """Write LLVM's fatal errors to a file descriptor before they end the process. Pytest would lose them, because it
+    captures standard error.
+    """
+
+    def write(reason: bytes) -> None:
+        advice = b"\nA test with this kernel needs the fixture `combined` (tests/compilation.py).\n"
+        os.write(descriptor, b"LLVM ERROR: " + reason + advice * reason.startswith(b"Cannot select"))
+
+    _handlers.append(_Handler(write))
+    shared_library.load(Path(os.environ[llvm.VARIABLE])).LLVMInstallFatalErrorHandler(_handlers[-1])
 
 
 # In the default suite, the thread that launches a kernel also computes it.  After each kernel, Dr.Jit's other threads

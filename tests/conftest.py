@@ -14,7 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from compilation import compute_alone, leave_out_optimisations
+from compilation import combine, compute_alone, leave_out_optimisations, show_fatal_errors
+from kit import work_in
 from report.chromium import Chromium, find_chromium
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
@@ -77,8 +78,8 @@ def pytest_configure(config: pytest.Config) -> None:
         # tests start would inherit this, but some of these runs must be interrupted.
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-    if is_quick(config):
-        leave_out_optimisations()
+    if is_quick(config) and leave_out_optimisations():
+        show_fatal_errors(os.dup(2))  # before pytest captures it
 
 
 def tested_variant() -> str:
@@ -101,6 +102,23 @@ def llvm(pytestconfig: pytest.Config) -> str:
     if variant.startswith("llvm") and is_quick(pytestconfig):
         compute_alone()
     return variant
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of the test as the working directory, with a cache of its own."""
+    work_in(tmp_path, monkeypatch)
+    return tmp_path
+
+
+@pytest.fixture
+def combined(llvm: str, pytestconfig: pytest.Config) -> Iterator[None]:
+    """Compile the kernels of a test with LLVM's combiner, which comparisons of two masks need (compilation.py)."""
+    if is_quick(pytestconfig):
+        combine(True)
+    yield
+    if is_quick(pytestconfig):
+        combine(False)
 
 
 @pytest.fixture(autouse=True, scope="module")

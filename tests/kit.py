@@ -1,6 +1,17 @@
-"""Parts of scene files, from which many tests build their small scenes."""
+"""Parts of scene files, from which many tests build their small scenes, and the folder in which a test works."""
 
 from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+
+def work_in(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Make `folder` the working directory, with a cache of its own."""
+    patch.chdir(folder)
+    patch.setenv("RESLRB_CACHE", str(folder / "cache"))
+
 
 #: The reflectance of a surface that shows `poster.exr` with nearest-texel lookup.
 TEXTURE = """<texture type="bitmap" name="reflectance">

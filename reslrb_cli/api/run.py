@@ -153,7 +153,7 @@ class Run:
                 calls.images("target", self.targets)
                 calls.images("initial", self.images)
             told = functools.partial(logger.warning, "%s")
-            for state, record in iterate(course.problem, course.state, told, watch=course.watch):
+            for state, record in iterate(course.problem, course.state, told):
                 course.add(state, record)
                 calls.iteration(record)
                 yield record

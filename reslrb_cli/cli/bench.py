@@ -70,8 +70,7 @@ def command(**given: Any) -> int:
     A step computes the image of CONFIG's first sensor, the loss, and the gradient of every parameter. Without CONFIG,
     the scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in its own processes.
     If an integrator runs out of memory, its result is recorded as out_of_memory. The measurement of the other
-    integrators continues. Ctrl-C keeps finished results. To continue after any interruption, repeat the command with
-    the same --json file.
+    integrators continues. Ctrl-C keeps finished results.
     """
     began, options = time.monotonic(), BenchOptions(**given)
     from reslrb_cli.backend.installation import load_packages
@@ -119,11 +118,10 @@ def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[Bench
         return [row.record for row in session.results()]
 
     say = logging.getLogger(__name__).info
-    with measuring(Bench, sweep, json_file, began, say) as (session, interrupts):
-        keeper = Keeper(json_file, origin_of(sweep.variant), lines, session.kept)
+    with measuring(Bench, sweep, began, say) as (session, interrupts):
+        keeper = Keeper(json_file, origin_of(sweep.variant), lines)
         echo(_conditions(sweep.config, sweep))
         echo(table.head())
-        show([row for row in session.results() if row.value in session.done])
         for rows in session.run():
             show(rows)
             keeper.refresh()

@@ -19,6 +19,7 @@ from reslrb_cli.cli.options import (
     experiment_arguments,
     measuring,
     origin_of,
+    read_earlier,
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.optimizers import loss_words
@@ -90,7 +91,7 @@ def command(**given: Any) -> int:
 
 def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write. Return the results, and True if the user interrupted."""
-    from reslrb_cli.measure.convergence import Role, Session
+    from reslrb_cli.measure.convergence import KIND, Role, Session
     from reslrb_cli.measure.judgement import Judgement
     from reslrb_cli.report.tables import (
         closing_sentence,
@@ -100,7 +101,8 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
         result_lines,
     )
 
-    with measuring(Session, plan, json_file, began) as (session, interrupts):
+    earlier = read_earlier(KIND, json_file)
+    with measuring(Session, plan, began, earlier=earlier) as (session, interrupts):
         origin = origin_of(plan.variant)
         keeper = Keeper(json_file, origin, lambda: result_lines(Judgement(session).results()), session.kept)
         table: Columns | None = None

@@ -15,7 +15,7 @@ from reslrb_cli.cli.terminal import echo
 @overrides_option
 @click.option(
     "-o", "--output", required=True, type=click.Path(path_type=Path),
-    help="Folder to create, which must not exist yet; or a file .stl, .3mf or .ply for the solid alone.",
+    help="Folder to create, which must not exist yet.",
 )  # fmt: skip
 @click.option("--tolerances", is_flag=True, help=
         "For a lens or a mirror, also render its image with errors of light, distance, index and tool; takes "
@@ -28,7 +28,7 @@ def command(run: Path, overrides: tuple[str, ...], output: Path, tolerances: boo
     textures and meshes are in FOLDER/recovered.
 
     If the configuration has a section `fabrication`, for example from `reslrb lens`, FOLDER also contains the closed
-    solid in millimetres (lens.stl, .3mf, .ply). FOLDER then also contains the solid's heights (heights.png, .exr)
+    solid in millimetres (lens.stl and lens.3mf). FOLDER then also contains the solid's heights (heights.png, .exr)
     and fabrication.json.
     """
     from reslrb_cli.records.run_folder import recovered

@@ -1,7 +1,6 @@
 """`reslrb optimize`: recover the parameters of a configuration, or continue a run.
 
-`--dry-run` prints the forecast of a run (`show_forecast`, `templates/forecast.txt.j2`). `Progress` shows how far a run
-is.
+`--dry-run` prints the forecast of a run (`show_forecast`). `Progress` shows how far a run is.
 """
 
 from __future__ import annotations
@@ -24,9 +23,8 @@ from reslrb_cli.cli.options import (
     optional_experiment_arguments,
     start_variant,
 )
-from reslrb_cli.cli.terminal import echo, fill
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.cluster.connection import Place
-from reslrb_cli.config.files import duration, in_words
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -38,31 +36,19 @@ if TYPE_CHECKING:
 
 
 def show_forecast(config: Config) -> None:
-    """Measure a few steps of `config` and print the expected time and memory of a run.
+    """Measure a few steps of `config` and print the expected memory and time of a run's iterations.
 
     A variant must be set. The function writes only the caches of kernels and decisions. A later run reuses these
     caches.
     """
-    from reslrb_cli.backend.doctor import resident_bytes
     from reslrb_cli.measure.missing import check_missing
-    from reslrb_cli.optimization.forecast import make_forecast
+    from reslrb_cli.optimization.forecast import forecast_lines
     from reslrb_cli.records.decisions import DecisionCache
 
     say = logger.info
-    forecast = make_forecast(
-        config, say, DecisionCache(), lambda problem: check_missing(problem, say, logger.warning)[0]
-    )
-    sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
-    sums += f" + {duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
-    text = fill(
-        "forecast.txt.j2",
-        {"bytes": in_words, "time": duration},
-        source=config.source,
-        forecast=forecast,
-        resident=resident_bytes(),
-        sums=sums,
-    )
-    click.echo(text, nl=False)
+    lines = forecast_lines(config, say, DecisionCache(), lambda problem: check_missing(problem, say, logger.warning)[0])
+    for line in [f"forecast of {config.source}; nothing was written", *lines]:
+        echo(line)
 
 
 NOTICE = "stopping after this iteration; a second signal stops at once"
@@ -85,7 +71,7 @@ class OptimizeOptions(ExperimentOptions):
 @click.option(
     "--dry-run",
     is_flag=True,
-    help="Measure a few small steps, print the memory and time that the run will take, and stop. Writes no run folder.",
+    help="Measure a few steps, print the memory and time of the iterations, and stop. Writes no run folder.",
 )
 @click.option(
     "--resume",

@@ -53,7 +53,8 @@ class Keeper:
     """Writer of a JSON file and of a file of samples. If the process is killed, only seconds of work are lost.
 
     `origin` is the first line. `lines` returns the current state of all other lines. `kept` returns the data for a
-    later session, or None if there is none yet. Without a file, the writer does nothing.
+    later session, or None if there is none yet. Without `kept`, there is no file of samples. Without a file, the writer
+    does nothing.
     """
 
     def __init__(
@@ -61,10 +62,9 @@ class Keeper:
         json_file: Path | None,
         origin: Line,
         lines: Callable[[], Sequence[Line]],
-        kept: Callable[[], Kept | None],
+        kept: Callable[[], Kept | None] | None = None,
     ) -> None:
-        self._file = json_file
-        self._samples = None if json_file is None or is_stream(json_file) else samples_file(json_file)
+        self._file, self._is_live = json_file, json_file is not None and not is_stream(json_file)
         self._origin, self._lines, self._kept = origin, lines, kept
         self._live = LivePage(self._write, "the file of --json")
 
@@ -72,7 +72,7 @@ class Keeper:
         """Write the files every few seconds. Writing takes only a small share of the time. Call this method between
         steps.
         """
-        if self._samples is not None:  # a stream gets only the final lines
+        if self._is_live:  # a stream gets only the final lines
             self._live.refresh()
 
     def finish(self) -> None:
@@ -83,13 +83,14 @@ class Keeper:
     def _write(self) -> bool:
         """Write both files. Return True if the samples were small enough to save."""
         assert self._file is not None
-        kept = None if self._samples is None else self._kept()
-        fits = kept is None or are_kept(kept[1])
-        if self._samples is not None:
+        fits = True
+        if self._is_live and self._kept is not None:
+            kept, samples = self._kept(), samples_file(self._file)
+            fits = kept is None or are_kept(kept[1])
             if kept is not None and fits:
-                write_samples(self._samples, *kept)
+                write_samples(samples, *kept)
             else:  # an existing file belongs to other lines
-                self._samples.unlink(missing_ok=True)
+                samples.unlink(missing_ok=True)
         write_lines(self._file, [self._origin, *self._lines()])
         return fits
 
@@ -99,18 +100,16 @@ A = TypeVar("A", bound="Arena[Any, Any, Any]")
 
 @contextmanager
 def measuring(
-    kind: type[A], plan: Measurement, json_file: Path | None, began: float,
-    say: Callable[[str], None] = echo,
-) -> Iterator[tuple[A, Interrupts]]:  # fmt: skip
+    kind: type[A], plan: Measurement, began: float, say: Callable[[str], None] = echo, **options: Any
+) -> Iterator[tuple[A, Interrupts]]:
     """Yield a session that measures `plan`, and the session's `Interrupts`. Removes the session's folder and workers at
     the end.
 
-    The session continues from the samples of `json_file`, if any. `began` is the `monotonic` time at which the command
-    was called. Raises ConfigError.
+    `began` is the `monotonic` time at which the command was called. `options` are further arguments of `kind`. Raises
+    ConfigError.
     """
     from reslrb_cli.measure.processes import abandon_all
 
-    earlier = read_earlier(plan.KIND, json_file)
     with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
 
         def tidy() -> None:
@@ -119,7 +118,7 @@ def measuring(
 
         with Interrupts(last_act=tidy) as interrupts:
             spent_s = time.monotonic() - began
-            session = kind(plan, Path(name), lambda: interrupts.requested, say, spent_s=spent_s, earlier=earlier)
+            session = kind(plan, Path(name), lambda: interrupts.requested, say, spent_s=spent_s, **options)
             echo(f"{plan.device}, {plan.variant}; {allowance(plan.budget_s, plan.rounds, 'round')}")
             yield session, interrupts
 
@@ -176,7 +175,8 @@ REMOVED = {
         ("bench gradcheck convergence", "--markdown",
          "`reslrb report FILE -o page.html` shows the table of results of --json FILE"),
         ("bench gradcheck convergence", "--plot", "`reslrb report FILE -o page.html` plots results of --json FILE"),
-        ("bench gradcheck convergence", "--resume", "--json FILE continues from the results in FILE"),
+        ("bench", "--resume", "--values LIST measures the values that are missing"),
+        ("gradcheck convergence", "--resume", "--json FILE continues from the results in FILE"),
         ("bench convergence", "--memory-limit", "the shell's `ulimit -v KIB` limits every process of the command"),
         ("bench", "--objective", "`reslrb convergence CONFIG --objective loss` measures steps of the loss"),
         ("optimize", "--force", "remove the folder of the earlier run; without that, the new folder has a number"),
@@ -224,8 +224,8 @@ overrides_option = click.option(
 json_option = click.option(
     "--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help=
-        "Write one JSON object per line as results come, and the samples beside the file. Results of the same "
-        "measurement in FILE are kept and not measured again.",
+        "Write one JSON object per line as results come. gradcheck and convergence also write their samples beside "
+        "the file, and take no sample again that is there.",
 )  # fmt: skip
 
 #: `--allow-code` (`allow_code`) of a command that runs users' own code.
@@ -282,8 +282,8 @@ def comparison_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `ComparisonOptions` to a command, except CONFIG, `--set` and `--integrators`."""
     rounds = click.option(
         "--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-        help="Number of steps of each integrator, including those in the file of --json, for any time: the same steps "
-        "on every machine.",
+        help="Number of steps of each integrator, for any time: the same steps on every machine. Steps in the file of "
+        "--json count.",
     )  # fmt: skip
     return allow_code_option(budget_option(rounds(json_option(function))))
 

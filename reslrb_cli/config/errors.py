@@ -65,7 +65,7 @@ REMOVED = {
     "loss.type: smape": "take relative_l2, or a loss of your own (type: custom)",
     "optimizer.average": "let optimizer.schedule lower the rate; the last values then have as little noise",
     "optimizer.clamp_gradient": "use more samples, or optimizer.type: adam with a larger beta_2",
-    "optimizer.schedule: plateau": "take cosine or exponential, and run.stop to end early",
+    "optimizer.schedule: plateau": "take cosine or exponential, and run.max_seconds to end early",
     "optimizer.type: adamw": "take adam; `bounds` and `regularizers` hold values back",
     "optimizer.type: rmsprop": "take adam with beta_1: 0",
     "regularizers.type: curvature": "take total_variation, or a larger precondition; export prints the smallest hollow",
@@ -77,6 +77,7 @@ REMOVED = {
     "run.first_batch": "the first batch always gives an image alone; remove it",
     "run.memory_budget": "set integrator.samples_per_pass; `reslrb optimize --dry-run` prints the memory of a step",
     "run.reach_spp": "it is always 64; remove it",
+    "run.stop": "set run.max_seconds, or end the run by Ctrl-C: its folder is complete, and --resume continues it",
     "run.stages": "start from the values of a coarser run, by initial: {run: RUN}",
 }
 

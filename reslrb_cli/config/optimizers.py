@@ -21,7 +21,6 @@ from reslrb_cli.config.base import (
     Choice,
     CodePlace,
     Positive,
-    Section,
     code_file,
     located,
     mark,
@@ -131,17 +130,6 @@ def loss_words(losses: Sequence[Loss]) -> str:
 
 
 _Decay = Annotated[float, Field(ge=0, lt=1)]
-
-
-class StopRule(Section):
-    """The test for a loss that has stopped falling."""
-
-    patience: Annotated[int, Field(ge=5, lt=2**31)] = 20
-    """Length of a window in iterations. The loss is tested at the end of each window, from the third on. Must be at
-    least 20 with held-out views, whose loss is computed every 10 iterations."""
-    relative: Annotated[float, Field(ge=0, lt=1)] = 0.01
-    """Smallest decrease that counts, as a fraction of the loss per window. The loss has stopped falling when the test
-    shows that it falls by less. Smaller values and noisier losses need more windows."""
 
 
 class OptimizerSettings(Choice):

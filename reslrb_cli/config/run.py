@@ -15,7 +15,6 @@ from typing_extensions import Self
 
 from reslrb_cli.config.base import Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from reslrb_cli.config.files import NAME_BYTES
-from reslrb_cli.config.optimizers import StopRule
 from reslrb_cli.config.views import SensorName
 
 #: Paths: text that starts at a root or a home folder, or contains `.` or `..` as a part. Words with a slash between
@@ -146,12 +145,6 @@ class RunConfig(Section):
     checkpoint_every: CheckpointEvery = CheckpointEvery(seconds=30.0)
     """`iterations` or `seconds` between two checkpoints, for `reslrb optimize --resume`. A run also writes a checkpoint
     before the first iteration and at its end, unless it is killed."""
-    stop: StopRule | None = None
-    """End the run, as finished, before its last iteration if the loss has stopped falling. The test uses the loss of
-    held-out views if there are any, otherwise the loss of the iterations. At most 5 % of the runs end while the loss
-    still falls by more than `relative` per window. With the defaults, a run continues for about 300 iterations after
-    its loss has stopped falling if losses have 10 % noise, and for about 500 at 30 % ([When a loss is
-    flat](steps.md#when-a-loss-is-flat)). `{}`: the defaults. null: never."""
 
     def idle(self) -> set[str]:
         return set() if self.adjoint in ("auto", "batched") else {"batches"}

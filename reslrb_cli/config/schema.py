@@ -309,7 +309,6 @@ class Config(Section):
                     at = option if j is None else f"{option}[{j}]"
                     raise located(f"parameters[{i}].{at}", f"`{name}` is already in parameters[{places[option, name]}]")
         self._check_samples()
-        self._check_standing()
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(
                 "integrator.weight",
@@ -321,13 +320,6 @@ class Config(Section):
             key = "integrator" if own is None else "target.render.integrator"
             _check_passes(own or self.integrator, self.target.render.spp, key, "target.render.spp")
         return self
-
-    def _check_standing(self) -> None:
-        """Raise an error that names the key if `run.stop` contradicts other settings."""
-        stop = self.run.stop
-        if stop is not None and self.run.held_out and stop.patience < 20:
-            reason = f"must be at least 20, not {stop.patience}: held-out views are rendered every 10 iterations"
-            raise located("run.stop.patience", reason)
 
     def _check_samples(self) -> None:
         """Raise an error that names the key if the samples of a step cannot be split as configured."""

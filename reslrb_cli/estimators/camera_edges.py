@@ -25,8 +25,8 @@ surface. v is the velocity of the surface, and m its normal at x. v_y is defined
 
 If a shape touches the surface behind it, the sensor's ray and the light's ray lose the same point at the same time. The
 light of this point counts once, as seen from the sensor's side. If the shape moves into the surface, the surface hides
-the edge. The curve in which both surfaces meet takes the place of the edge. m is the normal of the surface behind, and f
-a direction in the face of the shape. The velocity of the curve replaces v_p:
+the edge. The curve in which both surfaces meet takes the place of the edge. m is the normal of the surface behind, and
+f a direction in the face of the shape. The velocity of the curve replaces v_p:
 
     v_p - f <v_p - v_x, m> / <f, m>
 """

@@ -433,22 +433,16 @@ def stl(solid: Solid) -> bytes:
     return b"reslrb, millimetres".ljust(80) + np.uint32(len(corners)).astype("<u4").tobytes() + records.tobytes()
 
 
-def ply(solid: Solid) -> bytes:
-    """Return binary PLY with 32-bit floats, in mm."""
-    return ply_file(solid.points, solid.triangles, "comment millimetres\n")
-
-
-def ply_file(vertices: NDArray[Any], triangles: NDArray[Any], comment: str = "") -> bytes:
-    """Return a binary PLY. `vertices` are positions, normals and texture coordinates (N, 3, 6 or 8), as 32-bit floats.
-
-    `comment` is a line of the header, such as `comment millimetres` with its newline.
+def ply_file(vertices: NDArray[Any], triangles: NDArray[Any]) -> bytes:
+    """Return a binary PLY. `vertices` are positions, normals and texture coordinates (N, 3, 6 or 8), as 32-bit
+    floats.
     """
     names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")[: vertices.shape[1]]
     faces: NDArray[Any] = np.empty(len(triangles), [("n", "u1"), ("at", "<i4", 3)])
     faces["n"], faces["at"] = 3, triangles
     properties = "".join(f"property float {name}\n" for name in names)
     head = (
-        f"ply\nformat binary_little_endian 1.0\n{comment}element vertex {len(vertices)}\n{properties}"
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     return head.encode() + vertices.astype("<f4").tobytes() + faces.tobytes()
@@ -479,4 +473,4 @@ def three_mf(solid: Solid) -> bytes:
 
 
 #: Writers of a solid, by file suffix.
-WRITERS: dict[str, Callable[[Solid], bytes]] = {".stl": stl, ".3mf": three_mf, ".ply": ply}
+WRITERS: dict[str, Callable[[Solid], bytes]] = {".stl": stl, ".3mf": three_mf}

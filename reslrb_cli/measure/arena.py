@@ -16,7 +16,6 @@ from reslrb_cli.backend.doctor import memory_bytes
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.measure.methods import Measurement
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
-from reslrb_cli.records.measurement_files import Earlier
 
 #: If all processes together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
@@ -136,8 +135,7 @@ def start_process(first: dict[str, Any], does: str) -> Process:
 class Arena(Generic[Measured, Worker, Item]):
     """Running workers, `members`. The workers write files to `folder`, which the caller removes.
 
-    `spent_s` is the part of the budget that is already spent. Measurements of an `earlier` session count, and the new
-    session continues them. Raises ConfigError if the earlier measurements belong to another measurement.
+    `spent_s` is the part of the budget that is already spent.
     """
 
     #: Maximum number of rounds.
@@ -152,22 +150,17 @@ class Arena(Generic[Measured, Worker, Item]):
         start: Start = start_process,
         now: Callable[[], float] = time.monotonic,
         spent_s: float = 0.0,
-        earlier: Earlier | None = None,
     ) -> None:
-        self.plan, self.folder, self.settings, self._earlier = plan, folder, plan.settings(), earlier
+        self.plan, self.folder = plan, folder
         self.members: list[Worker] = []
         self._stop, self._say, self._start = stop, say, start
         self._said: set[str] = set()
-        if earlier is not None:
-            earlier.check(self.settings)
-        depths = self._set_up(earlier)
+        depths = self._set_up()
         self._pace = Pace(max(plan.budget_s - spent_s, 0.0), depths, plan.rounds, now, self.MOST_ROUNDS)
 
-    def _set_up(self, earlier: Earlier | None) -> int:
-        """Set up the parts that are specific to one kind of session. The parts start from the data of an earlier
-        session.
-
-        Returns the number of depths among which the time is divided. Raises ConfigError.
+    def _set_up(self) -> int:
+        """Set up the parts that are specific to one kind of session. Return the number of depths among which the time
+        is divided.
         """
         raise NotImplementedError
 
@@ -230,13 +223,11 @@ class Arena(Generic[Measured, Worker, Item]):
                 break
         return answer
 
-    def _take_rounds(self, first: int, before: int) -> Iterator[int]:
-        """Yield the number of completed rounds after each round. Rounds start at number `first`. Earlier sessions
-        completed `before` rounds.
-        """
-        tight, round = self._tight(), first
+    def _take_rounds(self, before: int = 0) -> Iterator[int]:
+        """Yield the number of completed rounds after each round. Earlier sessions completed `before` rounds."""
+        tight, round = self._tight(), before
         self._pace.begin_rounds(before)
-        while (workers := self._alive()) and self._pace.another(round - first):
+        while (workers := self._alive()) and self._pace.another(round - before):
             start = round % len(workers)  # the first worker changes from round to round
             for worker in [*workers[start:], *workers[:start]]:
                 worker.process.ask(worker.question(round) | {"cold": False, "release": tight})

@@ -1,15 +1,14 @@
-"""Time and memory of a step against path depth, or another quantity, for several integrators side by side.
+"""Time and memory of a step against path depth or the number of samples, for several integrators side by side.
 
-`sweep` selects the quantity: depth or number of samples. At each value, every case
-(`BenchRun`) has its own process, and all processes exist at once (`Bench`). Each process takes a cold step. Further
-steps follow until no new kernel is compiled. Then rounds follow. In each round, every process takes one step, and the
-order of the processes changes from round to round. The steps of a round share a seed. Ratios compare steps of the same
-round.
+`sweep` selects the quantity. At each value, every case (`BenchRun`) has its own process, and all processes exist at
+once (`Bench`). Each process takes a cold step. Further steps follow until no new kernel is compiled. Then rounds
+follow. In each round, every process takes one step, and the order of the processes changes from round to round. The
+steps of a round share a seed. Ratios compare steps of the same round.
 
-A case that runs out of memory is tried again at greater depths, so every record is an observation. A case of the
-default list that does not support the scene is left out, with the reason. The budget includes loading and compiling.
-Once the budget is spent, cases that still compile are left out, and the output names these cases. Each case that has
-compiled takes part in at least one round.
+A case that runs out of memory is tried again at greater depths, so every record is an observation. A measurement begins
+anew each time, because times of two days are not comparable. A case of the default list that does not support the scene
+is left out, with the reason. The budget includes loading and compiling. Once the budget is spent, cases that still
+compile are left out, and the output names these cases. Each case that has compiled takes part in at least one round.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from typing import Any
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure.arena import MAX_ROUNDS, NO_TIME, Arena, Contestant
 from reslrb_cli.measure.methods import Case, Sweep, paths_in_records
-from reslrb_cli.measure.processes import Ended, Stopped
-from reslrb_cli.records.measurement_files import Earlier, Kept, kept
+from reslrb_cli.measure.processes import Stopped
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
 
 #: Sizes that all cases have in common; None until a case has loaded its scene.
@@ -69,16 +67,6 @@ class BenchRun(Contestant):
         """Record a step."""
         self.steps[round] = answer
 
-    def kept(self) -> dict[str, Any]:
-        """Return the data for a later session, for JSON."""
-        end = self.end and vars(self.end)
-        return {"case": self.case.label, "cold": self.cold, "steps": self.steps, "end": end}
-
-    def restore(self, entry: Mapping[str, Any]) -> None:
-        """Restore the result of `kept`."""
-        self.cold, self.end = entry["cold"], entry["end"] and Ended(**entry["end"])
-        self.steps = {int(round): step for round, step in entry["steps"].items()}
-
 
 def _result(run: BenchRun, value: int, baseline: BenchRun, size: Mapping[str, int | None]) -> BenchResult:
     options, figures = run.config.integrator.options(), dict[str, Any](size)
@@ -119,35 +107,16 @@ STEPS = "reslrb_cli.measure.steps:begin_steps"
 class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
     """Measurement for each value of the sweep (see `Arena`). No process writes into its folder.
 
-    `runs` has the runs by value, `done` the finished values, and `left_out` the cases that do not support the scene.
-    `size` has the `width` and `height` of the film in pixels, and the `texels` of all textures that are parameters.
+    `runs` has the runs by value, and `left_out` the cases that do not support the scene. `size` has the `width` and
+    `height` of the film in pixels, and the `texels` of all textures that are parameters.
     """
 
     MOST_ROUNDS = MAX_ROUNDS
 
-    def _set_up(self, earlier: Earlier | None) -> int:
-        self.runs, self.done, self.left_out = dict[int, list[BenchRun]](), set[int](), list[Case]()
+    def _set_up(self) -> int:
+        self.runs, self.left_out = dict[int, list[BenchRun]](), list[Case]()
         self.size: dict[str, int | None] = dict.fromkeys(SIZES)
-        if earlier is not None:
-            self._restore(earlier)
-        self._to_do = [value for value in self.plan.values if value not in self.done]
-        return len(self._to_do)
-
-    def _restore(self, earlier: Earlier) -> None:
-        plan, most, self.size = self.plan, self.plan.rounds or MAX_ROUNDS, earlier.head["size"]
-        self.left_out = [case for case in plan.cases if case.label in earlier.head["left_out"]]
-        for value, entries in earlier.head["values"]:
-            by_label = {entry["case"]: entry for entry in entries}
-            runs = self.runs[value] = [self._run(case, value) for case in plan.cases if case not in self.left_out]
-            for run in runs:
-                if run.case.label in by_label:
-                    run.restore(by_label[run.case.label])
-            if all(run.end is not None or len(run.steps) >= most for run in runs):
-                self.done.add(value)
-
-    def _run(self, case: Case, value: int) -> BenchRun:
-        may_refuse = self.plan.may_refuse(case)
-        return BenchRun(process=None, may_refuse=may_refuse, case=case, config=self.plan.at(case, value))
+        return len(self.plan.values)
 
     def results(self) -> list[BenchResult]:
         """Return the results so far, in the order of the sweep."""
@@ -158,19 +127,11 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
         baseline = next(run for run in runs if run.case == self.plan.baseline)
         return [_result(run, value, baseline, self.size) for run in runs if run.done]
 
-    def kept(self) -> Kept | None:
-        """Return the data for a later session, or None if no data exist yet."""
-        values = [(value, [run.kept() for run in runs if run.done]) for value, runs in self.runs.items()]
-        if not any(entries for _, entries in values):
-            return None
-        content = {"values": values, "left_out": [case.label for case in self.left_out], "size": self.size}
-        return kept(self.plan.KIND, self.settings, None, **content)
-
     def _course(self) -> Iterator[list[BenchResult]]:
         """Measure. Yields an empty list after each round, and a value's results when the value is finished. Prints
         missing measurements.
         """
-        plan, values = self.plan, self._to_do
+        plan, values = self.plan, self.plan.values
         for number, value in enumerate(values):
             if self._pace.over():
                 self._say(f"not measured: {plan.name(*values[number:])}: {NO_TIME}")
@@ -192,23 +153,21 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
             if late:
                 names = ", ".join(run.case.label for run in late)
                 self._say(f"not measured: {plan.name(value)}, {names}: {NO_TIME}")
-            self.done.add(value)
             yield self._results(value)
             if stopped:
                 return
 
     def _begin(self, value: int) -> None:
-        """Start the cases at one value, and continue their earlier measurements. Cases that ended at this value are not
-        started.
-        """
-        plan, before = self.plan, {run.case.label: run for run in self.runs.get(value, ())}
-        self.members = self.runs[value] = []
+        """Start the cases at one value."""
+        plan, self.members = self.plan, []
+        self.runs[value] = self.members
         for case in plan.cases:
             if case not in self.left_out:
-                run = before.get(case.label) or self._run(case, value)
-                self.members.append(run)
-                if run.end is None:
-                    run.process = self._start(plan.first(run.config), STEPS)
+                config = plan.at(case, value)
+                process = self._start(plan.first(config), STEPS)
+                self.members.append(
+                    BenchRun(process=process, may_refuse=plan.may_refuse(case), case=case, config=config)
+                )
 
     def _measure(self) -> Iterator[int]:
         for run in self._alive():
@@ -217,6 +176,4 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
                 self.size = {name: answer[name] for name in SIZES}
         for run in self._alive():
             self._warm_up(run)
-        # Rounds continue after those of an earlier session, whose numbers set the seeds, until all have enough.
-        first = 1 + max((round for run in self.members for round in run.steps), default=-1)
-        return self._take_rounds(first, min((len(run.steps) for run in self._alive()), default=0))
+        return self._take_rounds(0)

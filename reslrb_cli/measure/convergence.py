@@ -25,6 +25,9 @@ from reslrb_cli.measure.processes import Ended, Refused
 from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import BenchStatus, Method
 
+#: The kind of measurement in stored samples.
+KIND = "convergence"
+
 #: The module of the functions that processes run.
 STEPS = "reslrb_cli.measure.steps"
 
@@ -127,14 +130,21 @@ class Member(Contestant):
 
 
 class Session(Arena[Plan, Member, int]):
-    """Running processes and their samples (see `Arena`).
+    """Running processes and their samples (see `Arena`). The session continues from the samples of an `earlier` one, if
+    given. Raises ConfigError if they belong to another measurement.
 
     `judges` maps names of independent stock integrators to their members. `facts` are those of `survey`, which an
     additional process, the referee, finds before the members start. If the referee fails, nothing is measured.
     """
 
-    def _set_up(self, earlier: Earlier | None) -> int:
-        self.rounds = self._before = 0 if earlier is None else earlier.head["rounds"]
+    def __init__(self, plan: Plan, *others: Any, earlier: Earlier | None = None, **more: Any) -> None:
+        self.settings, self._earlier = plan.settings(), earlier
+        if earlier is not None:
+            earlier.check(self.settings)
+        super().__init__(plan, *others, **more)
+
+    def _set_up(self) -> int:
+        self.rounds = self._before = 0 if self._earlier is None else self._earlier.head["rounds"]
         self.judges: dict[str, Member] = {}
         self.facts: dict[str, Any] = {}
         return 1
@@ -170,7 +180,7 @@ class Session(Arena[Plan, Member, int]):
         with np.load(self._arrays) as survey:
             samples |= {("survey", name): survey[name] for name in survey.files}
         content = {"facts": self.facts, "rounds": self.rounds, "members": entries}
-        return kept(self.plan.KIND, self.settings, samples, **content)
+        return kept(KIND, self.settings, samples, **content)
 
     def _restore(self, earlier: Earlier) -> None:
         """Give the members their earlier steps. Raises ConfigError if they differ."""
@@ -296,7 +306,7 @@ class Session(Arena[Plan, Member, int]):
             return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
-        rounds = self._take_rounds(self._before, self._before)
+        rounds = self._take_rounds(self._before)
         while self.rounds < most and (now := next(rounds, None)) is not None:
             self.rounds = now
             yield now

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, get_args
+from typing import Any, get_args
 
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
@@ -276,28 +276,14 @@ class Measurement:
     default: bool = False
     device: str = ""
 
-    #: The kind of measurement in stored samples.
-    KIND: ClassVar[str]
-
     def first(self, config: Config) -> dict[str, Any]:
         """Return the first message to a process that measures `config`."""
         return {"config": dump(config), "source": str(config.source), "variant": self.variant,
                 "memory_limit": self.memory_limit, "allow_code": config.allows_code}  # fmt: skip
 
-    def settings(self) -> dict[str, Any]:
-        """Return the settings that must be the same in all sessions, as JSON (`kept_settings`)."""
-        labels = [case.label for case in self.cases]
-        options = {"integrators": labels, **self._options(), "memory limit": self.memory_limit}
-        codes = code_files([*self.cases, *(each for each in vars(self).values() if isinstance(each, Case))])
-        return kept_settings(self.config, codes, self.variant, self.device, **options)
-
     def plays_roulette(self, depth: int) -> bool:
         """Whether paths of at most `depth` segments can meet Russian roulette. A depth of -1 is unbounded."""
         return plays_roulette(depth, self.config.integrator.rr_depth)
-
-    def _options(self) -> dict[str, Any]:
-        """Return the command's options that belong to the settings."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,15 +295,10 @@ class Sweep(Measurement):
     values: Sequence[int]
     swept: str = "depth"
 
-    KIND = "bench"
-
     @property
     def baseline(self) -> Case:
         """The first `ptracer` case in the list, or the first case if the list has no `ptracer`."""
         return next((case for case in self.cases if case.type == "ptracer"), self.cases[0])
-
-    def _options(self) -> dict[str, Any]:
-        return {"values": list(self.values), "sweep": self.swept}
 
     def may_refuse(self, case: Case) -> bool:
         """True if the measurement skips `case` when the case's integrator does not support the scene."""
@@ -387,8 +368,6 @@ class Plan(Measurement):
     reference: Case
     spps: Sequence[int] = ()
 
-    KIND = "convergence"
-
     @classmethod
     def of(cls, config: Config, objective: str, integrators: str | None, reference: str | None, **others: Any) -> Plan:
         """Return a plan from lists as text. None stands for the default list. `others` are further fields. Raises
@@ -405,8 +384,14 @@ class Plan(Measurement):
         plan.check()
         return plan
 
-    def _options(self) -> dict[str, Any]:
-        return {"objective": self.objective, "reference": self.reference.label, "spp": list(self.spps)}
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that must be the same in all sessions, as JSON (`kept_settings`)."""
+        codes = code_files([*self.cases, self.reference])
+        return kept_settings(
+            self.config, codes, self.variant, self.device, integrators=[case.label for case in self.cases],
+            objective=self.objective, reference=self.reference.label, spp=list(self.spps),
+            **{"memory limit": self.memory_limit},
+        )  # fmt: skip
 
     @property
     def known(self) -> bool:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import mitsuba as mi
 
-from reslrb_cli.backend.doctor import free_bytes
+from reslrb_cli.backend.doctor import free_bytes, resident_bytes
+from reslrb_cli.config.files import duration, in_words
 from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import optimize
-from reslrb_cli.optimization.problem import Problem, progress_spp, saved_spp
-from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.metrics import Record
@@ -55,83 +54,35 @@ def measure_steps(problem: Problem) -> tuple[float, float, float, int]:
     return steady, extra - compiled, compiled, peak
 
 
-#: Number of steps, approximately, for the verdicts on the values after the last iteration.
-VERDICTS = 30
-
-
-@dataclass(frozen=True)
-class Forecast:
-    """Forecast of a run.
-
-    `iteration_s` is the time of one step, `start_s` the additional time of the first steps with cached kernels, and
-    `compile_s` the current time for compiling. `peak` is the memory of the iterations in bytes, and `free` the free
-    memory. The fields `before_s`, `measuring_s`, `target_s`, `images_s` and `verdicts_s` are seconds outside the
-    iterations. The decisions took `measuring_s` now, and a run finds them in the
-    cache.
-    """
-
-    iteration_s: float
-    start_s: float
-    compile_s: float
-    peak: int
-    free: int
-    iterations: int
-    before_s: float
-    measuring_s: float
-    target_s: float
-    images_s: float
-    verdicts_s: float
-
-    @property
-    def elapsed_s(self) -> float:
-        """Seconds that all iterations take with cached kernels, like `elapsed_s` in `metrics.jsonl`."""
-        return self.iterations * self.iteration_s + self.start_s
-
-    @property
-    def whole_s(self) -> float:
-        """Seconds of the whole run, with the current caches of kernels and decisions."""
-        return self.elapsed_s + self.before_s + self.target_s + self.images_s + self.verdicts_s
-
-
-def make_forecast(
+def forecast_lines(
     config: Config,
     say: Callable[[str], None],
     cache: DecisionCache | None = None,
     before: Callable[[Problem], Problem] = lambda problem: problem,
-) -> Forecast:
-    """Measure a few steps of the run that `config` describes. A variant must be set.
+) -> list[str]:
+    """Measure a few steps of the run that `config` describes, and return lines about its memory and time. A variant
+    must be set.
 
     `say` is called with lines about slow work. Decisions are stored in `cache` for the run. `before` takes the problem
-    before its first iteration, and returns it. `before` makes measurements that no cache stores. Raises the same errors
-    as the run.
+    before its first iteration, and returns the problem that the run would have. Raises the same errors as the run.
     """
     # Errors are not part of a step.
-    problem = replace(assemble(with_short_target(config), say, cache), truth={})
-    image_s, views = _image_seconds(problem), len(problem.views)
-    begin = time.perf_counter()
-    problem = before(problem)
-    before_s = time.perf_counter() - begin
+    problem = before(replace(assemble(with_short_target(config), say, cache), truth={}))
     say("measuring a few steps")
     iteration_s, start_s, compile_s, peak = measure_steps(problem)
-    run = config.run
-    iterations = run.iterations
-    if run.max_seconds is not None:
-        left_s = run.max_seconds - problem.measured_s - start_s
+    iterations = config.run.iterations
+    if config.run.max_seconds is not None:
+        left_s = config.run.max_seconds - problem.measured_s - start_s
         iterations = min(iterations, max(int(left_s / max(iteration_s, 1e-6)), 1))
-    has_verdicts = run.certainty and config.by_pixel and run.iterations >= LEAST_ITERATIONS
-    return Forecast(
-        iteration_s=iteration_s,
-        start_s=start_s,
-        compile_s=compile_s,
-        peak=peak,
-        free=free_bytes(mi.variant()),
-        iterations=iterations,
-        before_s=before_s,
-        measuring_s=problem.measured_s,
-        target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
-        images_s=image_s * 2 * saved_spp(problem) * views,
-        verdicts_s=VERDICTS * iteration_s if has_verdicts else 0.0,
-    )
+    elapsed_s = iterations * iteration_s + start_s
+    sums = f"{iterations} x {1e3 * iteration_s:.3g} ms"
+    sums += f" + {duration(start_s)}" if start_s > 0.01 * elapsed_s else ""
+    return [
+        f"memory of the iterations: at most {in_words(peak)}; {in_words(free_bytes(mi.variant()))} are free",
+        f"memory of the whole process: {in_words(resident_bytes())}, with Python, libraries and the code of kernels",
+        f"time of the iterations: {duration(elapsed_s)} ({sums}), and {duration(compile_s)} to compile kernels, which "
+        "is done now and stored",
+    ]
 
 
 def with_short_target(config: Config) -> Config:
@@ -143,12 +94,3 @@ def with_short_target(config: Config) -> Config:
     spp = min(render.spp, -(-4 * config.run.spp // unit) * unit)
     target = config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
     return config.model_copy(update={"target": target})
-
-
-def _image_seconds(problem: Problem) -> float:
-    """Return the render time of a saved image of the first view, in seconds per sample per pixel."""
-    view, spp = problem.views[0], progress_spp(problem)
-    problem.render(view.sensor, spp, 0, "forecast")  # compiles, and records small calls: several times as long
-    begin = time.perf_counter()
-    problem.render(view.sensor, spp, 1, "forecast")
-    return (time.perf_counter() - begin) / spp

@@ -3,10 +3,7 @@
 A schedule gives the learning-rate factor for iteration i of n. The factor goes from 1 at the first iteration to
 `final_fraction` at the last.
 
-A run ends early if its time is up (`run.max_seconds`), or if its loss is flat (`run.stop`). The losses are divided into
-windows of `patience` iterations, and tested at the end of each window. A loss is flat if the test shows a fall of less
-than `relative` per window (`trend.stands`). If views are held out, the held-out loss is tested. The held-out loss has
-fewer values than the training loss. All held-out values use the same samples.
+A run ends early if its time is up (`run.max_seconds`).
 """
 
 from __future__ import annotations
@@ -18,9 +15,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.integrators.step import Refused, gradient_step
 from reslrb_cli.optimization.losses import own_losses
@@ -36,7 +31,6 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
 from reslrb_cli.optimization.state import State, put, standing
-from reslrb_cli.optimization.trend import SPANS, levels_of, line, stands
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
@@ -61,10 +55,6 @@ def learning_rate_factor(
     return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
 
 
-#: Prefix of `State.stopped` if `run.max_seconds` ended the run.
-OUT_OF_TIME = "the time is up"
-
-
 def time_share(limit_s: float | None, state: State) -> float:
     """Return the elapsed share of a run's time, or 0 without a limit. The first iteration does not count, because it
     compiles kernels.
@@ -81,48 +71,7 @@ def out_of_time(limit_s: float | None, state: State) -> str:
     mean_s = (state.elapsed_s - state.first_s) / max(state.iteration - 1, 1)
     if limit_s is None or state.elapsed_s + mean_s <= limit_s:
         return ""
-    return f"{OUT_OF_TIME}, after {state.elapsed_s:.3g} s of iterations"
-
-
-class Watch:
-    """Losses of a run so far, iteration by iteration. Equal losses lead to equal decisions."""
-
-    def __init__(self, config: Config) -> None:
-        self.config, self.held_out = config, bool(config.run.held_out)
-        self._values: dict[int, float] = {}
-
-    def add(self, record: Record) -> None:
-        """Add the record of one iteration. Earlier iterations of a resumed run must be added, too."""
-        loss = record.held_out if self.held_out else record.loss
-        if loss is not None and math.isfinite(loss):
-            self._values[record.iteration] = loss
-
-    def after(self, state: State, record: Record) -> State:
-        """Add the record. Return the state after the iteration, with the decision about stopping."""
-        self.add(record)
-        said = self._stands(state.iteration)
-        return replace(state, stopped=said) if said else state
-
-    def _stands(self, done: int) -> str:
-        """Return a message about a flat loss after `done` iterations. The message is "" if the loss is not flat, or if
-        `done` iterations do not end a window.
-        """
-        if (rule := self.config.run.stop) is None or done % rule.patience:
-            return ""
-        span = rule.patience
-        levels: list[float] = []
-        for end in range(done, 0, -span)[: SPANS[-1]]:
-            values = [self._values[each] for each in range(end - span, end) if each in self._values]
-            if len(values) < 2:
-                break
-            levels.insert(0, float(levels_of(np.array(values))))
-        if not (count := int(stands(np.array(levels), rule.relative, done // span))):
-            return ""
-        last = np.array(levels[-count:])
-        fall, error = (float(each) / max(abs(float(np.median(last))), 1e-300) for each in line(last))
-        kind = "loss of held-out views" if self.held_out else "loss"
-        share = f"{-100 * fall:.2g} +- {100 * error:.1g} %"
-        return f"the {kind} has stopped falling: over the last {count * span} iterations it fell by {share} in {span}"
+    return f"the time is up, after {state.elapsed_s:.3g} s of iterations"
 
 
 #: The moments are set to zero each time a large loss has fallen to this fraction. A first loss is large if the loss of
@@ -229,19 +178,15 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     )
 
 
-def iterate(
-    problem: Problem, state: State, on_nonfinite: Told = lambda found: None, watch: Watch | None = None
-) -> Iterator[tuple[State, Record]]:
+def iterate(problem: Problem, state: State, on_nonfinite: Told = lambda found: None) -> Iterator[tuple[State, Record]]:
     """Make all remaining iterations of the run, starting at `state`. `step` makes each iteration.
 
-    `watch` has the losses of the earlier iterations, and decides which iteration is the last. It is None without such a
-    test. Raises NonFinite if the run fails.
+    Raises NonFinite if the run fails.
     """
     reset_peak()
-    watch = Watch(problem.config) if watch is None else watch
     while state.iteration < problem.config.run.iterations and not state.stopped:
         state, record = step(problem, state, on_nonfinite)
-        problem.optimizer.stands_at = state = watch.after(state, record)
+        problem.optimizer.stands_at = state
         yield state, record
         if state.end:
             raise NonFinite(state.end)

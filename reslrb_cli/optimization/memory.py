@@ -28,8 +28,8 @@ from reslrb_cli.transport.plan import Plan
 #: a batch.
 FILM_IMAGES = 12
 
-#: Copies of a parameter: gradients, the optimiser's moments, their next values, the best values of a run.
-PARAMETER_COPIES = 9
+#: Copies of a parameter: gradients, the optimiser's moments, and their next values.
+PARAMETER_COPIES = 8
 
 #: Minimum bytes per entry of a parameter: value, the optimiser's copy, gradient, and the array for updates.
 ENTRY_BYTES = 4 * 4

@@ -1,9 +1,4 @@
-"""Results of a run: its best parameters, whether its loss fell, and values and errors at start and end.
-
-`Best` has the best parameters so far. The loss of an iteration is mostly noise, so the smallest loss would be the
-luckiest one. With held-out views, the best parameters have the smallest held-out loss. The held-out loss always uses
-the same samples. Without held-out views, the best parameters come from the end of WINDOW consecutive iterations. The
-window with the smallest mean loss counts.
+"""Results of a run: whether its loss fell, and values and errors at start and end.
 
 `got_worse` returns true if an error ended above its initial value. Errors are known exactly. `find_trend` does the same
 for the loss.
@@ -13,10 +8,8 @@ for the loss.
 
 from __future__ import annotations
 
-import math
-from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import mitsuba as mi
@@ -26,45 +19,6 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.trend import LEAST_ITERATIONS, find_trend, window
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.metrics import Figure, Record, finite
-
-#: Iterations over which losses are averaged.
-WINDOW = 10
-
-
-@dataclass(frozen=True)
-class Least:
-    """Smallest loss so far, and the number of updates before this loss."""
-
-    iteration: int
-    loss: float
-
-
-class Best:
-    """Best parameters so far: their loss, the values, and the last WINDOW losses (`recent`). Without any loss, they are
-    None.
-    """
-
-    def __init__(self, held_out: bool) -> None:
-        self.held_out = held_out
-        self.least: Least | None = None
-        self.values: dict[str, Any] = {}
-        self.recent: deque[float] = deque(maxlen=WINDOW)
-
-    def see(self, record: Record, values: Mapping[str, Any]) -> None:
-        """Record one iteration, and its starting values by key. The values are stored without a copy."""
-        self.recent.append(record.loss)
-        if self.held_out:
-            loss = math.inf if record.held_out is None else record.held_out
-        else:
-            loss = sum(self.recent) / WINDOW if len(self.recent) == WINDOW else math.inf
-        if loss < (math.inf if self.least is None else self.least.loss):  # never true for non-finite losses
-            self.least, self.values = Least(record.iteration, loss), dict(values)
-
-    def to_json(self) -> dict[str, Any] | None:
-        """Return the content for the manifest, or None."""
-        kind = "held_out" if self.held_out else f"mean of {WINDOW} iterations"
-        return None if self.least is None else {**asdict(self.least), "loss_is": kind}
-
 
 Array = np.ndarray[Any, Any]
 

@@ -1,19 +1,9 @@
-"""Tests of a noisy series of losses. The tests show whether the series is flat, and whether it fell or rose over a run.
+"""Tests of a noisy series of losses. The tests show whether the series fell or rose over a run, or was flat.
 
 Losses of iterations have heavy tails: one bright path can multiply a loss by ten. No test therefore uses a plain mean.
 
-`stands` proves that a loss is flat. A proof is stronger than a test that merely detects no fall. The level of a window
-of iterations is the interquartile mean of the window's losses (`levels_of`). A line through the levels of the last k
-windows has a slope, whose standard error has k - 2 degrees of freedom. The loss is flat if the upper bound for the fall
-per window is below `relative`. The standard error comes from the spread of the levels. The losses may therefore be
-correlated over less than a window.
-
-The test is repeated after every window, for several k, and a run stops at the first success. The j-th test therefore
-uses the share 2 / (j (j - 1)) of `CHANCE`. The tested values of k divide the share equally. The shares sum to 1 from j
-= 3 on. At most about `CHANCE` of runs stop although their loss falls by `relative` per window, for runs of any length.
-
-`find_trend` tests the ranks of all losses (Conover and Iman 1981). The test fits a line to ten parts of the series, as
-in `stands`.
+`find_trend` tests the ranks of all losses (Conover and Iman 1981). The test fits a line to the mean ranks of ten parts
+of the series.
 
 - The loss rose (or fell) if the line rises (or falls). The same holds if the last tenth of the iterations is
     significantly above (or below) the first tenth. In both cases, the levels of these tenths must agree.
@@ -36,12 +26,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.statistics import Array
-
-#: Maximum share of runs that stop although their loss falls by `relative` per window.
-CHANCE = 0.04
-
-#: Numbers of windows for a flat loss: more windows have less noise, fewer detect the end of the fall earlier.
-SPANS = sorted(least << power for least in (3, 4, 5) for power in range(7))
 
 #: Shorter series are not judged, and this is the minimum number of losses for a level at the start or the end.
 LEAST_ITERATIONS, LEAST_WINDOW = 20, 5
@@ -122,30 +106,6 @@ def find_trend(values: Sequence[float]) -> Trend | None:
     return Trend(start, end, change, late)
 
 
-def stands(levels: Array, relative: float, number: int) -> Array:
-    """For each series of levels (..., J), return the number of last windows over which the series is flat. The number
-    is 0 for a series that is not flat.
-
-    There is one level per window. A series is flat if its fall from one window to the next is significantly less than
-    the share `relative`. `number` is the number of windows so far in the run. Every window was tested.
-    """
-    spans = [k for k in SPANS if k <= levels.shape[-1]]
-    found = np.zeros(levels.shape[:-1], dtype=int)
-    for k in spans:
-        chance = CHANCE * 2 / (number * (number - 1)) / len(spans)
-        last = levels[..., -k:]
-        slope, error = line(last)
-        allowed = relative * np.abs(np.median(last, axis=-1))
-        found = np.where((found == 0) & (slope + allowed > _quantile(k - 2, chance) * error), k, found)
-    return found
-
-
-def levels_of(values: Array) -> Array:
-    """Return the interquartile mean of each window (..., n)."""
-    cut = values.shape[-1] // 4
-    return np.asarray(np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut].mean(axis=-1))
-
-
 def line(values: Array, at: Array | None = None) -> tuple[Array, Array]:
     """Return the least-squares slope of values (..., k) over `at` (default: 0 to k - 1), and its standard error."""
     count = values.shape[-1]
@@ -187,7 +147,9 @@ def _level(values: Array) -> Level:
     order, cut = np.sort(values), len(values) // 4
     kept = np.clip(values, order[cut], order[-1 - cut])
     share = 1 - 2 * cut / len(values)
-    return Level(float(levels_of(values)), float(np.std(kept, ddof=1)) / share / math.sqrt(len(values)))
+    return Level(
+        float(order[cut : values.size - cut].mean()), float(np.std(kept, ddof=1)) / share / math.sqrt(len(values))
+    )
 
 
 def _quantile(freedom: int, chance: float) -> float:

@@ -22,6 +22,7 @@ from reslrb_cli.lens.solid import (
     as_sheet,
     make_solid,
     measured,
+    ply_file,
     scaled,
     summary,
     within,
@@ -50,47 +51,38 @@ DIRECTIONS = {
     "solid-side": ((-1, 0.02, 0.12), [0, 1, 0]),
 }
 
-#: Unsupported formats of solids, which must not be taken for the name of a folder.
-_OTHER_SOLIDS = (".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf", ".fbx", ".amf", ".obj")
+#: Formats of solids, whose files must not be taken for the name of a folder.
+_SOLIDS = (*WRITERS, ".ply", ".obj", ".step", ".stp", ".iges", ".igs", ".dxf", ".f3d", ".sldprt", ".glb", ".gltf",
+           ".fbx", ".amf")  # fmt: skip
 
 #: Called with a line about each thing written.
 Say = Callable[[str], None]
 
 
 def check_export(config: Config, output: Path, tolerances: bool) -> None:
-    """Raise ConfigError if the export cannot be written to `output`, a folder or the file of a solid."""
-    if tolerances and (config.fabrication is None or output.suffix.lower() in WRITERS):
-        raise ConfigError("--tolerances", "", "needs a folder as output, and a configuration with a section "
-                          "`fabrication`")  # fmt: skip
-    if output.suffix.lower() in WRITERS:
-        check_file(output, config)
-    elif output.suffix.lower() in _OTHER_SOLIDS:
-        raise ConfigError("--output", "", f"{output}: {output.suffix} is not supported; give a folder, or a file that "
-                          f"ends in {', '.join(WRITERS)}")  # fmt: skip
-    elif os.path.lexists(output) and not (output.is_dir() and not output.is_symlink() and not any(output.iterdir())):
+    """Raise ConfigError if the export cannot be written to the folder `output`."""
+    if tolerances and config.fabrication is None:
+        raise ConfigError("--tolerances", "", "needs a configuration with a section `fabrication`")
+    if output.suffix.lower() in _SOLIDS:
+        reason = f"{output} is the name of a file; give a folder, into which the solid is written as .stl and .3mf"
+        raise ConfigError("--output", "", reason)
+    if os.path.lexists(output) and not (output.is_dir() and not output.is_symlink() and not any(output.iterdir())):
         raise ConfigError("--output", "", f"{output} exists; give a new or empty folder")
 
 
 def write_export(config: Config, run: Path, output: Path, tolerances: bool, say: Say) -> None:
-    """Export `config`, the experiment of `run` with its recovered values, to the folder or solid file `output`.
+    """Export `config`, the experiment of `run` with its recovered values, to the folder `output`.
 
     A variant must be set. `say` is called with a line about each thing written. Raises ConfigError and
     UnsupportedScene.
     """
-    plan, writer = config.fabrication, WRITERS.get(output.suffix.lower())
+    plan = config.fabrication
     described: list[Description] = []
     scene = load_configured(config, described.append)
     selection, sensors = select_parameters(scene, config.parameters, config.source), choose_sensors(config, scene)
     beside: dict[str, Callable[[Path], object]] = {}
     if plan is not None:
         sheet, solid = read_solid(config, plan, selection.params)
-        if writer is not None:
-            with writing("--output", output):
-                output.parent.mkdir(parents=True, exist_ok=True)
-                content = writer(solid)
-                write_atomically(output, lambda file: file.write(content))
-            tell_solid(output, measured(solid, sheet, plan), say)
-            return
     moves = what_moves(config, selection)
     check_integrator(config, config.integrator, scene, sensors, moves)
     paths = paths_of(config.integrator, scene, sensors, moves)
@@ -178,7 +170,7 @@ def pictures_of(solid: Solid) -> dict[str, Array]:
     found = {}
     with tempfile.TemporaryDirectory(prefix="reslrb-") as folder:
         file = Path(folder) / "solid.ply"
-        file.write_bytes(WRITERS[".ply"](solid))
+        file.write_bytes(ply_file(solid.points, solid.triangles))
         for name, (away, up) in DIRECTIONS.items():
             origin = middle + 4.2 * radius * np.array(away) / np.linalg.norm(away)
             scene = mi.load_dict({
@@ -196,19 +188,6 @@ def pictures_of(solid: Solid) -> dict[str, Array]:
             image = np.array(mi.render(scene, integrator=integrator, spp=PICTURE_SPP))
             found[name] = np.asarray(image[:, :, :3] + (1 - image[:, :, 3:4]) * 0.9, dtype=np.float32)
     return found
-
-
-def check_file(path: Path, config: Config) -> None:
-    """Raise ConfigError if no solid can be written to the file `path`."""
-    if config.fabrication is None:
-        raise ConfigError("--output", "", f"{path}: a solid needs a section `fabrication` in the configuration, which "
-                          "`reslrb lens` writes; give a folder, or add "
-                          "--set fabrication.thickness=25")  # fmt: skip
-    if os.path.lexists(path):
-        raise ConfigError("--output", "", f"{path} exists; give a new file")
-    if path.suffix.lower() == ".3mf" and not _writes_3mf():
-        raise ConfigError("--output", "", f"{path}: 3MF needs lib3mf, which is missing: "
-                          "pip install 'reslrb[fabrication]'; .stl and .ply work without")  # fmt: skip
 
 
 def _writes_3mf() -> bool:

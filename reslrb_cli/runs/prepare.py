@@ -29,9 +29,8 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import explained
-from reslrb_cli.optimization.loop import Watch
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.results import Best, Images, Least, Results
+from reslrb_cli.optimization.results import Images, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
 from reslrb_cli.optimization.views import view_records
@@ -40,7 +39,7 @@ from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest, commit_of
 from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
 from reslrb_cli.records.run_folder import RunFolder
-from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
+from reslrb_cli.records.tree import Arrays, Stored, entries, entry
 from reslrb_cli.report.tonemap import exposure_for
 from reslrb_cli.runs.callbacks import Callback, Calls, RunInfo
 from reslrb_cli.runs.log import collected
@@ -66,7 +65,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
 
 #: Settings that do not affect the iterations done so far. A change of any other setting would make it another run.
 MAY_CHANGE = re.compile(
-    r"run\.(iterations|name|output|checkpoint_every|certainty|on_nonfinite|stop|max_seconds)(\..*)?"
+    r"run\.(iterations|name|output|checkpoint_every|certainty|on_nonfinite|max_seconds)(\..*)?"
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 
@@ -188,8 +187,6 @@ class SavedResults:
 
     images: Images
     certainty: Noted
-    best: Least | None = None
-    best_values: Arrays = field(default_factory=dict, metadata=entry("best"))
     squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
     last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps"))
 
@@ -204,10 +201,8 @@ class RunProgress:
         self._settled, self.problem = settled_of(problem, variant), problem
         self.state, self.results = standing(problem), Results(problem)
         self.certainty = Certainty(problem)
-        self.best = Best(any(view.held_out for view in problem.views))
         self.nonfinite, self.regularized = NonFiniteTally(), RegularizedTally()
         self.last: Record | None = None
-        self.watch = Watch(problem.config)
 
     def compute_with(self, engine: Callable[..., Any]) -> None:
         """Let `engine` (`shards.Engine`) compute the shards of a step."""
@@ -225,7 +220,6 @@ class RunProgress:
 
     def add(self, state: State, record: Record) -> None:
         """Add one iteration, with the `state` after it."""
-        self.best.see(record, self.state.values)  # the iteration starts with the values of `self.state`
         self._take(record)
         self.certainty.see(self.state, state)
         self.state = state
@@ -252,16 +246,6 @@ class RunProgress:
         self.nonfinite.add(record)
         self.regularized.add(record)
 
-    def best_values(self) -> dict[str, Array]:
-        """Return the best parameters so far, in the form of `problem.values()`. The result is empty if there are no
-        best parameters yet.
-        """
-        shown = self.problem.selection.shown
-        return {
-            key: value if isinstance(value, np.ndarray) else shown(key, value)
-            for key, value in self.best.values.items()
-        }
-
     def shown(self, values: Mapping[str, Any]) -> dict[str, Array]:
         """Convert optimiser values or gradients, by key, to the form of `problem.values()`."""
         return {key: self.problem.selection.shown(key, value) for key, value in values.items()}
@@ -284,8 +268,7 @@ class RunProgress:
         `tree.entries`.
         """
         met = SavedResults(
-            self.results.images["initial"], self.certainty.noted, self.best.least,
-            self.best_values(), self.certainty.squares, self.certainty.last,
+            self.results.images["initial"], self.certainty.noted, self.certainty.squares, self.certainty.last,
         )  # fmt: skip
         return entries(self._settled, state.on_file(self.problem), met)
 
@@ -297,15 +280,11 @@ class RunProgress:
         problem, met = self.problem, stored.read(SavedResults)
         self.state = load(problem, stored)
         squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
-        wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
         kept = {key: each[0] for key, each in squares.items() if each is not None}
         last = {key: None for key in met.certainty.last if key in problem.selection.keys}
-        met = stored.fill(replace(met, best_values=wanted, squares=kept, last_steps=last))
+        met = stored.fill(replace(met, squares=kept, last_steps=last))
         for record in records:
             self._take(record)
-            self.watch.add(record)
-        self.best.recent.extend(record.loss for record in records)
-        self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
         self.certainty.restore(met.certainty, met.squares, met.last_steps)
 

@@ -198,7 +198,7 @@ class Recording:
 
     def _iterations(self) -> Iterator[tuple[State, Record]]:
         course = self.course
-        yield from iterate(course.problem, course.state, self._on_nonfinite, watch=course.watch)
+        yield from iterate(course.problem, course.state, self._on_nonfinite)
         if course.state.stopped:
             logger.info(f"stopped after {self.done} iterations: {course.state.stopped}")
 
@@ -268,11 +268,7 @@ class Recording:
         return status
 
     def _write_parameters(self) -> None:
-        """Write the last values and, if there are any, the best values."""
         write_parameters(self.folder.parameters, self.course.problem.values())
-        best = self.course.best_values()
-        if best:
-            write_parameters(self.folder.parameters / "best", best)
 
     def _write_live_page(self) -> None:
         if self.course.last is None:  # there is nothing to draw yet
@@ -348,7 +344,6 @@ class Recording:
             **({"seen": self.seen} if self.seen else {}),
             "nonfinite": self.course.nonfinite.to_json(),
             **({"regularized": self.course.regularized.to_json()} if self.course.regularized.iterations else {}),
-            "best": finite(self.course.best.to_json()),
         }
 
     def _ended(self) -> dict[str, Any]:

@@ -13,7 +13,6 @@ from reslrb_cli.config.loader import OVERRIDDEN, Override, dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.loop import OUT_OF_TIME
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.optimization.state import load as load_state
@@ -68,9 +67,8 @@ class OpenedRun:
 
     @property
     def has_stopped(self) -> bool:
-        """True if `run.stop` or `run.max_seconds` ended the run, and both settings are unchanged."""
-        ends = ("run.stop", "run.max_seconds")
-        return bool(self.stored.read(State).stopped) and not any(key.startswith(ends) for key in self.changed)
+        """True if `run.max_seconds` ended the run, and is unchanged."""
+        return bool(self.stored.read(State).stopped) and "run.max_seconds" not in self.changed
 
     def done_line(self, option: str, equals: str) -> str:
         """Return a line that the run is complete. The line names the setting that would continue the run.
@@ -79,9 +77,7 @@ class OpenedRun:
         """
         iterations = self.config.run.iterations
         stopped = iterations > self.iteration and self.stored.read(State).stopped
-        more = f"run.iterations{equals}NUMBER"
-        if stopped:
-            more = f"run.max_seconds{equals}NUMBER" if stopped.startswith(OUT_OF_TIME) else f"run.stop{equals}null"
+        more = f"run.{'max_seconds' if stopped else 'iterations'}{equals}NUMBER"
         done = f"{self.iteration} of {iterations} iterations"
         return f"{self.folder.path}: is finished, after {done}; {option} {more} continues it"
 

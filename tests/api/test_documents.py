@@ -16,6 +16,7 @@ import pytest
 from cli import tiny
 from cli.tiny import ROOT
 from compilation import search_path
+from kit import work_in
 from make_reference import DOCS, python_page
 
 import reslrb_cli
@@ -67,8 +68,7 @@ def quick_checkout(llvm: str, tmp_path: Path) -> Path:
 def run_here(script: str, folder: Path) -> list[str]:
     """Run a script in this process and return the lines it prints."""
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as said:
-        patch.chdir(folder)
-        patch.setenv("RESLRB_CACHE", str(folder / "cache"))
+        work_in(folder, patch)
         exec(compile(script, "script.py", "exec"), {"__name__": "__main__"})
     return said.getvalue().splitlines()
 

@@ -35,12 +35,10 @@ FAST = {"run.certainty": False, "run.iterations": 3}
 
 
 @pytest.fixture
-def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    write_experiment(tmp_path)
+def folder(llvm: str, workplace: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    write_experiment(workplace)
     work_alone(monkeypatch)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    return tmp_path
+    return workplace
 
 
 def experiment(**run: Any) -> dict[str, Any]:

@@ -22,11 +22,9 @@ TEXTURE, BALL = "floor.bsdf.reflectance.data", "ball.bsdf.reflectance.value"
 
 
 @pytest.fixture
-def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(llvm: str, workplace: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     work_alone(monkeypatch)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    return tmp_path
+    return workplace
 
 
 def bitmap(kind: type = np.float32, width: int = 4) -> mi.Bitmap:

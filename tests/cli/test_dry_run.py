@@ -42,7 +42,6 @@ def test_memory_matches_the_run(experiment: Path) -> None:
     told = re.search(r"memory of the iterations: at most ([\d.]+) MiB", printed)
     assert told is not None, printed
     assert "time of the iterations: " in printed
-    assert "time of the whole run: about " in printed
     call("--quiet")
     peak = read_metrics(experiment / "runs" / "tiny")[-1]["peak_mib"]
     assert peak > 0.5
@@ -69,14 +68,11 @@ def test_work_before_the_iterations_is_measured_once(experiment: Path, monkeypat
     monkeypatch.setenv("RESLRB_CACHE", str(experiment / "cache"))
     auto = ["--set", "integrator={type: reslrb, max_depth: 3, paths: light}", "--set", "run.certainty=false"]
     auto += ["--set", "run.measuring=1000", "--set", "scene.size=[16, 16]"]
-    printed = call("--dry-run", *auto)
-    assert re.search(r"^ +[\d.]+ m?s, done now and stored  choosing the sampling$", printed, re.MULTILINE), printed
+    call("--dry-run", *auto)
     call(*auto)
     manifest = read_manifest(experiment / "runs" / "tiny")
     assert manifest is not None
     assert [each["cached"] for each in manifest["decisions"] if each["gain"] is not None] == [True]
-    printed = call("--dry-run", *auto)
-    assert "none, or stored from before" in printed
 
 
 @pytest.mark.parametrize(

@@ -260,7 +260,7 @@ def test_a_step_beyond_the_free_memory(experiment: Path, monkeypatch: pytest.Mon
     # texture.
     for free, sets, said in (
         (40, ["parameters[0].resolution=[512, 512]"], "scene.size: a film of 512x512 pixels and 512x512 texels: "
-                                                      "a step takes at least 48.8 MiB, and 40 MiB are free; "),
+                                                      "a step takes at least 48 MiB, and 40 MiB are free; "),
         (64, ["parameters[0].resolution=[512, 512]"], "scene.file: a step takes at least "),
         (32, ["run.adjoint=correlated"], "run.spp: a step takes at least "),
         (32, [naive], "run.spp: ptracer stores the state of all 4194304 light paths of a pass, at least 192 MiB, and "),
@@ -292,7 +292,7 @@ def test_the_film_size_is_known_before_the_scene_is_built(
     sides = SCENE.replace('value="8"', 'value="11500"', 1).replace('value="8"', 'value="11500"', 1)
     (experiment / "scene.xml").write_text(sides)
     line = obstacle(experiment, "parameters[0].resolution=[8000, 8000]")
-    said = "scene.file: a film of 11500x11500 pixels and 8000x8000 texels: a step takes at least 22.6 GiB, and "
+    said = "scene.file: a film of 11500x11500 pixels and 8000x8000 texels: a step takes at least 22.4 GiB, and "
     assert line.endswith(f"{said}16 GiB are free; use a smaller film or coarser textures")
     assert obstacle(experiment, "run.spp=1000000").endswith(
         "set integrator.samples_per_pass to at most 32, or lower run.spp"

@@ -175,6 +175,7 @@ VIEW = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"
 <shape type="sphere"><point name="center" x="1.5" y="1" z="0"/><emitter type="area"/></shape></scene>"""
 
 
+@pytest.mark.usefixtures("combined")
 def test_large_visible_parameters_come_first(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(VIEW)
     found = propose(load_scene(tmp_path / "scene.xml"), 0)

@@ -67,6 +67,8 @@ SIMILAR = (
     "rectangle-spot-2",
     "box-moving_area-2",
     "box-moving_spot-2",
+    "flat-area-2",  # no planted fault needs these two: those of edges between surfaces show in two-area-3 as well
+    "box-indirect-3",
 )
 
 
@@ -408,11 +410,11 @@ def peak(max_depth: int) -> int:
 
 
 def test_memory_is_flat_in_depth():
-    peaks = {depth: peak(depth) for depth in (3, 24)}
+    peaks = {depth: peak(depth) for depth in (3, 12)}
     print(peaks)
     paths = SPP * SIZE**2
     assert max(peaks.values()) < paths / 3
-    assert max(peaks.values()) - min(peaks.values()) < paths / 30, peaks  # 24 bounces store nothing for a path
+    assert max(peaks.values()) - min(peaks.values()) < paths / 30, peaks  # less than a bit for a path
 
 
 @pytest.mark.long

@@ -245,8 +245,9 @@ def test_the_command_reports_all_figures(folder: Path) -> None:
     for axis in "xy":
         shift = told[f"light turned by {tolerance.TURN:g} degree about {axis}"]["shift"]
         assert np.hypot(*shift) == pytest.approx(200 * np.tan(np.radians(1)) / (100 / 32), abs=0.15)
-    result = reslrb("export", folder / "runs/lens", "-o", folder / "a.stl", "--tolerances")
-    assert "needs a folder as output" in f"{result.output}{result.exception}"
+    bare = ("--set", "fabrication=null")
+    result = reslrb("export", folder / "runs/lens", "-o", folder / "bare", "--tolerances", *bare)
+    assert "needs a configuration with a section `fabrication`" in f"{result.output}{result.exception}"
 
 
 @pytest.mark.long

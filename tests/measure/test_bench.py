@@ -123,7 +123,7 @@ def test_a_failing_case_gives_its_reason(
         (["--integrators", "pt"], "--integrators pt: integrator.type"),
         (["--json", "no/such/folder.json"], "--json: cannot write"),
         (["--plot", "a.png"], "--plot was removed; `reslrb report FILE -o page.html` plots results of --json FILE"),
-        (["--resume=a"], "--resume was removed; --json FILE continues from the results in FILE"),
+        (["--resume=a"], "--resume was removed; --values LIST measures the values that are missing"),
         (["--resum", "a"], "bench: No such option"),
     ],
 )

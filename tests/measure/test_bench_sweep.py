@@ -1,8 +1,7 @@
-"""Sweeps of `bench`: their order, the varied quantities, ended cases, and continued sessions."""
+"""Sweeps of `bench`: their order, the varied quantities, and ended cases."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from reslrb_cli.measure.arena import MAX_ROUNDS, MIN_ROUNDS, NO_TIME, Pace
 from reslrb_cli.measure.bench import Bench, BenchResult
 from reslrb_cli.measure.methods import Sweep, depths, parse_cases, sample_counts
 from reslrb_cli.measure.processes import Refused, Stopped
-from reslrb_cli.records.measurement_files import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
 from reslrb_cli.report.tables import bench_cells, bench_columns
 
@@ -341,91 +339,8 @@ def test_default_values() -> None:
     assert sample_counts(2) == [1, 2, 4, 8]
 
 
-# A `bench` that continues an earlier one: which measurements count, which are repeated, and what is refused.
-
-
-def session(what: Sweep, earlier: Earlier | None = None, stop: Callable[[], bool] = lambda: False) -> Bench:
-    return Bench(what, Path(), stop, lambda line: None, Pretended, earlier=earlier)
-
-
-def measure(what: Sweep, before: Earlier | None = None, stop: Callable[[], bool] = lambda: False) -> Bench:
-    made = session(what, before, stop)
-    list(made.run())
-    assert Pretended.alive == 0
-    return made
-
-
-def again(made: Bench) -> Earlier:
-    """Return the kept content of a session as it is read from the disk."""
-    kept = made.kept()
-    assert kept is not None
-    head, arrays = kept
-    return Earlier("bench", Path("b.jsonl"), json.loads(json.dumps(head)), arrays)
-
-
-def test_continued_rounds_give_the_records_of_one_session() -> None:
-    """Pretended steps become slower from round to round, so that every figure shows the rounds that it covers."""
-    short = measure(sweep(rounds=3))
-    Pretended.log.clear()
-    whole = measure(sweep(rounds=7), again(short))
-    asked = [round for depth, name, round in Pretended.log if (depth, name) == (2, "ptracer") and round > 0]
-    assert asked == [4, 5, 6, 7]  # rounds with new seeds
-    expected = measure(sweep(rounds=7)).results()
-    assert [result.record for result in whole.results()] == [result.record for result in expected]
-    assert [result.step_ratio for result in whole.results()] == [result.step_ratio for result in expected]
-    assert {result.record.repeats for result in whole.results()} == {7}
-
-
-@pytest.mark.parametrize("after", [5, 14, 20, 33, 40])
-def test_unmeasured_cases_of_a_stop_are_measured(after: int) -> None:
-    answers = iter(range(1000))
-    stopped = measure(sweep(), stop=lambda: next(answers) > after)
-    if stopped.kept() is None:
-        assert not any(result.record.repeats for result in stopped.results())
-        return
-    whole = measure(sweep(), again(stopped))
-    labels = [case.label for case in sweep().cases]
-    assert [(result.value, result.case.label) for result in whole.results()] == [(v, c) for v in (2, 4) for c in labels]
-    assert all(result.record.repeats >= 3 for result in whole.results())
-
-
-def test_finished_depths_are_not_repeated() -> None:
-    Pretended.ends = {("walk_ad", 2): 4}
-    first = measure(sweep(values=[2, 4], rounds=3), stop=lambda: len(Pretended.log) > 31)
-    assert {result.value for result in first.results()} == {2, 4}
-    Pretended.log.clear()
-    Pretended.ends = {}
-    whole = measure(sweep(values=[2, 4], rounds=3), again(first))
-    assert {depth for depth, _, _ in Pretended.log} == {4}
-    ended = whole.results()[2]
-    assert (ended.record.status, ended.reason) == (BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
-
-
-def test_refused_cases_stay_left_out() -> None:
-    Pretended.refusing = {"reslrb"}
-    first = measure(sweep(default=True))
-    Pretended.log.clear()
-    whole = measure(sweep(default=True, rounds=5), again(first))
-    assert {name for _, name, _ in Pretended.log} == {"ptracer", "walk_ad"}
-    assert {result.record.repeats for result in whole.results()} == {5}
-
-
-def test_a_result_without_its_baseline_is_continued() -> None:
-    """A stop can come after the first step of a case, and before that of the baseline."""
-    what = sweep("reslrb:stack,ptracer", values=[2])
-    stopped = measure(what, stop=lambda: len(Pretended.log) > 7)
-    continued = session(what, again(stopped))
-    assert [(result.case.label, result.step_ratio) for result in continued.results()] == [("reslrb:stack", None)]
-
-
-def test_running_work_is_saved_between_rounds() -> None:
-    """Saving after each round ensures that a process killed within a depth loses only its last round."""
-    made, seen = session(sweep(values=[2])), []
-    for rows in made.run():
-        kept = made.kept()
-        assert kept is not None
-        if not rows:
-            seen.append([len(run["steps"]) for run in kept[0]["values"][0][1]])
-            assert len(made.results()) == 3
-            assert not made.done
-    assert seen == [[1] * 3, [2] * 3, [3] * 3]
+def test_results_grow_with_each_round() -> None:
+    """The command writes its file after each round, so that a killed process loses only its last round."""
+    made = Bench(sweep(values=[2]), Path(), lambda: False, lambda line: None, Pretended)
+    seen = [[result.record.repeats for result in made.results()] for _ in made.run()]
+    assert seen == [[1] * 3, [2] * 3, [3] * 3, [3] * 3]

@@ -21,7 +21,7 @@ import reslrb_cli as rl
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.methods import Plan, Sweep, parse_cases
+from reslrb_cli.measure.methods import Plan, parse_cases
 from reslrb_cli.measure.methods import kept_settings as measured_as
 from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.sampling import settings as sampled_as
@@ -87,12 +87,10 @@ def write_image(path: Path, size: int, seed: int) -> None:
 
 
 @pytest.fixture
-def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(llvm: str, workplace: Path) -> Path:
     """Folder with `photo.yaml` and `cameras.yaml`, which together read a file of every kind."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
     for name in ("parts", "shots", "data/ior"):
-        (tmp_path / name).mkdir(parents=True)
+        (workplace / name).mkdir(parents=True)
     scene = tiny.SCENE.replace('value="8, 8, 8"', 'value="$bright"')
     texts = {
         "scene.xml": scene.replace("</scene>", '<include filename="lights.xml"/><!-- 0.25 -->\n</scene>'),
@@ -116,7 +114,7 @@ def folder(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_image(Path("shots/a.exr"), 8, 9)
     head = b"VOL\3" + struct.pack("<5i6f", 1, 2, 2, 2, 1, 0, 0, 0, 1, 1, 1)
     Path("parts/grid.vol").write_bytes(head + np.full(8, 0.25, np.float32).tobytes())
-    return tmp_path
+    return workplace
 
 
 def change(path: Path) -> Callable[[], object]:
@@ -146,7 +144,6 @@ def measurements(config: Config, ours: str = "reslrb:stack", reference: str = "p
     return {
         "gradcheck": sampled_as(CheckSettings(config, cases, 0), "llvm_ad_rgb", ""),
         "gradcheck --missing": measured_as(config, {}, "llvm_ad_rgb", ""),
-        "bench": Sweep(**shared, values=[2]).settings(),
         "convergence": Plan(**shared, objective="fixed", reference=parse_cases(reference)[0], spps=(4,)).settings(),
     }
 
@@ -171,7 +168,7 @@ def test_each_file_is_another_experiment(folder: Path, name: str, files: dict[st
 def test_code_named_by_a_command_counts(folder: Path) -> None:
     config = load("photo.yaml", ["loss={type: l2}"])
     named: list[tuple[tuple[str, ...], set[str]]] = [
-        (("prb,own.py:A(x=1)",), {"gradcheck", "bench", "convergence"}), (("prb", "own.py:A(x=1)"), {"convergence"}),
+        (("prb,own.py:A(x=1)",), {"gradcheck", "convergence"}), (("prb", "own.py:A(x=1)"), {"convergence"}),
     ]  # fmt: skip
     for given, commands in named:
         before = measurements(config, *given)

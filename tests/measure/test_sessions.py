@@ -1,4 +1,4 @@
-"""Sessions of `bench`, `convergence` and `gradcheck`: which stored samples are continued, and how a budget is spent.
+"""Sessions of `convergence` and `gradcheck`: which stored samples are continued, and how a budget is spent.
 All samples only pretend.
 """
 
@@ -14,12 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 from measure.pretended_steps import Pretended, Stage, plan, play
-from measure.test_bench_sweep import CONFIG, sweep
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import sampling
-from reslrb_cli.measure.bench import Bench
 from reslrb_cli.measure.convergence import Session
 from reslrb_cli.measure.gradients import Direction
 from reslrb_cli.measure.methods import parse_cases
@@ -152,13 +150,6 @@ class Ended:
     figures: list[Any]
 
 
-def bench(folder: Path, earlier: Earlier | None = None, **changes: Any) -> Ended:
-    Pretended.log = []
-    made = Bench(sweep(**changes), Path(), lambda: False, lambda line: None, Pretended, earlier=earlier)
-    list(made.run())
-    return Ended(made.kept(), len(Pretended.log), [result.record for result in made.results()])
-
-
 def convergence(folder: Path, earlier: Earlier | None = None, **changes: Any) -> Ended:
     stage = Stage()
     session, results, _ = play(folder, stage, plan(**{"rounds": 4} | changes), earlier=earlier)
@@ -179,11 +170,9 @@ def gradcheck(folder: Path, earlier: Earlier | None = None, **changes: Any) -> E
     return Ended(made.kept(check_settings(**changes)), taken, [made.of(name).tolist() for name in NAMES])
 
 
-SESSIONS: dict[str, Callable[..., Ended]] = {"bench": bench, "convergence": convergence, KIND: gradcheck}
+SESSIONS: dict[str, Callable[..., Ended]] = {"convergence": convergence, KIND: gradcheck}
 #: How each kind of session refuses stored samples of other settings.
 REFUSE: dict[str, Callable[..., object]] = {
-    "bench": lambda earlier, **changes: Bench(
-        sweep(**changes), Path(), lambda: False, print, Pretended, earlier=earlier),
     "convergence": lambda earlier, **changes: Session(
         plan(**{"rounds": 8} | changes), Path(), lambda: False, print, earlier=earlier),
     KIND: lambda earlier, **changes: earlier.check(check_settings(**changes)),
@@ -202,12 +191,8 @@ def test_stored_samples_are_not_taken_again(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "change", "line"),
     [
-        ("bench", {"config": loads(CONFIG, Path("x.yaml"), ["run.spp=8"])}, "run.spp is 4 there, 8 here"),
-        ("bench", {"cases": parse_cases("ptracer,walk_ad")}, "integrators is ['ptracer', 'reslrb:stack', 'walk_ad'] t"),
-        ("bench", {"values": [2, 8]}, "values is [2, 4] there, [2, 8] here"),
-        ("bench", {"swept": "spp"}, "sweep is depth there, spp here"),
-        ("bench", {"memory_limit": 2**30}, "memory limit is None there, 1073741824 here"),
-        ("bench", {"variant": "cuda_ad_rgb"}, "variant is llvm_ad_rgb there, cuda_ad_rgb here"),
+        ("convergence", {"memory_limit": 2**30}, "memory limit is None there, 1073741824 here"),
+        ("convergence", {"variant": "cuda_ad_rgb"}, "variant is llvm_ad_rgb there, cuda_ad_rgb here"),
         ("convergence", {"cases": "ptracer"}, "integrators is ['ptracer', 'reslrb:stack', 'reslrb:event'] there"),
         ("convergence", {"objective": "image"}, "objective is fixed there, image here"),
         ("convergence", {"spps": (4, 8)}, "spp is [] there, [4, 8] here"),

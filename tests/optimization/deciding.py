@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from cli import tiny
+from kit import work_in
 
 from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop
@@ -97,8 +98,7 @@ class World:
 def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write the tiny experiment to `folder`, make it the working directory, and set a cache of its own."""
     tiny.write_experiment(folder)
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
+    work_in(folder, monkeypatch)
     logging.getLogger("reslrb_cli").setLevel(logging.INFO)
     return folder
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +10,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from optimization.toy import make_problem
-from records.test_metrics import RECORD, make_record
+from records.test_metrics import make_record
 
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.optimization import loading, loop
 from reslrb_cli.optimization.assemble import assemble_scene, quantity
 from reslrb_cli.optimization.problem import ErrorMeter
-from reslrb_cli.optimization.results import WINDOW, Best, Results, summary
+from reslrb_cli.optimization.results import Results, summary
 
 # Parameters summarised in a few numbers, and results that exist whenever a run ends.
 
@@ -177,58 +176,6 @@ def test_quantities(name):
         scene = {**scene, "irradiance": {**IMAGE, "bitmap": bitmap}}
     params = mi.traverse(mi.load_dict(scene))
     assert quantity(params, key) == expected
-
-
-# How a run chooses its best parameters: by the mean of several losses, or by held-out views.
-
-
-def seen(losses, held_out=None):
-    best = Best(held_out is not None)
-    for number, loss in enumerate(losses):
-        held = held_out[number] if held_out is not None else None
-        best.see(replace(RECORD, iteration=number, loss=loss, held_out=held), {"a": number})
-    return best
-
-
-def test_noise_does_not_make_values_the_best():
-    """One lucky loss at the start does not count as the best. A lower mean loss later does."""
-    losses = [0.01] + [1.0] * 20 + [0.5] * 15 + [0.9] * 20
-    best = seen(losses)
-    means = [np.mean(losses[end - WINDOW : end]) for end in range(WINDOW, len(losses) + 1)]
-    assert best.least.iteration == int(np.argmin(means)) + WINDOW - 1
-    assert best.values == {"a": best.least.iteration}
-    assert best.least.loss == pytest.approx(0.5)
-
-
-def test_there_is_no_best_before_the_window_is_full():
-    assert seen([1.0] * (WINDOW - 1)).to_json() is None
-    assert seen([1.0] * WINDOW).to_json()["iteration"] == WINDOW - 1
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_non_finite_values_are_never_the_best(bad):
-    assert seen([bad] * 30).least is None
-    assert seen([*[bad] * 5, *[2.0] * 30]).least.iteration == 5 + WINDOW - 1
-
-
-def test_held_out_views_decide():
-    held_out = [3.0, None, 1.0, None, 2.0]
-    best = seen([5.0, 4.0, 3.0, 2.0, 1.0], held_out)
-    assert (best.least.iteration, best.least.loss, best.values) == (2, 1.0, {"a": 2})
-
-
-@pytest.mark.parametrize("at", [3, 12, 25])
-def test_the_best_values_survive_a_resume(at):
-    losses = list(np.random.default_rng(3).uniform(size=40))
-    whole, part = seen(losses), seen(losses[:at])
-    again = Best(False)
-    records = [replace(RECORD, iteration=number, loss=loss) for number, loss in enumerate(losses)]
-    again.recent.extend(losses[:at])
-    again.least, again.values = part.least, part.values
-    for record in records[at:]:
-        again.see(record, {"a": record.iteration})
-    assert again.to_json() == whole.to_json()
-    assert again.values == whole.values
 
 
 # Which of the saved images are recorded.

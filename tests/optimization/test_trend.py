@@ -1,4 +1,4 @@
-"""Trend and standstill of losses with heavy tails: frequency of errors of each test, over many simulated runs."""
+"""Trend of losses with heavy tails: frequency of errors of the test, over many simulated runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from turns import a_few
 
-from reslrb_cli.optimization.trend import Change, find_trend, levels_of, stands
+from reslrb_cli.optimization.trend import Change, find_trend
 from reslrb_cli.statistics import Array
 
 #: A hundred consecutive losses of grey_room by light paths (48 x 36 pixels, 4 samples), divided by their trend.
@@ -50,57 +50,6 @@ NOISE: dict[str, Callable[[np.random.Generator, tuple[int, int]], Array]] = {
     "grey_room": real,
     "wandering": wandering,
 }
-PATIENCE, RELATIVE = 20, 0.01
-
-
-def ends(losses: Array, patience: int = PATIENCE, relative: float = RELATIVE) -> Array:
-    """Return after how many iterations each run (R, N) stops. A run that does not stop gets a number beyond the
-    last.
-    """
-    runs, windows = len(losses), losses.shape[1] // patience
-    levels = levels_of(losses[:, : windows * patience].reshape(runs, windows, patience))
-    end = np.full(runs, losses.shape[1] + 1)
-    for number in range(3, windows + 1):
-        left = np.flatnonzero(end > losses.shape[1])
-        end[left[stands(levels[left, :number], relative, number) > 0]] = number * patience
-    return end
-
-
-def check_stops(kind: str, runs: int, iterations: int) -> None:
-    """Check that at most 5 % of runs stop while losses fall by `RELATIVE` per window or faster. A fall of just
-    `RELATIVE` gets a tolerance.
-    """
-    random, at = np.random.default_rng(4), np.arange(iterations)
-    tolerance = 3 * np.sqrt(0.05 * 0.95 / runs)
-    for window in (1 - RELATIVE, 1 - 2 * RELATIVE, 0.5 ** (PATIENCE / 100)):
-        stopped = ends(window ** (at / PATIENCE) * NOISE[kind](random, (runs, iterations))) <= iterations
-        exact = window == 1 - RELATIVE
-        assert stopped.mean() <= 0.05 + tolerance * exact, (kind, window, stopped.mean())
-    # The fall fades out. Runs must not stop while the fall is faster than the limit.
-    floor = 1 + 9 * 0.5 ** (at / 50)
-    standing = int(np.argmax(1 - floor[PATIENCE:] / floor[:-PATIENCE] < RELATIVE)) + PATIENCE
-    assert np.mean(ends(floor * NOISE[kind](random, (runs, iterations))) < standing) <= 0.05
-
-
-@pytest.mark.parametrize("kind", NOISE)
-def test_runs_with_a_falling_loss_are_not_stopped(kind: str) -> None:
-    check_stops(kind, 300, 600)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", NOISE)
-def test_long_runs_with_a_falling_loss_are_not_stopped(kind: str) -> None:
-    check_stops(kind, 2000, 3000)
-
-
-@pytest.mark.parametrize(("kind", "longest"), [
-    ("normal, 10 %", 300), ("normal, 30 %", 600), ("t of 3 degrees", 360), ("fireflies", 360), ("grey_room", 700),
-])  # fmt: skip
-def test_the_cost_of_a_stop(kind: str, longest: int) -> None:
-    """The medians are over runs whose losses stand still from the first iteration on. docs/steps.md has the figures."""
-    random = np.random.default_rng(5)
-    assert np.median(ends(NOISE[kind](random, (300, 1000)))) <= longest
-    assert np.median(ends(NOISE[kind](random, (300, 1000)), relative=0.05)) <= 240
 
 
 @pytest.mark.parametrize("kind", NOISE)

@@ -7,18 +7,17 @@ from pathlib import Path
 
 import pytest
 from cli import tiny
+from kit import work_in
 from runs.going_on import optimize, write_experiment
 
 from reslrb_cli.runs import recorder as recording
 
 
 @pytest.fixture
-def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def experiment(llvm: str, workplace: Path) -> Path:
     """The working directory, which contains `tiny.yaml` with two parameters. The cache is empty at first."""
-    write_experiment(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    return tmp_path
+    write_experiment(workplace)
+    return workplace
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +26,7 @@ def interrupted(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     folder = tmp_path_factory.mktemp("interrupted")
     tiny.write_experiment(folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setenv("RESLRB_CACHE", str(folder / "cache"))
+        work_in(folder, patch)
         patch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
         patch.setattr(recording, "seen_errors", lambda folder, results: {})
         iterate = recording.Recording._iterate

@@ -15,6 +15,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from cli import tiny
+from kit import work_in
 
 from reslrb_cli.cli import main
 from reslrb_cli.cli.optimize import Progress
@@ -90,8 +91,7 @@ def begin_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """
     write_experiment(folder)
     work_alone(monkeypatch)
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
+    work_in(folder, monkeypatch)
     monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
     monkeypatch.setattr(recording, "seen_errors", lambda folder, views: {})
 
@@ -164,11 +164,10 @@ def differences(first: Path, second: Path) -> list[str]:
     for what in (records_of, found_of, noted_by):
         if what(first) != what(second):
             found.append(what.__name__)
-    for name in ("", "best"):
-        values = [(run / "parameters" / name / "parameters.npz") for run in (first, second)]
-        if [path.exists() for path in values] == [True, True]:
-            arrays = [np.load(path) for path in values]
-            found += [f"{name} {key}" for key in arrays[0] if arrays[0][key].tobytes() != arrays[1][key].tobytes()]
+    values = [(run / "parameters/parameters.npz") for run in (first, second)]
+    if [path.exists() for path in values] == [True, True]:
+        arrays = [np.load(path) for path in values]
+        found += [key for key in arrays[0] if arrays[0][key].tobytes() != arrays[1][key].tobytes()]
     return found
 
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from cli import tiny
 from compilation import search_path
@@ -157,7 +156,7 @@ def _another_seed(run_seed, iteration, view, purpose):
 @pytest.mark.parametrize(
     "fault",
     a_few(
-        ["no moments", "another seed", "no best", "no squares", "no last steps", "metrics not cut back"],
+        ["no moments", "another seed", "no squares", "no last steps", "metrics not cut back"],
         ["no moments"],
     ),
 )
@@ -167,10 +166,6 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
 
     restore = prepare.RunProgress.restore
 
-    def without_best(self, stored, records):
-        restore(self, stored, records)
-        self.best.recent.clear()
-
     def without_squares(self, stored, records):
         restore(self, stored, records)
         self.certainty.squares = {}
@@ -179,15 +174,13 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
         restore(self, stored, records)
         self.certainty.last = {}
 
-    # A state in the last fifth of the run has all parts. With falling losses, the best of the run comes after this
-    # state.
+    # A state in the last fifth of the run has all parts.
     sets = ["--set", "run.checkpoint_every={iterations: 15}"]
     begun = FALLING if fault != "no last steps" else []  # only small parameters have last steps
     whole, left = run_and_kill(monkeypatch, 17, *ITERATIONS, *sets, *begun)
     places = {
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
         "another seed": (loop, "seed", _another_seed),
-        "no best": (prepare.RunProgress, "restore", without_best),
         "no squares": (prepare.RunProgress, "restore", without_squares),
         "no last steps": (prepare.RunProgress, "restore", without_steps),
         "metrics not cut back": (resume, "cut_back", lambda folder, size: None),
@@ -218,16 +211,6 @@ def test_a_state_survives_a_round_trip(experiment: Path, monkeypatch: pytest.Mon
     assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE, "--set", "run.name=whole") == 0
     assert optimize("--resume", str(RUN), "--quiet") == 0
     assert differences(Path("runs/whole"), RUN) == []
-
-
-def test_the_best_values_have_the_lowest_mean(experiment: Path) -> None:
-    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE) == 0
-    losses = [record["loss"] for record in records_of(RUN)]
-    means = [np.mean(losses[end - 10 : end]) for end in range(10, 19)]
-    found = json.loads((RUN / "manifest.json").read_text())["results"]["best"]
-    assert found["iteration"] == int(np.argmin(means)) + 9
-    assert found["loss"] == pytest.approx(min(means), rel=1e-12)
-    assert (RUN / "parameters/best/parameters.npz").exists()
 
 
 # Runs that are killed at random moments, or whose disks are too small, until they finish.
