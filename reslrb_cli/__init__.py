@@ -10,6 +10,7 @@ chooses the libLLVM that Dr.Jit loads.
 - `register` registers the plugins with Mitsuba.
 - `load_scene` loads a scene whose parameters have the same names as on the command line.
 - `step` computes one gradient step.
+- `torch.render` renders an image that PyTorch differentiates.
 
 `__all__` lists the public names.
 """
@@ -32,6 +33,7 @@ from reslrb_cli.backend import llvm as _llvm  # noqa: E402
 from reslrb_cli.version import __version__  # noqa: E402
 
 if TYPE_CHECKING:
+    from reslrb_cli.api import torch
     from reslrb_cli.api.experiment import convergence, export, gradcheck, gradient, load, render
     from reslrb_cli.api.run import Run, optimize
     from reslrb_cli.config.schema import Config
@@ -65,6 +67,7 @@ __all__ = [
     "register",
     "render",
     "step",
+    "torch",
 ]
 
 # Dr.Jit loads libLLVM on another thread during its import, so the choice must be made before.
@@ -84,6 +87,7 @@ _LAZY = {
     "optimize": ("reslrb_cli.api.run", "optimize"),
     "register": ("reslrb_cli.integrators.plugin", "register"),
     "step": ("reslrb_cli.integrators.step", "gradient_step"),
+    "torch": ("reslrb_cli.api.torch", ""),  # the module
 }  # fmt: skip
 
 
@@ -92,6 +96,7 @@ def __getattr__(name: str) -> Any:
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, its_name = _LAZY[name]
-    value = getattr(importlib.import_module(module), its_name)
+    found = importlib.import_module(module)
+    value = getattr(found, its_name) if its_name else found
     globals()[name] = value
     return value

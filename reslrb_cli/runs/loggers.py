@@ -29,7 +29,8 @@ from reslrb_cli.runs.callbacks import Array, Callback, RunInfo
 FEW = 4
 
 
-def _package(name: str, extra: str) -> Any:
+def package(name: str, extra: str) -> Any:
+    """Return the module `name`, which the extra `extra` of this package installs. Raises ConfigError without it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -90,7 +91,7 @@ class TensorBoard(_Logger):
     """
 
     def __init__(self, folder: str | os.PathLike[str] | None = None) -> None:
-        self._writers = _package("tensorboardX", "tensorboard")
+        self._writers = package("tensorboardX", "tensorboard")
         self._folder = folder
         self._writer: Any = None
 
@@ -123,7 +124,7 @@ class MLflow(_Logger):
     """
 
     def __init__(self) -> None:
-        self._mlflow = _package("mlflow", "mlflow")
+        self._mlflow = package("mlflow", "mlflow")
         self._owns = self._runs = False
 
     def _open(self, run: RunInfo) -> None:
@@ -159,7 +160,7 @@ class WandB(_Logger):
     """
 
     def __init__(self) -> None:
-        self._wandb = _package("wandb", "wandb")
+        self._wandb = package("wandb", "wandb")
         self._owns = False
         self._run: Any = None
 
