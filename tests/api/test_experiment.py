@@ -397,6 +397,8 @@ def weighted(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | Non
 scene = rl.load_scene("scene.xml")
 reveal_type(scene)
 rl.torch.render(scene, {}, spp=4)
+reveal_type([record.holds for record in rl.check_estimator("stack", ["furnace"])])
+reveal_type(rl.register_estimator)
 
 
 class Watch(rl.Callback):
