@@ -180,6 +180,11 @@ def other():
 SHORT = settings("run.certainty=false", "run.iterations=2")
 
 
+def errors(text: str) -> list[str]:
+    """Return the lines of the standard error, without the line about the variant."""
+    return [line for line in text.splitlines() if not line.startswith("variant ")]
+
+
 def name_callbacks(*names: str) -> None:
     """Write `run.callbacks` into the configuration."""
     text = Path("tiny.yaml").read_text()
@@ -196,7 +201,7 @@ def test_a_configuration_names_callbacks(experiment: Path, monkeypatch: pytest.M
     assert (code, out) == (2, "")
     file = experiment / "watch.py"
     said = f"tiny.yaml: run.callbacks[0]: would run the code of {file} with all your rights; --allow-code permits it"
-    assert err.splitlines()[1:] == [said]
+    assert errors(err) == [said]
     code, out, _ = outcome("optimize", "tiny.yaml", "--allow-code", "--log", "own", *SHORT)
     assert (code, out.splitlines()[:3]) == (0, ["the code was run", "saw 0", "saw 1"])
     assert len(heard) == 1  # although it is named twice
@@ -244,7 +249,7 @@ def test_callbacks_of_a_configuration_in_python(experiment: Path, capsys: pytest
 def test_wrong_callbacks_of_a_configuration(experiment: Path, name: str, message: str) -> None:
     name_callbacks(f'"{name}"' if ":" in name else name)
     code, _, err = outcome("optimize", "tiny.yaml", "--allow-code", *SHORT)
-    said = [line for line in err.splitlines() if not line.startswith("variant ")]
+    said = errors(err)
     assert (code, len(said)) == (2, 1), err
     assert message in said[0]
     assert not Path("runs").exists()
@@ -252,7 +257,7 @@ def test_wrong_callbacks_of_a_configuration(experiment: Path, name: str, message
 
 def test_log_names_no_file(experiment: Path) -> None:
     code, _, err = outcome("optimize", "tiny.yaml", "--log", "watch.py:Watch", "--allow-code")
-    assert (code, err.splitlines()[1:]) == (
+    assert (code, errors(err)) == (
         2,
         ["--log: a file is named by the setting `run.callbacks: [watch.py:Watch]`"],
     )
