@@ -32,7 +32,8 @@ def register_estimator(name: str, kind: type[Estimator]) -> None:
     `name` is then a value of `estimator`: in `mi.load_dict({"type": "reslrb", "estimator": name})`, in
     `integrator.estimator` of an experiment, and in lists such as `gradcheck(..., integrators="reslrb:NAME")`. `kind` is
     a class derived from `reslrb_cli.estimators.base.Estimator` (docs/your_estimator.md). Its options have their
-    defaults in an experiment. The same name may be registered again.
+    defaults in an experiment. The same name may be registered again. Other processes, such as those of `convergence`,
+    do not know the name; name the file there.
 
     `check_estimator` checks the gradients of the estimator. Raises ConfigError for a wrong name or class.
     """

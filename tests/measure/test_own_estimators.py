@@ -20,6 +20,7 @@ import reslrb_cli as rl
 from reslrb_cli.config import integrators
 from reslrb_cli.estimators import ESTIMATORS, Gather
 from reslrb_cli.integrators import own
+from reslrb_cli.measure import methods
 
 PAGE = (ROOT / "docs/your_estimator.md").read_text(encoding="utf-8")
 CODE, CHECK = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
@@ -104,6 +105,19 @@ def test_a_configuration_names_the_file(experiment: Path) -> None:
     code, _, err = outcome("optimize", "--resume", "runs/tiny", "--allow-code", *settings("run.iterations=4"))
     assert code == 2
     assert "integrator.estimator: has changed since" in err
+
+
+def test_gradcheck_names_the_file(experiment: Path) -> None:
+    words = ("gradcheck", "tiny.yaml", "--integrators", "reslrb:mine.py:Twice,reslrb:gather", "--seeds", 3, "--spp", 4)
+    code, _, err = outcome(*words)
+    assert (code, err) == (2, "--integrators reslrb:mine.py:Twice: would run with all your rights; --allow-code "
+                              "permits it\n")  # fmt: skip
+    code, out, _ = outcome(*words, "--allow-code")
+    assert code == 0
+    assert len(re.findall(r"reslrb:mine.py:Twice  walk_ad, equal seeds .* holds$", out, re.MULTILINE)) == 2
+    (case,) = methods.parse_cases("reslrb:mine.py:Twice(paths=light)")
+    assert case.options == {"estimator": f"{experiment}/mine.py:Twice", "paths": "light"}
+    assert methods.code_files([case]) == {case.label: experiment / "mine.py"}
 
 
 @pytest.mark.parametrize(
