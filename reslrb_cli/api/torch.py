@@ -192,7 +192,7 @@ def _operation() -> Any:
         dr.sync_thread()  # torch has a stream of its own
         return flat.torch().reshape(shape)
 
-    class Rendering(pytorch.autograd.Function):  # type: ignore[name-defined]
+    class TorchImage(pytorch.autograd.Function):  # type: ignore[name-defined]
         """Image of a scene as a function of parameters."""
 
         @staticmethod
@@ -214,4 +214,4 @@ def _operation() -> Any:
                 shaped = zip(found, ctx.shapes, strict=True)
                 return None, *(None if each is None else taken(each, shape) for each, shape in shaped)
 
-    return Rendering
+    return TorchImage

@@ -105,6 +105,10 @@ def test_a_configuration_names_the_file(experiment: Path) -> None:
     code, _, err = outcome("optimize", "--resume", "runs/tiny", "--allow-code", *settings("run.iterations=4"))
     assert code == 2
     assert "integrator.estimator: has changed since" in err
+    Path("mine.py").write_text(CODE.replace("def kept", "def keep"))
+    code, _, err = outcome("optimize", "tiny.yaml", "--allow-code", *SHORT, *named)  # a new run loads the file again
+    assert code == 2
+    assert "Twice lacks kept" in err
 
 
 def test_gradcheck_names_the_file(experiment: Path) -> None:
