@@ -8,8 +8,10 @@ chooses the libLLVM that Dr.Jit loads.
 - `render`, `gradient`, `gradcheck`, `convergence` and `export` run the commands of the same name on an experiment.
 - `Callback` receives the progress of a run; `TensorBoard`, `MLflow` and `WandB` log it.
 - `register` registers the plugins with Mitsuba.
+- `register_estimator` adds an estimator of your own to the integrator `reslrb`, and `check_estimator` checks it.
 - `load_scene` loads a scene whose parameters have the same names as on the command line.
 - `step` computes one gradient step.
+- `torch.render` renders an image that PyTorch differentiates.
 
 `__all__` lists the public names.
 """
@@ -32,10 +34,12 @@ from reslrb_cli.backend import llvm as _llvm  # noqa: E402
 from reslrb_cli.version import __version__  # noqa: E402
 
 if TYPE_CHECKING:
-    from reslrb_cli.api.experiment import convergence, export, gradcheck, gradient, load, render
+    from reslrb_cli.api import torch
+    from reslrb_cli.api.experiment import check_estimator, convergence, export, gradcheck, gradient, load, render
     from reslrb_cli.api.run import Run, optimize
     from reslrb_cli.config.schema import Config
     from reslrb_cli.errors import ConfigError, ReslrbError
+    from reslrb_cli.estimators import register_estimator
     from reslrb_cli.integrators.plugin import register
     from reslrb_cli.integrators.step import gradient_step as step
     from reslrb_cli.records.metrics import Record
@@ -55,6 +59,7 @@ __all__ = [
     "TensorBoard",
     "WandB",
     "__version__",
+    "check_estimator",
     "convergence",
     "export",
     "gradcheck",
@@ -63,8 +68,10 @@ __all__ = [
     "load_scene",
     "optimize",
     "register",
+    "register_estimator",
     "render",
     "step",
+    "torch",
 ]
 
 # Dr.Jit loads libLLVM on another thread during its import, so the choice must be made before.
@@ -72,7 +79,7 @@ _llvm.prepare()
 
 _LAZY = {
     **{name: ("reslrb_cli.api.experiment", name)
-       for name in ("convergence", "export", "gradcheck", "gradient", "load", "render")},
+       for name in ("check_estimator", "convergence", "export", "gradcheck", "gradient", "load", "render")},
     **{name: ("reslrb_cli.runs.loggers", name) for name in ("MLflow", "TensorBoard", "WandB")},
     **{name: ("reslrb_cli.runs.callbacks", name) for name in ("Callback", "RunInfo")},
     "Config": ("reslrb_cli.config.schema", "Config"),
@@ -83,7 +90,9 @@ _LAZY = {
     "load_scene": ("reslrb_cli.scene.load", "load_for_script"),
     "optimize": ("reslrb_cli.api.run", "optimize"),
     "register": ("reslrb_cli.integrators.plugin", "register"),
+    "register_estimator": ("reslrb_cli.estimators", "register_estimator"),
     "step": ("reslrb_cli.integrators.step", "gradient_step"),
+    "torch": ("reslrb_cli.api.torch", ""),  # the module
 }  # fmt: skip
 
 
@@ -92,6 +101,7 @@ def __getattr__(name: str) -> Any:
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, its_name = _LAZY[name]
-    value = getattr(importlib.import_module(module), its_name)
+    found = importlib.import_module(module)
+    value = getattr(found, its_name) if its_name else found
     globals()[name] = value
     return value

@@ -242,7 +242,9 @@ def python_reference() -> str:
     """Return the end of docs/python.md: all public names with their signatures and docstrings."""
     public = [name for name in reslrb_cli.__all__ if not name.startswith("_")]
     names = [*_FIRST, *(name for name in public if name not in _FIRST)]
-    return "\n".join([_PYTHON, *("\n".join(_described(name, getattr(reslrb_cli, name))) for name in names)])
+    things = {name: getattr(reslrb_cli, name) for name in names}
+    things["torch.render"] = things.pop("torch").render  # of the module
+    return "\n".join([_PYTHON, *("\n".join(_described(name, thing)) for name, thing in things.items())])
 
 
 def _described(name: str, thing: Any) -> Iterator[str]:

@@ -36,6 +36,8 @@ from reslrb_cli.records.run_folder import recovered
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from reslrb_cli.estimators.base import Estimator
+
 Array: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 #: Description of an experiment: a configuration file, a run folder, a mapping with the content of YAML, or a `Config`.
 Experiment: TypeAlias = "Config | str | os.PathLike[str] | Mapping[str, Any]"
@@ -308,6 +310,72 @@ def gradcheck(
             for line in look_into(check, records, stop, logger.debug):
                 logger.info(line)
         return records
+
+
+#: Scenes of `check_estimator`: factors of zero, roulette, emission, a closed sphere, glossy surfaces, masks, glass, a
+#: film's border, and dL/dI of both signs. References: differences, `ptracer`, `prb`, and exact values.
+CHECKED = ("albedo_0_in_one_channel", "albedo_1e-6_roulette", "black_lamp", "furnace", "roughplastic_0.1",
+           "opacity_texture_0_and_1", "nested_dielectrics", "film_crop", "negative_loss")  # fmt: skip
+
+
+def check_estimator(
+    estimator: str | type[Estimator],
+    scenes: Sequence[str] = CHECKED,
+    seeds: int | None = None,
+    allow_code: bool = False,
+) -> list[GradcheckRecord]:
+    """Compare the gradients of an estimator with independent references, in standard errors.
+
+    The scenes are those of the extreme suite (docs/extreme.md). The references are finite differences, `ptracer`,
+    `prb`, exact values, and naive AD of the same paths. Each comparison is one record with the fields of `gradcheck`:
+    `record.holds` is False if the comparison fails, and `record.case` is the scene. The log (`logging.INFO`) names each
+    scene. The default scenes take minutes, mostly for the compilation of kernels.
+
+    - `estimator`: a class derived from `reslrb_cli.estimators.base.Estimator`, a registered or built-in name, or
+        `FILE.py:CLASS`.
+    - `scenes`: names of scenes.
+    - `seeds`: number of seeds, at least 3. None: as many as each scene needs.
+    - `allow_code`: permit running the file.
+
+    An interrupt stops the check after the current scene. Sets the variant of `variant: auto` if none is set. Raises
+    ConfigError.
+    """
+    with called() as stop:
+        if seeds is not None and seeds < 3:
+            raise ConfigError("seeds", "", f"is {seeds}; at least 3 are needed")
+        keep_variant("auto", "check_estimator")
+        from reslrb_cli.config.base import is_code
+        from reslrb_cli.estimators import ESTIMATORS, check_own
+        from reslrb_cli.integrators.own import load_estimator
+        from reslrb_cli.measure.extreme import CASES
+        from reslrb_cli.measure.extreme.suite import run_case
+
+        unknown = [name for name in scenes if name not in CASES]
+        if unknown:
+            raise ConfigError("scenes", "", f"has {one_line(repr(unknown[0]), 60)}, which is no scene of the suite")
+        if isinstance(estimator, str) and is_code(estimator):
+            if not allow_code:
+                reason = f"would run the code of {estimator} with all your rights; allow_code=True permits it"
+                raise ConfigError("estimator", "", reason)
+            estimator = ESTIMATORS[load_estimator(os.path.abspath(estimator), "estimator", "")]
+        if isinstance(estimator, str):
+            if estimator not in ESTIMATORS:
+                raise ConfigError("estimator", "", f"there is no `{estimator}`; there are {', '.join(ESTIMATORS)}")
+            name = estimator
+        else:
+            check_own(estimator, "estimator")
+            name = "checked"
+            ESTIMATORS[name] = estimator
+        try:
+            found: list[GradcheckRecord] = []
+            for scene in scenes:
+                if not stop():
+                    logger.info(f"checking {scene}: {CASES[scene].about}")
+                    found += run_case(CASES[scene], [name], seeds)
+        finally:
+            if name == "checked":
+                del ESTIMATORS[name]
+        return found
 
 
 def convergence(

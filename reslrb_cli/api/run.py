@@ -28,7 +28,7 @@ from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import check_output
 from reslrb_cli.runs.callbacks import Callback
-from reslrb_cli.runs.loggers import Callbacks, made
+from reslrb_cli.runs.loggers import Callbacks, callbacks_of
 from reslrb_cli.runs.prepare import PreparedRun, begin
 from reslrb_cli.runs.recorder import Recording
 from reslrb_cli.runs.resume import open_earlier
@@ -125,9 +125,10 @@ class Run:
         """Yield the records of the remaining iterations, and write them if the run has a folder."""
         if self._stopped and self._writes and self._folder is not None:
             with called():
-                self._stack, self._begun, self._writes = _reopened(  # also restores a scene in memory
-                    self._folder, (), self.config.own_loss, self.config.allows_code, self.config.own_scene
-                )
+                self._stack, self._begun, self._writes, _ = _reopened(  # also restores a scene in memory
+                    self._folder, (), self.config.own_loss, self.config.allows_code, lambda _: self._callbacks,
+                    self.config.own_scene,
+                )  # fmt: skip
                 self._uses = self._scene_uses()
         self._stopped, self._status, self._failure = True, Status.RUNNING, None
         course = self._begun.course
@@ -329,14 +330,14 @@ def optimize(
     `loss` is your own loss function, `loss(image, target)` or `loss(image, target, weights)`. The arguments are
     `mi.TensorXf` (height, width, channels). The image tracks derivatives. The loss function returns a `mi.Float` of
     width 1 or a tensor with one entry. Pass it again with `resume`. `allow_code` permits running the code files that
-    the experiment names (`loss.file`, `integrator.file`).
+    the experiment names (`loss.file`, `integrator.file`, `run.callbacks`).
 
     `scene` replaces the scene of the experiment: a dictionary as for `mi.load_dict`, or an `mi.Scene` (see `load`). At
     the end of a loop, an `mi.Scene` has the recovered values, without derivatives. Only one run at a time can use it,
     and the run cannot be resumed from its folder.
 
-    `callbacks` receive the progress of the run (`Callback`). The names `"tensorboard"`, `"mlflow"` and `"wandb"` stand
-    for `TensorBoard()`, `MLflow()` and `WandB()`.
+    `callbacks` receive the progress of the run (`Callback`), after those of `run.callbacks`. The names `"tensorboard"`,
+    `"mlflow"` and `"wandb"` stand for `TensorBoard()`, `MLflow()` and `WandB()`.
 
     Before returning, `optimize` sets the experiment's Mitsuba variant if none is set. `optimize` loads and checks all
     files and makes the target. `optimize` also chooses the settings that the experiment leaves to measurement. Raises
@@ -354,7 +355,6 @@ def optimize(
             Override("folder", ("run", "name"), path.name),
         ]
     with called():
-        listeners = made(callbacks, "callbacks")
         if resume is not None:
             if folder is not None:
                 raise ConfigError("folder", "", "cannot be given with resume; copy the folder, and resume the copy")
@@ -363,7 +363,8 @@ def optimize(
             if scene is not None:
                 raise ConfigError("scene", "", "cannot be given with resume, which uses that of the run")
             earlier = as_path(resume, "resume", "the folder of a run")
-            run = Run(*_reopened(earlier, put_in, loss, allow_code), listeners)
+            listen = functools.partial(callbacks_of, more=callbacks, source="callbacks")
+            run = Run(*_reopened(earlier, put_in, loss, allow_code, listen))
             run._folder = earlier
             return run
         if experiment is None:
@@ -375,6 +376,7 @@ def optimize(
             except ConfigError as error:
                 raise ConfigError("folder", "", error.message) from None
         variant = keep_variant(config.variant, config.source)
+        listeners = callbacks_of(config, callbacks, "callbacks")
         begun = begin(config, variant, logger.info, logger.warning)
         return Run(contextlib.ExitStack(), begun, folder is not None, listeners)
 
@@ -389,16 +391,19 @@ def _with_own(config: Config, loss: Loss | None, allow_code: bool) -> Config:
 
 
 def _reopened(
-    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool, scene: Any = None
-) -> tuple[contextlib.ExitStack, PreparedRun, bool]:
-    """Return the lock stack, the prepared run to resume, and True if iterations are left. The stack holds the lock of
-    the run folder.
+    folder: Path, put_in: Sequence[Override], loss: Loss | None, allow_code: bool,
+    listen: Callable[[Config], Sequence[Callback]], scene: Any = None,
+) -> tuple[contextlib.ExitStack, PreparedRun, bool, Sequence[Callback]]:  # fmt: skip
+    """Return the lock stack, the prepared run to resume, True if iterations are left, and the callbacks that `listen`
+    makes for its configuration. The stack holds the lock of the run folder.
     """
     with contextlib.ExitStack() as stack:
         earlier = stack.enter_context(open_earlier(folder, put_in))
         earlier.config = _with_own(earlier.config, loss, allow_code).with_scene(scene)
         variant = keep_variant(earlier.settled.variant, earlier.config.source)
+        listeners = listen(earlier.config)
         begun = earlier.begin(variant, logger.info, logger.warning)
         if earlier.is_done:
             logger.warning("%s", earlier.done_line("the override", ": "))
-        return contextlib.ExitStack() if earlier.is_done else stack.pop_all(), begun, not earlier.is_done
+        kept = contextlib.ExitStack() if earlier.is_done else stack.pop_all()
+        return kept, begun, not earlier.is_done, listeners

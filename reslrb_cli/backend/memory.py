@@ -12,9 +12,9 @@ import drjit as dr
 import numpy as np
 
 
-def own_memory(kind: type[Any], array: np.ndarray[Any, Any]) -> Any:
-    """Return `array` (n,) as an evaluated flat array of type `kind` with the same bits."""
-    given = kind(np.ascontiguousarray(array))
+def own_memory(kind: type[Any], array: Any) -> Any:
+    """Return `array` (n,), of NumPy or torch, as an evaluated flat array of type `kind` with the same bits."""
+    given = kind(np.ascontiguousarray(array) if isinstance(array, np.ndarray) else array)
     copy = dr.empty(kind, dr.width(given))
     # A gather in index order would return the array itself.
     dr.scatter(copy, given, dr.arange(dr.uint32_array_t(kind), dr.width(given)))

@@ -88,7 +88,7 @@ class OptimizeOptions(ExperimentOptions):
 @click.option(
     "--log", multiple=True, metavar="NAME",
     help="Also log the run to tensorboard, mlflow or wandb (`pip install 'reslrb[tensorboard]'`, ...), or to a "
-    "callback that another package offers under this name. May be repeated.",
+    "callback that another package offers under this name. Adds to run.callbacks. May be repeated.",
 )  # fmt: skip
 @click.option("--quiet", is_flag=True, help="Print only the last line.")
 def command(**given: Any) -> int:
@@ -130,8 +130,8 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -
     check_output(config_file, config.run.output)
     if workers is not None:
         workers.check()
-    callbacks = _callbacks(options)
     variant = start_variant(config)
+    callbacks = _callbacks(config, options)
     if options.dry_run:
         show_forecast(config)
         return ExitCode.DONE
@@ -141,13 +141,11 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -
     return _run(begin(config, variant, logger.info, logger.warning), workers, callbacks, options.quiet)
 
 
-def _callbacks(options: OptimizeOptions) -> list[Callback]:
-    """Return the callbacks of `--log`. Raises ConfigError."""
-    if not options.log:
-        return []
-    from reslrb_cli.runs.loggers import made
+def _callbacks(config: Config, options: OptimizeOptions) -> list[Callback]:
+    """Return the callbacks of `run.callbacks` and `--log`. Raises ConfigError."""
+    from reslrb_cli.runs.loggers import callbacks_of
 
-    return made(options.log, "--log")
+    return callbacks_of(config, options.log, "--log")
 
 
 def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
@@ -161,8 +159,8 @@ def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
         _check_shards(config, workers)
         if workers is not None:
             workers.check()
-        callbacks = _callbacks(options)
         variant = start_variant(config.model_copy(update={"variant": earlier.settled.variant}))
+        callbacks = _callbacks(config, options)
         begun = earlier.begin(variant, logger.info, logger.warning)
         logger.info(f"continuing {run} after {earlier.iteration} of {config.run.iterations} iterations")
         return _run(begun, workers, callbacks, options.quiet)
@@ -180,12 +178,16 @@ def _run(begun: PreparedRun, workers: Place | None, callbacks: list[Callback], q
             return _run(begun, None, callbacks, quiet)
     from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.records.manifest import Status
+    from reslrb_cli.records.run_folder import link_latest
+    from reslrb_cli.records.sweeps import is_sweep
     from reslrb_cli.report.run_summary import last_line, parameter_lines, terminal_width
     from reslrb_cli.runs.recorder import Recording
 
     course, manifest = begun.course, begun.manifest
     iterations = course.problem.config.run.iterations
     with Interrupts(notice=None if quiet else NOTICE) as interrupts, begun.place() as place:
+        if not course.done and not is_sweep(place.path.parent):
+            link_latest(place.path)
         recording = Recording(course, place, manifest, begun.calls(callbacks, place.path), begun.said)
         interrupts.last_act = recording.abandon
         with Progress(iterations, quiet, course.results.meter, course.done) as progress:

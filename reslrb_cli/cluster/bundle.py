@@ -70,7 +70,7 @@ def bundle_of(config: Config, values: Values) -> Bundle:
         scene["cameras"] = f"{FILES}/colmap/{cameras.name}"
     bundle.files[SCENE_FILE] = _scene_text(bundle, config).encode()
     scene |= {"file": SCENE_FILE, "options": {}}
-    data["run"]["output"] = "runs"
+    data["run"] |= {"output": "runs", "callbacks": []}
     for parameter in data["parameters"]:
         parameter.pop("initial", None)
     shown = {name: data.pop(name) for name in ("target", "views") if name in data}

@@ -132,6 +132,22 @@ def code_place(value: Any, info: ValidationInfo) -> str:
 CodePlace = Annotated[str, BeforeValidator(code_place)]
 
 
+def named_or_code(value: Any, info: ValidationInfo) -> str:
+    """Return a name unchanged, and FILE.py:NAME with an absolute path. Raises as `config_path` does."""
+    if not isinstance(value, str) or not value.strip():
+        raise wrong("must be a name, or FILE.py:NAME")
+    return code_place(value, info) if is_code(value) else value
+
+
+#: A name, or FILE.py:NAME of a user's own code.
+NamedOrCode = Annotated[str, BeforeValidator(named_or_code)]
+
+
+def is_code(name: str) -> bool:
+    """Return whether a `NamedOrCode` is code of the user."""
+    return ":" in name or name.endswith(".py")
+
+
 def code_file(place: str) -> Path:
     """Return the file of a `CodePlace`."""
     return Path(place.rpartition(":")[0])

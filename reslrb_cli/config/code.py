@@ -54,6 +54,8 @@ def guarded(source: object, key: str, file: Path | None, what: str) -> Iterator[
     except (Exception, SystemExit) as error:
         if is_out_of_memory(error) or is_machine_fault(error):
             raise
+        while isinstance(error.__cause__, Exception) and "encountered an exception (see above)" in str(error):
+            error = error.__cause__  # the error in a loop or an indirect call of Dr.Jit
         trace = traceback.extract_tb(error.__traceback__)
         lines = [each.lineno for each in trace if file and each.filename == str(file)]
         if isinstance(error, SyntaxError) and error.filename == str(file):

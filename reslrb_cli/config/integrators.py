@@ -6,11 +6,16 @@ The limits on samples, passes and paths are checked here, before a scene is load
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     Discriminator,
     Field,
+    PlainSerializer,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WithJsonSchema,
+    WrapValidator,
     model_validator,
 )
 from typing_extensions import Self
@@ -23,6 +28,8 @@ from reslrb_cli.config.base import (
     CodePlace,
     Count,
     code_file,
+    code_place,
+    is_code,
     located,
     mark,
 )  # fmt: skip
@@ -88,6 +95,21 @@ UNDECIDED: dict[str, str | float] = {
 #: The estimator for `auto`: only `stack` has derivatives of camera paths and both `follow` and `stay`.
 AUTO_ESTIMATOR = "stack"
 
+_OWN_SCHEMA = WithJsonSchema(
+    {"anyOf": [{"enum": [*ESTIMATOR_OPTIONS], "type": "string"}, {"pattern": r"\.py:\w+$", "type": "string"}]}
+)
+
+#: Names of estimators that the user has registered in this process (`rl.register_estimator`).
+OWN_ESTIMATORS: set[str] = set()
+
+
+def _own_estimator(value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+    """Return the name of one of the user's estimators. Other values pass on to `handler`."""
+    if isinstance(value, str) and is_code(value):
+        return code_place(value, info)
+    return value if value in OWN_ESTIMATORS else handler(value)
+
+
 #: All options that select or configure the estimator.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 
@@ -97,11 +119,16 @@ class Reslrb(AttachingTracer):
 
     type: Literal["reslrb"] = "reslrb"
     """Light tracing that computes derivatives by replaying each path."""
-    estimator: Literal["auto", "reservoir", "gather", "event", "stack"] = "auto"
+    estimator: Annotated[
+        Literal["auto", "reservoir", "gather", "event", "stack"],
+        WrapValidator(_own_estimator), PlainSerializer(str, return_type=str), _OWN_SCHEMA,
+    ] = "auto"  # fmt: skip
     """How the connections of a path enter its gradient. `reservoir`: a few connections, selected at random. `gather`:
     all connections, by a second traversal. `event`: a few scattering events, selected at random. `stack`: all
     connections, stored in thread-local memory. `auto`: `stack`, the most efficient one in every experiment on CPUs.
-    On a GPU, `event` was more efficient in configs/cornell_floor.yaml."""
+    On a GPU, `event` was more efficient in configs/cornell_floor.yaml. `FILE.py:CLASS`: your own estimator, a file
+    relative to the config file and a class in it, which needs `--allow-code` on the command line
+    ([Your own estimator](your_estimator.md))."""
     capacity: Annotated[Count, Field(le=CAPACITY)] = 1
     """Number of connections (`reservoir`) or scattering events (`event`) that are stored for each path. Each adds
     code to the kernel; `gather` uses all connections. Only with estimators `reservoir` and `event`."""
@@ -189,7 +216,17 @@ class Reslrb(AttachingTracer):
 
     def idle(self) -> set[str]:
         """Return the options that belong only to other estimators."""
-        return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS[self.estimator]}
+        return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS.get(self.estimator, ())}
+
+    @property
+    def file(self) -> str | None:
+        """FILE.py:CLASS of the user's estimator, or None."""
+        return self.estimator if is_code(self.estimator) else None
+
+    @property
+    def path(self) -> Path | None:
+        """The file of code, or None."""
+        return None if self.file is None else code_file(self.file)
 
 
 class Ptracer(LightTracerOptions, json_schema_extra=NEEDS_TYPE):

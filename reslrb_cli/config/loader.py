@@ -14,10 +14,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from reslrb_cli.config.base import code_file
 from reslrb_cli.config.errors import SettingError, problems
 from reslrb_cli.config.files import read_file
-from reslrb_cli.config.integrators import Own
-from reslrb_cli.config.optimizers import Custom
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import UNFIT, Location, format_location, parse, write
 from reslrb_cli.errors import ConfigError, one_line
@@ -206,18 +205,18 @@ def told(first: Mapping[str, Any]) -> Config:
     return loads(first["config"], first["source"]).with_code(first.get("allow_code") is True)
 
 
-def check_code(config: Config, codes: Mapping[str, Custom | Own] | None = None) -> None:
+def check_code(config: Config, places: Mapping[str, str | None] | None = None) -> None:
     """Raise ConfigError, located by the key, if users' code must not run. Loads nothing.
 
-    `codes` maps keys to the settings that name users' code. If `codes` is None, check all the experiment's code
-    settings.
+    `places` maps keys to FILE.py:NAME, or to None for a function in memory. If `places` is None, check the losses and
+    integrators of the experiment.
     """
-    for key, one in (config.codes if codes is None else codes).items():
-        if one.file is None and config.own_loss is None:
+    for key, place in ({key: one.file for key, one in config.codes.items()} if places is None else places).items():
+        if place is None and config.own_loss is None:
             reason = "missing; give FILE.py:NAME, or in Python the same function as at the start of the run"
             raise ConfigError(config.source, key, reason)
-        if one.file is not None and not config.allows_code:
-            reason = f"would run the code of {one.path} with all your rights; --allow-code permits it"
+        if place is not None and not config.allows_code:
+            reason = f"would run the code of {code_file(place)} with all your rights; --allow-code permits it"
             raise ConfigError(config.source, key, reason)
 
 

@@ -13,7 +13,19 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from reslrb_cli.config.base import Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
+from reslrb_cli.config.base import (
+    Count,
+    NamedOrCode,
+    Positive,
+    Section,
+    Seed,
+    WorkPath,
+    by_kind,
+    is_code,
+    located,
+    mark,
+    wrong,
+)
 from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.views import SensorName
 
@@ -145,6 +157,17 @@ class RunConfig(Section):
     checkpoint_every: CheckpointEvery = CheckpointEvery(seconds=30.0)
     """`iterations` or `seconds` between two checkpoints, for `reslrb optimize --resume`. A run also writes a checkpoint
     before the first iteration and at its end, unless it is killed."""
+
+    callbacks: list[NamedOrCode] = Field(default=[])
+    """Loggers and callbacks of the run ([Loggers and callbacks](python.md#loggers-and-callbacks)): `tensorboard`,
+    `mlflow`, `wandb`, a name that another package offers, or `FILE.py:CLASS`, a file relative to the config file and
+    a class in it, which is called without arguments. Files need `--allow-code` on the command line. `--log NAME` adds
+    to the list."""
+
+    @property
+    def code_callbacks(self) -> dict[str, str]:
+        """FILE.py:CLASS of the user's own callbacks, by key."""
+        return {f"run.callbacks[{n}]": name for n, name in enumerate(self.callbacks) if is_code(name)}
 
     def idle(self) -> set[str]:
         return set() if self.adjoint in ("auto", "batched") else {"batches"}

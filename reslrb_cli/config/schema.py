@@ -229,12 +229,19 @@ class Config(Section):
         return config
 
     @property
-    def codes(self) -> dict[str, Custom | Own]:
-        """The user's own losses and integrators, as a mapping from the key that names each file."""
+    def codes(self) -> dict[str, Custom | Own | ReslrbConfig]:
+        """The user's own losses, integrators and estimators, as a mapping from the key that names each file."""
         integrators: dict[str, Integrator | None] = {"integrator": self.integrator}
         if self.target.render is not None:
             integrators["target.render.integrator"] = self.target.render.integrator
-        own: dict[str, Custom | Own] = {f"{key}.file": one for key, one in integrators.items() if isinstance(one, Own)}
+        own: dict[str, Custom | Own | ReslrbConfig] = {
+            f"{key}.file": one for key, one in integrators.items() if isinstance(one, Own)
+        }
+        own |= {
+            f"{key}.estimator": one
+            for key, one in integrators.items()
+            if isinstance(one, ReslrbConfig) and one.file is not None
+        }
         return own | {key: one for key, one in loss_keys("file", self.loss) if isinstance(one, Custom)}
 
     @property

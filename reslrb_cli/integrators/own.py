@@ -1,4 +1,4 @@
-"""User-defined integrators that are loaded from a file. Each error message has one line.
+"""User-defined integrators and estimators that are loaded from a file. Each error message has one line.
 
 User-defined integrators need Mitsuba's methods `render` and `render_backward`. `mi.ad.integrators.common.ADIntegrator`
 and `RBIntegrator` provide both methods for classes with `sample`.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -16,8 +17,43 @@ import mitsuba as mi
 from reslrb_cli.config.base import code_file
 from reslrb_cli.config.code import guarded, load_named
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.estimators import add_own, check_own
+from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.integrators.baselines import Replayed
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
+from reslrb_cli.scene.files import digest_of
+
+#: Digests of the files of estimators that have been loaded, by FILE.py:CLASS.
+_loaded: dict[str, str] = {}
+
+
+def load_estimator(place: str, source: object, key: str) -> str:
+    """Load the estimator FILE.py:CLASS, unless the same file is already loaded. Return its name in `ESTIMATORS`.
+
+    The caller has checked that the code may run. Raises ConfigError, located at `key` of `source`.
+    """
+    file, _, name = place.rpartition(":")
+    digest = digest_of(Path(file))
+    if _loaded.get(place) != digest:
+        kind = load_named(Path(file), name, source, key)
+        check_own(kind, source, key)
+        add_own(place, _with_guards(kind, Path(file), name))
+        _loaded[place] = digest
+    return place
+
+
+def _with_guards(kind: Any, file: Path, name: str) -> type[Estimator]:
+    """Return the class with methods whose errors have one line."""
+
+    def forward(self: Estimator, p: Pass) -> Any:
+        with guarded(file, name, file, "its forward"):
+            return kind.forward(self, p)
+
+    def backward(self: Estimator, p: Pass, state: Any) -> None:
+        with guarded(file, name, file, "its backward"):
+            kind.backward(self, p, state)
+
+    return type(kind.__name__, (kind,), {"forward": forward, "backward": backward, "__doc__": kind.__doc__})
 
 
 class OwnIntegrator(StepIntegrator):

@@ -131,13 +131,10 @@ def gradient_step(
 
     Raises ValueError for invalid arguments, and BackendError under an unsupported variant of Mitsuba.
     """
-    check_variant(mi.variant())
+    job = make_job(scene, sensor, seed, spp, params)
     one_of("adjoint", adjoint, get_args(Adjoint))
-    _check_number("spp", spp, 0, PASSES * PASS_SAMPLES)
     _check_number("batches", batches, 2 if adjoint == "batched" else 1, PASSES)
-    if isinstance(seed, Integral):
-        _check_number("seed", seed, 0, 2**32 - 1)
-    work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
+    work = interface_of(integrator)
     if adjoint == "batched":
         return _batched(work, job, objective, batches, on_samples)
     refused = Refused()
@@ -171,7 +168,7 @@ def known_step(
     """
     refused = Refused()
     gradient = refused.take(dr.detach(gradient))
-    image = interface_of(integrator).known(_job(scene, sensor, seed, spp, params), gradient)
+    image = interface_of(integrator).known(make_job(scene, sensor, seed, spp, params), gradient)
     return StepResult(image, dr.sum((image * gradient).array), refused)
 
 
@@ -183,7 +180,7 @@ def given_step(
 
     `gradient` must be finite and come from other samples. The other arguments are those of `gradient_step`.
     """
-    _differentiate(interface_of(integrator), _job(scene, sensor, seed, spp, params), gradient, on_samples)
+    _differentiate(interface_of(integrator), make_job(scene, sensor, seed, spp, params), gradient, on_samples)
 
 
 def _check_number(name: str, value: object, least: int, most: int) -> None:
@@ -202,7 +199,15 @@ def _differentiate(work: StepIntegrator, job: Job, gradient: mi.TensorXf, on_sam
         on_samples(work.known(job, gradient), gradient)
 
 
-def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: mi.SceneParameters | None) -> Job:
+def make_job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: mi.SceneParameters | None) -> Job:
+    """Return a job from a user's arguments. `params` are by default `mi.traverse(scene)`.
+
+    Raises ValueError, and BackendError under an unsupported variant.
+    """
+    check_variant(mi.variant())
+    _check_number("spp", spp, 0, PASSES * PASS_SAMPLES)
+    if isinstance(seed, Integral):
+        _check_number("seed", seed, 0, 2**32 - 1)
     image_seed = mi.UInt32(seed)
     dr.make_opaque(image_seed)
     return Job(

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
-from reslrb_cli.config.base import code_file
+from reslrb_cli.config.base import code_file, is_code
 from reslrb_cli.config.integrators import (
     AUTO_ESTIMATOR,
     ESTIMATOR_OPTIONS,
@@ -68,7 +68,7 @@ _ESTIMATOR_OPTIONS |= set(UNDECIDED)
 _OPTION = "--integrators"
 #: A user's own integrator.
 _OWN = re.compile(r"(?P<file>[^()]+\.py):(?P<name>\w+)(?:\((?P<options>.*)\))?")
-_ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
+_ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+|[^():]+\.py:\w+))?(?:\((?P<options>.*)\))?")
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Case:
             if values.get(option) == "auto" and not auto:
                 raise ConfigError(blame, option, f"`auto` is for whole runs; use `{fixed}`, or another value")
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
-        if self.type == "custom" and not config.allows_code:
+        if getattr(made.integrator, "file", None) is not None and not config.allows_code:
             raise ConfigError(blame, "", "would run with all your rights; --allow-code permits it")
         return made
 
@@ -141,11 +141,12 @@ def parse_cases(text: str, source: str = _OPTION) -> list[Case]:
     """
     cases: list[Case] = []
     for item in _split(text):
-        if match := _OWN.fullmatch(item):
-            place = f"{Path(match['file']).expanduser().absolute()}:{match['name']}"
-            kind, options = "custom", {"file": place}
-        elif match := _ITEM.fullmatch(item):
+        if match := _ITEM.fullmatch(item):
             kind, options = match["type"], {} if match["estimator"] is None else {"estimator": match["estimator"]}
+            if ":" in (match["estimator"] or ""):
+                options = {"estimator": _absolute(*match["estimator"].rsplit(":", 1))}
+        elif match := _OWN.fullmatch(item):
+            kind, options = "custom", {"file": _absolute(match["file"], match["name"])}
         else:
             wanted = "TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or FILE.py:CLASS"
             raise ConfigError(source, "", f"`{item}` is not an integrator; write {wanted}")
@@ -162,6 +163,11 @@ def parse_cases(text: str, source: str = _OPTION) -> list[Case]:
             raise ConfigError(source, "", f"`{item}` is given twice")
         cases.append(case)
     return cases
+
+
+def _absolute(file: str, name: str) -> str:
+    """Return FILE.py:NAME with an absolute path."""
+    return f"{Path(file).expanduser().absolute()}:{name}"
 
 
 def parse_checked(text: str) -> list[Case]:
@@ -233,8 +239,9 @@ def with_run(config: Config, **changes: Any) -> Config:
 
 
 def code_files(cases: Iterable[Case]) -> dict[str, Path]:
-    """Return the files of the user's own integrators among `cases`, by label."""
-    return {case.label: code_file(case.options["file"]) for case in cases if case.type == "custom"}
+    """Return the files of the user's own integrators and estimators among `cases`, by label."""
+    places = {case.label: str(case.options.get("file") or case.options.get("estimator", "")) for case in cases}
+    return {label: code_file(place) for label, place in places.items() if is_code(place)}
 
 
 def kept_settings(

@@ -12,7 +12,7 @@ import numpy as np
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ATTACHED
-from reslrb_cli.integrators.own import OwnIntegrator
+from reslrb_cli.integrators.own import OwnIntegrator, load_estimator
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
@@ -311,6 +311,8 @@ class Participants:
                 options |= {"paths": "light", "light_share": 0.5}
             if kind == "reslrb":  # as in a run
                 options["freeze"] = True
+                if (place := getattr(config.integrator, "file", None)) is not None:
+                    load_estimator(place, "--integrators", label)
             made[label] = make_integrator(kind, **options)
             if label in self.unguided:
                 made[_alike(label, Reference.UNGUIDED)] = make_integrator(kind, **options | {"guiding": "on"})

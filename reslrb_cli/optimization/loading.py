@@ -15,11 +15,13 @@ import numpy as np
 from reslrb_cli.config.base import size_of
 from reslrb_cli.config.integrators import Integrator, Own, WalkAdConfig
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import IN_MEMORY, Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.context import sensors_in_words
 from reslrb_cli.integrators.freezing import MOST_PATHS_APART
+from reslrb_cli.integrators.own import load_estimator
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
@@ -248,6 +250,9 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
     options: dict[str, Any] = integrator.options()
     if isinstance(integrator, ReslrbConfig):
         options["freeze"] = True  # the launches of a step are recorded, so that its Python runs once
+        if integrator.file is not None:
+            check_code(config, {"integrator.estimator": integrator.file})
+            load_estimator(integrator.file, config.source, "integrator.estimator")
     if isinstance(integrator, Own):
         options["allowed"] = config.allows_code
     return make_integrator(integrator.type, **options)

@@ -167,7 +167,7 @@ class OwnLoss:
     def function(self) -> Callable[..., Any]:
         """Return the user's function, loaded. Raises ConfigError."""
         if self._takes_weights is None:
-            check_code(self._config, {self._place: self.spec})
+            check_code(self._config, {self._place: self.spec.file})
             if self.spec.path is not None:
                 self._function = load_named(self.spec.path, self.spec.name, self.source, self.key)
             assert self._function is not None

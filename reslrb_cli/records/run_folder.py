@@ -37,6 +37,9 @@ Array = np.ndarray[Any, Any]
 #: Maximum number of keys that an error names.
 _SHOWN = 3
 
+#: Name of the link to the newest run folder.
+LATEST = "latest"
+
 #: Fabrication data of the solid of a run.
 FABRICATION_FILE = "fabrication.json"
 
@@ -212,6 +215,20 @@ class RunFolder:
             self.lock.release()
 
 
+def link_latest(folder: Path) -> None:
+    """Let the link `latest` beside a run folder lead to the folder.
+
+    Does nothing if the name belongs to a file or a folder, or if the file system has no links. If two runs start at the
+    same time, the link leads to one of them.
+    """
+    link = folder.with_name(LATEST)
+    if os.path.lexists(link) and not link.is_symlink():
+        return
+    with contextlib.suppress(OSError), unfinished_folder(folder.parent) as part:
+        (part / LATEST).symlink_to(folder.name)
+        os.replace(part / LATEST, link)
+
+
 def _who_works(content: Mapping[str, Any]) -> str:
     """Return the process that uses a folder, from the content of its manifest."""
     holder = Holder.from_json(content.get("process"))
@@ -232,6 +249,8 @@ def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
     Raises a ConfigError that names the folder if the folder is not a run folder or is in use.
     """
     content = _manifest_of(path)
+    if path.is_symlink():  # `latest` may lead to another folder soon
+        path = Path(os.path.realpath(path))
     in_use = ConfigError(path, "", f"is in use by a run ({_who_works(content)}); end that first")
     try:
         lock = FolderLock(Path(os.path.realpath(path)))

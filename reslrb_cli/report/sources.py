@@ -102,8 +102,13 @@ Source = ShownRun | Measurements | SweepRuns
 
 
 def read_sources(paths: Sequence[Path]) -> list[Source]:
-    """Read the source at each path. Raises a ConfigError that names the first path that a page cannot show."""
+    """Read the source at each path, but no link to another of the paths, such as `runs/latest` in `runs/*`.
+
+    Raises a ConfigError that names the first path that a page cannot show.
+    """
     found: list[Source] = []
+    others = {os.path.realpath(path) for path in paths if not path.is_symlink()}
+    paths = [path for path in paths if not (path.is_symlink() and os.path.realpath(path) in others)]
     for path, name in zip(paths, _names(paths), strict=True):
         if not os.path.isdir(path):
             found.append(_read_file(path, name))

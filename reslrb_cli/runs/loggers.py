@@ -15,8 +15,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from reslrb_cli.config.code import guarded
+from reslrb_cli.config.base import code_file, is_code
+from reslrb_cli.config.code import guarded, load_named
+from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.parameters import HEIGHTMAP
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.images import as_bytes, finite_range, in_range
 from reslrb_cli.records.metrics import Record
@@ -26,7 +29,8 @@ from reslrb_cli.runs.callbacks import Array, Callback, RunInfo
 FEW = 4
 
 
-def _package(name: str, extra: str) -> Any:
+def package(name: str, extra: str) -> Any:
+    """Return the module `name`, which the extra `extra` of this package installs. Raises ConfigError without it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -87,7 +91,7 @@ class TensorBoard(_Logger):
     """
 
     def __init__(self, folder: str | os.PathLike[str] | None = None) -> None:
-        self._writers = _package("tensorboardX", "tensorboard")
+        self._writers = package("tensorboardX", "tensorboard")
         self._folder = folder
         self._writer: Any = None
 
@@ -120,7 +124,7 @@ class MLflow(_Logger):
     """
 
     def __init__(self) -> None:
-        self._mlflow = _package("mlflow", "mlflow")
+        self._mlflow = package("mlflow", "mlflow")
         self._owns = self._runs = False
 
     def _open(self, run: RunInfo) -> None:
@@ -156,7 +160,7 @@ class WandB(_Logger):
     """
 
     def __init__(self) -> None:
-        self._wandb = _package("wandb", "wandb")
+        self._wandb = package("wandb", "wandb")
         self._owns = False
         self._run: Any = None
 
@@ -194,27 +198,38 @@ GROUP = "reslrb.callbacks"
 Callbacks: TypeAlias = "Sequence[Callback | str]"
 
 
-def made(given: Callbacks, source: str) -> list[Callback]:
-    """Return the callbacks, with one made for each name. Raises ConfigError, located in `source`."""
-    if isinstance(given, str) or not isinstance(given, Sequence):
-        raise ConfigError(source, "", f"is {one_line(repr(given), 60)}, not a list of callbacks")
+def callbacks_of(config: Config, more: Callbacks, source: str) -> list[Callback]:
+    """Return the callbacks of `run.callbacks`, then those that `more` adds. A variant must be set.
+
+    A name in both counts once. Raises ConfigError, located in the configuration, or in `source` for `more`.
+    """
+    if isinstance(more, str) or not isinstance(more, Sequence):
+        raise ConfigError(source, "", f"is {one_line(repr(more), 60)}, not a list of callbacks")
+    check_code(config, config.run.code_callbacks)
+    places = [(each, config.source, f"run.callbacks[{n}]") for n, each in enumerate(config.run.callbacks)]
     found = []
-    for each in given:
-        one = _named(each, source) if isinstance(each, str) else each
+    for each, where, key in [*places, *((each, source, "") for each in more if each not in config.run.callbacks)]:
+        one = _named(each, where, key) if isinstance(each, str) else each
         if not isinstance(one, Callback):
             instead = "; call it" if inspect.isclass(one) and issubclass(one, Callback) else ""
-            raise ConfigError(source, "", f"has {one_line(repr(one), 60)}, which is no reslrb_cli.Callback{instead}")
+            raise ConfigError(where, key, f"has {one_line(repr(one), 60)}, which is no reslrb_cli.Callback{instead}")
         found.append(one)
     return found
 
 
-def _named(name: str, source: str) -> Any:
-    kind: Callable[[], Any] | None = LOGGERS.get(name)
+def _named(name: str, source: object, key: str) -> Any:
+    if is_code(name):
+        if not key:
+            raise ConfigError(source, "", f"a file is named by the setting `run.callbacks: [{name}]`")
+        file = code_file(name)
+        kind = load_named(file, name.rpartition(":")[2], source, key)
+        with guarded(source, key, file, "the callback"):
+            return kind()
     others = {point.name: point for point in entry_points(group=GROUP)}
-    if kind is None and name not in others:
-        raise ConfigError(source, "", f"there is no `{name}`; there are {', '.join(sorted({*LOGGERS, *others}))}")
-    with guarded(source, name, None, "the callback"):
-        return kind() if kind is not None else others[name].load()()
+    if name not in LOGGERS and name not in others:
+        raise ConfigError(source, key, f"there is no `{name}`; there are {', '.join(sorted({*LOGGERS, *others}))}")
+    with guarded(source, key or name, None, "the callback"):
+        return LOGGERS[name]() if name in LOGGERS else others[name].load()()
 
 
 def _plain(name: str) -> str:

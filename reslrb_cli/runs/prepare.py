@@ -65,7 +65,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
 
 #: Settings that do not affect the iterations done so far. A change of any other setting would make it another run.
 MAY_CHANGE = re.compile(
-    r"run\.(iterations|name|output|checkpoint_every|certainty|on_nonfinite|max_seconds)(\..*)?"
+    r"run\.(iterations|name|output|checkpoint_every|certainty|on_nonfinite|max_seconds|callbacks)(\..*)?"
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from reslrb_cli.config.base import SEED_END
+from reslrb_cli.config.base import SEED_END, code_file
 from reslrb_cli.config.files import NAME_BYTES, open_file
 from reslrb_cli.config.loader import Override, check_code, dump, loads, parse_override, read_text, replaces
 from reslrb_cli.config.run import folder_name
@@ -119,6 +119,7 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
     for name, chosen in zip(names, itertools.product(*(each.overrides for each in varied)), strict=True):
         config = _with_chosen(text, path, overrides, chosen, allow_code)
         check_code(config)
+        check_code(config, config.run.code_callbacks)
         open_file(config.scene.file).close()
         if config.run.seed != first:
             reason = f"is {config.run.seed}, but {first} in the first combination; {OWN['run', 'seed']}"
@@ -127,6 +128,7 @@ def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[s
         combinations.append(Combination(name, settings))
         configs[name] = config
     own = {one.path for config in configs.values() for one in config.codes.values() if one.path is not None}
+    own |= {code_file(place) for config in configs.values() for place in config.run.code_callbacks.values()}
     files = own.union(*(files_of(config).values() for config in configs.values()))
     digests = file_digests({str(file): file for file in sorted(files)})
     codes = {str(file): digests.pop(str(file)) for file in sorted(own)}

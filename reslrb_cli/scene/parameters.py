@@ -199,7 +199,7 @@ def set_values(
     given: dict[str, str] = {}
     for pattern, value in values.items():
         place = Place(source, f"{option}.{pattern}", lambda _: "")  # a number has no options
-        for key in [pattern] if pattern in names else _matching(selection.params, pattern, place, [*names]):
+        for key in [pattern] if pattern in names else matching_keys(selection.params, pattern, place, [*names]):
             if key in given:
                 raise place.fail("", f"`{key}` is already matched by `{given[key]}`")
             if key in selection.deformation.keys:
@@ -233,15 +233,16 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
             for name, word in zip(spec.names, spec.motion.free if spec.motion is not None else ("",), strict=True):
                 chosen[name], origin[name] = spec.settings(word), index
             continue
-        keys = _tied_keys(params, spec.keys, place) if len(spec.keys) > 1 else _matching(params, spec.keys[0], place)
+        is_tied = len(spec.keys) > 1
+        keys = _tied_keys(params, spec.keys, place) if is_tied else matching_keys(params, spec.keys[0], place)
         for number, key in enumerate(keys):
-            at = f"key[{number}]" if len(spec.keys) > 1 else "key"
+            at = f"key[{number}]" if is_tied else "key"
             if key in origin:
                 raise place.fail(at, f"`{key}` is already matched by parameters[{origin[key]}]")
             if key in deformation.keys:
                 raise place.fail(at, f"`{key}` depends on a motion or a heightmap; remove one of the two")
             origin[key] = index
-        if len(spec.keys) > 1:
+        if is_tied:
             tied[keys[0]], keys = keys[1:], keys[:1]
         chosen |= dict.fromkeys(keys, spec.settings())
     return Selection(params, chosen, tied, deformation), origin
@@ -288,7 +289,7 @@ def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> lis
         at = Place(place.source, f"{place.key}.key[{number}]", lambda _: "")
         if key not in params.properties and any(fnmatchcase(name, key) for name in params.properties):
             raise at.fail("", f"`{key}` is a glob; name each key that is tied")
-        [name] = _matching(params, key, at)
+        [name] = matching_keys(params, key, at)
         first, this = describe(params, keys[0]), describe(params, name)
         if (this.shape, this.type) != (first.shape, first.type):
             shapes = " and ".join("x".join(map(str, info.shape)) or "one number" for info in (first, this))
@@ -297,8 +298,11 @@ def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> lis
     return found
 
 
-def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Sequence[str] = ()) -> list[str]:
-    """Return the keys that match `pattern`. They must be recoverable. `names` are other suggestions."""
+def matching_keys(params: mi.SceneParameters, pattern: str, place: Place, names: Sequence[str] = ()) -> list[str]:
+    """Return the keys that match `pattern`. They must be recoverable. `names` are other suggestions.
+
+    Raises ConfigError at `place`.
+    """
     is_key = pattern in params.properties
     matches = [pattern] if is_key else [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:

@@ -101,10 +101,11 @@ def blocks(name: str) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", (ROOT / name).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
-#: Pages with Python blocks, and the number of blocks of each page. A test runs each block: this file or
-#: tests/conformance/test_plugin.py.
+#: Pages with Python blocks, and the number of blocks of each page. A test runs each block: this file,
+#: tests/conformance/test_plugin.py, tests/api/test_torch.py or tests/measure/test_own_estimators.py.
 PYTHON = {"README.md": 1, "docs/python.md": 10, "docs/integrator.md": 2, "docs/steps.md": 1, "docs/losses.md": 1,
-          "docs/benchmarks.md": 1, "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1}  # fmt: skip
+          "docs/benchmarks.md": 1, "docs/benchmarks/page.md": 1, "docs/your_integrator.md": 1,
+          "docs/pytorch.md": 1, "docs/your_estimator.md": 2}  # fmt: skip
 
 
 def test_every_python_block_of_the_docs_is_run() -> None:
@@ -135,7 +136,7 @@ def test_statements_of_the_docs_about_a_run_hold(checkout: Path) -> None:
 def test_the_reference_matches_the_docstrings() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert text == python_page(text), "run `python scripts/make_reference.py`"
-    for name in set(reslrb_cli.__all__) - {"__version__"}:
+    for name in {*reslrb_cli.__all__, "torch.render"} - {"__version__", "torch"}:
         assert f"### `{name}`\n" in text
 
 

@@ -394,6 +394,17 @@ def weighted(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | Non
 
 scene = rl.load_scene("scene.xml")
 reveal_type(scene)
+rl.torch.render(scene, {}, spp=4)
+reveal_type([record.holds for record in rl.check_estimator("stack", ["furnace"])])
+reveal_type(rl.register_estimator)
+
+
+class Watch(rl.Callback):
+    def iteration(self, run: rl.RunInfo, record: rl.Record) -> None:
+        reveal_type((run.folder, run.iterations, record.loss))
+
+
+rl.optimize(config, callbacks=[Watch(), rl.TensorBoard("x"), rl.MLflow(), rl.WandB(), "wandb"])
 reveal_type(rl.step(mi.load_dict({"type": "reslrb"}), scene, 0, lambda image: l2(image, image), seed=1, spp=4).loss)
 try:
     rl.optimize("x.yaml", loss=l2)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from runs.going_on import work_alone
 import reslrb_cli as rl
 from reslrb_cli.config.loader import load
 from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.xml import dictionary
 from reslrb_cli.scene.xml.dictionary import write_dictionary
 
 TEXTURE, BALL = "floor.bsdf.reflectance.data", "ball.bsdf.reflectance.value"
@@ -104,6 +107,35 @@ def test_equal_dictionaries_share_a_file(folder: Path) -> None:
     assert first.parent.parent == third.parent.parent == folder / "cache" / "scenes"
     assert first.read_text() == third.read_text()  # only the pixels differ
     assert first != third
+
+
+def test_writing_a_scene_removes_old_ones(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def written(radius: float) -> Path:
+        return write_dictionary(room(ball={"type": "sphere", "radius": radius}), "<dict>", folder).parent
+
+    def age(place: Path, days: float) -> None:
+        os.utime(place, (time.time() - 86400 * days,) * 2)
+
+    old, used, young = written(1), written(2), written(3)
+    stale = old.with_name(".reslrb-0123")  # of a process that was killed
+    stale.mkdir()
+    for place, days in ((old, 91), (used, 91), (young, 89), (stale, 91)):
+        age(place, days)
+    assert written(2) == used  # now needed again
+    assert old.is_dir()  # nothing was written
+    written(4)
+    assert [each.is_dir() for each in (old, used, young, stale)] == [False, True, True, False]
+    size = sum(each.stat().st_size for each in used.iterdir())
+    monkeypatch.setattr(dictionary, "KEPT_BYTES", int(2.5 * size))
+    age(used, 3)
+    age(young, 2)
+    new = [written(4), written(5)]  # the oldest of three goes
+    assert [each.is_dir() for each in (used, young, *new)] == [False, True, True, True]
+    monkeypatch.setattr(dictionary, "KEPT_BYTES", 0)
+    written(5.5)  # those of today stay
+    assert [each.is_dir() for each in (young, *new)] == [False, True, True]
+    monkeypatch.setattr(shutil, "rmtree", lambda path, ignore_errors: None)  # a folder of another user
+    assert (written(6) / "scene.xml").is_file()
 
 
 # --- equal results ----------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ light.
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -125,7 +126,8 @@ def test_saved_files_of_a_run_agree(experiment):
     assert outcome(*again)[0] == 0
     first, repeated = (read_metrics(folder)[0]["loss"] for folder in ("runs/box", "runs/box-2"))
     assert first == pytest.approx(repeated, rel=1e-5)  # threads add values in any order
-    assert names("runs") == ["box", "box-2"]
+    assert names("runs") == ["box", "box-2", "latest"]
+    assert os.readlink("runs/latest") == "box-2"
 
 
 def test_a_target_without_light_is_refused(experiment):

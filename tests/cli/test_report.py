@@ -15,6 +15,7 @@ from report.measured import make_run, write_bench, write_convergence, write_grad
 from reslrb_cli.records import measurement_files
 from reslrb_cli.records.manifest import read_content
 from reslrb_cli.records.measurement_files import LivePage
+from reslrb_cli.report.sources import read_sources
 from reslrb_cli.runs import recorder
 from reslrb_cli.runs import recorder as recording
 
@@ -33,6 +34,16 @@ def test_one_page_for_everything(tmp_path, monkeypatch):
     page = (tmp_path / "page.html").read_text()
     assert page.endswith("</html>\n")
     assert 'http-equiv="refresh"' not in page
+
+
+def test_a_link_to_a_run_is_shown_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_run(tmp_path / "a")
+    make_run(tmp_path / "b")
+    (tmp_path / "latest").symlink_to("b")
+    names = [each.name for each in read_sources([Path("a"), Path("b"), Path("latest")])]
+    assert names == ["a", "b"]
+    assert [each.name for each in read_sources([Path("a"), Path("latest")])] == ["a", "latest"]
 
 
 def test_the_page_of_one_run_is_rewritten(tmp_path, monkeypatch):

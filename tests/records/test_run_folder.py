@@ -21,7 +21,7 @@ from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records.decisions import CACHE_FILE, MOST, Decision, DecisionCache, cache_folder, key_of
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
-from reslrb_cli.records.run_folder import RunFolder, check_output
+from reslrb_cli.records.run_folder import RunFolder, check_output, link_latest, opened
 
 # Run folders: their names, and that no half-made folder remains.
 
@@ -60,6 +60,49 @@ def test_taken_names_get_a_number(tmp_path):
     (tmp_path / "run-3").write_text("a file of that name")
     assert [create(tmp_path).path.name for _ in range(2)] == ["run-2", "run-4"]
     assert names(tmp_path / "run") == []
+
+
+def test_the_newest_folder_has_a_link(tmp_path, monkeypatch):
+    first, second = create(tmp_path), create(tmp_path)
+    for folder in (first, second, first):
+        link_latest(folder.path)
+        assert os.readlink(tmp_path / "latest") == folder.path.name
+    assert names(tmp_path) == ["latest", "run", "run-2"]
+    with opened(tmp_path / "latest") as (folder, _):
+        link_latest(second.path)  # by another run
+        assert folder.path == first.path
+        assert folder.is_there
+    assert create(tmp_path, "latest").path.name == "latest-2"
+
+    def no_links(*_, **__):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "symlink_to", no_links)
+        link_latest(first.path)
+    assert os.readlink(tmp_path / "latest") == second.path.name
+    assert names(tmp_path) == ["latest", "latest-2", "run", "run-2"]
+    for make in (Path.mkdir, Path.touch):  # neither a folder nor a file is replaced
+        other = tmp_path / make.__name__
+        other.mkdir()
+        make(other / "latest")
+        link_latest(create(other).path)
+        assert not (other / "latest").is_symlink()
+        assert names(other) == ["latest", "run"]
+
+
+def test_many_runs_at_once_leave_one_link(tmp_path):
+    folders = [create(tmp_path).path for _ in range(8)]
+    threads = [threading.Thread(target=lambda at=at: [link_latest(at) for _ in range(50)]) for at in folders]
+    link_latest(folders[0])
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        assert (tmp_path / "latest").is_dir()
+    for thread in threads:
+        thread.join()
+    assert (tmp_path / "latest").resolve() in folders
+    assert len(names(tmp_path)) == 9
 
 
 def test_the_longest_name_leaves_room_for_a_number(tmp_path):

@@ -18,6 +18,7 @@ from runs.going_on import begin_alone
 import reslrb_cli as rl
 from reslrb_cli.records.images import as_bytes
 from reslrb_cli.runs import log, loggers
+from reslrb_cli.runs.sweep import make_plan
 
 SET = {"run.certainty": False, "run.iterations": 3}
 POSTER, LAMP = "poster.reflectance.data", "lamp.emitter.radiance.value"
@@ -158,6 +159,120 @@ def test_a_callback_of_another_package_has_a_name(experiment: Path, monkeypatch:
     code, _, err = outcome("optimize", "tiny.yaml", "--log", "other")
     assert code == 2
     assert "--log: there is no `other`; there are mlflow, own, tensorboard, wandb" in err
+
+
+WATCH = """
+import reslrb_cli as rl
+
+print("the code was run")
+
+class Watch(rl.Callback):
+    def iteration(self, run, record):
+        print("saw", record.iteration)
+
+class Broken(rl.Callback):
+    def __init__(self):
+        raise ValueError("no room")
+
+def other():
+    return 3
+"""
+SHORT = settings("run.certainty=false", "run.iterations=2")
+
+
+def errors(text: str) -> list[str]:
+    """Return the lines of the standard error, without the line about the variant."""
+    return [line for line in text.splitlines() if not line.startswith("variant ")]
+
+
+def name_callbacks(*names: str) -> None:
+    """Write `run.callbacks` into the configuration."""
+    text = Path("tiny.yaml").read_text()
+    assert text.count("\nrun: {") == 1
+    Path("tiny.yaml").write_text(text.replace("\nrun: {", f"\nrun: {{callbacks: [{', '.join(names)}], "))
+    Path("watch.py").write_text(WATCH)
+
+
+def test_a_configuration_names_callbacks(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[Listener] = []
+    monkeypatch.setitem(loggers.LOGGERS, "own", lambda: heard.append(Listener()) or heard[-1])
+    name_callbacks("watch.py:Watch", "own")
+    code, out, err = outcome("optimize", "tiny.yaml", *SHORT)
+    assert (code, out) == (2, "")
+    file = experiment / "watch.py"
+    said = f"tiny.yaml: run.callbacks[0]: would run the code of {file} with all your rights; --allow-code permits it"
+    assert errors(err) == [said]
+    code, out, _ = outcome("optimize", "tiny.yaml", "--allow-code", "--log", "own", *SHORT)
+    assert (code, out.splitlines()[:3]) == (0, ["the code was run", "saw 0", "saw 1"])
+    assert len(heard) == 1  # although it is named twice
+    assert heard[0].calls[-1] == ("end", "finished")
+    # The folder continues with the same callbacks, or with others, and after a change of the file.
+    longer = settings("run.iterations=3")
+    assert outcome("optimize", "--resume", "runs/tiny", *longer)[0] == 2
+    Path("watch.py").write_text(WATCH.replace("saw", "sees"))
+    assert "sees 2\n" in outcome("optimize", "--resume", "runs/tiny", "--allow-code", *longer)[1]
+    without = settings("run.iterations=4", "run.callbacks=[]")
+    code, out, _ = outcome("optimize", "--resume", "runs/tiny", *without)
+    assert (code, "the code was run" in out) == (0, False)
+
+
+def test_callbacks_of_a_configuration_in_python(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name_callbacks("watch.py:Watch")
+    with pytest.raises(rl.ConfigError, match=r"run.callbacks\[0\]: would run .*; allow_code=True permits it"):
+        rl.optimize("tiny.yaml", overrides=SET)
+    heard = Listener()
+    run = rl.optimize("tiny.yaml", "runs/a", overrides=SET, callbacks=[heard], allow_code=True)
+    next(iter(run))
+    run.close()
+    list(run)  # a second loop has the same callbacks
+    assert capsys.readouterr().out == "the code was run\nsaw 0\nsaw 1\nsaw 2\n"
+    assert [name for name, *_ in heard.calls].count("iteration") == 3
+    list(rl.optimize(resume="runs/a", overrides={"run.iterations": 4}, allow_code=True))
+    assert capsys.readouterr().out == "the code was run\nsaw 3\n"
+    rl.gradient("tiny.yaml")  # needs none of them
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("watch.py:Nobody", "watch.py has nothing of the name `Nobody`"),
+        ("watch.py:other", "run.callbacks[0]: has 3, which is no reslrb_cli.Callback"),
+        ("watch.py:Broken", "run.callbacks[0]: the callback raises in line 12 ValueError: no room"),
+        ("gone.py:Watch", "gone.py: no such file"),
+        ("wand", "run.callbacks[0]: there is no `wand`; there are mlflow, tensorboard, wandb"),
+        ("watch.py", "run.callbacks[0]: must be FILE.py:NAME"),
+        ("''", "run.callbacks[0]: must be a name, or FILE.py:NAME"),
+        ("3", "run.callbacks[0]: must be a name, or FILE.py:NAME"),
+    ],
+)
+def test_wrong_callbacks_of_a_configuration(experiment: Path, name: str, message: str) -> None:
+    name_callbacks(f'"{name}"' if ":" in name else name)
+    code, _, err = outcome("optimize", "tiny.yaml", "--allow-code", *SHORT)
+    said = errors(err)
+    assert (code, len(said)) == (2, 1), err
+    assert message in said[0]
+    assert not Path("runs").exists()
+
+
+def test_log_names_no_file(experiment: Path) -> None:
+    code, _, err = outcome("optimize", "tiny.yaml", "--log", "watch.py:Watch", "--allow-code")
+    assert (code, errors(err)) == (
+        2,
+        ["--log: a file is named by the setting `run.callbacks: [watch.py:Watch]`"],
+    )
+
+
+def test_a_sweep_needs_permission_for_callbacks(experiment: Path) -> None:
+    name_callbacks("watch.py:Watch")
+    code, _, err = outcome("sweep", "tiny.yaml", "-o", "sweep")
+    assert code == 2
+    assert "run.callbacks[0]: would run the code of" in err
+    plan = make_plan(Path("tiny.yaml"), [], 1, [], allow_code=True)
+    assert list(plan.sweep.codes) == [str(experiment / "watch.py")]
+
+
+# --- packages and the folder ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

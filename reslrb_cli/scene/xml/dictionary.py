@@ -6,8 +6,11 @@ The file has the ids that `mi.load_dict` gives: the key of each object directly 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import shutil
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,9 @@ from reslrb_cli.scene.xml.read import Element, quoted, tag_lines
 
 #: Name of the written scene file.
 SCENE_FILE = "scene.xml"
+#: Writing a scene removes scenes from the cache: those that no dictionary has needed for `KEPT_SECONDS`, and the oldest
+#: while all together exceed `KEPT_BYTES`. Scenes younger than `YOUNG_SECONDS` stay: a process may soon load them.
+KEPT_SECONDS, KEPT_BYTES, YOUNG_SECONDS = 90 * 86400.0, 2 * 2**30, 86400.0
 _INSTEAD = "or load the scene with `mi.load_dict(..., optimize=False)` and pass `scene=` that"
 #: Tags of plugins' objects, where they are not the name of Mitsuba's type in lower case.
 _TAGS = {"PhaseFunction": "phase", "ReconstructionFilter": "rfilter"}
@@ -53,7 +59,10 @@ def write_dictionary(scene: Mapping[str, Any], source: object, base: Path) -> Pa
         folder = cache_folder() / "scenes"
         place = folder / digest.hexdigest()
         if (place / SCENE_FILE).is_file():
+            with contextlib.suppress(OSError):  # a cache of another user
+                os.utime(place)
             return place / SCENE_FILE
+        _prune(folder)
         folder.mkdir(parents=True, exist_ok=True)
         with unfinished_folder(folder) as unfinished:
             for name, image in writer.images.items():
@@ -65,6 +74,21 @@ def write_dictionary(scene: Mapping[str, Any], source: object, base: Path) -> Pa
         reason = getattr(error, "strerror", None) or error
         raise MachineError(f"{place}: cannot write the scene: {reason}; set RESLRB_CACHE to a folder") from None
     return place / SCENE_FILE
+
+
+def _prune(folder: Path) -> None:
+    """Remove old scenes from the cache `folder`. Entries that cannot be read or removed stay."""
+    found = []
+    with contextlib.suppress(OSError):
+        for entry in os.scandir(folder):
+            with contextlib.suppress(OSError):
+                size = sum(each.stat().st_size for each in os.scandir(entry.path))
+                found.append((time.time() - entry.stat().st_mtime, size, entry.path))
+    total = sum(size for _, size, _ in found)
+    for age, size, path in sorted(found, reverse=True):
+        if age > KEPT_SECONDS or (total > KEPT_BYTES and age > YOUNG_SECONDS):
+            shutil.rmtree(path, ignore_errors=True)
+            total -= size
 
 
 class _Writer:
