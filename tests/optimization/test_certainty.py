@@ -27,6 +27,7 @@ from optimization.judged import (
     run,
     write_scene,
 )
+from optimization.judged import SCENE as LIGHTS
 from optimization.toy import make_problem
 
 from reslrb_cli.optimization import targets
@@ -116,6 +117,18 @@ def test_a_value_at_its_bound_without_a_gradient_is_at_its_bound(folder, monkeyp
               ("run.iterations=24", "run.spp=8", "target.render.spp=64"))  # fmt: skip
     found = run(folder, toy)
     assert verdicts(toy, found) == toy.right, told(toy, found)
+
+
+def test_a_lamp_that_moves_through_a_wall_has_lost_its_effect(folder):
+    """The target has the lamp nearer to the wall. The first step moves the lamp behind the wall."""
+    motion = "motion: {of: left, free: [z]}, initial: -2.4, learning_rate: 2"
+    toy = Toy("through the wall", {"left.z": motion}, {"left.z": "effect lost"},
+              ("scene.file=smooth.xml", "run.iterations=20", "run.spp=8", "integrator.edges=off",
+               "target.render={spp: 64, parameters: {left.z: -2.7}}"))  # fmt: skip
+    (folder / "smooth.xml").write_text(LIGHTS.replace('rfilter type="box"', 'rfilter type="tent"'))
+    found = run(folder, toy)
+    assert verdicts(toy, found) == toy.right, told(toy, found)
+    assert found.final["left.z"] < -3.5  # the wall is 3.5 away
 
 
 @pytest.mark.long

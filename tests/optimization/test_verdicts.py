@@ -62,6 +62,8 @@ def judged(*entries: dict[str, float | bool]) -> list[ParameterVerdict]:
     ({"touched": False, "value": 0.0}, ParameterVerdict.AT_BOUND),
     ({"touched": False, "value": 1.0}, ParameterVerdict.AT_BOUND),
     ({"touched": False, "value": 0.0, "start": 0.0}, ParameterVerdict.NO_EFFECT),
+    # The run moved the value to a place where the whole parameter has no gradient.
+    ({"touched": False, "start": 0.3}, ParameterVerdict.EFFECT_LOST),
     # The value is at a bound, and the gradient holds it there: L falls downwards where dL/dx > 0.
     ({"value": 0.0, "gradient": 5.0, "spread": 0.2}, ParameterVerdict.AT_BOUND),
     ({"value": 0.0, "gradient": 0.5, "spread": 0.2}, ParameterVerdict.AT_BOUND),
@@ -80,6 +82,9 @@ def test_the_rules(changes, verdict):
 
 def test_entries_are_judged_one_by_one():
     assert judged({}, {"touched": False}) == [ParameterVerdict.SETTLED, ParameterVerdict.NO_EFFECT]
+    assert judged({}, {"touched": False, "start": 0.3})[1] is ParameterVerdict.NO_EFFECT
+    lost, resting = {"touched": False, "start": 0.3}, {"touched": False}
+    assert judged(lost, resting) == [ParameterVerdict.EFFECT_LOST, ParameterVerdict.NO_EFFECT]
 
 
 @pytest.mark.parametrize(("entries", "verdict"), [

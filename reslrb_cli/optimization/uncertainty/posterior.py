@@ -145,11 +145,11 @@ class Measured:
         return np.asarray(lower | upper)
 
     @property
-    def driven(self) -> Array:
-        """Entries (N,) that the run has moved to a bound. Entries that the run moves to a bound have gradients on the
-        way, but may have no gradients at the bound.
+    def moved(self) -> Array:
+        """Entries (N,) that the run has moved. They had gradients on the way, but may have none at their final
+        values.
         """
-        return np.asarray(self.at_bound & (False if self.start is None else self.value != self.start))
+        return np.zeros(self.value.shape, dtype=bool) if self.start is None else self.value != self.start
 
     def within(self, to_go: Array) -> Array:
         """Return movements to the optimum, clipped at the bounds. Far away, the curvature is not valid."""

@@ -13,8 +13,9 @@ refers to the optimum for a target without noise.
 | verdict          | condition |
 |---|---|
 | `not seen`       | a texel that no view shows, even if its light reaches the images |
-| `no effect`      | every gradient sample was exactly 0, and the run has not driven it to a bound |
+| `no effect`      | every gradient sample was exactly 0, and neither of the next two rules applies |
 | `at its bound`   | the value is within a step of a bound, and the gradient does not pull it back |
+| `effect lost`    | the run has moved it, and every gradient sample of its whole parameter was exactly 0 |
 | `settled`        | spread <= tau |
 | `still moving`   | `to_go` differs from 0 by `SURE` of its errors, and spread > tau without the target's noise |
 | `not determined` | `alone` <= `OTHERS` of `spread`: others compensate for it; the most correlated one is named |
@@ -68,9 +69,14 @@ class ParameterVerdict(str, enum.Enum):
     NOT_DETERMINED = "not determined"
     BELOW_NOISE = "below the noise"
     NO_EFFECT = "no effect"
+    EFFECT_LOST = "effect lost"
     NOT_SEEN = "not seen"
     INCOMPLETE = INCOMPLETE
     SETTLED = "settled"
+
+
+#: Verdicts on entries without an effect on the images at their final values.
+WITHOUT = (ParameterVerdict.NO_EFFECT, ParameterVerdict.EFFECT_LOST, ParameterVerdict.NOT_SEEN)
 
 
 def judge(
@@ -81,9 +87,11 @@ def judge(
     `of_run` is the spread without the target's noise, and `error` the standard error of `to_go`.
     """
     tolerance = TOLERANCE * own.scale
+    lost = own.moved & (not own.touched.any())
     rules = [
-        (~own.touched & ~own.driven, ParameterVerdict.NO_EFFECT),
+        (~own.touched & ~(own.at_bound & own.moved) & ~lost, ParameterVerdict.NO_EFFECT),
         (own.at_bound, ParameterVerdict.AT_BOUND),
+        (lost, ParameterVerdict.EFFECT_LOST),
         (spread <= tolerance, ParameterVerdict.SETTLED),
         ((np.abs(to_go) > SURE * error) & (of_run > tolerance), ParameterVerdict.STILL_MOVING),
         (alone <= OTHERS * spread, ParameterVerdict.NOT_DETERMINED),
@@ -100,13 +108,12 @@ def shares(verdicts: Sequence[ParameterVerdict]) -> dict[ParameterVerdict, float
 
 def summarise(found: Mapping[ParameterVerdict, float]) -> ParameterVerdict:
     """Return the verdict of a parameter from the shares of its entries."""
-    without = (ParameterVerdict.NO_EFFECT, ParameterVerdict.NOT_SEEN)
-    effective = {verdict: share for verdict, share in found.items() if verdict not in without}
+    effective = {verdict: share for verdict, share in found.items() if verdict not in WITHOUT}
     if not effective:
-        return max(without, key=lambda verdict: found.get(verdict, 0.0))
+        return max(WITHOUT, key=lambda verdict: found.get(verdict, 0.0))
     if effective.get(ParameterVerdict.SETTLED, 0.0) >= SETTLED_SHARE * sum(effective.values()):
         return ParameterVerdict.SETTLED
-    others = [verdict for verdict in ParameterVerdict if verdict not in (ParameterVerdict.SETTLED, *without)]
+    others = [verdict for verdict in ParameterVerdict if verdict not in (ParameterVerdict.SETTLED, *WITHOUT)]
     return max(others, key=lambda verdict: found.get(verdict, 0.0))
 
 
@@ -310,7 +317,7 @@ def _small(own: Measured, at: Sequence[int], found: JointPosterior) -> Parameter
     named = [name for name, each in zip(partners, verdicts, strict=True) if name and each is verdict]
     partner = named[0] if named and verdict is ParameterVerdict.NOT_DETERMINED else None
     # A value at a bound may be as far from the optimum as the optimum is beyond the bound.
-    known = [each not in (ParameterVerdict.AT_BOUND, ParameterVerdict.NO_EFFECT) for each in verdicts]
+    known = [each not in (ParameterVerdict.AT_BOUND, *WITHOUT) for each in verdicts]
     parts = (np.where(known, part, np.nan) for part in (spread, to_go, found.of_target[at]))
     return _certainty(verdict, verdicts, partner, *parts)
 
@@ -346,10 +353,7 @@ def _large(
     shown = touched if own.seen is None else touched & own.seen
     if verdict is ParameterVerdict.SETTLED and pixels is not None and int(shown.sum()) > pixels:
         verdict, partner = ParameterVerdict.NOT_DETERMINED, None
-    kept = [
-        each not in (ParameterVerdict.AT_BOUND, ParameterVerdict.NO_EFFECT, ParameterVerdict.NOT_SEEN)
-        for each in verdicts
-    ]
+    kept = [each not in (ParameterVerdict.AT_BOUND, *WITHOUT) for each in verdicts]
     is_known = diagonal is not None and any(kept)
     sizes = (np.array([rms(part[kept]) if is_known else np.nan]) for part in (spread, to_go, of_target))
     return _certainty(verdict, verdicts, partner, *sizes)
