@@ -57,7 +57,7 @@ STATE_FILE, PREVIOUS_FILE_NAME, _NEXT_FILE = "state.npz", "previous.npz", "next.
 NONFINITE_FILE_NAME = "nonfinite.npz"
 
 #: Format version in the JSON of a state. It changes when the meaning of an entry changes.
-FORMAT = 3
+FORMAT = 4
 
 
 def save_checkpoint(

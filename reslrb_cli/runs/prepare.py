@@ -33,9 +33,9 @@ from reslrb_cli.optimization.loop import Watch
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Best, Images, Least, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
-from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
+from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.views import view_records
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, entries_below, save_checkpoint
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest, commit_of
 from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
@@ -187,10 +187,8 @@ class SavedResults:
     """Results in a checkpoint, in addition to the records of the iterations."""
 
     images: Images
-    certainty: Noted
     best: Least | None = None
     best_values: Arrays = field(default_factory=dict, metadata=entry("best"))
-    squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
     last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps"))
 
 
@@ -284,8 +282,7 @@ class RunProgress:
         `tree.entries`.
         """
         met = SavedResults(
-            self.results.images["initial"], self.certainty.noted, self.best.least,
-            self.best_values(), self.certainty.squares, self.certainty.last,
+            self.results.images["initial"], self.best.least, self.best_values(), self.certainty.last,
         )  # fmt: skip
         return entries(self._settled, state.on_file(self.problem), met)
 
@@ -296,18 +293,16 @@ class RunProgress:
         """
         problem, met = self.problem, stored.read(SavedResults)
         self.state = load(problem, stored)
-        squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
         wanted = {key: expected(problem.selection.array(key).shape) for key in problem.selection.keys if met.best}
-        kept = {key: each[0] for key, each in squares.items() if each is not None}
-        last = {key: None for key in met.certainty.last if key in problem.selection.keys}
-        met = stored.fill(replace(met, best_values=wanted, squares=kept, last_steps=last))
+        last = dict.fromkeys(entries_below(stored.arrays, "last steps/"))
+        met = stored.fill(replace(met, best_values=wanted, last_steps=last))
         for record in records:
             self._take(record)
             self.watch.add(record)
         self.best.recent.extend(record.loss for record in records)
         self.best.least, self.best.values = met.best, met.best_values
         self.results.images["initial"] = met.images
-        self.certainty.restore(met.certainty, met.squares, met.last_steps)
+        self.certainty.last = dict(met.last_steps)
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ def _another_seed(run_seed, iteration, view, purpose):
 @pytest.mark.parametrize(
     "fault",
     a_few(
-        ["no moments", "another seed", "no best", "no squares", "no last steps", "metrics not cut back"],
+        ["no moments", "another seed", "no best", "no last steps", "metrics not cut back"],
         ["no moments"],
     ),
 )
@@ -171,15 +171,11 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
         restore(self, stored, records)
         self.best.recent.clear()
 
-    def without_squares(self, stored, records):
-        restore(self, stored, records)
-        self.certainty.squares = {}
-
     def without_steps(self, stored, records):
         restore(self, stored, records)
         self.certainty.last = {}
 
-    # A state in the last fifth of the run has all parts. With falling losses, the best of the run comes after this
+    # With falling losses, the best of the run comes after this
     # state.
     sets = ["--set", "run.checkpoint_every={iterations: 15}"]
     begun = FALLING if fault != "no last steps" else []  # only small parameters have last steps
@@ -188,7 +184,6 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
         "another seed": (loop, "seed", _another_seed),
         "no best": (prepare.RunProgress, "restore", without_best),
-        "no squares": (prepare.RunProgress, "restore", without_squares),
         "no last steps": (prepare.RunProgress, "restore", without_steps),
         "metrics not cut back": (resume, "cut_back", lambda folder, size: None),
     }
