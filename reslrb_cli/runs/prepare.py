@@ -244,8 +244,7 @@ class RunProgress:
 
     def _take(self, record: Record) -> None:
         self.last = record
-        if self.problem.config.run.max_seconds is not None:
-            self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
+        self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
         self.results.add(record)
         self.nonfinite.add(record)
         self.regularized.add(record)

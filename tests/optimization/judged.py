@@ -99,6 +99,7 @@ def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     state = standing(problem)
     for after, record in iterate(problem, state):
         certainty.see(state, after)
+        certainty.rates.append(record.lr / problem.config.optimizer.learning_rate)
         state, last = after, record
     before = {key: value.copy() for key, value in problem.values().items()}
     found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)

@@ -201,12 +201,12 @@ def test_noisy_curvature_is_measured_again_with_all_samples(folder, monkeypatch)
         return directions, H * (self.spp > blind), B
 
     monkeypatch.setattr(measuring.LossCurvature, "along", hidden)
-    toy = replace(WORK[2], settings=("run.spp=64", "run.iterations=60", "optimizer.schedule=cosine"))
+    toy = replace(WORK[2], settings=("run.spp=256", "run.iterations=60", "optimizer.schedule=cosine"))
     found = {}
-    for blind in (0, 16, 64):
+    for blind in (0, 64, 256):
         asked.clear()
         found[blind] = run(folder, toy).certainty.parameters[WALL]
-        assert asked == ([16, 64] if blind else [16])
+        assert asked == ([64, 256] if blind else [64])
     assert [each.verdict for each in found.values()] == [SETTLED, SETTLED, NOISE]
 
 

@@ -10,7 +10,6 @@ import drjit as dr
 import numpy as np
 
 from reslrb_cli.optimization.identifiability import shown_texels
-from reslrb_cli.optimization.loop import learning_rate_factor
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
@@ -60,7 +59,7 @@ class Certainty:
         self.last: dict[str, Array] = {}
         #: Texels (H, W) of each texture that are visible in some view and lit, once computed.
         self.shown: dict[str, Array] = {}
-        #: Factors of the learning rate so far, if no formula gives them.
+        #: The schedule's factor for each iteration.
         self.rates: list[float] = []
 
     def see(self, before: State, state: State) -> None:
@@ -120,13 +119,12 @@ class Certainty:
             compiled_ms += times.codegen_ms
             if stop():
                 return None
-            rates = self._rates(iterations)
-            measured = self._measured(gradients, iterations, rates[-1])
+            measured = self._measured(gradients, iterations)
             weighed = weigh(measured, directions, H, B, by_entry)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             render = config.target.render
             return CertaintyRecord(
-                parameters={key: self._with_course(about, measured[key], key, rates) for key, about in weighed.items()},
+                parameters={key: self._with_course(about, measured[key], key) for key, about in weighed.items()},
                 measure_s=measure_s,
                 share=measure_s / max(elapsed_s, 1e-9),
                 iterations=iterations,
@@ -144,13 +142,11 @@ class Certainty:
         read = [view.file is not None for view in self.problem.trained]
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
-    def _with_course(
-        self, about: ParameterCertainty, own: Measured, key: str, rates: Sequence[float]
-    ) -> ParameterCertainty:
+    def _with_course(self, about: ParameterCertainty, own: Measured, key: str) -> ParameterCertainty:
         """Return the certainty with the distance moved, the possible distance, and the learning rate."""
         optimizer = self.problem.optimizer
         step = optimizer.first_step(key)
-        reach = None if step is None else step * float(sum(rates))
+        reach = None if step is None else step * float(sum(self.rates))
         kept = own.touched & (True if own.seen is None else own.seen)
         moved = rms((own.value - own.start)[kept]) if kept.any() else 0.0
         return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key))
@@ -184,16 +180,7 @@ class Certainty:
         wide = np.pad(shown, ((0, 0), (halo // 2, halo - halo // 2)), mode="wrap")
         return np.repeat(wide.ravel(), channels)
 
-    def _rates(self, iterations: int) -> list[float]:
-        """Return the schedule's factor for each iteration."""
-        settings, planned = self.problem.config.optimizer, self.problem.config.run.iterations
-        return self.rates or [
-            learning_rate_factor(settings.schedule, each, planned, settings.final_fraction)
-            for each in range(iterations)
-        ]
-
-    def _measured(self, gradients: Gradients, iterations: int, factor: float) -> dict[str, Measured]:
-        """Return the measurements of all parameters. `factor` is the schedule's factor of the last iteration."""
+    def _measured(self, gradients: Gradients, iterations: int) -> dict[str, Measured]:
         optimizer, found = self.problem.optimizer, {}
         for key, rows in gradients.items():
             value, last = row_of(self.problem, key), self.last.get(key)
@@ -202,7 +189,7 @@ class Certainty:
                 bounds=self.problem.selection.specs[key].bounds or (-np.inf, np.inf),
                 scale=self.scale(key),
                 gradients=rows,
-                step=np.nan_to_num(optimizer.response(key) * optimizer.rate(key) * factor),
+                step=np.nan_to_num(optimizer.response(key) * optimizer.rate(key) * self.rates[-1]),
                 is_small=value.size <= MOST_ENTRIES,
                 start=self._initial[key],
                 last=None if last is None else last[-(iterations // 2) :],

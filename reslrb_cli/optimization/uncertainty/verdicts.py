@@ -42,7 +42,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
-from reslrb_cli.optimization.uncertainty.posterior import CURVATURE_ERROR, SURE, Measured, Posterior, joint, pooled
+from reslrb_cli.optimization.uncertainty.posterior import (
+    CURVATURE_ERROR,
+    SURE,
+    TOLERANCE,
+    Measured,
+    Posterior,
+    joint,
+    pooled,
+)
 from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.records.measurements import INCOMPLETE
 from reslrb_cli.statistics import Array, rms
@@ -55,8 +63,6 @@ SETTLED_SHARE = 0.8
 LEAST_CORRELATION = 0.5
 #: Entries are on their way if the cosine between their movement so far and the remaining distance exceeds this.
 ON_THE_WAY = 0.3
-#: A texture whose brightness is known to this share is known as a whole.
-KNOWN_WHOLE = 0.1
 Gradients = dict[str, Array]
 Values = list[float | None] | None
 
@@ -321,7 +327,7 @@ def _large(own: Measured, by_entry: EntryCurvature | None, at: Sequence[int], fo
         name, row = found.partners[place], found.places.get(place)
         if name is not None and row is not None and found.posterior is not None:
             alone, whole = found.posterior.alone[row], found.posterior.spread[row]
-            if alone <= OTHERS * whole and whole > KNOWN_WHOLE:
+            if alone <= OTHERS * whole and whole > TOLERANCE:
                 verdict, partner = ParameterVerdict.NOT_DETERMINED, name
     if total is None:
         return _certainty(verdict, verdicts, partner, *np.full((3, 1), np.nan))
