@@ -345,25 +345,10 @@ class Optimizer:
             steepness = np.full_like(value, 1 - own.momentum)
         if key not in self._variables:
             return 1 / steepness
-        variable = self._variables[key]
-        result: np.ndarray[Any, Any] = self.slope(key) ** 2 / variable.gain / steepness
+        variable, moved = self._variables[key], dr.detach(self._own[key][key])
+        slope = np.array(variable.chain(moved, dr.zeros(type(moved), dr.shape(moved)) + 1), dtype=np.float64).ravel()
+        result = slope**2 / variable.gain / steepness
         return result if variable.smoother is None else result * variable.smoother.gain
-
-    def squares(self, key: str) -> tuple[Any, float] | None:
-        """Return the running mean of the squared gradients as the optimiser stores the mean. Also return the mean's
-        decay. Return None if the optimiser stores no such mean, or a mean of other derivatives (`balance`).
-        """
-        if self._balanced is not None and key == self._balanced[0]:
-            return None
-        own, extra = self._own[key], self._own[key].state[key][3]
-        return (extra[2], own.beta_2) if isinstance(own, dropt.Adam) else None
-
-    def slope(self, key: str) -> np.ndarray[Any, Any]:
-        """Return the gradient that the optimiser receives per unit of the scene value's gradient, as a flat array."""
-        variable, moved = self.variable(key), dr.detach(self._own[key][key])
-        if key not in self._variables:
-            return np.ones(int(np.array(moved).size))
-        return np.array(variable.chain(moved, dr.zeros(type(moved), dr.shape(moved)) + 1), dtype=np.float64).ravel()
 
     def rate(self, key: str) -> float:
         """Return the learning rate of a parameter, before any schedule."""

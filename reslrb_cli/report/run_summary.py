@@ -22,7 +22,7 @@ from reslrb_cli.report.format import count, line, number, shorten, with_error
 
 #: Recorded verdicts on a value: SETTLED is reliable, and the others give the reason why a value is not.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
-NOISE, UNSEEN = "below the noise", "not seen"
+NOISE, UNSEEN, LOST = "below the noise", "not seen", "effect lost"
 
 #: Minimum share of the target's noise in a spread for it to be the cause that hides a value.
 OF_TARGET = 0.7
@@ -38,6 +38,7 @@ LOWER, MORE_SAMPLES = 3, 16
 
 #: Proposals in the order of priority: the first ones make the later ones useless.
 ORDER = (
+    "a limit",
     "a lower rate",
     "scale: auto",
     "a higher rate",
@@ -109,11 +110,14 @@ def verdict_words(results: Mapping[str, Any], key: str) -> str:
 
 
 def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
-    """Return a proposal for a parameter whose value is still moving, or for a value that the target's noise hides.
+    """Return a proposal for a parameter whose value is still moving, for a value that the target's noise hides, or for
+    a value that has lost its effect.
 
     Return None for all other values, and if the records are insufficient.
     """
     about, measured = _about(results, key), results.get("certainty") or {}
+    if about.get("verdict") == LOST:
+        return Remedy("a limit", "its own bounds: [LOW, HIGH]")
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
         return Remedy("more samples for it", f"--set target.render.spp={MORE_SAMPLES * measured['target_spp']}")
     moved, rate, iterations = about.get("moved"), about.get("rate"), measured.get("iterations")

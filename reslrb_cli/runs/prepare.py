@@ -32,9 +32,9 @@ from reslrb_cli.optimization.autotune.sampling import explained
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Images, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
-from reslrb_cli.optimization.uncertainty.measuring import Certainty, Noted
+from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.views import view_records
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_checkpoint
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, entries_below, save_checkpoint
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest, commit_of
 from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
@@ -186,8 +186,6 @@ class SavedResults:
     """Results in a checkpoint, in addition to the records of the iterations."""
 
     images: Images
-    certainty: Noted
-    squares: Arrays = field(default_factory=dict, metadata=entry("squares"))
     last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps"))
 
 
@@ -240,8 +238,7 @@ class RunProgress:
 
     def _take(self, record: Record) -> None:
         self.last = record
-        if self.problem.config.run.max_seconds is not None:
-            self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
+        self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
         self.results.add(record)
         self.nonfinite.add(record)
         self.regularized.add(record)
@@ -268,7 +265,7 @@ class RunProgress:
         `tree.entries`.
         """
         met = SavedResults(
-            self.results.images["initial"], self.certainty.noted, self.certainty.squares, self.certainty.last,
+            self.results.images["initial"], self.certainty.last,
         )  # fmt: skip
         return entries(self._settled, state.on_file(self.problem), met)
 
@@ -279,14 +276,12 @@ class RunProgress:
         """
         problem, met = self.problem, stored.read(SavedResults)
         self.state = load(problem, stored)
-        squares = {key: problem.optimizer.squares(key) for key in met.certainty.keys if key in problem.selection.keys}
-        kept = {key: each[0] for key, each in squares.items() if each is not None}
-        last = {key: None for key in met.certainty.last if key in problem.selection.keys}
-        met = stored.fill(replace(met, squares=kept, last_steps=last))
+        last = dict.fromkeys(entries_below(stored.arrays, "last steps/"))
+        met = stored.fill(replace(met, last_steps=last))
         for record in records:
             self._take(record)
         self.results.images["initial"] = met.images
-        self.certainty.restore(met.certainty, met.squares, met.last_steps)
+        self.certainty.last = dict(met.last_steps)
 
 
 @dataclass(frozen=True)

@@ -141,16 +141,16 @@ def test_an_unfinished_run_is_marked_everywhere():
     last, out, results = optimize(*sets)
     about = results["certainty"]["parameters"][KEY]
     assert about["verdict"] == "still moving"
-    assert 0.5 < about["shares"]["still moving"] < 1
+    assert about["shares"]["still moving"] > 0.5
     remedy = "(a higher rate: --set optimizer.learning_rate="
     assert f"; not converged, still moving: {KEY} {remedy}" in last
     assert "spread" in out.splitlines()[0]
-    assert re.search(r"\+- 0\.\d+ +still moving \(\d\d.* %\): a higher rate$", out.splitlines()[1])
+    assert re.search(r"\+- 0\.\d+ +still moving( \(\d\d.* %\))?: a higher rate$", out.splitlines()[1])
     assert [line.startswith(f"not converged, still moving: {KEY} {remedy}") for line in results["warnings"]] == [True]
     page = Path("runs/box/report.html").read_text()
     assert f"not converged, still moving: {KEY}" in page.partition("<section>")[0]
     assert '<th scope="col">verdict</th>' in page
-    assert '<span class="worse">still moving (' in page
+    assert '<span class="worse">still moving' in page
     # A run without certainty ends with the same values.
     values = np.load("runs/box/parameters/parameters.npz")[KEY]
     optimize(*sets, "run.certainty=false")

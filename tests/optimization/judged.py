@@ -52,7 +52,10 @@ run: {iterations: 100, spp: 16}
 
 @dataclass(frozen=True)
 class Toy:
-    """One run, with its parameters and their options, its settings, and the correct verdict for each parameter."""
+    """One run, with its parameters and their options, its settings, and the correct verdict for each parameter.
+
+    The options of a motion contain its `motion`.
+    """
 
     name: str
     parameters: dict[str, str]
@@ -86,7 +89,8 @@ def write_scene(folder: Path) -> None:
 
 def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     """Run the recovery in `folder`, which holds the scene, and return the measured certainty."""
-    parameters = ", ".join(f"{{key: {key}, {options}}}" for key, options in toy.parameters.items())
+    entries = {key: "" if options.startswith("motion:") else f"key: {key}, " for key, options in toy.parameters.items()}
+    parameters = ", ".join(f"{{{named}{toy.parameters[key]}}}" for key, named in entries.items())
     settings = [f"parameters=[{parameters}]", f"run.seed={seed}", *toy.settings]
     problem = assemble(load(folder / "toy.yaml", settings))
     true = {key: np.asarray(value, dtype=np.float64) for key, value in problem.truth.items()}
@@ -95,6 +99,7 @@ def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     state = standing(problem)
     for after, record in iterate(problem, state):
         certainty.see(state, after)
+        certainty.rates.append(record.lr / problem.config.optimizer.learning_rate)
         state, last = after, record
     before = {key: value.copy() for key, value in problem.values().items()}
     found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)

@@ -21,7 +21,6 @@ from reslrb_cli.cli import main
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.optimization import loop, optimizers, problem, sensitivity, targets
 from reslrb_cli.optimization.uncertainty import measuring
-from reslrb_cli.records.checkpoint import read_state
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.runs import recorder as recording
 
@@ -147,11 +146,6 @@ def found_of(run: Path) -> dict[str, Any]:
     return {key: value for key, value in results.items() if key not in ("elapsed_s", "certainty", "error_maps")}
 
 
-def noted_by(run: Path) -> Any:
-    """Return the values, without arrays, that the newest state holds for the certainty measurement."""
-    return read_state(run / "checkpoint/state.npz")[1]["certainty"]
-
-
 def differences(first: Path, second: Path) -> list[str]:
     """Return the names of all entries in which two runs differ in any bit."""
     one, other = state_of(first), state_of(second)
@@ -161,7 +155,7 @@ def differences(first: Path, second: Path) -> list[str]:
         for name in sorted(set(one) & set(other))
         if one[name].dtype != other[name].dtype or one[name].tobytes() != other[name].tobytes()
     ]
-    for what in (records_of, found_of, noted_by):
+    for what in (records_of, found_of):
         if what(first) != what(second):
             found.append(what.__name__)
     values = [(run / "parameters/parameters.npz") for run in (first, second)]

@@ -156,7 +156,7 @@ def _another_seed(run_seed, iteration, view, purpose):
 @pytest.mark.parametrize(
     "fault",
     a_few(
-        ["no moments", "another seed", "no squares", "no last steps", "metrics not cut back"],
+        ["no moments", "another seed", "no last steps", "metrics not cut back"],
         ["no moments"],
     ),
 )
@@ -165,10 +165,6 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
     from reslrb_cli.runs import prepare, resume
 
     restore = prepare.RunProgress.restore
-
-    def without_squares(self, stored, records):
-        restore(self, stored, records)
-        self.certainty.squares = {}
 
     def without_steps(self, stored, records):
         restore(self, stored, records)
@@ -181,7 +177,6 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
     places = {
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
         "another seed": (loop, "seed", _another_seed),
-        "no squares": (prepare.RunProgress, "restore", without_squares),
         "no last steps": (prepare.RunProgress, "restore", without_steps),
         "metrics not cut back": (resume, "cut_back", lambda folder, size: None),
     }

@@ -10,8 +10,13 @@ image, and W = d2L/dI2 has a second derivative for each pixel.
                         diagonal of H (Hutchinson 1989; Bekas et al. 2007), again from two sets of samples
 
 For the curvature along directions, a standard error is subtracted from the sum over the pixels. Overestimated curvature
-would make results look too certain. In the estimate by entry, single values are mostly noise. Entries whose gradients
-have similar noise have similar curvature, so `smooth` averages the curvatures.
+would make results look too certain. In the estimate by entry, single values are mostly noise, so `EntryCurvature`
+averages them over groups.
+
+The film's filter and the interpolation of a texture couple neighbouring texels. The mean of p_i p_j over the probes is
+H_ij. `EntryCurvature` averages these products over all pairs of texels with the same distance. With D for the diagonal
+of H, H is then D^1/2 K D^1/2, where K is a filter with the eigenvalues `eigenvalues` in a cosine transform. In the
+directions of the smallest eigenvalues, images do not determine a texture.
 
 Regularizers have their own curvature, without noise. Differences of the regularizers' gradient are added to both kinds
 of curvature.
@@ -38,6 +43,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.fft
 
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.optimization.loading import make_configured, paths_of, render_in_passes
@@ -52,10 +58,9 @@ _PURPOSE = "curvature"
 MOST_ENTRIES = 4
 #: Parts of keys of textures that mix channels into one number.
 MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metallic", "anisotropic")
-#: Minimum number of entries over which curvature is averaged.
-GROUP = 64
-#: A pixel shows a texture if its change exceeds this share of the largest change.
-SHOWN = 0.05
+#: Maximum distance of two texels that are coupled, along each axis, and the smallest eigenvalue of their coupling that
+#: counts as not 0.
+NEIGHBOURS, LEAST_EIGENVALUE = 2, 0.05
 #: Standard errors that are subtracted from curvature and added to the noise of the target.
 MARGIN = 1.0
 #: Maximum number of image values in H along directions; of more, a random subset, the same for all. Also the number of
@@ -180,6 +185,65 @@ class TargetNoise:
         return self.odd * spread
 
 
+@dataclass(frozen=True)
+class EntryCurvature:
+    """Curvature of each of N entries, from random probes: the diagonal of H (N,), and that of B (N,) or None.
+
+    For a texture, `probes` has pairs of probes (N,) with common signs, and `shape` is (height, width, channels).
+    """
+
+    diagonal: Array
+    of_target: Array | None
+    probes: Sequence[tuple[Array, Array]] = ()
+    shape: tuple[int, ...] = ()
+
+    def mean_of_target(self, group: Array) -> float:
+        """Return the mean of B's diagonal over some entries, plus a margin."""
+        if self.of_target is None:
+            return 0.0
+        chosen = self.of_target[group]
+        return max(float(chosen.mean() + MARGIN * chosen.std() / len(chosen) ** 0.5), 0.0)
+
+    def solve(self, gradients: Array, groups: Sequence[Array]) -> tuple[Array, Array, float]:
+        """Return the offsets (K, N) that would cause K gradients (K, N), and the mean curvature (N,) of each entry's
+        group. Also return the share of directions that images do not determine, which are left out of the offsets.
+
+        Entries outside all groups have no offset. A mean curvature of 0 is not known.
+        """
+        h = np.zeros_like(self.diagonal)
+        for group in groups:
+            h[group] = max(float(self.diagonal[group].mean()), 0.0)
+        root = np.where(h > 0, 1 / np.sqrt(np.maximum(h, 1e-300)), 0.0)
+        if len(self.shape) != 3 or not self.probes or not root.any():
+            return gradients * root**2, h, 0.0
+        eigenvalues = self._eigenvalues(root)
+        kept = eigenvalues > LEAST_EIGENVALUE
+        images = (gradients * root).reshape(-1, *self.shape)
+        spectrum = scipy.fft.dctn(images, axes=(1, 2), norm="ortho")
+        spectrum *= (kept / np.maximum(eigenvalues, LEAST_EIGENVALUE))[:, :, None]
+        offsets = scipy.fft.idctn(spectrum, axes=(1, 2), norm="ortho").reshape(gradients.shape) * root
+        return offsets, h, 1 - float(kept.mean())
+
+    def _eigenvalues(self, root: Array) -> Array:
+        """Return the eigenvalues (height, width) of the coupling K between texels of unit curvature."""
+        known = _correlation((root > 0).reshape(self.shape), (root > 0).reshape(self.shape))
+        pairs = (((a * root).reshape(self.shape), (b * root).reshape(self.shape)) for a, b in self.probes)
+        kernel = sum(_correlation(a, b) for a, b in pairs) / np.maximum(known, 0.5)
+        kernel = 0.25 * (kernel + kernel[::-1] + kernel[:, ::-1] + kernel[::-1, ::-1])
+        lags = np.arange(-NEIGHBOURS, NEIGHBOURS + 1)
+        waves = [np.cos(np.outer(np.pi * np.arange(size) / size, lags)) for size in self.shape[:2]]
+        middle = max(float(kernel[NEIGHBOURS, NEIGHBOURS]), 1e-300)
+        return np.asarray(waves[0] @ (kernel / middle) @ waves[1].T)
+
+
+def _correlation(one: Array, other: Array) -> Array:
+    """Return the sums of products of texels with each distance up to `NEIGHBOURS` along both axes."""
+    size = [length + NEIGHBOURS for length in one.shape[:2]]
+    a, b = (np.fft.rfft2(each, s=size, axes=(0, 1)) for each in (one, other))
+    lags = np.arange(-NEIGHBOURS, NEIGHBOURS + 1)
+    return np.asarray(np.fft.irfft2(np.conj(a) * b, s=size, axes=(0, 1)).sum(axis=2)[np.ix_(lags, lags)])
+
+
 class LossCurvature:
     """Measurement of the curvature at the current values of `problem`. The problem needs its targets.
 
@@ -188,8 +252,6 @@ class LossCurvature:
 
     def __init__(self, problem: Problem, spp: int) -> None:
         self.problem, self.spp = problem, spp
-        #: Number of image values that show each texture, for textures changed as a whole.
-        self.pixels: dict[str, int] = {}
         self.integrator = unrecorded(problem.integrator)
         self._base = [see_images(problem, spp, -1 - half, _PURPOSE) for half in (0, 1)]
         self._weights = [self._weight(place, view) for place, view in enumerate(problem.trained)]
@@ -228,8 +290,6 @@ class LossCurvature:
                         odd[half].append(np.concatenate([noise.in_blocks(each) for noise, each in pulls]))
                         sums = sum(float(np.sum(each * noise.even)) for noise, each in pulls)
                         even[-1] += 0.5 * sums / len(self.noises)
-                if direction.entry is None:
-                    self.pixels[direction.key] = self.pixels.get(direction.key, 0) + _changed(slopes)
         if not directions:
             return [], np.zeros((0, 0)), np.zeros((0, 0))
         a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
@@ -250,45 +310,57 @@ class LossCurvature:
             for one in directions
         ]))  # fmt: skip
 
-    def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
-        """Return the diagonal of H for each parameter as a flat array, unsmoothed. The result is empty if the first
-        call of `go_on` returns false.
+    def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, EntryCurvature]:
+        """Return the curvature of each entry of all parameters. The result is empty if the first call of `go_on`
+        returns false.
         """
-        total: dict[str, Array] = {}
+        found: list[dict[str, tuple[Array, Array]]] = []
+        bent: dict[str, Array] = {}
         random = np.random.default_rng(self._seed(0, probes))
-        done = 0
         for probe in range(probes):
             if not go_on():
                 break
-            done += 1
             roots = [np.sqrt(weight) * random.choice([-1.0, 1.0], size=weight.shape) for weight in self._weights]
-            self._add_probe(total, roots, 2 * probe)
-            for key in total:
-                signs = random.choice([-1.0, 1.0], size=total[key].shape)
-                total[key] = total[key] + signs * self.problem.stiffness(key, signs)
-        return {key: value / done for key, value in total.items()}
+            found.append(self._two_probes(roots, 2 * probe))
+            for key, (a, _) in found[-1].items():
+                signs = random.choice([-1.0, 1.0], size=a.shape)
+                bent[key] = bent.get(key, 0.0) + signs * self.problem.stiffness(key, signs)
+        if not found:
+            return {}
+        of_target = self._by_entry_of_target(probes, go_on)
+        return {
+            key: EntryCurvature(
+                np.mean([each[key][0] * each[key][1] for each in found], axis=0) + bent[key] / len(found),
+                of_target.get(key),
+                [each[key] for each in found],
+                tuple(dr.shape(self.problem.optimizer[key])),
+            )
+            for key in bent
+        }
 
-    def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
-        """Return the diagonal of B for each parameter as a flat array, unsmoothed. The probes are numbered from `first`
-        on. It is empty without a rendered target.
+    def _by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
+        """Return the diagonal of B for each parameter as a flat array. The probes are numbered from `first` on. It is
+        empty without a rendered target.
         """
-        odd: dict[str, Array] = {}
-        even: dict[str, Array] = {}
-        random = np.random.default_rng(self._seed(1, first))
+        total: dict[str, Array] = {}
         views = self.noises[:PROBED]
+        random = np.random.default_rng(self._seed(1, first))
         for number, noises in enumerate(views):
             if not go_on():
                 return {}
-            self._add_probe(odd, [noise.signed(random) for noise in noises], 2 * (first + number))
-        if odd:
-            self._add_probe(even, [noise.even for noise in views[0]], 2 * (first + PROBED))
-        return {key: value / len(views) + even[key] for key, value in odd.items()}
+            for key, (a, b) in self._two_probes(
+                [noise.signed(random) for noise in noises], 2 * (first + number)
+            ).items():
+                total[key] = total.get(key, 0.0) + a * b / len(views)
+        if total:
+            for key, (a, b) in self._two_probes([noise.even for noise in views[0]], 2 * (first + PROBED)).items():
+                total[key] = total[key] + a * b
+        return total
 
-    def _add_probe(self, total: dict[str, Array], gradients: Sequence[Array], number: int) -> None:
-        """Add the product of two gradients from separate sample sets. `gradients` has dL/dI for each view."""
+    def _two_probes(self, gradients: Sequence[Array], number: int) -> dict[str, tuple[Array, Array]]:
+        """Return two gradients of each parameter from separate sample sets. `gradients` has dL/dI for each view."""
         a, b = (self._probe(gradients, number + half) for half in (0, 1))
-        for key in a:
-            total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
+        return {key: (a[key].astype(np.float64), b[key].astype(np.float64)) for key in a}
 
     def _target_noises(self) -> list[list[TargetNoise]]:
         config, trained = self.problem.config, self.problem.trained
@@ -382,20 +454,6 @@ class LossCurvature:
         return seed(self.problem.config.run.seed, number, sensor, _PURPOSE)
 
 
-def smooth(diagonal: Array, noise: Array, sure: float = 0.0) -> Array:
-    """Return averages of `diagonal` (N,) over groups of at least GROUP entries. The gradients of a group's entries have
-    similar `noise`.
-
-    The function adds `sure` standard errors to each group's average.
-    """
-    order = np.argsort(noise, kind="stable")
-    result = np.empty_like(diagonal)
-    for group in np.array_split(order, max(len(order) // GROUP, 1)):
-        margin = sure * float(diagonal[group].std()) / len(group) ** 0.5
-        result[group] = max(float(diagonal[group].mean()) + margin, 0.0)
-    return result
-
-
 def _symmetric(product: Array) -> Array:
     return np.asarray(0.5 * (product + product.T))
 
@@ -413,8 +471,3 @@ def _sure_share(terms: Array) -> Array:
     """
     sums, errors = terms.sum(axis=1), np.sqrt(np.square(terms).sum(axis=1))
     return np.asarray(np.clip(1 - MARGIN * errors / np.maximum(sums, 1e-300), 0, 1))
-
-
-def _changed(slopes: Sequence[Array]) -> int:
-    most = max(float(np.abs(slope).max()) for slope in slopes)
-    return sum(int(np.sum(np.abs(slope) > SHOWN * most)) for slope in slopes) if most else 0

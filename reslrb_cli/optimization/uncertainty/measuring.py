@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 
 from reslrb_cli.optimization.identifiability import shown_texels
-from reslrb_cli.optimization.loop import learning_rate_factor
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
@@ -34,34 +32,19 @@ _PURPOSE = "certainty"
 LEAST_ITERATIONS = 20
 #: Gradients at the final values: iterations per gradient, and the limits of their number. They have the samples of a
 #: step, so they compile no kernel.
-ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 3, 16
+ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 4, 16
 #: Random probes for large parameters; minimum number of renderings along directions, and iterations per rendering.
 PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
 #: Divisor of a step's samples for each of the two sets that measure curvature, and samples per pixel below which all
-#: are used. All are also used if noise hides the curvature of an entry.
+#: are used. All are also used if noise hides the curvature of entries.
 PART, FEW = 4, 4
 #: Step of the differences along directions, as a share of a parameter's scale.
 STEP = 0.05
-#: Last part of a run whose gradients give the noise, and for small parameters the mean gradient; maximum number of
-#: iterations.
-RECENT, MOST_LAST = 0.2, 200
+#: Maximum number of the last iterations, at most half of all, whose gradients and values are used; maximum number of
+#: entries of a texture whose brightness is recorded.
+MOST_LAST, MOST_RECORDED = 200, 2**22
 #: Curvature that takes longer than this share of the run's iterations, and than this many of them, is left out.
 SHARE, MOST_STEPS = 0.25, 50
-
-
-@dataclass(frozen=True)
-class Noted:
-    """Iterations at which data were recorded.
-
-    `seen` is the iteration at which squared gradients were recorded, or 0 before the recording. `keys` are the
-    parameters with recorded squares, and `last` those with recorded later steps. `paces` has each parameter's movement
-    per unit of gradient, recorded after some iterations.
-    """
-
-    seen: int
-    keys: list[str]
-    last: list[str] = field(default_factory=list)
-    paces: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
 
 
 class Certainty:
@@ -72,72 +55,26 @@ class Certainty:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
-        #: The optimiser's squares (`Optimizer.squares`) at that time, by key.
-        self._seen, self.squares = 0, dict[str, Any]()
-        #: Since then, by key of a small parameter: `Measured.last`.
+        #: Gradients and values of the last iterations, by key of a small parameter or a texture: `Measured.last`.
         self.last: dict[str, Array] = {}
-        self._paces: dict[str, list[tuple[int, float]]] = {key: [] for key in problem.selection.keys}
         #: Texels (H, W) of each texture that are visible in some view and lit, once computed.
         self.shown: dict[str, Array] = {}
-        #: Factors of the learning rate so far, if no formula gives them.
+        #: The schedule's factor for each iteration.
         self.rates: list[float] = []
-
-    @property
-    def noted(self) -> Noted:
-        """Recorded data without arrays."""
-        return Noted(self._seen, list(self.squares), list(self.last), self._paces)
-
-    def restore(self, noted: Noted, squares: dict[str, Any], last: dict[str, Array]) -> None:
-        """Continue from recorded data: `noted`, `squares` and `last`."""
-        self._seen, self.squares, self.last = noted.seen, squares, last
-        self._paces |= {key: looks for key, looks in noted.paces.items() if key in self._initial}
 
     def see(self, before: State, state: State) -> None:
         """Record data of the iteration that leads from `before` to `state`. This costs almost nothing."""
-        planned, iterations = self.problem.config.run.iterations, state.iteration
-        if state.level != before.level:
-            self.squares = {}  # the running means start again
-        if 0 < self._seen < iterations:
-            for key, initial in self._initial.items():
-                if initial.size <= MOST_ENTRIES:
-                    self._add_step(key, before, state)
-        if iterations == int((1 - RECENT) * planned):
-            kept = {key: self.problem.optimizer.squares(key) for key in self._initial}
-            self.squares = {key: each[0] for key, each in kept.items() if each is not None}
-            self._seen, self.last = iterations, {}
-        # Twice per doubling of the iteration's number, independent of the planned number, which may change.
-        if iterations % max((1 << iterations.bit_length()) // 4, 1) == 0:
-            for key, looks in self._paces.items():
-                pace = self._pace(key)
-                if np.isfinite(pace) and pace > 0:
-                    looks.append((iterations, pace))
-
-    def _add_step(self, key: str, before: State, state: State) -> None:
-        gradient, value = (to_array(each[key]).astype(np.float64).ravel() for each in (state.gradients, before.values))
-        if not np.isfinite(gradient).all():
-            return
-        earlier = self.last.get(key, np.zeros((0, 2, gradient.size)))
-        self.last[key] = np.concatenate([earlier, [[gradient, value]]])[-MOST_LAST:]
-
-    def _pace(self, key: str) -> float:
-        """Return how far a step currently moves a parameter, per unit of gradient. The parameter's steepest entries
-        dominate the value.
-        """
-        with np.errstate(divide="ignore"):  # of parameters that have not moved yet
-            steepness = rms(1 / self.problem.optimizer.response(key))
-        return 1 / max(steepness, 1e-300)
-
-    def _recent(self, key: str, iterations: int) -> Array | None:
-        """Return the mean square (N,) of the gradients after the recording of squares, or None if the optimiser stores
-        no squares.
-        """
-        before, now = self.squares.get(key), self.problem.optimizer.squares(key)
-        if before is None or now is None or iterations <= self._seen:
-            return None
-        first, last = (np.array(mean, dtype=np.float64).ravel() for mean in (before, now[0]))
-        kept = now[1] ** (iterations - self._seen)
-        squares = np.maximum(last - kept * first, 0) / max(1 - kept, 1e-300)
-        return np.asarray(squares / np.maximum(self.problem.optimizer.slope(key) ** 2, 1e-300))
+        for key, initial in self._initial.items():
+            shape = self.problem.selection.array(key).shape
+            if initial.size > MOST_ENTRIES and (len(shape) != 3 or initial.size > MOST_RECORDED):
+                continue
+            both = (state.gradients, before.values)
+            gradient, value = (to_array(each[key]).astype(np.float64).ravel() for each in both)
+            if initial.size > MOST_ENTRIES:
+                gradient, value = brightness(gradient, value, shape[2])
+            if np.isfinite(gradient).all():
+                earlier = self.last.get(key, np.zeros((0, 2, gradient.size)))
+                self.last[key] = np.concatenate([earlier, [[gradient, value]]])[-MOST_LAST:]
 
     def measure(self, iterations: int, elapsed_s: float, stop: Callable[[], bool]) -> CertaintyRecord | None:
         """Measure after `iterations` iterations of `elapsed_s` seconds. Returns None after fewer than
@@ -151,8 +88,7 @@ class Certainty:
         try:
             problem.apply()
             rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
-            count = min(max(iterations // ITERATIONS_A_SAMPLE, LEAST_SAMPLES), MOST_SAMPLES)
-            for number in range(count):
+            for number in range(gradient_count(iterations)):
                 if stop():
                     return None
                 with clock.step() as times:
@@ -179,17 +115,16 @@ class Certainty:
                 # By entry, if a parameter has no directions for its entries.
                 seen = {direction.key for direction in directions if direction.entry is not None}
                 left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
-                diagonal = curvature.by_entry(PROBES, go_on) if left else {}
-                of_target = curvature.by_entry_of_target(PROBES, go_on) if diagonal else {}
+                by_entry = curvature.by_entry(PROBES, go_on) if left else {}
             compiled_ms += times.codegen_ms
             if stop():
                 return None
             measured = self._measured(gradients, iterations)
-            weighed = weigh(measured, directions, H, diagonal, curvature.pixels, B, of_target)
+            weighed = weigh(measured, directions, H, B, by_entry)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             render = config.target.render
             return CertaintyRecord(
-                parameters={key: self._with_course(key, about, measured[key]) for key, about in weighed.items()},
+                parameters={key: self._with_course(about, measured[key], key) for key, about in weighed.items()},
                 measure_s=measure_s,
                 share=measure_s / max(elapsed_s, 1e-9),
                 iterations=iterations,
@@ -207,13 +142,13 @@ class Certainty:
         read = [view.file is not None for view in self.problem.trained]
         return "left out" if all(read) else "in part" if any(read) else "measured"
 
-    def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:
+    def _with_course(self, about: ParameterCertainty, own: Measured, key: str) -> ParameterCertainty:
         """Return the certainty with the distance moved, the possible distance, and the learning rate."""
         optimizer = self.problem.optimizer
         step = optimizer.first_step(key)
-        reach = None if step is None else step * float(sum(own.rates))
+        reach = None if step is None else step * float(sum(self.rates))
         kept = own.touched & (True if own.seen is None else own.seen)
-        moved = rms((own.value - self._initial[key])[kept]) if kept.any() else 0.0
+        moved = rms((own.value - own.start)[kept]) if kept.any() else 0.0
         return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key))
 
     def scale(self, key: str) -> float:
@@ -246,44 +181,49 @@ class Certainty:
         return np.repeat(wide.ravel(), channels)
 
     def _measured(self, gradients: Gradients, iterations: int) -> dict[str, Measured]:
-        settings, optimizer, selection = self.problem.config.optimizer, self.problem.optimizer, self.problem.selection
-        planned, final = self.problem.config.run.iterations, settings.final_fraction
-        rates = self.rates or [
-            learning_rate_factor(settings.schedule, each, planned, final) for each in range(iterations)
-        ]
-        found = {}
+        optimizer, found = self.problem.optimizer, {}
         for key, rows in gradients.items():
-            value = row_of(self.problem, key)
+            value, last = row_of(self.problem, key), self.last.get(key)
             found[key] = Measured(
                 value=value,
-                bounds=selection.specs[key].bounds or (-np.inf, np.inf),
+                bounds=self.problem.selection.specs[key].bounds or (-np.inf, np.inf),
                 scale=self.scale(key),
                 gradients=rows,
-                response=np.nan_to_num(optimizer.response(key) * optimizer.rate(key)),
-                rates=rates,
+                step=np.nan_to_num(optimizer.response(key) * optimizer.rate(key) * self.rates[-1]),
                 is_small=value.size <= MOST_ENTRIES,
-                recent=self._recent(key, iterations),
-                seen=self._seen_entries(key, rows),
-                last=self.last.get(key),
-                pace=self._paces_of(key, iterations),
                 start=self._initial[key],
+                last=None if last is None else last[-(iterations // 2) :],
+                seen=self._seen_entries(key, rows),
             )
         return found
 
-    def _paces_of(self, key: str, iterations: int) -> Array | None:
-        """Return a parameter's step length in each iteration, relative to the current step length. Return None if step
-        lengths were not recorded.
-        """
-        if not (looks := self._paces[key]):
-            return None
-        at, found = np.array(looks).T
-        return np.asarray(np.interp(np.arange(1, iterations + 1), at, found) / found[-1])
+
+def gradient_count(iterations: int) -> int:
+    """Return the number of gradients at the final values."""
+    return min(max(iterations // ITERATIONS_A_SAMPLE, LEAST_SAMPLES), MOST_SAMPLES)
+
+
+def brightness(gradient: Array, value: Array, channels: int) -> tuple[Array, Array]:
+    """Return the derivative by the logarithm of the brightness of each channel of a texture, and that logarithm.
+
+    `gradient` and `value` are flat arrays with the channels last. The brightness is the square root of the sum of
+    squares.
+    """
+    g, x = (each.reshape(-1, channels) for each in (gradient, value))
+    return np.einsum("ic,ic->c", g, x), np.log(np.maximum(np.linalg.norm(x, axis=0), 1e-300))
 
 
 def hides(directions: Sequence[ParameterDirection], curvature: Array, gradients: Gradients) -> bool:
-    """True if noise hides all curvature along the direction of some entry with gradients. The curvature is (M, M)."""
-    flat = [d for d, h in zip(directions, np.diag(curvature), strict=True) if d.entry is not None and h <= 0]
-    return any(np.any(gradients[d.key][:, d.entry]) for d in flat)
+    """True if noise hides the curvature (M, M) along some combination of entries with gradients. The curvature is then
+    zero or negative.
+    """
+    at = [place for place, each in enumerate(directions)
+          if each.entry is not None and np.any(gradients[each.key][:, each.entry])]  # fmt: skip
+    chosen = curvature[np.ix_(at, at)]
+    size = np.diag(chosen)
+    if not at or np.any(size <= 0):
+        return bool(at)
+    return bool(np.linalg.eigvalsh(chosen / np.sqrt(np.outer(size, size)))[0] <= 0)
 
 
 class _Budget:

@@ -1,59 +1,35 @@
-"""Distance of the final values from the optimum. The estimate is the offset that remains after the run's steps,
-corrected by gradients at the end.
+"""Distance of the final values from the optimum, estimated from the gradients of the last half of a run.
 
-A `Measured` has the measurements of one parameter at the end of a run. A `Posterior` is the result. `joint` treats
-entries together. `alone` treats each entry as if all other entries were known.
+Near the optimum, the loss is quadratic with curvature H. A gradient at the values x is then
 
-Near the optimum, the loss is quadratic with curvature H. The offset of the values from the optimum is d = x - x*. P is
-an entry's movement by one step per unit of gradient (`Optimizer.response`).
+    g = H (x - x*) + noise
 
-    d <- d - eta_t P (H d + noise)
+The offset of the final values is d = x_T - x*. Each gradient of the last half measures H d once the known movement of
+the values is subtracted. Gradients at the final values are treated alike.
 
-C is the covariance of the offset. C starts with the square of each entry's scale, because nothing is known about the
-optimum. Each step changes C.
+    y_t = g_t - H (x_t - x_T) = H d + noise
 
-    C <- (1 - eta_t P H) C (1 - eta_t P H)^T + eta_t^2 P Sigma P
+`joint` treats all directions together. The y_t are averaged in `BLOCKS` blocks. The variance of the block means gives
+the covariance V of their mean y. No model of the noise or of the optimiser is needed. If H is wrong, or if the loss is
+not quadratic, y_t drifts, and V contains the drift. The optimum is as uncertain as the scale before the measurement.
 
-C has three parts: the initial offset that remains after too few iterations, directions that the view does not
-determine, and the steps' noise. In undetermined directions, H has no curvature, so C keeps its initial value. After the
-steps, the mean g of K gradients at the final values measures H d. The measurement updates C as in a Kalman filter.
+    C = scale^2,   gain = C H (H C H + V)^-1,   to go = gain y,   C <- C - gain H C
 
-    gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
+In directions that the views do not determine, H has no curvature, and C keeps its initial value. The distance between
+the final values and their mean is known without H. Only the remainder (`pulled`) is wrong if H is wrong.
 
-The last iterations measure H d as well (`Measured.last`). The noise of the last iterations is part of C, but the total
-movement m of the last iterations is known. C is then the covariance of the values before the last iterations. The
-offset d has the mean m in place of 0. The gradient of a step is H (d + y) plus noise. Here y is the offset of the
-step's values from the final values. After subtracting H y, a step's gradient counts as one more gradient at the end.
+Noise of the target adds the same b to every gradient. B is the second moment of b, and gain B gain^T the part of the
+spread that comes from the target.
 
-    to go = m + gain (g - H m)
-
-C is only as good as the model. At first, other parameters with wrong values may have driven the parameters of C in the
-wrong direction. The curvature may also have been smaller during the run. C may then be too small by any factor, because
-the remainder of the initial offset falls exponentially. Gradients at the end show this. Let u be an eigenvector of H
-with curvature h. For u (g - H m), the model predicts the variance h^2 c + s. The term c comes from C, and s comes from
-noise. If the observed u (g - H m) exceeds `SURPRISE` standard deviations, c is replaced.
-
-    c <- ((u (g - H m))^2 - s) / h^2      at most that of the start
-
-Noise of the target adds the same b to every gradient. A gradient is then H d + b + noise. Here d is the offset from the
-optimum for a target without noise. B is the second moment of b. D is the steps' total movement per unit of a constant
-gradient. E, cov(d, g) and cov(g) replace C, C H and H C H + Sigma / K.
-
-    D <- (1 - eta_t P H) D + eta_t P
-    E = C + D B D^T,   cov(d, g) = E H - D B,   cov(g) = H E H - H D B - B D^T H + B + Sigma / K
-
-If the run has converged, D = H^-1. In a converged run, no gradient shows the effect of b. The covariance H^-1 B H^-1
-remains.
-
-The model omits momentum, because over many steps the movement is the same with and without momentum. P is measured at
-the end of the run. eta_t contains the ratio of earlier step lengths to the final step length (`Measured.pace`). For
-Adam, earlier steps are shorter until the large gradients of the start are forgotten.
+`pooled` treats many entries of a large parameter as a group. Each of K independent gradients at the final values gives
+an estimate H^-1 g of d. The mean of the products of two estimates, over the entries and over pairs of gradients, is an
+unbiased estimate of the mean of d^2.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -61,54 +37,57 @@ from reslrb_cli.statistics import Array
 
 #: A distance of this many standard errors is significant; the same for gradients.
 SURE = 2.0
-#: Gradients this many standard deviations from the model's prediction contradict the model.
-SURPRISE = 3.0
 #: A value within this share of its scale of a bound counts as at the bound, however small the steps are.
 AT_BOUND = 1e-3
 #: Steps by which noise may have moved a value away from its bound.
 STEPS_OFF = 3.0
+#: Blocks of consecutive gradients.
+BLOCKS = 12
+#: One-sided probability that a value is within its limit, and the relative error of the curvature.
+CONFIDENCE, CURVATURE_ERROR = 0.85, 0.3
+#: Minimum number of entries of a group, and maximum number of groups.
+GROUP, MOST_GROUPS = 64, 10
+#: Tolerance as a share of a value. Values smaller than this share of the parameter's scale have the tolerance of a
+#: larger value.
+TOLERANCE, LEAST_VALUE = 0.1, 0.4
 
 
 @dataclass(frozen=True)
 class Measured:
     """Parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
-    - `response` is an entry's movement by one step per unit of gradient, at the schedule's factor 1. `rates` has the
-        schedule's factor for each iteration.
-    - `pace` is the step length of each iteration divided by the step length at the end. `pace` is None if all step
-        lengths are equal.
-    - `last` (n, 2, N) has the last n iterations, if known: the gradients, and the values at which the gradients were
-        computed. `recent` (N,) is the mean square of the gradients in the last
-        iterations, if the optimiser stores this mean.
-    - `seen` (N,) marks the entries of a texture that some view shows. `seen` is None for other parameters.
+    - `step` (N,) is an entry's movement by the last step, per unit of gradient.
     - `start` (N,) are the values before the first iteration.
-    - `mean` and `noise`, both (N,), are the gradients' mean and variance.
+    - `last` (n, 2, m) has the last n iterations, if known: the gradients, and the values at which they were computed.
+        m is N for a small parameter. For a texture, they are the derivative by the logarithm of each channel's
+        brightness, and that logarithm (`brightness`).
+    - `seen` (N,) marks the entries of a texture that some view shows. `seen` is None for other parameters.
     """
 
     value: Array
     bounds: tuple[float, float]
     scale: float
     gradients: Array
-    response: Array
-    rates: Sequence[float]
+    step: Array
     is_small: bool
-    recent: Array | None = None
-    seen: Array | None = None
+    start: Array
     last: Array | None = None
-    pace: Array | None = None
-    start: Array | None = None
-    mean: Array = field(init=False)
-    noise: Array = field(init=False)
+    seen: Array | None = None
 
-    def __post_init__(self) -> None:
-        noise = np.var(self.gradients, axis=0, ddof=1)
-        if self.is_small and self.recent is None:  # few samples: use the mean over all entries
-            noise = np.where(noise > 0, noise.mean(), 0.0)
-        mean = self.gradients.mean(axis=0)
-        if self.recent is not None:  # the longer average, because few samples of heavy-tailed gradients underestimate
-            noise = np.maximum(noise, self.recent - mean**2)
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "noise", noise)
+    @property
+    def mean(self) -> Array:
+        """Mean gradient (N,) at the final values."""
+        return np.asarray(self.gradients.mean(axis=0))
+
+    @cached_property
+    def noise(self) -> Array:
+        """Variance (N,) of one gradient. Entries of a large parameter share the variance of their group."""
+        if self.is_small and self.last is not None:
+            return np.var(np.concatenate([self.last[:, 0], self.gradients]), axis=0, ddof=1)
+        found = np.var(self.gradients, axis=0, ddof=1)
+        for group in self.groups(found > 0):
+            found[group] = found[group].mean()
+        return found
 
     @property
     def prior(self) -> float:
@@ -117,12 +96,6 @@ class Measured:
         """
         low, high = self.bounds
         return min(self.scale, (high - low) / np.sqrt(12))
-
-    @property
-    def steps(self) -> Array:
-        """Step factor eta of each iteration, which is the schedule's factor times the pace."""
-        rates = np.asarray(self.rates, dtype=np.float64)
-        return rates if self.pace is None else rates * self.pace
 
     @property
     def touched(self) -> Array:
@@ -137,159 +110,150 @@ class Measured:
         The gradient points to larger losses. A positive gradient therefore holds the value at the lower bound.
         """
         low, high = (np.float32(bound) for bound in self.bounds)
-        step = self.response * self.rates[-1] * np.sqrt(self.noise)  # the noise of the last step
-        near = np.maximum(AT_BOUND * self.scale, STEPS_OFF * step)
+        near = np.maximum(AT_BOUND * self.scale, STEPS_OFF * self.step * np.sqrt(self.noise))
         back = SURE * np.sqrt(self.noise / len(self.gradients))
         lower = (self.value - low <= near) & (self.mean >= np.where(self.value <= low, -back, back))
         upper = (high - self.value <= near) & (self.mean <= np.where(self.value >= high, back, -back))
         return np.asarray(lower | upper)
 
     @property
-    def driven(self) -> Array:
-        """Entries (N,) that the run has moved to a bound. Entries that the run moves to a bound have gradients on the
-        way, but may have no gradients at the bound.
+    def moved(self) -> Array:
+        """Entries (N,) that the run has moved. They had gradients on the way, but may have none at their final
+        values.
         """
-        return np.asarray(self.at_bound & (False if self.start is None else self.value != self.start))
+        return np.asarray(self.value != self.start)
+
+    def tolerance(self, value: Array | float) -> Array:
+        """Return the tolerance of entries with this value."""
+        return np.asarray(TOLERANCE * np.maximum(np.abs(value), LEAST_VALUE * self.scale))
 
     def within(self, to_go: Array) -> Array:
         """Return movements to the optimum, clipped at the bounds. Far away, the curvature is not valid."""
         low, high = self.bounds
         return np.clip(to_go, np.minimum(self.value - high, 0), np.maximum(self.value - low, 0)).astype(np.float64)
 
+    def groups(self, kept: Array) -> list[Array]:
+        """Return the indices of the entries in `kept`, in groups whose steps have similar lengths.
+
+        Adam's steps are short where gradients are large. The groups do not depend on `gradients`, so a selection by
+        noise cannot bias a group's mean.
+        """
+        chosen = np.flatnonzero(kept)
+        order = chosen[np.argsort(self.step[chosen], kind="stable")]
+        return np.array_split(order, int(np.clip(len(order) // GROUP, 1, MOST_GROUPS))) if order.size else []
+
 
 @dataclass(frozen=True)
 class Posterior:
-    """Estimated offset of each of M entries from the optimum.
+    """Estimated offset of each of M directions from the optimum.
 
-    A posterior has the mean offset `to_go` (M,) and its `variance` (M,). `of_target` (M,) is the part of the spread
-    that comes from the target. If the entries were judged together, the posterior also has the covariance (M, M).
+    A posterior has the mean offset `to_go` (M,), its standard error `error` (M,), and the part `pulled` (M,) of `to_go`
+    that depends on the curvature. `of_target` (M,) is the standard deviation that comes from the target's noise.
+    `alone` (M,) is the error if all other directions were known, and `covariance` (M, M) that of the offsets. `sure` is
+    the number of standard errors to the end of an interval.
     """
 
     to_go: Array
-    variance: Array
+    error: Array
+    pulled: Array
     of_target: Array
-    covariance: Array | None = None
-
-    @property
-    def error(self) -> Array:
-        """Standard error of `to_go`, (M,)."""
-        return np.sqrt(np.maximum(self.variance, 0.0))
+    alone: Array
+    covariance: Array
+    sure: float
 
     @property
     def spread(self) -> Array:
         """Root mean square (M,) of the offset, which is one standard deviation of a final value around the optimum."""
-        return np.hypot(self.to_go, self.error)
+        return np.sqrt(self.to_go**2 + self.error**2 + self.of_target**2)
+
+    @property
+    def limit(self) -> Array:
+        """Distance (M,) that the offset does not exceed with `CONFIDENCE`, for a target without noise."""
+        return self._limit(self.of_target)
+
+    @property
+    def limit_of_run(self) -> Array:
+        """Like `limit`, but for the optimum of the noisy target."""
+        return self._limit(np.zeros_like(self.to_go))
+
+    @property
+    def is_pulled(self) -> Array:
+        """Directions (M,) in which the gradients still pull the values. Values that only fluctuate are not pulled."""
+        return np.asarray(np.minimum(np.abs(self.to_go), np.abs(self.pulled)) > self.sure * self.error)
+
+    def _limit(self, of_target: Array) -> Array:
+        parts = self.error**2 + (CURVATURE_ERROR * self.pulled) ** 2 + of_target**2
+        return np.asarray(np.abs(self.to_go) + self.sure * np.sqrt(parts))
 
 
-@dataclass(frozen=True)
-class Entries:
-    """M entries at the end of a run.
+def joint(gradients: Array, offsets: Array, scale: Array, curvature: Array, fixed: Array) -> Posterior:
+    """Return the joint offset of M directions.
 
-    - `response` (M,) is the diagonal of P, and `scale` (M,) is the standard deviation of the offset at the start.
-    - `gradient` (M,) is the mean of `samples` gradients. `samples` is one count for all entries, or one count for each
-        entry. If the counts differ, the smaller sample set is part of the larger sample set.
-    - `rates` are the eta of all iterations. `came` (M,) is the known movement in the last iterations, which `rates`
-        does not contain.
+    `gradients` (n, M) are the gradients, and `offsets` (n, M) the distances of their values from the final values.
+    `scale` (M,) is the standard deviation of the offset at the start, `curvature` is H (M, M), and `fixed` is B (M, M).
+    The computation expresses each direction in units of its scale. Matrices of directions with different units are
+    therefore well-conditioned.
     """
+    units, one = np.outer(scale, scale), np.eye(len(scale))
+    H, B = _positive(curvature * units), _positive(fixed * units)
+    y = gradients * scale - (offsets / scale) @ H
+    blocks = np.array([block.mean(axis=0) for block in np.array_split(y, min(BLOCKS, len(y)))])
+    V = noise_covariance(blocks.T, blocks.var(axis=0, ddof=1), H) / len(blocks)
+    seen = H @ H + V
+    gain = np.linalg.solve(seen + one * max(1e-9 * float(np.trace(seen)), 1e-30), H).T
+    to_go, C = gain @ blocks.mean(axis=0), _positive(one - gain @ H)
+    pulled = to_go + gain @ H @ (offsets.mean(axis=0) / scale)
+    of_target = np.minimum(np.sqrt(np.maximum(np.diag(gain @ B @ gain.T), 0.0)), 1.0)
+    alone = 1 / np.sqrt(1 + np.diag(H) ** 2 / np.maximum(np.diag(V), 1e-300))
+    return Posterior(
+        to_go * scale,
+        np.sqrt(np.diag(C)) * scale,
+        pulled * scale,
+        of_target * scale,
+        alone * scale,
+        C * units,
+        _quantile(len(blocks) - 1),
+    )
 
-    response: Array
-    scale: Array
-    gradient: Array
-    samples: int | Array
-    rates: Sequence[float] | Array
-    came: Array | float = 0.0
 
+def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array:
+    """Return the noise covariance (M, M) of one sample. `samples` (M, K) are gradients, `variance` (M,) their
+    variances, and `curvature` is H (M, M).
 
-def joint(entries: Entries, curvature: Array, noise: Array, fixed: Array | None = None) -> Posterior:
-    """Return the joint offset of all entries.
-
-    `curvature` is H (M, M), and `noise` the covariance of one gradient (M, M). `fixed` is the matrix B (M, M) of the
-    noise that all gradients have in common, or None. The computation expresses each entry in units of the entry's
-    scale. Matrices of entries with different units are therefore well-conditioned.
+    With far fewer samples than entries, the samples do not determine a covariance. However, noise of dL/dI reaches the
+    parameters through the same Jacobian J that determines the curvature. The noise correlations are therefore the
+    correlations of H times one factor in [0, `LIKE`]. The function fits the factor to the samples.
     """
-    scale, gradient = entries.scale, entries.gradient
-    units = np.outer(scale, scale)
-    H, Sigma = _positive(curvature * units), _positive(noise * units)
-    C, D = _after(H, entries.response / scale**2, Sigma, entries.rates)
-    B = np.zeros_like(H) if fixed is None else _positive(fixed * units)
-    counts = np.broadcast_to(np.asarray(entries.samples, dtype=np.float64), scale.shape)
-    m, driven = entries.came / scale, D @ B @ D.T
-    E, pulled = C + driven, H @ D @ B
-    beside = B - pulled - pulled.T + Sigma / np.maximum.outer(counts, counts)
-    surprise = gradient * scale - H @ m
-    E = E + _unforeseen(H, E, beside, surprise)
-    seen = H @ E @ H + beside
-    seen = seen + np.eye(len(scale)) * max(1e-9 * float(np.trace(seen)), 1e-30)
-    shared = E @ H - D @ B
-    gain = np.linalg.solve(seen, shared.T).T
-    covariance = _positive(E - gain @ shared.T) * units
-    of_target = np.sqrt(np.maximum(np.diag(driven), 0.0)) * scale
-    return Posterior((m + gain @ surprise) * scale, np.diag(covariance), of_target, covariance)
+    size = np.sqrt(np.maximum(np.diag(curvature), 0.0))
+    alike = np.clip(curvature / np.maximum(np.outer(size, size), 1e-300), -1, 1) * np.outer(size > 0, size > 0)
+    deviation = samples - samples.mean(axis=1, keepdims=True)
+    sd = np.sqrt(np.maximum(variance, 1e-300))
+    found = (deviation @ deviation.T) / (samples.shape[1] - 1) / np.outer(sd, sd)
+    beside = ~np.eye(len(sd), dtype=bool)
+    weight = float(np.sum(np.square(alike[beside])))
+    factor = float(np.clip(np.sum(found[beside] * alike[beside]) / weight, 0, LIKE)) if weight else 0.0
+    return np.asarray(np.where(beside, factor * alike, 1.0) * np.outer(sd, sd))
 
 
-def _unforeseen(H: Array, E: Array, beside: Array, surprise: Array) -> Array:
-    """Return the amount to add to the offsets' covariance E if the gradients contradict E. The addition and E are in
-    units of the standard deviations at the start.
+#: Maximum similarity of the gradients' noise and their curvature: part of the noise is independent.
+LIKE = 0.95
 
-    `surprise` is the difference between measured and expected gradients. `beside` is the part of `surprise`'s
-    covariance that does not come from E.
+
+def pooled(offsets: Array) -> tuple[float, float]:
+    """Return an unbiased estimate of the mean square offset of N entries, and its standard error. `offsets` (K, N) are
+    independent unbiased estimates of the offsets.
     """
-    values, vectors = np.linalg.eigh(H)
-    c, s = (np.einsum("me,mn,ne->e", vectors, each, vectors) for each in (E, beside))
-    square, h2 = (vectors.T @ surprise) ** 2, np.maximum(values, 0.0) ** 2
-    found = np.clip((square - s) / np.maximum(h2, 1e-300), 0.0, 1.0)
-    more = np.where(square > SURPRISE**2 * np.maximum(h2 * c + s, 1e-300), np.maximum(found - c, 0.0), 0.0)
-    return np.asarray((vectors * more) @ vectors.T)
+    count = len(offsets)
+    products = (offsets.sum(axis=0) ** 2 - np.square(offsets).sum(axis=0)) / (count * (count - 1))
+    error = products.std(ddof=1) / np.sqrt(products.size) if products.size > 1 else np.inf
+    return float(products.mean()), float(error)
 
 
-def alone(entries: Entries, curvature: Array, noise: Array, fixed: Array | float = 0.0) -> Posterior:
-    """Return the offset of each entry, as if all other entries were known. `curvature`, `noise` and `fixed` are the
-    diagonals (M,) of the matrices in `joint`. The function does not correct the model's covariance C, even if gradients
-    contradict the model.
-    """
-    response, came = entries.response, entries.came
-    h = np.maximum(curvature, 0.0)
-    C, D = entries.scale**2, np.zeros_like(h)
-    for rate in entries.rates:
-        left = np.clip(1 - rate * response * h, 0, 1)
-        C = left**2 * C + (rate * response) ** 2 * noise
-        D = left * D + _driven(rate * response, h)
-    E = C + D**2 * fixed
-    seen = h**2 * E - 2 * h * D * fixed + fixed + np.maximum(noise / entries.samples, 1e-300)
-    shared = E * h - D * fixed
-    gain = shared / seen
-    return Posterior(came + gain * (entries.gradient - h * came), E - gain * shared, D * np.sqrt(fixed))
+def _quantile(freedom: int) -> float:
+    """Return the quantile of Student's t at `CONFIDENCE`."""
+    from scipy.special import stdtrit  # late, because the command line must start fast
 
-
-def _driven(step: Array, curvature: Array) -> Array:
-    """Return one step's movement per unit of a constant gradient. The movement ends where the curvature compensates for
-    the gradient.
-    """
-    return np.asarray(np.minimum(step, 1 / np.maximum(curvature, 1e-300)))
-
-
-def _after(H: Array, response: Array, noise: Array, rates: Sequence[float] | Array) -> tuple[Array, Array]:
-    """Return the covariance after all steps if all variances are 1 at the start. Also return the total movement by a
-    constant gradient.
-
-    An entry that no step moves stays unchanged.
-    """
-    C, D, moved = np.eye(len(response)), np.zeros_like(H), response > 0
-    if not moved.any():
-        return C, D
-    # Steps are symmetric in units of the square root of the response.
-    q, free = np.sqrt(response[moved]), np.ix_(moved, moved)
-    values, vectors = np.linalg.eigh(H[free] * np.outer(q, q))
-    now = vectors.T @ np.diag(q**-2) @ vectors
-    shaken = vectors.T @ (noise[free] * np.outer(q, q)) @ vectors
-    values, driven = np.maximum(values, 0.0), np.zeros(len(values))
-    for rate in rates:
-        left = np.clip(1 - rate * values, 0, 1)
-        now = left[:, None] * now * left[None, :] + rate**2 * shaken
-        driven = left * driven + _driven(np.full_like(values, rate), values)
-    back = q[:, None] * vectors
-    C[free], D[free] = back @ now @ back.T, (back * driven) @ back.T
-    return C, D
+    return float(stdtrit(freedom, CONFIDENCE))
 
 
 def _positive(matrix: Array) -> Array:

@@ -5,18 +5,20 @@ scenes.
 - `judge_together` judges all directions together, and finds out which of them compensate for each other.
 - `ParameterVerdict`, `judge` and `summarise` apply the rules below.
 
-The first rule that applies to an entry decides. `spread` is the standard deviation of the entry's final value around
-the optimum. `alone` is the spread that remains if all other parameters are known. `to_go` is the estimated distance to
-the optimum. tau is `TOLERANCE` times the entry's scale. `to_go` refers to the optimum for the noisy target. `spread`
-refers to the optimum for a target without noise.
+The first rule that applies to an entry decides. `limit` is the distance to the optimum that the entry does not exceed
+with a probability of `CONFIDENCE`, and `limit_of_run` the same without the noise of the target. `spread` is the
+standard deviation of the entry's final value around the optimum. `alone` is the spread that remains if all other
+parameters are known. tau is the entry's tolerance: `TOLERANCE` times the value, or times a share of the scale if that
+is larger.
 
 | verdict          | condition |
 |---|---|
 | `not seen`       | a texel that no view shows, even if its light reaches the images |
-| `no effect`      | every gradient sample was exactly 0, and the run has not driven it to a bound |
+| `no effect`      | every gradient sample was exactly 0, and neither of the next two rules applies |
 | `at its bound`   | the value is within a step of a bound, and the gradient does not pull it back |
-| `settled`        | spread <= tau |
-| `still moving`   | `to_go` differs from 0 by `SURE` of its errors, and spread > tau without the target's noise |
+| `effect lost`    | the run has moved it, and every gradient sample of its whole parameter was exactly 0 |
+| `settled`        | `limit` <= tau |
+| `still moving`   | the gradients pull it by more than their noise, and `limit_of_run` > tau |
 | `not determined` | `alone` <= `OTHERS` of `spread`: others compensate for it; the most correlated one is named |
 | `below the noise`| otherwise: the gradients do not determine the value to tau |
 
@@ -26,8 +28,9 @@ move together.
 If the derivative of a parameter lacks a significant share, or if this share is unknown, its verdict is `derivative
 incomplete`. A run measures the missing share before its first iteration (`measure/missing.py`).
 
-A parameter of several entries is `settled` if at least `SETTLED_SHARE` of its visible entries with an effect are
-settled. Otherwise, the parameter gets the most frequent verdict of the unsettled visible entries with an effect.
+A small parameter is `settled` if at least `SETTLED_SHARE` of its entries with an effect are settled. The entries of a
+large parameter are judged in groups. If the limit of their root mean square is at most tau, all of them are settled.
+Otherwise, the parameter gets the most frequent verdict of the unsettled visible entries with an effect.
 """
 
 from __future__ import annotations
@@ -38,22 +41,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reslrb_cli.optimization.uncertainty.curvature import MARGIN, ParameterDirection, smooth
-from reslrb_cli.optimization.uncertainty.posterior import SURE, Entries, Measured, alone, joint
+from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
+from reslrb_cli.optimization.uncertainty.posterior import (
+    CURVATURE_ERROR,
+    SURE,
+    TOLERANCE,
+    Measured,
+    Posterior,
+    joint,
+    pooled,
+)
 from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.records.measurements import INCOMPLETE
 from reslrb_cli.statistics import Array, rms
 
-#: A value known to this share of its scale is settled.
-TOLERANCE = 0.1
 #: Remaining share of a value's spread, given the others, below which they compensate for it.
 OTHERS = 0.5
 #: Minimum share of settled entries among those with an effect.
 SETTLED_SHARE = 0.8
 #: Minimum correlation of the offsets of two entries that compensate for each other.
 LEAST_CORRELATION = 0.5
-#: Maximum similarity of the gradients' noise and their curvature: part of the noise is independent.
-LIKE = 0.95
+#: Entries are on their way if the cosine between their movement so far and the remaining distance exceeds this.
+ON_THE_WAY = 0.3
 Gradients = dict[str, Array]
 Values = list[float | None] | None
 
@@ -68,25 +77,39 @@ class ParameterVerdict(str, enum.Enum):
     NOT_DETERMINED = "not determined"
     BELOW_NOISE = "below the noise"
     NO_EFFECT = "no effect"
+    EFFECT_LOST = "effect lost"
     NOT_SEEN = "not seen"
     INCOMPLETE = INCOMPLETE
     SETTLED = "settled"
 
 
-def judge(
-    own: Measured, spread: Array, of_run: Array, alone: Array, to_go: Array, error: Array
-) -> list[ParameterVerdict]:
-    """Return the verdict on each entry of a parameter. All arrays are (N,), in the parameter's unit.
+#: Verdicts on entries without an effect on the images at their final values.
+WITHOUT = (ParameterVerdict.NO_EFFECT, ParameterVerdict.EFFECT_LOST, ParameterVerdict.NOT_SEEN)
 
-    `of_run` is the spread without the target's noise, and `error` the standard error of `to_go`.
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimates for the N entries of a parameter, each (N,): the limits of their distances from the optimum, the
+    spreads, the spreads given all other parameters, and the entries that gradients pull.
     """
-    tolerance = TOLERANCE * own.scale
+
+    limit: Array
+    limit_of_run: Array
+    spread: Array
+    alone: Array
+    is_pulled: Array
+
+
+def judge(own: Measured, found: Estimate, tolerance: Array) -> list[ParameterVerdict]:
+    """Return the verdict on each entry of a parameter. `tolerance` (N,) is in the parameter's unit."""
+    lost = own.moved & (not own.touched.any())
     rules = [
-        (~own.touched & ~own.driven, ParameterVerdict.NO_EFFECT),
+        (~own.touched & ~(own.at_bound & own.moved) & ~lost, ParameterVerdict.NO_EFFECT),
         (own.at_bound, ParameterVerdict.AT_BOUND),
-        (spread <= tolerance, ParameterVerdict.SETTLED),
-        ((np.abs(to_go) > SURE * error) & (of_run > tolerance), ParameterVerdict.STILL_MOVING),
-        (alone <= OTHERS * spread, ParameterVerdict.NOT_DETERMINED),
+        (lost, ParameterVerdict.EFFECT_LOST),
+        (found.limit <= tolerance, ParameterVerdict.SETTLED),
+        (found.is_pulled & (found.limit_of_run > tolerance), ParameterVerdict.STILL_MOVING),
+        (found.alone <= OTHERS * found.spread, ParameterVerdict.NOT_DETERMINED),
         (np.ones(own.value.shape, dtype=bool), ParameterVerdict.BELOW_NOISE),
     ]
     first = np.argmax([holds for holds, _ in rules], axis=0)
@@ -100,13 +123,12 @@ def shares(verdicts: Sequence[ParameterVerdict]) -> dict[ParameterVerdict, float
 
 def summarise(found: Mapping[ParameterVerdict, float]) -> ParameterVerdict:
     """Return the verdict of a parameter from the shares of its entries."""
-    without = (ParameterVerdict.NO_EFFECT, ParameterVerdict.NOT_SEEN)
-    effective = {verdict: share for verdict, share in found.items() if verdict not in without}
+    effective = {verdict: share for verdict, share in found.items() if verdict not in WITHOUT}
     if not effective:
-        return max(without, key=lambda verdict: found.get(verdict, 0.0))
+        return max(WITHOUT, key=lambda verdict: found.get(verdict, 0.0))
     if effective.get(ParameterVerdict.SETTLED, 0.0) >= SETTLED_SHARE * sum(effective.values()):
         return ParameterVerdict.SETTLED
-    others = [verdict for verdict in ParameterVerdict if verdict not in (ParameterVerdict.SETTLED, *without)]
+    others = [verdict for verdict in ParameterVerdict if verdict not in (ParameterVerdict.SETTLED, *WITHOUT)]
     return max(others, key=lambda verdict: found.get(verdict, 0.0))
 
 
@@ -164,104 +186,65 @@ class CertaintyRecord(Jsonable):
 
 
 @dataclass
-class JointPosterior:
-    """Joint posterior of all free directions, in the order of the directions.
-
-    `spread` is the standard deviation, and `of_target` is the part of `spread` that the target's noise causes. `to_go`
-    is the distance to the optimum, and `error` is its standard error. `to_go` and `error` exclude the target's noise.
-    For each direction, `partners` names the parameter that compensates.
+class Judged:
+    """Joint estimate of all free directions. `places` has the row of each free direction, by its place. `partners`
+    names the parameter that compensates for each direction.
     """
 
-    spread: Array
-    of_target: Array
-    to_go: Array
-    error: Array
+    posterior: Posterior | None
+    places: dict[int, int]
     partners: list[str | None]
-    alone: Array
 
 
 def judge_together(
     measured: Mapping[str, Measured], directions: Sequence[ParameterDirection], curvature: Array, fixed: Array
-) -> JointPosterior:
+) -> Judged:
     """Judge all directions in one joint posterior. `curvature` is H (M, M), and `fixed` is the target noise B (M, M).
 
     Entries at their bounds, or without effect, count as known.
     """
-    count, iterations = len(directions), len(next(iter(measured.values())).rates)
-    scale = np.array([1.0 if d.entry is None else measured[d.key].prior for d in directions])
-    response, noise, gradient, of_target, to_go, error = (np.zeros(count) for _ in range(6))
-    # Of the last iterations: their number, the mean gradient, and the movement from the mean and from the first values.
-    steps, pull, mean, came = (np.zeros(count) for _ in range(4))
-    free, rows = np.ones(count, dtype=bool), []
-    for place, direction in enumerate(directions):
-        own, v = measured[direction.key], direction.vector
-        rows.append(along := own.gradients @ v)
-        response[place] = own.response @ v**2 / np.sum(v**2) ** 2
-        gradient[place], noise[place] = along.mean(), np.var(along, ddof=1)
-        if direction.entry is not None:
-            noise[place] = own.noise[direction.entry]
-            free[place] = not own.at_bound[direction.entry]
-            if own.last is not None:
-                gradients, values = own.last[:, 0, direction.entry], own.last[:, 1, direction.entry]
-                steps[place], pull[place] = len(own.last), gradients.mean()
-                mean[place], came[place] = own.value[direction.entry] - (values.mean(), values[0])
-        free[place] = free[place] and np.any(along)
-    result = JointPosterior(scale.copy(), of_target, to_go, error, [None] * count, scale.copy())
-    at = np.flatnonzero(free)
-    if not at.size:
-        return result
-    samples = np.array([rows[place] for place in at])
-    H, B = curvature[np.ix_(at, at)], fixed[np.ix_(at, at)]
-    Sigma = noise_covariance(samples, noise[at], H)
-    few, rates = samples.shape[1], _eta(measured, {directions[place].key for place in at.tolist()})
-    counts = few + steps[at]
-    gradient[at] = (few * gradient[at] + steps[at] * (pull[at] + H @ mean[at])) / counts
-    until = rates[: iterations - int(steps.max())]
-    entries = Entries(response[at], scale[at], gradient[at], counts, until, came[at])
-    posterior, whole = (joint(entries, H, Sigma, each) for each in (None, B))
-    single = alone(entries, np.diag(H), noise[at], np.maximum(np.diag(B), 0.0))
-    result.to_go[at], result.error[at], result.alone[at] = posterior.to_go, posterior.error, single.spread
-    result.spread[at], result.of_target[at] = whole.spread, whole.of_target
-    assert posterior.covariance is not None
+    at = [place for place, direction in enumerate(directions) if _is_free(measured[direction.key], direction)]
+    partners: list[str | None] = [None] * len(directions)
+    if not at:
+        return Judged(None, {}, partners)
+    chosen = [directions[place] for place in at]
+    rows = [measured[each.key].last for each in chosen]
+    count = min(0 if row is None else len(row) for row in rows)
+    series = [_series(measured[each.key], each, count) for each in chosen]
+    gradients, offsets = (np.array(part).T for part in zip(*series, strict=True))
+    scale = np.array([1.0 if each.entry is None else measured[each.key].prior for each in chosen])
+    free = np.ix_(at, at)
+    posterior = joint(gradients, offsets, scale, curvature[free], fixed[free])
     correlation = np.abs(posterior.covariance) / np.maximum(np.outer(posterior.error, posterior.error), 1e-300)
-    for row, place in zip(correlation, at.tolist(), strict=True):
-        result.partners[place] = _partner(row, place, at, directions)
-    return result
+    for row, place in zip(correlation, at, strict=True):
+        partners[place] = _partner(row, place, at, directions)
+    return Judged(posterior, {place: row for row, place in enumerate(at)}, partners)
 
 
-def _eta(measured: Mapping[str, Measured], keys: Collection[str]) -> Array:
-    """Return one eta per iteration for all parameters in `keys`. Each eta is the geometric mean over all parameters in
-    `keys`.
+def _is_free(own: Measured, direction: ParameterDirection) -> bool:
+    held = direction.entry is not None and bool(own.at_bound[direction.entry])
+    return not held and bool(np.any(own.gradients @ direction.vector))
+
+
+def _series(own: Measured, direction: ParameterDirection, count: int) -> tuple[Array, Array]:
+    """Return the gradients along a direction, and the distances of their values from the final values. Both have the
+    last `count` iterations, and then the gradients at the final values.
     """
-    first, paces = next(iter(measured.values())), [measured[key].pace for key in keys]
-    found = [np.log(np.maximum(pace, 1e-300)) for pace in paces if pace is not None]
-    return np.asarray(first.rates, dtype=np.float64) * np.exp(np.sum(found, axis=0) / len(paces) if found else 0.0)
+    along = own.gradients @ direction.vector
+    if not count or own.last is None:
+        return along, np.zeros(len(along))
+    column = direction.entry if direction.entry is not None else direction.channel or 0
+    gradients, values = own.last[-count:, 0, column], own.last[-count:, 1, column]
+    size = np.linalg.norm(direction.vector) if direction.entry is None else None
+    final = own.value[column] if size is None else np.log(size)
+    return np.concatenate([gradients, along]), np.concatenate([values - final, np.zeros(len(along))])
 
 
-def noise_covariance(samples: Array, variance: Array, curvature: Array) -> Array:
-    """Return the noise covariance (M, M) of one gradient. `samples` (M, K) are gradients, `variance` (M,) their
-    variances, and `curvature` is H (M, M).
-
-    With far fewer samples than entries, the samples do not determine a covariance. However, noise of dL/dI reaches the
-    parameters through the same Jacobian J that determines the curvature. The noise correlations are therefore the
-    correlations of H times one factor in [0, `LIKE`]. The function fits the factor to the samples.
-    """
-    size = np.sqrt(np.maximum(np.diag(curvature), 0.0))
-    alike = np.clip(curvature / np.maximum(np.outer(size, size), 1e-300), -1, 1) * np.outer(size > 0, size > 0)
-    deviation = samples - samples.mean(axis=1, keepdims=True)
-    sd = np.sqrt(np.maximum(variance, 1e-300))
-    found = (deviation @ deviation.T) / (samples.shape[1] - 1) / np.outer(sd, sd)
-    beside = ~np.eye(len(sd), dtype=bool)
-    weight = float(np.sum(np.square(alike[beside])))
-    factor = float(np.clip(np.sum(found[beside] * alike[beside]) / weight, 0, LIKE)) if weight else 0.0
-    return np.asarray(np.where(beside, factor * alike, 1.0) * np.outer(sd, sd))
-
-
-def _partner(row: Array, place: int, chosen: Array, directions: Sequence[ParameterDirection]) -> str | None:
+def _partner(row: Array, place: int, chosen: Sequence[int], directions: Sequence[ParameterDirection]) -> str | None:
     """Return the parameter whose offset has the highest correlation with the offset at `place`. Return None if no other
     offset has a sufficient correlation.
     """
-    others = {other: value for other, value in zip(chosen.tolist(), row, strict=True) if other != place}
+    others = {other: value for other, value in zip(chosen, row, strict=True) if other != place}
     likely = {other: value for other, value in others.items() if value >= LEAST_CORRELATION}
     foreign = {other: value for other, value in likely.items() if directions[other].key != directions[place].key}
     pool = foreign or likely
@@ -272,17 +255,13 @@ def weigh(
     measured: Mapping[str, Measured],
     directions: Sequence[ParameterDirection],
     curvature: Array,
-    diagonal: Gradients,
-    pixels: Mapping[str, int],
     fixed: Array,
-    fixed_diagonal: Gradients,
+    by_entry: Mapping[str, EntryCurvature],
 ) -> dict[str, ParameterCertainty]:
-    """Return the certainty of each parameter, from the curvature along directions. For large parameters, also use the
+    """Return the certainty of each parameter, from the curvature along directions and, for large parameters, the
     curvature of each entry.
 
-    `pixels` is the number of image values that show a texture, if known. They determine at most as many entries.
-    `fixed` is the target noise B (M, M), in the same directions as `curvature`. `fixed_diagonal` is the target noise of
-    each entry, as in `diagonal`.
+    `fixed` is the target noise B (M, M), in the same directions as `curvature`.
     """
     found, result = judge_together(measured, directions, curvature, fixed), {}
     for key, own in measured.items():
@@ -290,7 +269,7 @@ def weigh(
         if at and directions[at[0]].entry is not None:
             result[key] = _small(own, at, found)
         else:
-            result[key] = _large(own, diagonal.get(key), fixed_diagonal.get(key), at, found, pixels.get(key))
+            result[key] = _large(own, by_entry.get(key), at, found)
     moving = {key for key, about in result.items() if about.verdict == ParameterVerdict.STILL_MOVING.value}
     for place, direction in enumerate(directions):
         about = result[direction.key]
@@ -299,60 +278,130 @@ def weigh(
     return result
 
 
-def _small(own: Measured, at: Sequence[int], found: JointPosterior) -> ParameterCertainty:
-    to_go, error = own.within(found.to_go[at]), found.error[at]
-    of_run = np.hypot(to_go, error)
-    spread = np.maximum(found.spread[at], of_run)  # bounds may have shortened the distance
+def _small(own: Measured, at: Sequence[int], found: Judged) -> ParameterCertainty:
     partners = [found.partners[place] for place in at]
-    alone_ = np.where([partner is None for partner in partners], np.inf, found.alone[at])
-    verdicts = judge(own, spread, of_run, alone_, to_go, error)
+
+    def of(name: str, otherwise: float) -> Array:
+        """Return a field of the posterior for each entry. Entries that are not free have the value `otherwise`."""
+        return np.array([
+            getattr(found.posterior, name)[found.places[place]] if place in found.places else otherwise for place in at
+        ])  # fmt: skip
+
+    to_go, of_target = own.within(of("to_go", 0.0)), of("of_target", 0.0)
+    spread = np.sqrt(to_go**2 + of("error", own.prior) ** 2 + of_target**2)  # bounds may have shortened the distance
+    alone = np.where([partner is None for partner in partners], np.inf, of("alone", np.inf))
+    estimate = Estimate(of("limit", np.inf), of("limit_of_run", np.inf), spread, alone, of("is_pulled", 0.0) > 0)
+    verdicts = judge(own, estimate, own.tolerance(own.value))
     verdict = summarise(shares(verdicts))
     named = [name for name, each in zip(partners, verdicts, strict=True) if name and each is verdict]
     partner = named[0] if named and verdict is ParameterVerdict.NOT_DETERMINED else None
     # A value at a bound may be as far from the optimum as the optimum is beyond the bound.
-    known = [each not in (ParameterVerdict.AT_BOUND, ParameterVerdict.NO_EFFECT) for each in verdicts]
-    parts = (np.where(known, part, np.nan) for part in (spread, to_go, found.of_target[at]))
+    known = [each not in (ParameterVerdict.AT_BOUND, *WITHOUT) for each in verdicts]
+    parts = (np.where(known, part, np.nan) for part in (spread, to_go, of_target))
     return _certainty(verdict, verdicts, partner, *parts)
 
 
-def _large(
-    own: Measured, diagonal: Array | None, fixed: Array | None, at: Sequence[int], found: JointPosterior,
-    pixels: int | None,
-) -> ParameterCertainty:  # fmt: skip
-    """Judge each entry of a large parameter as if all other entries and parameters were known. Another parameter may
-    still compensate for the offset of the whole parameter.
+def _large(own: Measured, by_entry: EntryCurvature | None, at: Sequence[int], found: Judged) -> ParameterCertainty:
+    """Judge the entries of a large parameter in groups. Another parameter may still compensate for the offset of the
+    whole parameter.
     """
-    touched, shape = own.touched, own.value.shape
-    prior = np.full(shape, own.prior)
-    spread, of_run, to_go, error, of_target = prior, prior, np.zeros(shape), prior, np.zeros(shape)
-    if diagonal is not None and touched.any():
-        h, B = np.zeros(shape), np.zeros(shape)
-        h[touched] = smooth(diagonal[touched], own.noise[touched])
-        if fixed is not None:
-            B[touched] = smooth(fixed[touched], own.noise[touched], MARGIN)
-        entries = Entries(own.response, prior, own.mean, len(own.gradients), own.steps)
-        known, whole = (alone(entries, h, own.noise, each) for each in (0.0, B))
-        to_go, error, of_target = own.within(known.to_go), known.error, whole.of_target
-        of_run = np.where(touched, np.hypot(to_go, error), prior)
-        spread = np.where(touched, np.hypot(own.within(whole.to_go), whole.error), prior)
-    verdicts = judge(own, spread, of_run, np.full(shape, np.inf), to_go, error)
+    shape, seen = own.value.shape, True if own.seen is None else own.seen
+    kept = own.touched & seen & ~own.at_bound
+    groups = [] if by_entry is None else own.groups(kept)
+    rows = [] if by_entry is None else _groups(own, groups, by_entry)
+    limit, limit_of_run, known = np.full((3, *shape), np.inf)
+    spread, pulled = np.zeros(shape), np.zeros(shape, dtype=bool)
+    for group, each in zip(groups, rows, strict=True):
+        limit[group], limit_of_run[group], pulled[group] = each.limit, each.limit_of_run, each.is_pulled
+        spread[group], known[group] = each.spread, each.known
+    tolerance = np.full(shape, own.tolerance(rms(own.value[kept]) if kept.any() else 0.0))
+    estimate = Estimate(limit, limit_of_run, spread, known, pulled)
+    verdicts = judge(own, estimate, tolerance)
+    total = Group.together(rows)
+    if total is not None and total.limit <= tolerance[0]:
+        verdicts = [ParameterVerdict.SETTLED if free else v for free, v in zip(kept, verdicts, strict=True)]
     if own.seen is not None:
         verdicts = [v if seen else ParameterVerdict.NOT_SEEN for v, seen in zip(verdicts, own.seen, strict=True)]
     verdict, partner = summarise(shares(verdicts)), None
     for place in at if verdict in (ParameterVerdict.SETTLED, ParameterVerdict.BELOW_NOISE) else ():
-        name = found.partners[place]
-        if name is not None and found.alone[place] <= OTHERS * found.spread[place] and found.spread[place] > TOLERANCE:
-            verdict, partner = ParameterVerdict.NOT_DETERMINED, name
-    shown = touched if own.seen is None else touched & own.seen
-    if verdict is ParameterVerdict.SETTLED and pixels is not None and int(shown.sum()) > pixels:
-        verdict, partner = ParameterVerdict.NOT_DETERMINED, None
-    kept = [
-        each not in (ParameterVerdict.AT_BOUND, ParameterVerdict.NO_EFFECT, ParameterVerdict.NOT_SEEN)
-        for each in verdicts
-    ]
-    is_known = diagonal is not None and any(kept)
-    sizes = (np.array([rms(part[kept]) if is_known else np.nan]) for part in (spread, to_go, of_target))
-    return _certainty(verdict, verdicts, partner, *sizes)
+        name, row = found.partners[place], found.places.get(place)
+        if name is not None and row is not None and found.posterior is not None:
+            alone, whole = found.posterior.alone[row], found.posterior.spread[row]
+            if alone <= OTHERS * whole and whole > TOLERANCE:
+                verdict, partner = ParameterVerdict.NOT_DETERMINED, name
+    if total is None:
+        return _certainty(verdict, verdicts, partner, *np.full((3, 1), np.nan))
+    sizes = (min(total.spread, own.prior), max(total.square, 0.0) ** 0.5, total.of_target**0.5)
+    return _certainty(verdict, verdicts, partner, *(np.array([size]) for size in sizes))
+
+
+@dataclass(frozen=True)
+class Group:
+    """Estimate for a group of `count` entries: the mean square of their offsets, its standard error, and the mean
+    square of the part that comes from the target. `unknown` is the mean square of the part that images do not
+    determine. `is_pulled` is true if the entries are on their way.
+    """
+
+    count: int
+    square: float
+    error: float
+    of_target: float
+    unknown: float
+    is_pulled: bool = False
+
+    @property
+    def known(self) -> float:
+        """Root mean square of the offsets without the part that images do not determine. A standard error is added,
+        because the estimate may be negative.
+        """
+        return float(np.sqrt(max(self.square, 0.0) + self.error + self.of_target))
+
+    @property
+    def spread(self) -> float:
+        """Root mean square of the offsets."""
+        return float(np.sqrt(self.known**2 + self.unknown))
+
+    @property
+    def limit(self) -> float:
+        """Limit of the root mean square of the offsets, for a target without noise."""
+        left = (1 + CURVATURE_ERROR) ** 2 * max(self.square, 0.0)
+        return float(np.sqrt(left + SURE * self.error + self.of_target + self.unknown))
+
+    @property
+    def limit_of_run(self) -> float:
+        """Like `limit`, but for the optimum of the noisy target."""
+        return replace(self, of_target=0.0).limit
+
+    @staticmethod
+    def together(groups: Sequence[Group]) -> Group | None:
+        """Return the estimate for all entries of some groups, or None without groups."""
+        if not groups:
+            return None
+        counts = np.array([each.count for each in groups])
+        rows = np.array([(each.square, each.of_target, each.unknown, each.error) for each in groups])
+        square, of_target, unknown, _ = counts @ rows / counts.sum()
+        error = float(np.linalg.norm(counts * rows[:, 3]) / counts.sum())
+        return Group(int(counts.sum()), float(square), error, float(of_target), float(unknown))
+
+
+def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) -> list[Group]:
+    """Estimate the offsets of the entries of each group. They are as large as at the start if noise hides the
+    curvature.
+    """
+    inside = np.isin(np.arange(own.value.size), np.concatenate(groups)) if groups else np.zeros(0, dtype=bool)
+    offsets, h, unknown = by_entry.solve(np.where(inside, own.gradients, 0.0), groups)
+    found = []
+    for group in groups:
+        if h[group[0]] <= 0:
+            found.append(Group(len(group), 0.0, 0.0, 0.0, own.prior**2))
+            continue
+        square, error = pooled(offsets[:, group])
+        way, left = (own.value - own.start)[group], offsets[:, group].mean(axis=0)
+        cosine = -way @ left / max(float(np.linalg.norm(way) * np.linalg.norm(left)), 1e-300)
+        of_target = by_entry.mean_of_target(group) / h[group[0]] ** 2
+        is_pulled = bool(square > SURE * error and cosine > ON_THE_WAY)
+        found.append(Group(len(group), square, error, of_target, unknown * own.prior**2, is_pulled))
+    return found
 
 
 def _certainty(
