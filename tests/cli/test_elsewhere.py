@@ -100,7 +100,7 @@ def test_invisible_texels_are_told_from_settled_ones(tmp_path: Path, monkeypatch
     (tmp_path / "scene.xml").write_text(scene)
     image = mi.render(mi.load_file("scene.xml"), spp=1024, integrator=mi.load_dict({"type": "path", "max_depth": 3}))
     mi.Bitmap(image).write("photo.exr")
-    sets = ("target={file: photo.exr}", "run.iterations=80", "run.spp=512", "loss.type=relative_l2",
+    sets = ("target={file: photo.exr}", "run.iterations=80", "run.spp=2048", "loss.type=relative_l2",
             "optimizer={learning_rate: 0.05, schedule: cosine}")  # fmt: skip
     done = reslrb("optimize", "tiny.yaml", *settings(*sets))
     assert done.exit_code == 0, done.output

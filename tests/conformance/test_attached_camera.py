@@ -120,7 +120,7 @@ CASES = [
 BY_NAME = {case.name: case for case in CASES}
 
 
-@pytest.mark.parametrize("case", a_few(CASES, ["matte-wide-2", "plastic-area-2", "glass-sky-3"]))
+@pytest.mark.parametrize("case", a_few(CASES, ["matte-wide-2", "glass-sky-3"]))
 def test_gradient(case: Case):
     agreement = case.agreement()
     print(f"{case.name}: {agreement}")
@@ -130,7 +130,7 @@ def test_gradient(case: Case):
 
 FAULTS = [
     Fault("emission_has_no_derivative", "matte-wide-2", "estimators.attached_camera:AttachedCameraFrame.differentiate",
-          "weight * reached.emission", "weight", quick=True),
+          "weight * reached.emission", "weight"),
     Fault("lamps_have_no_distance", "matte-area-3", "transport.camera:next_event_again",
           "measure / dr.detach(measure)", "mi.Float(1)"),
     Fault("sky_is_constant", "mirror-sky-2", "estimators.attached_camera:AttachedCameraFrame.differentiate",
