@@ -421,8 +421,13 @@ class Plan(Measurement):
         return self.reference.at(self.config, self.config.integrator.max_depth, True, auto)
 
     def settled_reference(self, paths: str) -> Case:
-        """Return the reference case for the scene's kinds of `paths`."""
-        return self.reference if self.reference.label != REFERENCE else parse_cases(REFERENCES[paths], "--reference")[0]
+        """Return the reference case for the scene's kinds of `paths`. It has edges if any of the cases has."""
+        if self.reference.label != REFERENCE:
+            return self.reference
+        name = REFERENCES[paths]
+        if any(case.options.get("edges") == "on" for case in self.cases):
+            name = f"{name.removesuffix(')')}{',' if ')' in name else '('}edges=on)"
+        return parse_cases(name, "--reference")[0]
 
     def independent_config(self, name: str) -> Config:
         """Return the experiment with a stock integrator. `ptracer` runs without Russian roulette, because naive AD with
