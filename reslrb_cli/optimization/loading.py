@@ -33,7 +33,6 @@ from reslrb_cli.scene.needs import (
     camera_finds_all,
     camera_finds_nothing,
     check_paths,
-    light_finds_all,
     paths_obstacle,
     scaled_emitter,
     scene_needs,
@@ -199,12 +198,9 @@ def paths_of(
     if camera_finds_nothing(scene) or scaled_emitter(scene) is not None:
         return "light"
     looked = [scene.sensors()[sensor] for sensor in sensors]
-    kinds = ["both", "camera"]
-    if moves and camera_finds_all(scene, integrator.max_depth):
-        kinds = ["camera"]
-    elif moves and light_finds_all(scene, looked, integrator.hide_emitters):
-        kinds = []
-    for kind in kinds:
+    if moves and not camera_finds_all(scene, integrator.max_depth, gloss=True):
+        return "light"
+    for kind in ("camera",) if moves else ("both", "camera"):
         if all(paths_obstacle(scene, sensor, kind) is None for sensor in looked):
             return kind
     return "light"

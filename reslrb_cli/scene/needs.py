@@ -221,19 +221,22 @@ def scaled_emitter(scene: Any) -> str | None:
     return None
 
 
-def camera_finds_all(scene: Any, max_depth: int) -> bool:
+def camera_finds_all(scene: Any, max_depth: int, gloss: bool = False) -> bool:
     """True if camera paths of up to `max_depth` segments find all light with good probability. A `max_depth` of -1
     means any number.
 
     Camera paths find all light if no surface is specular or glossy, or if all light comes straight from the emitters.
-    An emitter that emits only along its normal is not allowed.
+    An emitter that emits only along its normal is not allowed. With `gloss`, surfaces may have a glossy lobe beside a
+    diffuse one.
     """
     if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
         return False
     if 0 <= max_depth <= 2:  # light goes straight from an emitter to a visible surface
         return True
-    bundled = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Glossy)
-    return not any(int(bsdf.flags()) & bundled for bsdf in SceneGraph.of(scene).surface_bsdfs())
+    delta, glossy, diffuse = (int(flag) for flag in (mi.BSDFFlags.Delta, mi.BSDFFlags.Glossy, mi.BSDFFlags.Diffuse))
+    bundled = delta & ~int(mi.BSDFFlags.Null)
+    flags = [int(bsdf.flags()) for bsdf in SceneGraph.of(scene).surface_bsdfs()]
+    return not any(each & bundled or (each & glossy and not (gloss and each & diffuse)) for each in flags)
 
 
 def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> bool:

@@ -176,6 +176,11 @@ def test_camera_paths_find_all_except_light_from_gloss_and_glass():
     }  # fmt: skip
     scene = mi.load_dict(room)
     assert [camera_finds_all(scene, depth) for depth in (-1, 3, 2)] == [False, False, True]
+    assert not camera_finds_all(scene, -1, gloss=True)
+    for bsdf, found in (("roughplastic", [False, True]), ("plastic", [False, False]), ("dielectric", [False, False])):
+        room["wall"]["bsdf"] = {"type": bsdf}
+        scene = mi.load_dict(room)
+        assert [camera_finds_all(scene, -1, gloss=gloss) for gloss in (False, True)] == found
     room["wall"]["bsdf"] = {"type": "diffuse"}
     assert camera_finds_all(mi.load_dict(room), -1)
     room["beam"] = {"type": "rectangle", "emitter": {"type": "directionalarea"}}
@@ -251,7 +256,8 @@ def test_beams_and_scaled_emitters_are_left_to_light_paths():
 @pytest.mark.parametrize(("name", "settings", "paths"), [
     ("lens_pose", [], "light"), ("lens_pose", ["integrator.paths=both"], "both"),
     ("lens_pose", ["integrator.attached_sampling=follow"], "light"),
-    ("moved_box", [], "camera"), ("moved_box", ["integrator.paths=light"], "light"),
+    ("moved_box", [], "camera"), ("moved_box", ["integrator.max_depth=6"], "camera"),
+    ("moved_box", ["integrator.paths=light"], "light"),
 ])  # fmt: skip
 def test_paths_of_runs_that_move_shapes(name: str, settings: list[str], paths: str):
     problem = assemble_scene(load(ROOT / "configs" / f"{name}.yaml", settings))
