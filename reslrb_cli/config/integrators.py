@@ -126,9 +126,9 @@ class Reslrb(AttachingTracer):
     """How the connections of a path enter its gradient. `reservoir`: a few connections, selected at random. `gather`:
     all connections, by a second traversal. `event`: a few scattering events, selected at random. `stack`: all
     connections, stored in thread-local memory. `auto`: `stack`, the most efficient one in every experiment on CPUs.
-    On a GPU, `event` was more efficient in configs/cornell_floor.yaml. `FILE.py:CLASS`: your own estimator, a file
-    relative to the config file and a class in it, which needs `--allow-code` on the command line
-    ([Your own estimator](your_estimator.md))."""
+    On a GPU, `event` was more efficient in configs/cornell_floor.yaml, and less efficient in configs/grey_room.yaml.
+    `FILE.py:CLASS`: your own estimator, a file relative to the config file and a class in it, which needs
+    `--allow-code` on the command line ([Your own estimator](your_estimator.md))."""
     capacity: Annotated[Count, Field(le=CAPACITY)] = 1
     """Number of connections (`reservoir`) or scattering events (`event`) that are stored for each path. Each adds
     code to the kernel; `gather` uses all connections. Only with estimators `reservoir` and `event`."""
