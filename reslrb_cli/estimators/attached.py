@@ -113,31 +113,17 @@ def find_following_vertex(
     return si, reaching, dr.select(active & (measure > 0), measure / dr.detach(measure), 1)
 
 
-@dataclass
-class Reached:
-    """Vertex that a ray reaches, and the factor (C,) of value 1 with the derivatives of s_{i-1} that belong to it.
-
-    Emission has a vertex and a factor of its own, because its derivative is never a sum of two parts (`Plan.near`).
-    """
-
-    hit: Hit
-    factor: mi.Spectrum
-    emitting: mi.SurfaceInteraction3f
-    emission: mi.Spectrum
-
-
 def reach(
     plan: Plan, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool,
     parameters: bool = True,
-) -> Reached:  # fmt: skip
-    """Return the vertex at the intersection `pi` of `ray`.
+) -> tuple[Hit, mi.Spectrum]:  # fmt: skip
+    """Return the vertex at the intersection `pi` of `ray`, and a factor (C,) of value 1.
 
-    Call the function under `dr.resume_grad()` with a differentiable ray. Set `parameters` to False if only gradients of
-    the ray are resumed.
+    The factor carries the derivatives of s_{i-1} that belong to this vertex. Call the function under `dr.resume_grad()`
+    with a differentiable ray. Set `parameters` to False if only gradients of the ray are resumed.
     """
     if not before:
-        hit = find_vertex(ray, pi, active)
-        return Reached(hit, mi.Spectrum(1), hit.si, mi.Spectrum(1))
+        return find_vertex(ray, pi, active), mi.Spectrum(1)
     stays = active & is_staying(before)
     slid = find_vertex(ray, pi, active if plan.near > 0 else active & ~stays).si
     stayed, reaching, factor = find_following_vertex(ray, pi, stays)
@@ -148,7 +134,6 @@ def reach(
     with dr.suspend_grad(when=parameters), dr.resume_grad(reaching.d, when=parameters):
         f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
     changed = dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1) * factor
-    emitting, emission = dr.select(stays, stayed, slid), dr.select(stays, changed, 1)
     if plan.near > 0:
         near = plan.near**2
         shares = [near / (dr.squared_norm(place - ray.o) + near) for place in (stayed.p, slid.p)]
@@ -159,7 +144,7 @@ def reach(
     si = dr.select(stays, stayed, slid)
     there = mi.Ray3f(ray)
     there.d = dr.select(stays, reaching.d, ray.d)
-    return Reached(Hit(si, si.bsdf(), there), dr.select(stays, changed, 1), emitting, emission)
+    return Hit(si, si.bsdf(), there), dr.select(stays, changed, 1)
 
 
 def _blend(stayed: mi.SurfaceInteraction3f, slid: mi.SurfaceInteraction3f, share: mi.Float) -> mi.SurfaceInteraction3f:
@@ -179,8 +164,8 @@ def segment_again(
     connected: mi.Bool, scattered: mi.Bool,
 ) -> tuple[Segment, mi.Spectrum]:  # fmt: skip
     """Return the segment from a vertex with attached derivatives, and the factor that `reach` returns."""
-    reached = reach(samples.plan, before, ray, pi, connected | scattered)
-    return segment(samples, reached.hit, numbers, connected, scattered, attached=True), reached.factor
+    hit, factor = reach(samples.plan, before, ray, pi, connected | scattered)
+    return segment(samples, hit, numbers, connected, scattered, attached=True), factor
 
 
 # ---- The stack of segments ----
@@ -196,6 +181,11 @@ class Adjoint:
     origin: mi.Vector3f
     direction: mi.Vector3f
     B: mi.Spectrum
+
+    @staticmethod
+    def none() -> Adjoint:
+        """Return the adjoint behind the end of a path."""
+        return Adjoint(mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0))
 
 
 @dataclass
@@ -338,8 +328,7 @@ class AttachedStack(Stack):
         def before(end: mi.UInt32) -> StackState:
             return again.walk(AttachedSweep(again, ring, end), end > 0).stack
 
-        behind = Adjoint(mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0))
-        return walk_back(p, AttachedFrame.blank(p.plan), ring, state.stack, behind, before)
+        return walk_back(p, AttachedFrame.blank(p.plan), ring, state.stack, Adjoint.none(), before)
 
 
 def begins(plan: Plan, vertex: Vertex) -> mi.Bool:

@@ -10,23 +10,22 @@ delta is one number per channel for each path, and is a factor of P_i. e_i is th
 hits at vertex i, times its weight. c_i is the next event. m_i is the factor that `reach` returns, and r_i is the
 roulette weight.
 
-    S_i     = <P_i, e_i + m_i (c_i + r_i s_i B_i)> + <a_{i+1}, v_{i+1}>
+    S_i     = <P_i, m_i (e_i + c_i + r_i s_i B_i)> + <a_{i+1}, v_{i+1}>
     B_{i-1} = e_i + c_i + r_i s_i B_i
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.attached import Adjoint, Before, begins, concerns_emission, reach
-from reslrb_cli.estimators.base import STACK_SIZE, Pass, SurfacePoint
-from reslrb_cli.estimators.stack import Ring, StackState, walk_back
+from reslrb_cli.estimators.base import Pass, SurfacePoint
+from reslrb_cli.estimators.stack import Ring, StackState
 from reslrb_cli.transport.bsdf import EventNumbers, Scattering, scatter
-from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk, next_event_again
+from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, next_event_again
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -76,8 +75,8 @@ class AttachedCameraFrame:
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
-            reached = reach(plan, self.before, ray, pi, (connected | scattered | lit) & ~leaves)
-            hit, event, own, light = reached.hit, None, mi.Spectrum(0), mi.Spectrum(0)
+            hit, factor = reach(plan, self.before, ray, pi, (connected | scattered | lit) & ~leaves)
+            event, own = None, mi.Spectrum(0)
             if self.scale:
                 event = next_event_again(samples, hit.si, self.place[0], connected)
             numbers = EventNumbers(self.sample_2, self.sample_1)
@@ -85,18 +84,17 @@ class AttachedCameraFrame:
             if event is not None:
                 own = dr.select(connected, f * event.weight * self.scale[0], 0)
             for weight in self.met:
-                there = reached.emitting
+                there = hit.si
                 if self.leaves:
                     there.wi = dr.select(leaves, -ray.d, there.wi)
-                emitter = there.emitter(samples.scene, lit)
-                light = dr.select(lit, emitter.eval(there, lit) * weight * reached.emission, 0)
+                own += dr.select(lit, there.emitter(samples.scene, lit).eval(there, lit) * weight, 0)
             later = dr.select(scattered, scattering.weight * B, 0)
             following = hit.si.spawn_ray(scattering.d)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
-            objective = dr.dot(P, light + reached.factor * (own + later)) + dr.select(scattered, moved, 0)
+            objective = dr.dot(P, factor * (own + later)) + dr.select(scattered, moved, 0)
             dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
             # A lane without light may compute NaN, which must not reach earlier vertices.
-            B = dr.detach(light + own + later) * self.roulette
+            B = dr.detach(own + later) * self.roulette
             here = connected | scattered | lit
             values = mi.Vector3f(dr.grad(ray.o)), dr.grad(ray.d), B
             return Adjoint(*(dr.select(here, value, 0) for value in values))
@@ -167,19 +165,3 @@ class AttachedCameraSweep(CameraHooks):
 
     def survived(self, state: AttachedCameraState, weight: mi.Float) -> AttachedCameraState:
         return AttachedCameraState(state.stack.scaled(weight), state.before, state.L)
-
-
-def differentiate_attached_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
-    """Add the derivatives of a pass's camera paths with known dL/dI, and splat their image if there is one."""
-    ring = Ring.of(p.plan, stack_size, last=1)
-    again = Pass(p.samples, None, p.adjoint)
-    first, state = camera_walk(p.samples, AttachedCameraSweep(p, ring))
-    if p.block is not None:
-        p.samples.film.put(p.block, first.u, state.L[0] * first.weight, mi.Bool(True))
-
-    def before(end: mi.UInt32) -> StackState:
-        swept: Any = camera_walk(p.samples, AttachedCameraSweep(again, ring, end), end > 0)[1]
-        return swept.stack
-
-    behind = Adjoint(mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0))
-    walk_back(p, AttachedCameraFrame.blank(p.plan), ring, state.stack, behind, before)

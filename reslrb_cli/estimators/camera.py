@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.attached_camera import differentiate_attached_camera_paths
+from reslrb_cli.estimators.attached import Adjoint
+from reslrb_cli.estimators.attached_camera import AttachedCameraFrame, AttachedCameraSweep
 from reslrb_cli.estimators.base import STACK_SIZE, Pass, PathAdjoint, differentiate_passage
 from reslrb_cli.estimators.stack import Frame, Ring, StackState, push, walk_back
 from reslrb_cli.transport.bsdf import Scattering
@@ -125,15 +126,15 @@ class CameraSweep(CameraHooks):
 
 def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
     """Add the derivatives of a pass's camera paths with known dL/dI, and splat their image if there is one."""
-    if p.plan.attached:
-        differentiate_attached_camera_paths(p, stack_size)
-        return
-    ring, again = Ring.of(p.plan, stack_size), Pass(p.samples, None, p.adjoint)
-    first, state = camera_walk(p.samples, CameraSweep(p, ring))
+    attached = p.plan.attached
+    form = (AttachedCameraFrame if attached else Frame).blank(p.plan)
+    sweep = AttachedCameraSweep if attached else CameraSweep
+    ring, again = Ring.of(p.plan, stack_size, last=int(attached)), Pass(p.samples, None, p.adjoint)
+    first, state = camera_walk(p.samples, sweep(p, ring))
     if p.block is not None:
         p.samples.film.put(p.block, first.u, state.L[0] * first.weight, mi.Bool(True))
 
     def before(end: mi.UInt32) -> StackState:
-        return camera_walk(p.samples, CameraSweep(again, ring, end), end > 0)[1].stack
+        return camera_walk(p.samples, sweep(again, ring, end), end > 0)[1].stack
 
-    walk_back(p, Frame.blank(p.plan), ring, state.stack, state.stack.since, before)
+    walk_back(p, form, ring, state.stack, Adjoint.none() if attached else state.stack.since, before)

@@ -41,7 +41,6 @@ import mitsuba as mi
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.camera import Radiance
 from reslrb_cli.estimators.edges import (
-    AROUND,
     LAMP_EDGES,
     MAY_LACK,
     OTHER_EDGES,
@@ -53,15 +52,16 @@ from reslrb_cli.estimators.edges import (
     chances_of,
     edge_samples,
     for_camera,
+    halves,
     moved_by,
-    ray_offset,
+    sample_between,
     share_of,
     touches_behind,
 )
 from reslrb_cli.transport.bsdf import Scattering, begins_caustic
 from reslrb_cli.transport.camera import FilmRay, camera_walk
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.edges import Chances, sample_outline, view_from_lamps, view_from_sensor
+from reslrb_cli.transport.edges import sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.factors import Product, showing
 from reslrb_cli.transport.samples import Samples
@@ -71,11 +71,9 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 def differentiate_edges_of_camera_paths(p: Pass) -> None:
     """Add the derivatives of the light that edges of moving shapes cover and uncover. dL/dI must be known."""
     # The radiance on both sides of an outline is noisier than other terms, so that this term has more samples.
-    terms = (
-        (SENSOR_EDGES, _from_sensor, 1),
-        (LAMP_EDGES, _from_lamps, PATHS_PER_OUTLINE),
-        (OTHER_EDGES, _between, PATHS_PER_OUTLINE),
-    )
+    terms = [(SENSOR_EDGES, _from_sensor, 1), (LAMP_EDGES, _from_lamps, PATHS_PER_OUTLINE)]
+    if p.plan.max_depth > 2:
+        terms.append((OTHER_EDGES, _between, PATHS_PER_OUTLINE))
     for stream, side, each in terms:
         samples = edge_samples(p.samples, stream, each)
         samples.plan = replace(samples.plan, camera=False, paths="light")
@@ -85,13 +83,6 @@ def differentiate_edges_of_camera_paths(p: Pass) -> None:
 def _of_all_classes(samples: Samples) -> Samples:
     """Return the samples for light paths of all classes."""
     return replace(samples, plan=replace(samples.plan, by_class=False))
-
-
-def _halves(samples: Samples, numbers: mi.PCG32) -> tuple[mi.Bool, Chances]:
-    """Return the lanes that continue from p, which are half of all, and the random numbers that pairs share."""
-    lane = dr.arange(mi.UInt32, samples.width)
-    count = dr.opaque(mi.UInt32, (samples.width + 1) // 2)
-    return lane % 2 == 0, Chances.spread(numbers, samples.seed, lane // 2, count)
 
 
 def _at_contact(beside: Beside, adjoint: mi.Vector3f, touches: mi.Bool) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -112,7 +103,7 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines and creases seen from the sensor."""
     samples = for_camera(p.samples)
     assert samples.edges is not None
-    over, chances = _halves(samples, numbers)
+    over, chances = halves(samples, numbers)
     view = view_from_sensor(samples, chances.viewpoint)
     outline = sample_outline(samples, samples.edges.sensor, view, chances, creases=True)
     beside = both_sides(samples, outline, creases=True, everywhere=True)
@@ -145,6 +136,10 @@ class Importance:
     rest: mi.Float
     normal: mi.Vector3f
     counts: mi.Float
+
+    def motion(self, outline: mi.Vector3f, part: mi.Float) -> mi.Vector3f:
+        """Return the adjoint of the position of the point. The point counts with the factor `part`."""
+        return part * (showing(self.slid) * self.normal + showing(self.rest) * outline)
 
 
 class ImportanceHooks(Hooks):
@@ -181,11 +176,6 @@ class ImportanceHooks(Hooks):
             counts=dr.select(first & ends, 0, state.counts),
         )
 
-    @staticmethod
-    def motion(W: Importance, outline: mi.Vector3f, part: mi.Float) -> mi.Vector3f:
-        """Return the adjoint of the position of the point. The point counts with the factor `part`."""
-        return part * (showing(W.slid) * W.normal + showing(W.rest) * outline)
-
 
 def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines seen from lamps."""
@@ -204,23 +194,16 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     s = dr.select(view.parallel, 1, view.distance / behind)
     with dr.resume_grad(), dr.isolate_grad():
         moved = moved_by(beside.pi, beside.over, -size * n, active)
-        moved += moved_by(x, beside.past, ImportanceHooks.motion(W, n, s * p.scale), active)
+        moved += moved_by(x, beside.past, W.motion(n, s * p.scale), active)
         dr.backward_from(moved, flags=MAY_LACK)
 
 
 def _between(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines on segments between two surfaces. Both surfaces are not specular."""
-    samples, scene = p.samples, p.samples.scene
-    assert samples.edges is not None
-    outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
-    n, to_y = outline.normal, outline.view.to_y
-    offset = ray_offset(outline)
-    back = mi.Ray3f(outline.p + n * offset, to_y)
-    y = scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
-    outline.active = outline.active & y.is_valid()
-    outline.view.distance = y.t
-    beside = both_sides(samples, outline)
-    x, active = beside.x, beside.active & beside.x.is_valid()
+    samples = p.samples
+    between = sample_between(samples, numbers)
+    outline, beside, back, y = between.outline, between.beside, between.back, between.y
+    n, x, s, active = outline.normal, beside.x, between.s, between.active
     first = FilmRay(beside.past, mi.Point2f(0), mi.Spectrum(1), continues=True)
     _, found = camera_walk(for_camera(samples), PickLight(numbers), active, first)
     total = showing(found.total)
@@ -231,10 +214,9 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     W = walk(_of_all_classes(samples), hooks, active & (total > 0), emission, depth)
     size = showing(W.all) * p.scale
     active = active & (size != 0)
-    s = y.t / (y.t + x.t - AROUND * offset)
     at_p, at_x = _at_contact(beside, -size * n, active & touches_behind(outline, beside))
     with dr.resume_grad(), dr.isolate_grad():
         moved = moved_by(beside.pi, beside.over, at_p, active)
         moved += moved_by(x, beside.past, (size * s) * n + at_x, active)
-        moved += moved_by(y, back, ImportanceHooks.motion(W, n, (1 - s) * p.scale), active)
+        moved += moved_by(y, back, W.motion(n, (1 - s) * p.scale), active)
         dr.backward_from(moved, flags=MAY_LACK)

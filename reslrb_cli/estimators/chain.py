@@ -445,12 +445,12 @@ def segment_jacobian(
         ray = mi.Ray3f(vertex.ray)
         ray.o = ray.o + frame.s * p[0] + frame.t * p[1] + vertex.ray.d * dr.select(stays, p[2], 0)
         ray.d = dr.normalize(ray.d + dr.select(stays, 0, frame.s * p[2] + frame.t * p[3]))
-        reached = reach(samples.plan, before, ray, vertex.pi, connected | scattered, parameters=False)
-        this = segment(samples, reached.hit, numbers, connected, scattered, evaluates, attached=True)
+        hit, reached = reach(samples.plan, before, ray, vertex.pi, connected | scattered, parameters=False)
+        this = segment(samples, hit, numbers, connected, scattered, evaluates, attached=True)
         following, scattering, connection = this.next_ray(attached=True), this.scattering, this.connection
-        factors = [reached.factor * scattering.weight]
+        factors = [reached * scattering.weight]
         if evaluates:
-            factors.append(reached.factor * connection.f * connection.weight)
+            factors.append(reached * connection.f * connection.weight)
         # `select` makes new variables: no other output depends on them, so clearing them on the way is harmless.
         outputs = [dr.select(scattered, value, 0) for value in (following.o, following.d, factors[0])]
         if evaluates:

@@ -110,6 +110,15 @@ def chances_of(samples: Samples, numbers: mi.PCG32) -> Chances:
     return Chances.spread(numbers, samples.seed, lane, dr.opaque(mi.UInt32, samples.width))
 
 
+def halves(samples: Samples, numbers: mi.PCG32) -> tuple[mi.Bool, Chances]:
+    """Return the half of the lanes that continue from p, and random numbers that two lanes share. The other lane of a
+    pair continues from x.
+    """
+    lane = dr.arange(mi.UInt32, samples.width)
+    count = dr.opaque(mi.UInt32, (samples.width + 1) // 2)
+    return lane % 2 == 0, Chances.spread(numbers, samples.seed, lane // 2, count)
+
+
 @dataclass
 class Beside:
     """Two rays from the viewpoint beside an outline. `over` hits the shape, with intersection `pi`. `past` misses the
@@ -271,9 +280,7 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     """
     samples = p.samples
     assert samples.edges is not None
-    lane = dr.arange(mi.UInt32, samples.width)
-    over = lane % 2 == 0
-    chances = Chances.spread(numbers, samples.seed, lane // 2, dr.opaque(mi.UInt32, (samples.width + 1) // 2))
+    over, chances = halves(samples, numbers)
     view = view_from_lamps(samples, chances.viewpoint)
     outline = sample_outline(samples, samples.edges.lamp, view, chances, creases=True)
     beside = both_sides(samples, outline, creases=True)
@@ -472,19 +479,40 @@ class PickLight(CameraHooks):
         return replace(state, counts=dr.select(first & scattering.is_delta, 0, state.counts))
 
 
-def _between(p: Pass, numbers: mi.PCG32) -> None:
-    """Add the derivatives of outlines on segments between two surfaces. The first surface is not specular."""
-    samples, scene = p.samples, p.samples.scene
+@dataclass
+class Between:
+    """An outline on a segment between two surfaces. The ray `back` leads from the outline to y. `y` is the intersection
+    there, and `beside.x` the intersection behind the outline. p divides the segment from y to x in the ratio `s`.
+    """
+
+    outline: Outline
+    beside: Beside
+    back: mi.Ray3f
+    y: mi.PreliminaryIntersection3f
+    s: mi.Float
+    active: mi.Bool
+
+
+def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
+    """Return a random outline for each lane, seen from a random direction."""
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
-    n, to_y = outline.normal, outline.view.to_y
     offset = ray_offset(outline)
-    back = mi.Ray3f(outline.p + n * offset, to_y)
-    y = scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
+    back = mi.Ray3f(outline.p + outline.normal * offset, outline.view.to_y)
+    y = samples.scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
     outline.active = outline.active & y.is_valid()
     outline.view.distance = y.t
     beside = both_sides(samples, outline)
-    x, active = beside.x, beside.active & beside.x.is_valid()
+    s = y.t / (y.t + beside.x.t - AROUND * offset)
+    return Between(outline, beside, back, y, s, beside.active & beside.x.is_valid())
+
+
+def _between(p: Pass, numbers: mi.PCG32) -> None:
+    """Add the derivatives of outlines on segments between two surfaces. The first surface is not specular."""
+    samples = p.samples
+    between = sample_between(samples, numbers)
+    outline, beside, back, y = between.outline, between.beside, between.back, between.y
+    n, x, s, active = outline.normal, beside.x, between.s, between.active
     _, found = camera_walk(
         for_camera(samples), PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
     )
@@ -493,7 +521,6 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
     W = showing(walk(samples, Contribution(p), active & (total > 0), emission, found.segments + 1)[0] * p.scale)
     active = active & (W != 0)
-    s = y.t / (y.t + x.t - AROUND * offset)
     slope = dr.select(found.direct != 0, dr.dot(n, found.towards) / dr.dot(found.n_y, found.towards), 0)
     at_y = dr.select(active, (W * (1 - s)) * dr.select(found.direct != 0, slope * found.n_y, n), 0)
     at_x = dr.select(active, (W * s) * n, 0)

@@ -194,7 +194,7 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, s
         raise UnsupportedScene(motion.obstacle, "estimator")
     if plan.needs.has_null:
         raise UnsupportedScene("attached derivatives do not support masks and other surfaces with null lobes")
-    if plan.paths == "light" and sensor.film().rfilter().is_box_filter():
+    if plan.paths != "camera" and sensor.film().rfilter().is_box_filter():
         raise UnsupportedScene(
             f"sensor {sensor.id()} has a box filter, whose splats do not change while they move within a pixel; use a "
             "smooth filter, such as gaussian, for derivatives of moving light"

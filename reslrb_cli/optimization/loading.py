@@ -189,8 +189,10 @@ def paths_of(
         return integrator.paths
     if not isinstance(integrator, ReslrbConfig | WalkAdConfig):
         return "light" if integrator.type in LIGHT_TRACERS else "camera"
-    if moves is Moves.LAMPS or (moves and (isinstance(integrator, WalkAdConfig) or _follows(integrator))):
+    if moves is Moves.LAMPS:
         return "light"
+    if moves and (isinstance(integrator, WalkAdConfig) or integrator.attached_sampling == "follow"):
+        return "light"  # naive differentiation and `follow` have no derivatives of camera paths
     if integrator.paths == "both" and integrator.light_share in (0, 1):
         return "light" if integrator.light_share else "camera"
     if integrator.paths != "auto":
@@ -204,11 +206,6 @@ def paths_of(
         if all(paths_obstacle(scene, sensor, kind) is None for sensor in looked):
             return kind
     return "light"
-
-
-def _follows(integrator: ReslrbConfig) -> bool:
-    """Whether the options ask for directions that turn with moving surfaces. Camera paths do not have them."""
-    return integrator.attached_sampling == "follow"
 
 
 def check_integrator(

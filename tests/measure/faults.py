@@ -163,6 +163,14 @@ def plant(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(function, "__code__", getattr(broken, "__func__", broken).__code__)
 
 
+def assert_found(fault: Fault, monkeypatch: pytest.MonkeyPatch, holds: Callable[[], object]) -> None:
+    """Plant a fault, and assert that the result of `holds` is false."""
+    plant(fault, monkeypatch)
+    found = holds()
+    print(f"{fault.name}: {found}")
+    assert not found
+
+
 def by(estimators: str, *references: str) -> frozenset[tuple[str | None, str]]:
     """Return all pairs of these estimators with these references. The name `image` gives the estimator None."""
     return frozenset((None if e == "image" else e, r) for e in estimators.split() for r in references)
