@@ -148,9 +148,9 @@ class Reslrb(AttachingTracer):
     likely either side was to find it, so that the image has all light. `auto`: usually `both`. It is `camera` if camera
     paths find all light and a few steps before the first iteration show that they are more efficient. It is `light` if
     `both` and `camera` cannot render the scene or find none of its light, or if guided light paths are more efficient.
-    If shapes move, `both` divides the light: light paths have the light that a mirror, glass or metal bundles, and
-    camera paths have the rest. `auto` is then `camera` if no surface bundles light, and otherwise `light`. Runs that
-    move lamps always use `light`. The default is `auto` with
+    If shapes move, `both` divides the light: light paths have the light that meets a mirror, glass or metal first, and
+    camera paths have the rest. `auto` is then `camera` if no surface is a mirror, clear glass or metal, and otherwise
+    `light`. Runs that move lamps always use `light`. The default is `auto` with
     estimator `auto`, and `light` with an estimator that you name."""
     light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.5
     """Fraction of the samples that are light paths, with `paths: both`. With 0 or 1 the code of the other side is not

@@ -234,9 +234,9 @@ def camera_finds_all(scene: Any, max_depth: int, gloss: bool = False) -> bool:
     if 0 <= max_depth <= 2:  # light goes straight from an emitter to a visible surface
         return True
     delta, glossy, diffuse = (int(flag) for flag in (mi.BSDFFlags.Delta, mi.BSDFFlags.Glossy, mi.BSDFFlags.Diffuse))
-    bundled = delta & ~int(mi.BSDFFlags.Null)
+    delta &= ~int(mi.BSDFFlags.Null)
     flags = [int(bsdf.flags()) for bsdf in SceneGraph.of(scene).surface_bsdfs()]
-    return not any(each & bundled or (each & glossy and not (gloss and each & diffuse)) for each in flags)
+    return not any(each & delta or (each & glossy and not (gloss and each & diffuse)) for each in flags)
 
 
 def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> bool:

@@ -367,8 +367,8 @@ def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: m
 
 
 def begins_caustic(bsdf: mi.BSDFPtr, is_delta: mi.Bool | bool) -> mi.Bool:
-    """Return the lanes in which light from an emitter is bundled by its first scattering event: a delta event, or any
-    event at a BSDF without a diffuse lobe.
+    """Return the lanes in which a scattering event begins a caustic if it is the first event of light from an emitter:
+    a delta event, or any event at a BSDF without a diffuse lobe.
     """
     return mi.Bool(is_delta) | ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
 

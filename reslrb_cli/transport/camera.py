@@ -174,11 +174,11 @@ class CameraPath:
     events: mi.UInt32
     M: list[mi.Float]
     rivals: list[Rivals]
-    classes: list[Bundled]
+    classes: list[PathClass]
 
 
 @dataclass
-class Bundled:
+class PathClass:
     """Class of a camera path, if paths are divided by class. `before` is 1 if the sensor sees a surface before the
     current vertex that is not specular. `last` is 1 if light that arrives at the current vertex from an emitter would
     begin a caustic at the last vertex.
@@ -191,14 +191,14 @@ class Bundled:
         """Return the lanes in which an emitter that the path hits belongs to light paths."""
         return (self.before & self.last) != 0
 
-    def past(self, depth: mi.UInt32, bsdf: mi.BSDFPtr, scattering: Scattering, continues: bool) -> Bundled:
+    def past(self, depth: mi.UInt32, bsdf: mi.BSDFPtr, scattering: Scattering, continues: bool) -> PathClass:
         """Return the class behind a vertex. The first vertex itself never begins the light of light paths, unless the
         path `continues`.
         """
         first = (depth == 1) if not continues else mi.Bool(False)
         before = dr.select(first, dr.select(scattering.is_delta, mi.UInt32(0), 1), self.before)
         last = begins_caustic(bsdf, scattering.is_delta) & ~first
-        return Bundled(before, dr.select(last, mi.UInt32(1), 0))
+        return PathClass(before, dr.select(last, mi.UInt32(1), 0))
 
 
 def camera_walk(
@@ -229,7 +229,7 @@ def camera_walk(
     path = CameraPath(
         active, mi.UInt32(1), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
         mi.Point3f(first.ray.o), mi.UInt32(0), M, rivals,
-        [Bundled(mi.UInt32(1 if first.continues else 0), mi.UInt32(0))] if plan.by_class else [],
+        [PathClass(mi.UInt32(1 if first.continues else 0), mi.UInt32(0))] if plan.by_class else [],
     )  # fmt: skip
 
     def body(path: CameraPath, state: Any, sampler: mi.Sampler) -> tuple[CameraPath, Any, mi.Sampler]:

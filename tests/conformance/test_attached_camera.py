@@ -208,7 +208,7 @@ CLASS_FAULTS = [
     Fault("camera_paths_hit_all_light", "", "transport.camera:_meet", "active &= ~own_class.excludes_hit()", "pass"),
     Fault("metal_counts_twice", "", "transport.camera:camera_walk",
           "~((own_class.before != 0) & begins_caustic(bsdf, False))", "True"),
-    Fault("caustics_in_mirrors_left_out", "", "transport.camera:Bundled.past",
+    Fault("caustics_in_mirrors_left_out", "", "transport.camera:PathClass.past",
           "dr.select(scattering.is_delta, mi.UInt32(0), 1)", "mi.UInt32(1)"),
 ]  # fmt: skip
 
