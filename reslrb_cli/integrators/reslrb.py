@@ -21,6 +21,7 @@ from typing_extensions import Self
 from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.estimators.camera_edges import differentiate_edges_of_camera_paths
+from reslrb_cli.estimators.chain_edges import weigh_pixels
 from reslrb_cli.estimators.edges import differentiate_edges
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
@@ -150,6 +151,9 @@ class LightTracer(StepIntegrator):
             return parts
         now = self.preparation.edges(plan).now()
         tables = [weigh_edges(side, now) for side in parts[0].sides()]
+        for side, table in zip(parts[0].sides(), tables, strict=True):
+            if side.plan.camera and side.plan.needs.has_delta_lobes:
+                table.pixels = [weigh_pixels(side)]
         return [part.with_edges(*tables) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:

@@ -97,6 +97,7 @@ class EdgeTable(_Rows):
     sensor: mi.Float
     anywhere: mi.Float
     balls: list[Ball]
+    pixels: list[mi.Float]
 
 
 def _number(shape: mi.Shape) -> int:
@@ -296,7 +297,7 @@ class EdgeSet:
             free = 4 * (dr.pi - turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a))
             free = dr.select(rows.kind == SEGMENT, dr.select(dr.isfinite(free), free, 0), 4 * dr.pi)
             return EdgeTable(**vars(rows), moves=dr.concat(moves), lamp=length, sensor=length, anywhere=length * free,
-                             balls=balls)  # fmt: skip
+                             balls=balls, pixels=[])  # fmt: skip
 
 
 def across(along: mi.Vector3f, corner: mi.Vector3f) -> mi.Vector3f:

@@ -29,13 +29,15 @@ class FilmRay:
     """Ray through film position `u` (pixels, relative to the crop window).
 
     `weight` (C,) is the sensor's importance, normalised so that a sum over lanes gives an image. If `continues` is
-    true, the ray is the later part of a path, and the sensor sees a surface that is not specular before it.
+    true, the ray is the later part of a path, and the sensor sees a surface that is not specular before it. `depth` is
+    the number of the vertex that the ray reaches. It is above 1 behind specular vertices.
     """
 
     ray: mi.Ray3f
     u: mi.Point2f
     weight: mi.Spectrum
     continues: bool = False
+    depth: mi.UInt32 | int = 1
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
@@ -227,8 +229,8 @@ def camera_walk(
             near = near + dr.norm(first.ray.o - begun)
         M, rivals = [], [Rivals(samples.ratio_at(first.u) / film_density(sensor, cos), mi.Float(0), mi.Float(near))]
     path = CameraPath(
-        active, mi.UInt32(1), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
-        mi.Point3f(first.ray.o), mi.UInt32(0), M, rivals,
+        active, mi.UInt32(first.depth), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
+        mi.Point3f(first.ray.o), mi.UInt32(first.depth) - 1, M, rivals,
         [PathClass(mi.UInt32(1 if first.continues else 0), mi.UInt32(0))] if plan.by_class else [],
     )  # fmt: skip
 
