@@ -87,15 +87,17 @@ class LightTracer(StepIntegrator):
         """Share of light paths in the samples if there are both kinds."""
         return self.preparation.sampling.light_share
 
-    def afresh(self, light_share: float | None = None, **changes: Any) -> Self:
-        """Return a copy of the tracer with no facts about any scene, and with changed `SamplingOptions`.
+    def afresh(self, light_share: float | None = None, **settings: str) -> Self:
+        """Return a copy of the tracer with no facts about any scene, and with changed `settings`
+        (`SamplingOptions.chosen`).
 
         If `light_share` is given, the copy traces light paths and camera paths, with this share of light paths. Images
         then have the same film border for any share.
         """
         other = copy.copy(self)
+        changes: dict[str, Any] = {"chosen": {**self.preparation.sampling.chosen, **settings}}
         if light_share is not None:
-            changes = {"paths": "both", "whole": True} | changes | {"light_share": light_share}
+            changes |= {"paths": "both", "whole": True, "light_share": light_share}
         other.preparation = self.preparation.afresh(**changes)
         return other
 
@@ -105,7 +107,9 @@ class LightTracer(StepIntegrator):
 
         The keys of the densities (`note_pixels`) are sensor numbers.
         """
-        return self.afresh(shares_out=True, given={int(number): density for number, density in noted.items()})
+        other = self.afresh(pixels="measured")
+        other.preparation = other.preparation.afresh(given={int(number): density for number, density in noted.items()})
+        return other
 
     def to_measure(self) -> Self:
         """Return this tracer. If the tracer is guided, return a copy with separate tables instead.
@@ -164,7 +168,7 @@ class LightTracer(StepIntegrator):
         The tracer measures an unknown distribution once, for the differentiated parameters.
         """
         preparation = self.preparation
-        if not plan.shares_out:
+        if "pixels" not in plan.on:
             return None
         number = sensor_number(job.scene, job.sensor)
         known = preparation.sampling.given
