@@ -34,8 +34,8 @@ since the last pushed vertex, per unit of throughput behind it. Without such gap
 The stack is a ring of `stack_size` places in thread-local memory. The ring holds the last vertices, in about 95 bytes
 each. A longer path is traced again for its earlier vertices, block by block from the last block to the first.
 
-If delta is known before the paths are traced (`run.adjoint: batched`), `forward` makes the image and walks back, in one
-kernel. Otherwise, `backward` traces the paths again, without shadow rays, and walks back.
+With `run.adjoint: batched` or `independent`, delta is known before the paths are traced. `forward` then also walks
+back, in the same kernel. With `correlated`, `backward` traces the paths again, without shadow rays, and walks back.
 
 `attached.py` uses this recursion for parameters that move light. `camera.py` uses the recursion for camera paths.
 """
