@@ -262,15 +262,16 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
 class Frame:
     """Vertex k on the stack. Its BSDF is evaluated again: f_c towards the sensor and f_s along the path.
 
-    The factors are c_k = f_c r_c and s_k = f_s r_s. `rest_c` (C,) is P_k delta_k r_c, and `rest_s` (C,) is P_k r_s. B
-    of the vertex that was pushed before is `own` + `onward` B_k. `lobe` has the rest of the sampled event.
+    The factors are c_k = f_c r_c and s_k = f_s r_s. `adjoint_c` (C,) is dS/df_c = P_k delta_k r_c. `adjoint_s_per_B`
+    (C,) is P_k r_s, because dS/df_s = P_k r_s B_k. B of the vertex that was pushed before is `own` + `onward` B_k.
+    `lobe` has the rest of the sampled event.
     """
 
     point: SurfacePoint
     wo_c: mi.Vector3f
     wo_s: mi.Vector3f
-    rest_c: mi.Spectrum
-    rest_s: mi.Spectrum
+    adjoint_c: mi.Spectrum
+    adjoint_s_per_B: mi.Spectrum
     own: mi.Spectrum
     onward: mi.Spectrum
     lobe: list[mi.UInt32 | mi.Float | mi.Point2f]
@@ -290,7 +291,7 @@ class Frame:
     def differentiate(self, p: Pass, B: mi.Spectrum) -> mi.Spectrum:
         """Add the derivatives of both factors, given B_k (C,). Returns B of the vertex that was pushed before."""
         si, bsdf = self.point.interaction(p.plan)
-        adjoint_c, adjoint_s = self.rest_c, showing(self.rest_s * B)  # dS/df_c and dS/df_s
+        adjoint_c, adjoint_s = self.adjoint_c, showing(self.adjoint_s_per_B * B)
         connected, scattered = dr.any(adjoint_c != 0), dr.any(adjoint_s != 0)
         with dr.resume_grad():
             sampled = event(self.wo_s, self.lobe)
@@ -301,24 +302,24 @@ class Frame:
 
 def push(
     plan: Plan, state: StackState, ring: Ring, here: mi.Bool, vertex: Vertex, scattering: Scattering,
-    connection: Connection | None, rest_c: mi.Spectrum,
+    connection: Connection | None, delta_r: mi.Spectrum,
 ) -> StackState:  # fmt: skip
     """Return the state behind a vertex. The vertex is pushed in the lanes `here`.
 
-    `rest_c` (C,) is delta_k r_c: delta times the connection without its BSDF, or 0 if the connection does not count.
+    `delta_r` (C,) is delta_k r_c: delta times the connection without its BSDF, or 0 if the connection does not count.
     """
     T, P, on = state.throughput, vertex.product.value(), scattering.active
     wo, own, visible = mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False)
     if connection is not None:
-        wo, own, visible = connection.wo, rest_c * connection.f, connection.active
+        wo, own, visible = connection.wo, delta_r * connection.f, connection.active
     if not state.stack:  # no BSDF is differentiated, so only B_0 is needed
         return state.plus(own, visible).scaled(scattering.s)
     frame = Frame(
         point=SurfacePoint.of(plan, vertex),
         wo_c=wo,
         wo_s=scattering.wo,
-        rest_c=showing(P * rest_c),
-        rest_s=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
+        adjoint_c=showing(P * delta_r),
+        adjoint_s_per_B=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
         own=state.gap() + T * own,
         onward=dr.select(on, T * scattering.s, 0),
         lobe=kept_lobe(plan, scattering),
@@ -376,8 +377,8 @@ class LightSweep(VertexHooks):
         elif plan.differentiate_null:
             own = PathAdjoint(dr.select(visible, delta * C.nonzero, 0), C)
             differentiate_passage(p, vertex.si, vertex.depth, connection, visible, own)
-        rest_c = dr.select(visible, delta * p.scale * connection.rest * connection.through, 0)
-        return push(plan, state, self.ring, here, vertex, scattering, connection, rest_c)
+        delta_r = dr.select(visible, delta * p.scale * connection.rest * connection.through, 0)
+        return push(plan, state, self.ring, here, vertex, scattering, connection, delta_r)
 
     def survived(self, state: StackState, factor: mi.Float) -> StackState:
         return state.scaled(factor)
