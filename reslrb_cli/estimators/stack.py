@@ -262,7 +262,7 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
 class Frame:
     """Vertex k on the stack. Its BSDF is evaluated again: f_c towards the sensor and f_s along the path.
 
-    The factors are c_k = f_c r_c and s_k = f_s r_s. `adjoint_c` (C,) is dS/df_c = P_k delta_k r_c. `adjoint_s_per_B`
+    The factors are c_k = f_c r_c and s_k = f_s r_s. `adjoint_c` (C,) is dS/df_c = P_k delta_k r_c. `adjoint_s_per_b`
     (C,) is P_k r_s, because dS/df_s = P_k r_s B_k. B of the vertex that was pushed before is `own` + `onward` B_k.
     `lobe` has the rest of the sampled event.
     """
@@ -271,7 +271,7 @@ class Frame:
     wo_c: mi.Vector3f
     wo_s: mi.Vector3f
     adjoint_c: mi.Spectrum
-    adjoint_s_per_B: mi.Spectrum
+    adjoint_s_per_b: mi.Spectrum
     own: mi.Spectrum
     onward: mi.Spectrum
     lobe: list[mi.UInt32 | mi.Float | mi.Point2f]
@@ -291,7 +291,7 @@ class Frame:
     def differentiate(self, p: Pass, B: mi.Spectrum) -> mi.Spectrum:
         """Add the derivatives of both factors, given B_k (C,). Returns B of the vertex that was pushed before."""
         si, bsdf = self.point.interaction(p.plan)
-        adjoint_c, adjoint_s = self.adjoint_c, showing(self.adjoint_s_per_B * B)
+        adjoint_c, adjoint_s = self.adjoint_c, showing(self.adjoint_s_per_b * B)
         connected, scattered = dr.any(adjoint_c != 0), dr.any(adjoint_s != 0)
         with dr.resume_grad():
             sampled = event(self.wo_s, self.lobe)
@@ -319,7 +319,7 @@ def push(
         wo_c=wo,
         wo_s=scattering.wo,
         adjoint_c=showing(P * delta_r),
-        adjoint_s_per_B=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
+        adjoint_s_per_b=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
         own=state.gap() + T * own,
         onward=dr.select(on, T * scattering.s, 0),
         lobe=kept_lobe(plan, scattering),
