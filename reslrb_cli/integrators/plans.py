@@ -1,11 +1,9 @@
 """Options of a light tracer, differentiated parameters, and the features of a plan that both need.
 
 `SamplingOptions` has the choice of paths. `Motion` has the options of attached derivatives, and `attach` adds them to a
-plan. The values `follow` and `stay` of
-`attached_sampling` (`estimators/attached.py`) differ in only one case. The case occurs when a nonspecular surface
-scatters moving light to another visible surface. `bounces` tests whether moving light reaches a visible surface after
-nonspecular scattering. In a caustic of few segments, moving light does not bounce, because paths end where light first
-lands.
+plan. The values `follow` and `stay` of `attached_sampling` (`estimators/attached.py`) differ only if a nonspecular
+surface scatters moving light to another visible surface. `bounces` tests whether this happens. In a caustic of few
+segments, moving light does not bounce, because paths end where light first lands.
 """
 
 from __future__ import annotations
