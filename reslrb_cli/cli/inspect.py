@@ -371,9 +371,8 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
     """
     import drjit as dr
 
-    from reslrb_cli.integrators.plan_report import plan_rows
     from reslrb_cli.integrators.reslrb import Reslrb
-    from reslrb_cli.optimization.autotune.sampling import as_decided, decided, explained, open_settings
+    from reslrb_cli.optimization.autotune.sampling import as_decided, decided, open_settings, plan_rows
     from reslrb_cli.optimization.loading import choose_sensors, make_configured, pass_spp, paths_of, what_moves
     from reslrb_cli.records.decisions import Decision
 
@@ -398,10 +397,10 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
             dr.enable_grad(leaf)
             params[key] = leaf
         params.update()
-        rows = plan_rows(integrator.plan(scene, scene.sensors()[sensor], params))
+        plan = integrator.plan(scene, scene.sensors()[sensor], params)
     except (ConfigError, UnsupportedScene) as error:
         return str(error)
     if not decisions:
         open_ = open_settings(config, paths)
         decisions = [Decision(setting=setting, value="auto", why="which a run decides") for setting in open_]
-    return explained(rows, decisions)
+    return plan_rows(plan, decisions)

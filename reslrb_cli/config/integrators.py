@@ -5,8 +5,9 @@ The limits on samples, passes and paths are checked here, before a scene is load
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import (
     Discriminator,
@@ -81,16 +82,13 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "stack": (),
 }
 
-#: Options that a run decides if they are `auto` (`optimization/autotune/sampling.py`), and their values without a
-#: decision. `light_share` is never `auto`; measurements of single steps take its value from here.
-UNDECIDED: dict[str, str | float] = {
-    "paths": "light",
-    "light_share": 0.5,
-    "guiding": "off",
-    "sequence": "independent",
-    "pixels": "even",
-    "edges": "off",
-}
+
+@dataclass(frozen=True)
+class Undecided:
+    """Mark of a setting that a run decides (`optimization/autotune/sampling.py`), with its value without a decision."""
+
+    value: str | float
+
 
 #: The estimator for `auto`: only `stack` has derivatives of camera paths and both `follow` and `stay`.
 AUTO_ESTIMATOR = "stack"
@@ -141,7 +139,7 @@ class Reslrb(AttachingTracer):
     turns with the surface, as in `ptracer`. It then sweeps over edges of objects that do not move, and the derivative
     lacks this effect. `stay`: light still arrives at the same point. `auto`: `stay` after diffuse surfaces, `follow`
     after glossy ones, where `stay` is noisy."""
-    paths: Literal["auto", "light", "camera", "both"] = "auto"
+    paths: Annotated[Literal["auto", "light", "camera", "both"], Undecided("light")] = "auto"
     """Where paths start. `light`: at the emitters. Finds caustics and light through glass; mirrors and clear glass are
     black. `camera`: at the sensor. Finds reflections in mirrors, the view through glass, and most light in rooms, but
     no caustics of small lamps. Only with estimators `auto` and `stack`. `both`: at both, with each path weighted by how
@@ -152,10 +150,10 @@ class Reslrb(AttachingTracer):
     camera paths have the rest. `auto` is then `camera` if no surface is a mirror, clear glass or metal, and otherwise
     `light`. Runs that move lamps always use `light`. The default is `auto` with
     estimator `auto`, and `light` with an estimator that you name."""
-    light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.5
+    light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), Undecided(0.5)] = 0.5
     """Fraction of the samples that are light paths, with `paths: both`. With 0 or 1 the code of the other side is not
     compiled."""
-    guiding: Literal["auto", "on", "off"] = "auto"
+    guiding: Annotated[Literal["auto", "on", "off"], Undecided("off")] = "auto"
     """Importance sampling of light paths, learned in earlier steps. `on`: paths start where earlier paths contributed
     to the gradient and the image (at least a quarter start anywhere), and end early where earlier paths contributed
     little. In scenes with glossy surfaces, paths are also aimed at points that the sensor sees. From the second step
@@ -164,13 +162,13 @@ class Reslrb(AttachingTracer):
     and without guiding, before the first iteration, show that it is more efficient. Runs that move geometry or lamps
     are not guided. The default is `auto` with
     estimator `auto`, and `off` with an estimator that you name."""
-    sequence: Literal["auto", "independent", "low_discrepancy"] = "auto"
+    sequence: Annotated[Literal["auto", "independent", "low_discrepancy"], Undecided("independent")] = "auto"
     """Random numbers that decide where light paths start and how they first scatter. `low_discrepancy`: spread evenly
     over all paths of a step, and independent between steps. This reduces noise where little else decides where light
     goes, as in a beam through glass, and a little elsewhere. `auto`: `low_discrepancy`, or `independent` if
     paths are guided. The default is `auto` with estimator `auto`, and
     `independent` with an estimator that you name."""
-    pixels: Literal["auto", "even", "measured"] = "auto"
+    pixels: Annotated[Literal["auto", "even", "measured"], Undecided("even")] = "auto"
     """Number of camera paths in each pixel. `even`: the same in all pixels. `measured`: a quarter of the paths is
     spread evenly, and the others go to the pixels whose noise adds most to the noise of the gradient, by the curvature
     of the loss (0 in pixels that a mask leaves out). A few paths through each pixel measure this before the first
@@ -178,7 +176,7 @@ class Reslrb(AttachingTracer):
     get noisier. `auto`: `measured` if there are camera paths, the loss is `l2`, and the measurement takes at most 2 %
     of the samples of the run. The default is `auto` with estimator `auto`, and `even` with an estimator that you
     name."""
-    edges: Literal["auto", "on", "off"] = "auto"
+    edges: Annotated[Literal["auto", "on", "off"], Undecided("off")] = "auto"
     """Whether the derivatives of moving shapes contain their outlines and shadows: the light that edges cover and
     uncover. `on`: a step also samples points on the edges of moving shapes, as lamps, the sensor and other surfaces see
     them. Meshes, rectangles, disks, spheres and cylinders have edges. `auto`: `on` if finite differences before the
@@ -227,6 +225,23 @@ class Reslrb(AttachingTracer):
     def path(self) -> Path | None:
         """The file of code, or None."""
         return None if self.file is None else code_file(self.file)
+
+
+#: Settings that a run decides if they are `auto`, and their values without a decision, as in Mitsuba's plugin.
+#: `light_share` is never `auto`; measurements of single steps take its value from here.
+UNDECIDED: dict[str, Any] = {
+    name: mark.value
+    for name, setting in Reslrb.model_fields.items()
+    for mark in setting.metadata
+    if isinstance(mark, Undecided)
+}
+
+#: The possible decisions on each setting that may be `auto`. The first is its value without a decision.
+DECIDABLE: dict[str, tuple[str, ...]] = {
+    name: (off, *(value for value in get_args(Reslrb.model_fields[name].annotation) if value not in ("auto", off)))
+    for name, off in UNDECIDED.items()
+    if name != "light_share"
+}
 
 
 class Ptracer(LightTracerOptions, json_schema_extra=NEEDS_TYPE):

@@ -230,8 +230,8 @@ class AttachedFrame:
             there, following = this.connection, this.next_ray(attached=True)
             seen = connected & there.active
             delta = p.adjoint.lookup(there.u, seen, plan.attached_normalization) * p.scale
-            own = dr.select(seen, delta * there.f * there.weight, 0)
-            later = dr.select(scattered, this.scattering.weight * B, 0)
+            own = dr.select(seen, delta * there.f * there.rest, 0)
+            later = dr.select(scattered, this.scattering.s * B, 0)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             dr.backward_from(dr.dot(P, reached * (own + later)) + dr.select(scattered, moved, 0))
             # A lane without light may compute NaN, which must not reach earlier vertices.
@@ -296,8 +296,8 @@ class AttachedSweep(VertexHooks):
         stack = state.stack.pushed(frame, self.ring, here, seen)
         return AttachedState(stack, Before.of(plan, vertex, scattering))
 
-    def survived(self, state: AttachedState, weight: mi.Float) -> AttachedState:
-        return AttachedState(state.stack.scaled(weight), state.before)
+    def survived(self, state: AttachedState, factor: mi.Float) -> AttachedState:
+        return AttachedState(state.stack.scaled(factor), state.before)
 
     def _useful(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
         """Return the lanes in which the vertex, or one before it, depends on a parameter."""
@@ -348,7 +348,7 @@ def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
         return
     with dr.resume_grad(), dr.isolate_grad():
         emission = p.emission()
-        objective = dr.dot(adjoint.B, emission.weight)
+        objective = dr.dot(adjoint.B, emission.E)
         if plan.moving_emission:
             objective += dr.dot(adjoint.origin, emission.ray.o) + dr.dot(adjoint.direction, emission.ray.d)
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)

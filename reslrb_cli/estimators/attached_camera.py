@@ -82,13 +82,13 @@ class AttachedCameraFrame:
             numbers = EventNumbers(self.sample_2, self.sample_1)
             scattering, f = scatter(plan, hit, numbers, scattered, event, attached=True)
             if event is not None:
-                own = dr.select(connected, f * event.weight * self.scale[0], 0)
+                own = dr.select(connected, f * event.rest * self.scale[0], 0)
             for weight in self.met:
                 there = hit.si
                 if self.leaves:
                     there.wi = dr.select(leaves, -ray.d, there.wi)
                 own += dr.select(lit, there.emitter(samples.scene, lit).eval(there, lit) * weight, 0)
-            later = dr.select(scattered, scattering.weight * B, 0)
+            later = dr.select(scattered, scattering.s * B, 0)
             following = hit.si.spawn_ray(scattering.d)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             objective = dr.dot(P, factor * (own + later)) + dr.select(scattered, moved, 0)
@@ -163,5 +163,5 @@ class AttachedCameraSweep(CameraHooks):
         stack = state.stack.pushed(frame, self.ring, here, contributes)
         return AttachedCameraState(stack, Before.of(plan, vertex, scattering), L)
 
-    def survived(self, state: AttachedCameraState, weight: mi.Float) -> AttachedCameraState:
-        return AttachedCameraState(state.stack.scaled(weight), state.before, state.L)
+    def survived(self, state: AttachedCameraState, factor: mi.Float) -> AttachedCameraState:
+        return AttachedCameraState(state.stack.scaled(factor), state.before, state.L)

@@ -101,12 +101,12 @@ class Estimator(ABC):
         """Return a PyTree with the types of all data that are stored for a path at the same time."""
 
 
-def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]) -> None:
-    """Add the derivative of E (C,), multiplied by `weight(E)`, if the plan differentiates emission."""
+def differentiate_emission(p: Pass, adjoint: Callable[[mi.Spectrum], mi.Spectrum]) -> None:
+    """Add the derivative of E (C,), multiplied by `adjoint(E)`, if the plan differentiates emission."""
     if p.plan.differentiate_emission:
         with dr.resume_grad(), dr.isolate_grad():
-            E = p.emission().weight
-            dr.backward_from(dr.dot(weight(dr.detach(E)), E))
+            E = p.emission().E
+            dr.backward_from(dr.dot(adjoint(dr.detach(E)), E))
 
 
 @dataclass
@@ -258,7 +258,7 @@ def event(wo: mi.Vector3f, lobe: list[mi.UInt32 | mi.Float | mi.Point2f]) -> Sca
     """Return a sampled event from its stored direction and `lobe`. The event has all data that its factor needs."""
     kind, sample_1, sample_2 = lobe or [mi.UInt32(0), None, None]
     return Scattering(
-        weight=None, f=None, wo=wo, d=None, pdf=None, eta=None, correction=None,
+        s=None, f=None, wo=wo, d=None, pdf=None, eta=None, correction=None,
         is_delta=kind == 1, is_null=kind == 2, sample_1=sample_1, sample_2=sample_2, active=None,
     )  # fmt: skip
 

@@ -96,18 +96,18 @@ class CameraSweep(CameraHooks):
             differentiate_passage(self.p, vertex.si, depth, event, active, adjoint)
         if not plan.differentiate_bsdfs:
             return CameraState(state.stack, L)
-        stack, weight = state.stack, mi.Spectrum(0)
+        stack, delta_r = state.stack, mi.Spectrum(0)
         if met is not None:
             stack = stack.plus(self.delta * met.Le * met.weight, met.active)
         if event is not None:
-            weight = dr.select(event.active, self.delta * event.weight * event.through, 0)
+            delta_r = dr.select(event.active, self.delta * event.rest * event.through, 0)
         here = vertex.active & vertex.si.is_valid() & (depth < plan.max_depth) & plan.differentiates(vertex.bsdf)
         if self.end is not None:
             here = here & (stack.count < self.end)
-        return CameraState(push(plan, stack, self.ring, here, vertex, scattering, event, weight), L)
+        return CameraState(push(plan, stack, self.ring, here, vertex, scattering, event, delta_r), L)
 
-    def survived(self, state: CameraState, weight: mi.Float) -> CameraState:
-        return CameraState(state.stack.scaled(weight), state.L)
+    def survived(self, state: CameraState, factor: mi.Float) -> CameraState:
+        return CameraState(state.stack.scaled(factor), state.L)
 
     def _differentiate_emission(self, vertex: Vertex, met: MetLight | None, event: NextEvent | None) -> None:
         """Add the derivatives at a vertex with respect to the radiance of emitters."""

@@ -324,7 +324,7 @@ class ChainReplay(SlotReplay):
             on, own = here & (depth < kept.slot.number), here & (depth == kept.slot.number)
             by_o, by_d = spread(scattering.d, row, is_staying(after))
             origin, direction = origin + dr.select(on, by_o, 0), direction + dr.select(on, by_d, 0)
-            by_s += dr.select(on, adjoint_of_factor(kept.adjoint, depth, scattering.weight, 1), 0)
+            by_s += dr.select(on, adjoint_of_factor(kept.adjoint, depth, scattering.s, 1), 0)
             by_c += dr.select(own, kept.slot.prefix * (kept.share * p.scale), 0)
             connected, scattered = connected | own, scattered | (on & scattering.active)
         assert p.adjoint is not None
@@ -332,9 +332,9 @@ class ChainReplay(SlotReplay):
             this, reached = segment_again(p.samples, before, vertex.ray, vertex.pi, numbers, connected, scattered)
             there, following = this.connection, this.next_ray(attached=True)
             delta = p.adjoint.lookup(there.u, connected, plan.attached_normalization)
-            own_part = dr.select(connected, dr.dot(by_c, reached * delta * there.f * there.weight), 0)
+            own_part = dr.select(connected, dr.dot(by_c, reached * delta * there.f * there.rest), 0)
             moved = dr.dot(origin, following.o) + dr.dot(direction, following.d)
-            later = dr.select(scattered, moved + dr.dot(by_s, reached * this.scattering.weight), 0)
+            later = dr.select(scattered, moved + dr.dot(by_s, reached * this.scattering.s), 0)
             dr.backward_from(own_part + later)
 
 
@@ -369,7 +369,7 @@ def differentiate(p: Pass, kept: list[KeptConnection], damping: float) -> None:
         for one in kept:
             inside, weight = one.part(ChainBlocks.of(p.plan))
             by_o, by_d = spread(emission.ray.d, dr.select(inside, one.row * weight, 0), mi.Bool(False))
-            B += adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1)
+            B += adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.E), 1)
             origin, direction = origin + by_o, direction + by_d
         differentiate_start(p, dr.detach(Adjoint(origin, direction, B)))
     if p.plan.moving_shapes or p.plan.differentiate_bsdfs:  # otherwise there is no parameter, and Dr.Jit refuses it
@@ -448,9 +448,9 @@ def segment_jacobian(
         hit, reached = reach(samples.plan, before, ray, vertex.pi, connected | scattered, parameters=False)
         this = segment(samples, hit, numbers, connected, scattered, evaluates, attached=True)
         following, scattering, connection = this.next_ray(attached=True), this.scattering, this.connection
-        factors = [reached * scattering.weight]
+        factors = [reached * scattering.s]
         if evaluates:
-            factors.append(reached * connection.f * connection.weight)
+            factors.append(reached * connection.f * connection.rest)
         # `select` makes new variables: no other output depends on them, so clearing them on the way is harmless.
         outputs = [dr.select(scattered, value, 0) for value in (following.o, following.d, factors[0])]
         if evaluates:

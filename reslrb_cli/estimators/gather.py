@@ -29,7 +29,7 @@ from reslrb_cli.estimators.base import (
     vertices,
 )
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
-from reslrb_cli.transport.connection import Connection, Seen, stand_in
+from reslrb_cli.transport.connection import Connection, KnownVisibility, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product, showing
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
@@ -59,14 +59,14 @@ class Visibility:
         words = [word | dr.select(visible & ((index >> 5) == k), bit, 0) for k, word in enumerate(self.words)]
         return Visibility(words, dr.select(visible, last, self.last))
 
-    def seen(self, depth: mi.UInt32, vertices: int) -> Seen:
+    def of(self, depth: mi.UInt32, vertices: int) -> KnownVisibility:
         """Return the known visibility at vertex `depth`, for paths with at most `vertices` vertices."""
         index = depth - 1
         visible = mi.Bool(False)
         for k, word in enumerate(self.words):
             visible |= ((index >> 5) == k) & (((word >> (index & 31)) & 1) != 0)
         enough = vertices <= 32 * len(self.words)
-        return Seen(visible, None if enough else index < 32 * len(self.words))
+        return KnownVisibility(visible, None if enough else index < 32 * len(self.words))
 
 
 @dataclass
@@ -181,8 +181,8 @@ class Revisiting(VertexHooks):
         super().__init__(p)
         self.visibility = visibility
 
-    def seen(self, vertex: Vertex) -> Seen:
-        return self.visibility.seen(vertex.depth, vertices(self.p.plan))
+    def known_visibility(self, vertex: Vertex) -> KnownVisibility:
+        return self.visibility.of(vertex.depth, vertices(self.p.plan))
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
         return vertex.depth < self.visibility.last
@@ -214,12 +214,12 @@ class Taking(Revisiting):
         delta = p.delta(connection.u, connected)
         S = state.minus(delta, C, vertex.depth, connected)
         own = PathAdjoint(delta * C.nonzero, C)
-        weight_c = adjoint_of_connection(p, vertex, connection, connected, own)
-        weight_s = S.adjoint_of_factor(scattering.f, vertex.product, scattering.correction / scattering.pdf)
+        adjoint_c = adjoint_of_connection(p, vertex, connection, connected, own)
+        adjoint_s = S.adjoint_of_factor(scattering.f, vertex.product, scattering.correction / scattering.pdf)
         connected, scattered = connected & useful, scattering.active & useful
         with dr.resume_grad():
             f_c, f_s = tracked_factors(plan, vertex.si, vertex.bsdf, connection.wo, connected, scattering, scattered)
-            dr.backward_from(dr.select(connected, weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
+            dr.backward_from(dr.select(connected, adjoint_c * f_c, 0) + dr.select(scattered, adjoint_s * f_s, 0))
         return S
 
 

@@ -61,7 +61,7 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
 
     Raises ValueError for `adjoint` if delta is not known.
     """
-    value = C.weight()
+    value = C.magnitude()
     if weight == "luminance":
         return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
     if p.adjoint is None:
@@ -114,7 +114,7 @@ def chosen_by(numbers: list[mi.Float], w: mi.Float, W: mi.Float, this: S, slots:
 class SlotReplay(VertexHooks):
     """Replay up to the vertex `last`, which is the last vertex that any slot differentiates."""
 
-    replaying = True
+    needs_product = False
     connects = False
 
     def __init__(self, p: Pass, last: list[mi.UInt32]) -> None:

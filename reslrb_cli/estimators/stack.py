@@ -1,27 +1,41 @@
-"""Use every connection of a path without additional variance, in one traversal. The forward pass pushes vertices on a
-stack. The walk back then visits the vertices in reverse order.
+"""Use every connection of a path without additional variance. The forward pass traces the paths and pushes their
+vertices on a stack. The walk back visits the vertices in reverse order, and adds their derivatives.
 
-P_j is the throughput before vertex j. s_j is the scattering factor and c_j the connection factor at vertex j. Each of
-s_j and c_j is f = bsdf * cos times numbers without a derivative. B_j is the contribution of all later connections to
-the objective, per unit of throughput behind s_j. delta_j is dL/dI at the film position of c_j. The recursion starts at
-the last vertex.
+P_j is the throughput before vertex j, so P_1 = E at the first vertex. s_j is the scattering factor and c_j the
+connection factor at vertex j. Each of s_j and c_j is f = bsdf * cos times numbers r without a derivative. delta_j is
+dL/dI at the film position of c_j, times `Pass.scale`. B_j is the contribution of all later connections to the
+objective, per unit of throughput behind s_j. The recursion starts at the last vertex.
 
     dS     += P_j [ delta_j dc_j + B_j ds_j ]
     B_{j-1} = delta_j c_j + s_j B_j                      B = 0 behind the last vertex
     dS     += B_0 dE                                     at the emitter
 
-Nothing is divided, so zero factors need no special treatment.
+If Russian roulette with probability q lets the path go on to vertex j, 1/q multiplies P_j and B_{j-1}. For example, a
+path with three vertices and without roulette contributes E c_1 + E s_1 c_2 + E s_1 s_2 c_3, each weighted by its delta.
 
-Only differentiated vertices are pushed. Vertices between two pushed vertices are combined in the forward pass. T is the
-throughput, including roulette, since the last pushed vertex. D is the contribution of all vertices since the last
-pushed vertex. Vertex k stores both when it is pushed.
+    vertex 3   dS += E s_1 s_2 [ delta_3 dc_3 ]              B_2 = delta_3 c_3
+    vertex 2   dS += E s_1 [ delta_2 dc_2 + B_2 ds_2 ]       B_1 = delta_2 c_2 + s_2 B_2
+    vertex 1   dS += E [ delta_1 dc_1 + B_1 ds_1 ]           B_0 = delta_1 c_1 + s_1 B_1
+    emitter    dS += B_0 dE
+
+This is like Mitsuba's `prb`, except that `prb` traces each path a second time. `prb` then knows the sum of all
+contributions, subtracts those of the vertices that it passes, and divides by s_j. Here, the stack has what a vertex
+needs, and B_j comes from multiplications. Nothing is divided, so zero factors need no special treatment.
+
+Paths are traced while gradients are suspended. Only `Frame.differentiate` resumes them. It evaluates both factors f of
+one vertex again, and `dr.backward_from` adds their derivatives to the parameters' gradients, inside the symbolic loop.
+
+Only differentiated vertices are pushed. If there are others, the forward pass combines the vertices between two pushed
+vertices. T is the throughput, including roulette, since the last pushed vertex. D is the contribution of all vertices
+since the last pushed vertex, per unit of throughput behind it. Without such gaps, D is 0 and T only has roulette's 1/q.
 
     B = (D + T delta_k c_k) + (T s_k) B_k                of the vertex that was pushed before k
 
 The stack is a ring of `stack_size` places in thread-local memory. The ring holds the last vertices, in about 95 bytes
-each. A longer path is traced again for its earlier vertices, block by block from the last block to the first. If delta
-is known before the paths are traced, image and gradient are one kernel. Otherwise, paths are traced again for the
-gradient, without shadow rays.
+each. A longer path is traced again for its earlier vertices, block by block from the last block to the first.
+
+With `run.adjoint: batched` or `independent`, delta is known before the paths are traced. `forward` then also walks
+back, in the same kernel. With `correlated`, `backward` traces the paths again, without shadow rays, and walks back.
 
 `attached.py` uses this recursion for parameters that move light. `camera.py` uses the recursion for camera paths.
 """
@@ -52,7 +66,7 @@ from reslrb_cli.estimators.base import (
 from reslrb_cli.estimators.base import lobe as kept_lobe
 from reslrb_cli.estimators.gather import Gathering, Visibility
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
-from reslrb_cli.transport.connection import Connection, Seen
+from reslrb_cli.transport.connection import Connection, KnownVisibility
 from reslrb_cli.transport.factors import Product, showing
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
@@ -141,9 +155,10 @@ class Ring:
 class StackState:
     """Loop state of the forward pass.
 
-    `count` vertices have been pushed. The first `needed` vertices come before the last contribution. `throughput` is T
-    at the current vertex. If the stack leaves out no vertex, `throughput` contains only the roulette weight. `since` is
-    the contribution D since vertex number `needed`. `stack` has an array for each member of a frame.
+    `count` vertices have been pushed, with the numbers 0 to `count` - 1. The last contribution comes from the vertex
+    with number `needed` - 1, or from vertices behind it that are not pushed. `since` is D behind this vertex.
+    `throughput` is T at the current vertex. T is a Float if all vertices are pushed, because it only has roulette's
+    1/q, which is the same for all channels. `stack` has an array for each member of a frame.
     """
 
     stack: list[dr.Local]
@@ -161,7 +176,7 @@ class StackState:
         return StackState(stack, mi.UInt32(0), mi.UInt32(0), throughput, mi.Spectrum(0))
 
     def gap(self) -> mi.Spectrum:
-        """Return D behind the last pushed vertex."""
+        """Return D behind the last pushed vertex. It is 0 if that vertex comes after the last contribution."""
         return dr.select(self.needed == self.count, self.since, 0)
 
     def plus(self, value: mi.Spectrum, active: mi.Bool) -> StackState:
@@ -171,9 +186,9 @@ class StackState:
         since = dr.select(active, self.gap() + self.throughput * value, self.since)
         return replace(self, needed=dr.select(active, self.count, self.needed), since=since)
 
-    def scaled(self, weight: mi.Float | mi.Spectrum) -> StackState:
-        """Return the state behind a factor of the path. The throughput is multiplied by `weight`."""
-        return replace(self, throughput=self.throughput * weight)
+    def scaled(self, factor: mi.Float | mi.Spectrum) -> StackState:
+        """Return the state behind a factor of the path, which multiplies the throughput."""
+        return replace(self, throughput=self.throughput * factor)
 
     def pushed(self, frame: Any, ring: Ring, here: mi.Bool, contributes: mi.Bool) -> StackState:
         """Return the state after pushing a vertex in lanes `here`. In lanes `contributes`, the vertex has its own
@@ -194,13 +209,14 @@ class StackState:
 def walk_back(
     p: Pass, form: Any, ring: Ring, state: StackState, adjoint: A, again: Callable[[mi.UInt32], StackState]
 ) -> A:
-    """Differentiate all vertices, from the last to the first. Returns the adjoint before the first vertex.
+    """Differentiate the pushed vertices up to the last contribution, from the last to the first. Returns the adjoint
+    before the first vertex.
 
     `form` is a frame, such as `Frame.blank`. A frame's `differentiate(p, adjoint)` adds the derivatives of a vertex. It
-    takes the adjoint behind the vertex, and returns the adjoint before it.
+    takes the adjoint behind the vertex, such as B_k, and returns the adjoint behind the vertex that was pushed before.
 
-    `adjoint` is the adjoint behind the last contribution. `again(end)` traces the paths again, and pushes the vertices
-    before number `end`. `again` is called only if paths may be longer than the stack.
+    `adjoint` is the adjoint behind the vertex with number `state.needed` - 1. `again(end)` traces the paths again, and
+    pushes the vertices before number `end`. `again` is called only if paths may be longer than the stack.
     """
     if not state.stack:
         return adjoint
@@ -244,18 +260,18 @@ def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, botto
 
 @dataclass
 class Frame:
-    """Vertex on the stack. The vertex's BSDF is evaluated again towards the sensor and along the path.
+    """Vertex k on the stack. Its BSDF is evaluated again: f_c towards the sensor and f_s along the path.
 
-    `weight_c` (C,) is P_k delta_k c_k / f_c, the weight of the derivative of f_c. `weight_s` (C,) is P_k s_k / f_s. The
-    product of `weight_s` and B_k is the weight of the derivative of f_s. B of the previously pushed vertex is `own` +
-    `onward` B_k.
+    The factors are c_k = f_c r_c and s_k = f_s r_s. `adjoint_c` (C,) is dS/df_c = P_k delta_k r_c. `adjoint_s_per_b`
+    (C,) is P_k r_s, because dS/df_s = P_k r_s B_k. B of the vertex that was pushed before is `own` + `onward` B_k.
+    `lobe` has the rest of the sampled event.
     """
 
     point: SurfacePoint
     wo_c: mi.Vector3f
     wo_s: mi.Vector3f
-    weight_c: mi.Spectrum
-    weight_s: mi.Spectrum
+    adjoint_c: mi.Spectrum
+    adjoint_s_per_b: mi.Spectrum
     own: mi.Spectrum
     onward: mi.Spectrum
     lobe: list[mi.UInt32 | mi.Float | mi.Point2f]
@@ -272,47 +288,45 @@ class Frame:
         throughput = mi.Float(1) if is_gapless(plan) else mi.Spectrum(1)
         return StackState.begin(Frame.blank(plan) if plan.differentiate_bsdfs else None, ring, throughput)
 
-    def differentiate(self, p: Pass, adjoint: mi.Spectrum) -> mi.Spectrum:
-        """Add the derivatives of both factors, given B (C,) behind the vertex. Returns B of the vertex pushed
-        before.
-        """
+    def differentiate(self, p: Pass, B: mi.Spectrum) -> mi.Spectrum:
+        """Add the derivatives of both factors, given B_k (C,). Returns B of the vertex that was pushed before."""
         si, bsdf = self.point.interaction(p.plan)
-        weight_c, weight_s = self.weight_c, showing(self.weight_s * adjoint)
-        connected, scattered = dr.any(weight_c != 0), dr.any(weight_s != 0)
+        adjoint_c, adjoint_s = self.adjoint_c, showing(self.adjoint_s_per_b * B)
+        connected, scattered = dr.any(adjoint_c != 0), dr.any(adjoint_s != 0)
         with dr.resume_grad():
             sampled = event(self.wo_s, self.lobe)
             f_c, f_s = tracked_factors(p.plan, si, bsdf, self.wo_c, connected, sampled, scattered)
-            dr.backward_from(dr.select(connected, weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
-        return self.own + self.onward * adjoint
+            dr.backward_from(dr.select(connected, adjoint_c * f_c, 0) + dr.select(scattered, adjoint_s * f_s, 0))
+        return self.own + self.onward * B
 
 
 def push(
     plan: Plan, state: StackState, ring: Ring, here: mi.Bool, vertex: Vertex, scattering: Scattering,
-    connection: Connection | None, weight: mi.Spectrum,
+    connection: Connection | None, delta_r: mi.Spectrum,
 ) -> StackState:  # fmt: skip
     """Return the state behind a vertex. The vertex is pushed in the lanes `here`.
 
-    `weight` (C,) is delta times the connection without its BSDF, or 0 if the connection does not count.
+    `delta_r` (C,) is delta_k r_c: delta times the connection without its BSDF, or 0 if the connection does not count.
     """
     T, P, on = state.throughput, vertex.product.value(), scattering.active
-    wo, own, seen = mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False)
+    wo, own, visible = mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False)
     if connection is not None:
-        wo, own, seen = connection.wo, weight * connection.f, connection.active
-    if not state.stack:
-        return state.plus(own, seen).scaled(scattering.weight)
+        wo, own, visible = connection.wo, delta_r * connection.f, connection.active
+    if not state.stack:  # no BSDF is differentiated, so only B_0 is needed
+        return state.plus(own, visible).scaled(scattering.s)
     frame = Frame(
         point=SurfacePoint.of(plan, vertex),
         wo_c=wo,
         wo_s=scattering.wo,
-        weight_c=showing(P * weight),
-        weight_s=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
+        adjoint_c=showing(P * delta_r),
+        adjoint_s_per_b=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
         own=state.gap() + T * own,
-        onward=dr.select(on, T * scattering.weight, 0),
+        onward=dr.select(on, T * scattering.s, 0),
         lobe=kept_lobe(plan, scattering),
     )
     if not is_gapless(plan):
-        state = state.plus(own, seen & ~here).scaled(scattering.weight)
-    return state.pushed(frame, ring, here, seen)
+        state = state.plus(own, visible & ~here).scaled(scattering.s)
+    return state.pushed(frame, ring, here, visible)
 
 
 def is_gapless(plan: Plan) -> bool:
@@ -324,10 +338,12 @@ def is_gapless(plan: Plan) -> bool:
 
 
 class LightSweep(VertexHooks):
-    """Forward pass of light paths. The pass splats the image and pushes the vertices before number `end`. If `end` is
-    None, the pass pushes all vertices.
+    """Forward pass of light paths, which splats the image if there is one, and pushes the vertices. Three walks use it.
 
-    `visibility` is the result of an earlier walk, if there was one.
+    - If delta is known beforehand, the only walk.
+    - If delta is known after the image, the second walk. `visibility` is the result of the first walk (`Gathering`).
+    - If paths are longer than the stack, another walk for each block. It pushes the vertices before number `end`, and
+        ends there.
     """
 
     def __init__(self, p: Pass, ring: Ring, visibility: Visibility | None = None, end: mi.UInt32 | None = None) -> None:
@@ -340,8 +356,8 @@ class LightSweep(VertexHooks):
     def concerned(self, state: StackState) -> mi.Bool:
         return state.count > 0
 
-    def seen(self, vertex: Vertex) -> Seen | None:
-        return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p.plan))
+    def known_visibility(self, vertex: Vertex) -> KnownVisibility | None:
+        return None if self.visibility is None else self.visibility.of(vertex.depth, vertices(self.p.plan))
 
     def goes_on(self, state: StackState, vertex: Vertex) -> mi.Bool:
         if self.end is not None:
@@ -351,25 +367,25 @@ class LightSweep(VertexHooks):
     def vertex(
         self, state: StackState, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
     ) -> StackState:  # fmt: skip
-        p, plan, seen = self.p, self.p.plan, connection.active
+        p, plan, visible = self.p, self.p.plan, connection.active
         C = contribution(p, vertex, connection)
-        p.splat(connection.u, C.value(), seen)
-        delta = p.delta(connection.u, seen)
+        p.splat(connection.u, C.value(), visible)
+        delta = p.delta(connection.u, visible)
         here = vertex.active & plan.differentiates(vertex.bsdf)
         if self.end is not None:
             here = here & (state.count < self.end)
         elif plan.differentiate_null:
-            own = PathAdjoint(dr.select(seen, delta * C.nonzero, 0), C)
-            differentiate_passage(p, vertex.si, vertex.depth, connection, seen, own)
-        weight = dr.select(seen, delta * p.scale * connection.weight * connection.through, 0)
-        return push(plan, state, self.ring, here, vertex, scattering, connection, weight)
+            own = PathAdjoint(dr.select(visible, delta * C.nonzero, 0), C)
+            differentiate_passage(p, vertex.si, vertex.depth, connection, visible, own)
+        delta_r = dr.select(visible, delta * p.scale * connection.rest * connection.through, 0)
+        return push(plan, state, self.ring, here, vertex, scattering, connection, delta_r)
 
-    def survived(self, state: StackState, weight: mi.Float) -> StackState:
-        return state.scaled(weight)
+    def survived(self, state: StackState, factor: mi.Float) -> StackState:
+        return state.scaled(factor)
 
 
 class Stack(Estimator):
-    """The estimator `stack`: exact, like `gather`, without tracing the paths a second time."""
+    """The estimator `stack`: exact, like `gather`. It does not trace paths a second time if delta is known."""
 
     exact = True
 
@@ -380,7 +396,9 @@ class Stack(Estimator):
         self.stack_size = stack_size
 
     def forward(self, p: Pass) -> Visibility | mi.Spectrum:
-        """Trace the image pass. Returns B_0 (C,) if delta is known, otherwise the visibility of the connections."""
+        """Trace the image pass. If delta is known, add the derivatives of BSDFs, and return B_0 (C,). Otherwise, return
+        the visibility of the connections.
+        """
         if p.adjoint is not None:
             return self._sweep(p, None)
         return p.walk(Gathering(p)).visibility
@@ -393,6 +411,7 @@ class Stack(Estimator):
         return [Visibility.none(vertices(plan)), mi.Spectrum(0)]  # `forward` keeps one of them
 
     def _sweep(self, p: Pass, visibility: Visibility | None) -> mi.Spectrum:
+        """Trace the paths and walk back, which adds the derivatives of BSDFs. Returns B_0 (C,)."""
         ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
         active = True if visibility is None else visibility.last > 0
         state: StackState = p.walk(LightSweep(p, ring, visibility), active)

@@ -298,14 +298,14 @@ class Hearing(Hooks):
     def start(self, product: Product) -> Heard:
         number, factor = voices(self.samples.plan) - 1, [mi.Float(1)] if self.film else []
         counts, sums = [mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)]
-        return Heard(counts, sums, mi.Float(0), dr.max(dr.abs(product.weight())), Trail.begin(number), factor)
+        return Heard(counts, sums, mi.Float(0), dr.max(dr.abs(product.magnitude())), Trail.begin(number), factor)
 
     def vertex(
         self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
     ) -> Heard:  # fmt: skip
         plan, active = self.samples.plan, connection.active
         C = vertex.product.times(connection.c, vertex.depth)
-        said = self.adjoint.lookup(connection.u, active) * self.loudness * C.weight()
+        said = self.adjoint.lookup(connection.u, active) * self.loudness * C.magnitude()
         said = dr.select(active, said, 0)
         met = [meets(group, vertex) for group in self.groups]
         parts = [said * mi.Float(count + here) for count, here in zip(state.counts, met, strict=True)]
@@ -325,7 +325,7 @@ class Hearing(Hooks):
         trail = state.trail.with_vertex([*parts, image])
         scattered = scattering.active
         counts = [count + dr.select(scattered, here, 0) for count, here in zip(state.counts, met, strict=True)]
-        throughput = dr.max(dr.abs(vertex.product.times(scattering.weight, vertex.depth).weight()))
+        throughput = dr.max(dr.abs(vertex.product.times(scattering.s, vertex.depth).magnitude()))
         inverse = dr.select(scattered & (throughput > 0), dr.rcp(throughput), 0)
         trail.leaves(self.survival.cell(vertex.si.p, scattering.d), inverse)
         return replace(state, counts=counts, sums=sums, image=state.image + image, trail=trail)
@@ -334,8 +334,8 @@ class Hearing(Hooks):
         # Leave out the weight of a roulette that is being learned from.
         return replace(state, factor=[factor])
 
-    def survived(self, state: Heard, weight: mi.Float) -> Heard:
-        state.trail.survives(weight)
+    def survived(self, state: Heard, factor: mi.Float) -> Heard:
+        state.trail.survives(factor)
         return state
 
 

@@ -231,7 +231,7 @@ class Trajectory(LightTracer):
             adjoint = parts[0].film.adjoint(gradient)
 
             def differentiate(part: Samples, block: mi.ImageBlock | None) -> None:
-                with dr.isolate_grad():  # as in `replay_stored`; without it, the derivatives of textures are lost
+                with dr.isolate_grad():  # as in `backward_stored`; without it, the derivatives of textures are lost
                     differentiate_visible_emission(part, adjoint)
                     with dr.resume_grad():
                         dr.backward_from(walk(part, RecordedObjective(part, adjoint)), flags=_MAY_LACK)

@@ -27,7 +27,7 @@ from reslrb_cli.integrators.plans import (
     SamplingOptions,
     attach,
     bounces,
-    settle,
+    set_up,
     with_shading_normals,
 )
 from reslrb_cli.scene.deformation import Surroundings
@@ -166,7 +166,7 @@ class Preparation:
         self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, sampling: SamplingOptions
     ) -> None:  # fmt: skip
         self.sampling = sampling
-        self.guiding = Guiding() if sampling.guided else None
+        self.guiding = Guiding() if "guiding" in sampling.on else None
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
         self._found = AboutScene([])
@@ -216,7 +216,7 @@ class Preparation:
         drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
         plan = replace(plan, evened_lamps=drawn)
         if moves:
-            edged, motion = self._edges(which, scene) if self.sampling.edges else None, self._motion
+            edged, motion = self._edges(which, scene) if "edges" in self.sampling.on else None, self._motion
             if edged is not None:
                 if motion.sampling == "follow":
                     why = "follow has no derivatives of edges between two surfaces; use auto, or edges: off"
@@ -287,13 +287,13 @@ class Preparation:
         check_paths(scene, sensor, paths, self._hide_emitters)
         needs = scene_needs(scene, sensor)
         renewal = self._found.renewal = self._found.renewal or Renewal(scene)
-        settle(scene)
+        set_up(scene)
         plan = make_plan(needs, *self._depths, self._hide_emitters)
-        shares_out = self.sampling.shares_out and paths != "light" and not moves
-        plan = replace(plan, paths=paths, whole=whole, by_class=moves and paths == "both", shares_out=shares_out)
+        on = self.sampling.on - {"pixels"} if moves or paths == "light" else self.sampling.on
+        plan = replace(plan, paths=paths, whole=whole, by_class=moves and paths == "both", on=on)
         if plan.weighs:
             plan = renewal.renew(plan, scene)  # the horizon
-        if plan.paths == "camera" or (self.guiding is None and not self.sampling.low_discrepancy):
+        if plan.paths == "camera" or (self.guiding is None and "sequence" not in on):
             return plan
         [samples] = passes(renewal.renew(plan, scene), scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
         return self._with_numbers(plan, samples)
@@ -326,7 +326,7 @@ class Preparation:
                 number = sensor_number(samples.scene, samples.sensor)
                 aims = self.guiding.aims(number, film_blocks(samples.sensor))
         plan = replace(plan, aims=aims)
-        if not self.sampling.low_discrepancy:
+        if "sequence" not in plan.on:
             return replace(plan, grid=grid)
         sequence = make_coordinates(used_numbers(samples), len(plan.needs.emitters), plan.max_depth)
         return replace(plan, grid=grid, sequence=sequence)

@@ -57,8 +57,8 @@ class TangentSplat(Hooks):
         d_ray = [mi.Vector3f(0), mi.Vector3f(0)] if plan.attached else []
         return Tangent(mi.Spectrum(self.dE), d_ray, Before.start(plan))
 
-    def survived(self, state: Tangent, weight: mi.Float) -> Tangent:
-        return replace(state, d_product=state.d_product * weight)
+    def survived(self, state: Tangent, factor: mi.Float) -> Tangent:
+        return replace(state, d_product=state.d_product * factor)
 
     def vertex(
         self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
@@ -74,10 +74,10 @@ class TangentSplat(Hooks):
             f_s = tracked_factor(plan, vertex.si, vertex.bsdf, scattering, scattering.active)
             df_c, df_s = forward_derivatives(f_c, f_s)
             f_c = dr.detach(f_c)
-        c = f_c * through * connection.weight
-        dc = (df_c * through + f_c * d_through) * connection.weight
+        c = f_c * through * connection.rest
+        dc = (df_c * through + f_c * d_through) * connection.rest
         s.film.put(self.block, connection.u, (dP * c + P * dc) * s.scale, seen)
-        return replace(state, d_product=dP * scattering.weight + P * tangent_of_scattering(scattering, df_s))
+        return replace(state, d_product=dP * scattering.s + P * tangent_of_scattering(scattering, df_s))
 
     def _attached(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
         """Return the tangent after a vertex, for moving light.
@@ -102,7 +102,7 @@ class TangentSplat(Hooks):
             taps = [(pixel, k * dr.select(total != 0, dr.rcp(total), 0)) for pixel, k in taps]
             # `select` makes new variables: no other output depends on them, so clearing them on the way is harmless.
             there, sampled = this.connection, this.scattering
-            c, weight = reached * there.f * there.weight, reached * sampled.weight
+            c, weight = reached * there.f * there.rest, reached * sampled.s
             outputs = [dr.select(seen, c, 0)]
             outputs += [dr.select(scattered, value, 0) for value in (weight, following.o, following.d)]
             dc, ds, d_origin, d_direction, *d_weights = forward_derivatives(*outputs, *(k for _, k in taps))
@@ -131,8 +131,8 @@ class CameraTangents(CameraHooks):
     def start(self, first: FilmRay) -> CameraTangent:
         return CameraTangent(mi.Spectrum(0), mi.Spectrum(0))
 
-    def survived(self, state: CameraTangent, weight: mi.Float) -> CameraTangent:
-        return replace(state, d_product=state.d_product * weight)
+    def survived(self, state: CameraTangent, factor: mi.Float) -> CameraTangent:
+        return replace(state, d_product=state.d_product * factor)
 
     def vertex(
         self, state: CameraTangent, vertex: Vertex, met: MetLight | None, event: NextEvent | None,
@@ -157,7 +157,7 @@ class CameraTangents(CameraHooks):
             c = f_c * Le * through
             dc = (df_c * Le + f_c * dLe_n) * through + f_c * Le * d_through
             dL = dL + dr.select(event.active, (dP * c + P * dc) * event.scale, 0)
-        return CameraTangent(dP * scattering.weight + P * tangent_of_scattering(scattering, df_s), dL)
+        return CameraTangent(dP * scattering.s + P * tangent_of_scattering(scattering, df_s), dL)
 
 
 def tangent_of_passage(
@@ -202,7 +202,7 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
     plan, dE = samples.plan, mi.Spectrum(0)
     with dr.resume_grad():
         if plan.differentiate_emission and not plan.camera:
-            E = sample_emission(samples, samples.sampler()).weight
+            E = sample_emission(samples, samples.sampler()).E
             [dE] = forward_derivatives(E)
         if plan.visible_emission and plan.paths == "light" and (plan.differentiate_emission or plan.differentiate_null):
             ray, u, weight = primary_ray(samples)

@@ -1,17 +1,15 @@
 """Options of a light tracer, differentiated parameters, and the features of a plan that both need.
 
 `SamplingOptions` has the choice of paths. `Motion` has the options of attached derivatives, and `attach` adds them to a
-plan. The values `follow` and `stay` of
-`attached_sampling` (`estimators/attached.py`) differ in only one case. The case occurs when a nonspecular surface
-scatters moving light to another visible surface. `bounces` tests whether moving light reaches a visible surface after
-nonspecular scattering. In a caustic of few segments, moving light does not bounce, because paths end where light first
-lands.
+plan. The values `follow` and `stay` of `attached_sampling` (`estimators/attached.py`) differ only if a nonspecular
+surface scatters moving light to another visible surface. `bounces` tests whether this happens. In a caustic of few
+segments, moving light does not bounce, because paths end where light first lands.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -19,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from reslrb_cli.config.integrators import UNDECIDED
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.scene.catalog import entry_value, parameter_kind
@@ -121,26 +120,21 @@ class Motion:
 class SamplingOptions:
     """Options of a light tracer for its choice of paths. Raises ValueError, which names the option, for a wrong value.
 
-    - `guided` tells whether emission is guided (`tables.py`). Camera paths alone are never guided.
-    - `low_discrepancy` tells whether the first numbers of a path are low-discrepancy numbers (`sobol.py`).
     - `paths` are light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
         only one kind of paths remains.
+    - `chosen` has the values of the other settings that a run may decide (`DECIDABLE`). A setting without an entry has
+        its value in `UNDECIDED`. Camera paths alone are never guided.
     - If `whole` is true, images of light paths alone have the same film border as images with camera paths.
-    - `shares_out` tells whether camera paths are distributed over the pixels by need. The distribution by sensor,
-        (H, W), may be `given` for all scenes with the same sensors. Otherwise it is stored for each scene and its
-        parameters.
-    - `edges` tells whether derivatives contain the light that moving edges cover and uncover (`estimators/edges.py`).
+    - `given` are distributions (H, W) of camera paths over the pixels by sensor, for all scenes with the same sensors.
+        Other distributions are stored for each scene and its parameters.
     - `expected` is the sample count of the passes that tables learn from. If it is None, each pass uses its own count.
     """
 
-    guided: bool = False
-    low_discrepancy: bool = False
     paths: str = "light"
     light_share: float = 0.5
+    chosen: Mapping[str, str] = field(default_factory=dict)
     whole: bool = False
-    shares_out: bool = False
     given: dict[int, NDArray[np.float32]] = field(default_factory=dict)
-    edges: bool = False
     expected: int | None = None
 
     def __post_init__(self) -> None:
@@ -150,12 +144,17 @@ class SamplingOptions:
         paths = self.paths
         if paths == "both" and self.light_share in (0, 1):
             paths = "light" if self.light_share else "camera"
-        guided = self.guided and paths != "camera"  # no camera path starts from a table
-        for name, value in {"paths": paths, "whole": self.whole or paths != "light", "guided": guided}.items():
+        chosen = {**self.chosen, "guiding": "off"} if paths == "camera" else self.chosen  # no table has its starts
+        for name, value in {"paths": paths, "whole": self.whole or paths != "light", "chosen": chosen}.items():
             object.__setattr__(self, name, value)
 
+    @property
+    def on(self) -> frozenset[str]:
+        """Settings in `chosen` with another value than in `UNDECIDED`, as for `Plan.on`."""
+        return frozenset(name for name, value in self.chosen.items() if value != UNDECIDED[name])
 
-def settle(scene: mi.Scene) -> None:
+
+def set_up(scene: mi.Scene) -> None:
     """Make textures and emitters set up their data (padded storage, distributions) now instead of at their first use.
 
     Data set-up during tracing would split the kernels of the first step. The second step would then compile new

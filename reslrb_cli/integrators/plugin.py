@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.llvm import loaded_fault
 from reslrb_cli.backend.variant import check_variant, works_under
+from reslrb_cli.config.integrators import DECIDABLE, UNDECIDED
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import Trajectory, WalkAd
@@ -36,12 +37,7 @@ OPTIONS: dict[str, Any] = {
     "attached": "auto",
     "filter_normalization": "attached",
     "attached_sampling": "auto",
-    "edges": "off",
-    "guiding": "off",
-    "sequence": "independent",
-    "paths": "light",
-    "light_share": 0.5,
-    "pixels": "even",
+    **UNDECIDED,
 }
 
 
@@ -101,7 +97,7 @@ def make_reslrb(**given: Any) -> Reslrb:
     options = {**OPTIONS, **given}
     if options["paths"] == "camera" and "estimator" not in given:
         options["estimator"] = "stack"
-    estimator, choices = options.pop("estimator"), {}
+    estimator = options.pop("estimator")
     one_of("estimator", estimator, tuple(ESTIMATORS))
     if options["paths"] == "camera" and estimator != "stack":
         raise ValueError(
@@ -114,29 +110,16 @@ def make_reslrb(**given: Any) -> Reslrb:
             f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
             f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
         )
-    for name, other in (
-        ("guiding", "on"),
-        ("sequence", "low_discrepancy"),
-        ("pixels", "measured"),
-        ("edges", "on"),
-    ):
-        value = options.pop(name)
-        one_of(name, value, (OPTIONS[name], other))
-        choices[name] = value == other
+    light_share, chosen = options.pop("light_share"), {name: options.pop(name) for name in DECIDABLE}
+    for name, value in chosen.items():
+        one_of(name, value, DECIDABLE[name])
     motion = Motion(
         options.pop("attached"),
         options.pop("filter_normalization"),
         obstacle,
         options.pop("attached_sampling"),
     )
-    sampling = SamplingOptions(
-        guided=choices["guiding"],
-        low_discrepancy=choices["sequence"],
-        paths=options.pop("paths"),
-        light_share=options.pop("light_share"),
-        shares_out=choices["pixels"],
-        edges=choices["edges"],
-    )
+    sampling = SamplingOptions(chosen.pop("paths"), light_share, chosen)
     own = {name: options.pop(name) for name in options_of(estimator) if name in options}
     return Reslrb(make_estimator(estimator, own), motion=motion, sampling=sampling, **options)
 

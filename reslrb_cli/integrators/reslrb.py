@@ -88,15 +88,17 @@ class LightTracer(StepIntegrator):
         """Share of light paths in the samples if there are both kinds."""
         return self.preparation.sampling.light_share
 
-    def afresh(self, light_share: float | None = None, **changes: Any) -> Self:
-        """Return a copy of the tracer with no facts about any scene, and with changed `SamplingOptions`.
+    def afresh(self, light_share: float | None = None, **settings: str) -> Self:
+        """Return a copy of the tracer with no facts about any scene, and with changed `settings`
+        (`SamplingOptions.chosen`).
 
         If `light_share` is given, the copy traces light paths and camera paths, with this share of light paths. Images
         then have the same film border for any share.
         """
         other = copy.copy(self)
+        changes: dict[str, Any] = {"chosen": {**self.preparation.sampling.chosen, **settings}}
         if light_share is not None:
-            changes = {"paths": "both", "whole": True} | changes | {"light_share": light_share}
+            changes |= {"paths": "both", "whole": True, "light_share": light_share}
         other.preparation = self.preparation.afresh(**changes)
         return other
 
@@ -106,7 +108,9 @@ class LightTracer(StepIntegrator):
 
         The keys of the densities (`note_pixels`) are sensor numbers.
         """
-        return self.afresh(shares_out=True, given={int(number): density for number, density in noted.items()})
+        other = self.afresh(pixels="measured")
+        other.preparation = other.preparation.afresh(given={int(number): density for number, density in noted.items()})
+        return other
 
     def to_measure(self) -> Self:
         """Return this tracer. If the tracer is guided, return a copy with separate tables instead.
@@ -168,7 +172,7 @@ class LightTracer(StepIntegrator):
         The tracer measures an unknown distribution once, for the differentiated parameters.
         """
         preparation = self.preparation
-        if not plan.shares_out:
+        if "pixels" not in plan.on:
             return None
         number = sensor_number(job.scene, job.sensor)
         known = preparation.sampling.given
@@ -263,7 +267,7 @@ class Reslrb(LightTracer):
             parts = self.passes(job, Purpose.BOTH)
             image, state = self.launch("trace", parts, partial(trace_image, self.estimator))
         gradient = derivative(image)
-        self._replay(parts, gradient, job.params, state)
+        self._differentiate(parts, gradient, job.params, state)
         self.learn(job, gradient)
         return image
 
@@ -271,7 +275,7 @@ class Reslrb(LightTracer):
         """Add the gradient of the objective. `gradient` (H, W, C) is dL/dI."""
         with dr.suspend_grad():
             parts = self.passes(job, delta=gradient)
-        self._replay(parts, gradient, job.params)
+        self._differentiate(parts, gradient, job.params)
         self.learn(job, gradient)
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
@@ -285,7 +289,7 @@ class Reslrb(LightTracer):
         self.learn(job, gradient)
         return image
 
-    def _replay(
+    def _differentiate(
         self, parts: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None, state: Any = None
     ) -> None:
         """Add the gradient. If `state` is None, the paths are traced again, otherwise `state` has their stored data."""
@@ -294,7 +298,7 @@ class Reslrb(LightTracer):
                 work = partial(fused, self.estimator, False)
                 self.launch("trace and replay", parts, work, gradient, params=params)
             else:
-                self.launch("replay", parts, partial(replay_stored, self.estimator), gradient, state)
+                self.launch("replay", parts, partial(backward_stored, self.estimator), gradient, state)
 
 
 def image_of(samples: list[Samples]) -> mi.TensorXf:
@@ -317,9 +321,10 @@ def image_of(samples: list[Samples]) -> mi.TensorXf:
 def forward(
     samples: Samples, estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage | None = None
 ) -> Any:
-    """Trace the samples and return the stored data of each path. The returned data are not evaluated.
+    """Trace the samples and return what the estimator stores of each path. The returned data are not evaluated.
 
-    Contributions are splatted to the block. If the block is None, there is no image.
+    Contributions are splatted to the block. If the block is None, there is no image. If the `adjoint` is known, an
+    estimator may already add derivatives: `stack` walks back here. Derivatives of camera paths are always added here.
     """
     if block is not None:
         splat_visible_emission(samples, block)
@@ -356,31 +361,33 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
     return image, state
 
 
-def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, done: bool = False) -> None:
-    """Add the derivatives of the objective. `adjoint` is the objective's derivative with respect to the film.
+def backward(
+    samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, after_forward: bool = False
+) -> None:
+    """Add the derivatives that `forward` has not added. `state` is what `forward` has returned.
 
-    If `done` is true, the only traversal of the camera paths has already added the camera paths' derivatives.
+    `after_forward` is true if `forward` knew the `adjoint`. It has then added the derivatives of camera paths.
     """
     differentiate_visible_emission(samples, adjoint)
     for side in samples.sides():
         p = Pass(side, None, adjoint)
         if not side.plan.camera:
             estimator.of(side.plan).backward(p, state)
-        elif not done:
+        elif not after_forward:
             differentiate_camera_paths(p, estimator.stack_size)
     for side in samples.sides() if samples.edges is not None else ():
         terms = differentiate_edges_of_camera_paths if side.plan.camera else differentiate_edges
         terms(Pass(side, None, adjoint))
 
 
-def replay_stored(estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any) -> None:
+def backward_stored(estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any) -> None:
     """Add the gradient. `gradient` (H, W, C) is dL/dI, and `state` is the stored data of the paths of the only pass."""
     [part] = samples
     adjoint = part.film.adjoint(gradient)
-    # Isolated: on their way to the parameters, gradients are evaluated with everything they depend on, which must be
-    # one kernel. They start together at the end.
+    # Derivatives wait at the edge of this block, and go on to the parameters together at its end. Otherwise, each of
+    # them would be evaluated on its way, in a kernel of its own that traces the paths again.
     with dr.isolate_grad():
-        replay(part, estimator, state, adjoint)
+        backward(part, estimator, state, adjoint)
 
 
 def fused(
@@ -389,15 +396,17 @@ def fused(
 ) -> mi.TensorXf | None:  # fmt: skip
     """Trace samples with a known dL/dI, `gradient` (H, W, C), and add the gradient. Return the image if requested.
 
-    The data of a path stay within the kernel, and take no memory. With one pass, `params` may be None.
+    For `stack`, `forward` does nearly all work, and `backward` adds the derivatives of emission and edges. The data of
+    a path stay within the kernel, and take no memory. With one pass, `params` may be None.
     """
     film = samples[0].film
     block = film.block() if with_image else None
     adjoint = film.adjoint(gradient)
 
     def differentiate(part: Samples, own: mi.ImageBlock | None) -> None:
-        with dr.isolate_grad():  # as above
-            replay(part, estimator, forward(part, estimator, own, adjoint), adjoint, done=True)
+        with dr.isolate_grad():  # as in `backward_stored`
+            state = forward(part, estimator, own, adjoint)
+            backward(part, estimator, state, adjoint, after_forward=True)
             image = [] if own is None else [own.tensor()]
             dr.schedule(image)
             if len(samples) > 1:

@@ -8,8 +8,9 @@
     (`_batched`).
 
 Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would turn the gradients of
-all parameters on that pixel's paths into NaN. Some estimators would lose the NaN. The kernel that computes dL/dI also
-counts the non-finite entries. Only code that reads the count waits for the kernel.
+all parameters on that pixel's paths into NaN. It might also be lost: with `weight: adjoint`, `reservoir` and `event` do
+not select a connection whose weight is NaN. The kernel that computes dL/dI also counts the non-finite entries. Only
+code that reads the count waits for the kernel.
 """
 
 from __future__ import annotations
@@ -227,7 +228,7 @@ def _batched(
     if job.spp < 1 or job.spp % batches:
         raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches})")
     parts = [replace(job, seed=seed, spp=job.spp // batches) for seed in batch_seeds(job.seed, batches)]
-    share = 1 / (batches - 1)
+    share = 1 / (batches - 1)  # the gradient is the mean over the batches that have a dL/dI
     image, refused = integrator.image(parts[0]), Refused()
     for b in range(1, batches):
         _, gradient = derivative_of(objective, image, refused)

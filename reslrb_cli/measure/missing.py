@@ -308,7 +308,7 @@ def check_missing(
         if lacking:
             say(f"chosen by measurement: {decision.line()}")
             found = measure_missing(problem)
-    has_edge_terms = tracer is not None and tracer.preparation.sampling.edges
+    has_edge_terms = tracer is not None and "edges" in tracer.preparation.sampling.on
     if has_edge_terms and len(edged) == len(moving):
         found = [record for record in found if not record.is_unknown]
     told = [record for record in found if record.is_incomplete]

@@ -179,10 +179,10 @@ class Checks:
         """Return the state after a vertex. `rows` check the light that the vertex adds at `u` in the lanes `lit`.
         `df_s` is the derivative of the scattering factor.
         """
-        product = vertex.product.times(scattering.weight, vertex.depth).value()
+        product = vertex.product.times(scattering.s, vertex.depth).value()
         useful = scattering.active & self.samples.plan.differentiates(vertex.bsdf)
         scattered = (
-            (_S, scattering.weight, scattering.active), (_DS, df_s, useful), (_PRODUCT, product, scattering.active)
+            (_S, scattering.s, scattering.active), (_DS, df_s, useful), (_PRODUCT, product, scattering.active)
         )  # fmt: skip
         at = vertex.depth, vertex.si.p, dr.reinterpret_array(mi.UInt32, vertex.si.shape)
         found, there = state.first.otherwise(rows, *at), self._reaches(u)
@@ -212,7 +212,7 @@ class LightSearch(Hooks):
         self.checks, self.emission, self.derivative = checks, emission, derivative
 
     def start(self, product: Product) -> Search:
-        rows = (_E, dr.detach(self.emission.weight), mi.Bool(True)), (_DE, self.derivative, mi.Bool(True))
+        rows = (_E, dr.detach(self.emission.E), mi.Bool(True)), (_DE, self.derivative, mi.Bool(True))
         first = Suspect.none().otherwise(rows, mi.UInt32(0), self.emission.ray.o, mi.UInt32(0))
         return Search(first, Suspect.none(), mi.Point2f(0), mi.Bool(False))
 
@@ -275,9 +275,9 @@ def search_paths(
             _, state = camera_walk(samples, CameraSearch(checks))
         else:
             with dr.resume_grad(when=plan.differentiate_emission):
-                E = sample_emission(samples, samples.sampler())
-                [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
-            state = walk(samples, LightSearch(checks, Emission(E.ray, dr.detach(E.weight), E.emitter), dE))
+                first = sample_emission(samples, samples.sampler())
+                [dE] = forward_derivatives(first.E) if plan.differentiate_emission else [mi.Spectrum(0)]
+            state = walk(samples, LightSearch(checks, Emission(first.ray, dr.detach(first.E), first.emitter), dE))
         dr.eval(state)
     bad = np.array(state.found.kind) != 0
     preferred = np.flatnonzero(bad & np.array(state.there))

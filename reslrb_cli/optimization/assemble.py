@@ -18,7 +18,7 @@ from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.baselines import Projective
 from reslrb_cli.integrators.own import OwnIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
-from reslrb_cli.optimization.autotune.sampling import settle
+from reslrb_cli.optimization.autotune.sampling import decide
 from reslrb_cli.optimization.identifiability import check_exposures, find_reached
 from reslrb_cli.optimization.loading import (
     check_integrator,
@@ -101,7 +101,7 @@ def assemble(
             own.attempt(view.target, view.weights)
     if settled is not None:
         return reach_as(decide_as(problem, settled), settled)
-    problem = settle(problem, say, None if config.own_scene is not None else cache)  # the cache compares files
+    problem = decide(problem, say, None if config.own_scene is not None else cache)  # the cache compares files
     if to_run:
         check_exposures(problem)
         problem = find_reached(problem)

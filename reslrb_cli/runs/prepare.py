@@ -24,11 +24,10 @@ from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
-from reslrb_cli.integrators.plan_report import plan_rows
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.sampling import explained
+from reslrb_cli.optimization.autotune.sampling import plan_rows
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Images, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
@@ -57,7 +56,7 @@ def plan_record(problem: Problem) -> dict[str, Any]:
     if not isinstance(integrator, Reslrb):
         return {"integrator": config.type, "estimator": None, "rows": []}
     plan = integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]], problem.selection.params)
-    rows = [vars(row) for row in explained(plan_rows(plan), problem.decisions)]
+    rows = [vars(row) for row in plan_rows(plan, problem.decisions)]
     estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
     assert isinstance(config, ReslrbConfig)
     return {"integrator": config.type, "estimator": estimator, "rows": rows}

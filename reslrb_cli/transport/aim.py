@@ -175,7 +175,7 @@ class Pending:
         p_film = dr.gather(mi.Float, aim.density, film.block(connection.u), visible)
         cos_z = dr.abs(dr.dot(si.n, dr.normalize(connection.target - si.p)))
         cos = dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-20)
-        p_a = p_film * cos_z * connection.weight[0] * dr.square(si.t) / cos
+        p_a = p_film * cos_z * connection.rest[0] * dr.square(si.t) / cos
         r = dr.rcp((1 - self.share) + self.share * dr.select(visible, p_a, 0) / self.pdf)
         missed = (self.distance > 0) & ~(visible & (si.t > self.distance * REACHED))
         return dr.detach(dr.select(missed, 0, r))

@@ -136,11 +136,11 @@ class Aimed:
 class Scattering:
     """Scattering event at a vertex.
 
-    `weight` is s_j (C,), with Veach's correction. `f` (C,) is the differentiable part of `weight`: weight = f
-    correction / pdf. `wo` is the local direction, and `d` the direction in world space.
+    `s` (C,) is the factor s_j of the path, with Veach's correction. `f` (C,) is its differentiable part:
+    s = f correction / pdf. `wo` is the local direction, and `d` the direction in world space.
     """
 
-    weight: mi.Spectrum
+    s: mi.Spectrum
     f: mi.Spectrum
     wo: mi.Vector3f
     d: mi.Vector3f
@@ -155,9 +155,9 @@ class Scattering:
     ways: Any = None  # `Ways`, in walks that need these densities
 
     def track(self, plan: Plan, hit: Hit) -> None:
-        """Give `weight` the derivatives of the scene's parameters, for naive AD."""
+        """Give `s` the derivatives of the scene's parameters, for naive AD."""
         f = tracked_factor(plan, hit.si, hit.bsdf, self, self.active)
-        self.weight = dr.replace_grad(self.weight, f * (self.correction / self.pdf))
+        self.s = dr.replace_grad(self.s, f * (self.correction / self.pdf))
 
 
 @dataclass
@@ -296,7 +296,7 @@ def scatter(
             f = evaluate(plan, si, bsdf, wo, active & ~singular)
             weight = dr.select(singular, weight / (1 - DEFENSIVE), dr.select(pdf > 0, f / pdf, 0))
         scattering = Scattering(
-            weight=weight * correction,
+            s=weight * correction,
             f=weight * pdf,
             wo=wo,
             d=d,

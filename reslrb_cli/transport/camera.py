@@ -102,7 +102,7 @@ class MetLight:
 class NextEvent(Connection):
     """Connection of a camera path's vertex to a point on an emitter, or to a direction.
 
-    `weight` (C,) is the contribution without BSDF and transmittance: Le w_N / density. `scale` is `weight` without the
+    `rest` (C,) is the contribution without BSDF and transmittance: Le w_N / density. `scale` is `rest` without the
     radiance. `Le` (C,) is the detached radiance, `through` (C,) the transmittance, and `target` the point on the
     emitter. `sample` holds the random numbers of this point.
     """
@@ -153,8 +153,8 @@ class CameraHooks:
         """
         return state
 
-    def survived(self, state: Any, weight: mi.Float) -> Any:
-        """Return the state after roulette has multiplied the path's product by `weight`."""
+    def survived(self, state: Any, factor: mi.Float) -> Any:
+        """Return the state after roulette has multiplied the path's product by `factor`, 1/q."""
         return state
 
 
@@ -262,11 +262,11 @@ def camera_walk(
             _weigh(samples, path, arrived, si, event, scattering)
             event.f = f
             if not (hooks.tracked or plan.track_zeros):
-                event.active = event.active & ~dr.all(f * event.weight == 0)  # passes NaN on
+                event.active = event.active & ~dr.all(f * event.rest == 0)  # passes NaN on
             with dr.suspend_grad(when=not plan.differentiate_null):
                 seen = passage(plan, scene, si, path.depth, event, loop_mode=mode)
             event.active, event.through = seen
-            weight = event.weight
+            weight = event.rest
             if hooks.tracked:
                 event.f = evaluate(plan, si, bsdf, event.wo, event.active)
                 weight = event.radiance(scene, si) * event.scale
@@ -274,17 +274,17 @@ def camera_walk(
                 event.f = dr.select(event.active, event.f, 0)
             event.c = dr.select(event.active, event.f * event.through * weight, 0)
         state = hooks.vertex(state, vertex, met, event, scattering)
-        product = path.product.times(scattering.weight, path.depth)
+        product = path.product.times(scattering.s, path.depth)
         eta = path.eta * dr.detach(scattering.eta)
         active = scattering.active & product.alive()
 
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
         if plan.roulette:
-            throughput = dr.max(dr.abs(product.weight()))
-            survives, weight = play(plan, None, path.depth, throughput, eta, si.p, scattering.d, number)
+            throughput = dr.max(dr.abs(product.magnitude()))
+            survives, factor = play(plan, None, path.depth, throughput, eta, si.p, scattering.d, number)
             active &= survives
-            product, state = product.scaled(weight), hooks.survived(state, weight)
+            product, state = product.scaled(factor), hooks.survived(state, factor)
 
         path = _behind(plan, path, arrived, si, scattering)
         path.classes = [each.past(path.depth, bsdf, scattering, first.continues) for each in path.classes]
@@ -372,7 +372,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
 def _next_event(
     samples: Samples, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, numbers: mi.Point2f, active: mi.Bool
 ) -> NextEvent:  # fmt: skip
-    """Sample a point on an emitter, or a direction. `weight` and `scale` do not include w_N yet."""
+    """Sample a point on an emitter, or a direction. `rest` and `scale` do not include w_N yet."""
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     ds, weight = sample_lamp(samples, si, numbers, active)
     active = active & (ds.pdf > 0) & dr.isfinite(ds.pdf)
@@ -388,9 +388,9 @@ def next_event_again(
     samples: Samples, si: mi.SurfaceInteraction3f, numbers: mi.Point2f, active: mi.Bool
 ) -> NextEvent:  # fmt: skip
     """Return the next event with the random `numbers`, with attached derivatives. A point on an emitter stays at its
-    place on the emitter. `weight` (C,) is the arriving radiance.
+    place on the emitter. `rest` (C,) is the arriving radiance.
 
-    Call the function under `dr.resume_grad()`. The density is detached. In its place, `weight` has the derivative of
+    Call the function under `dr.resume_grad()`. The density is detached. In its place, `rest` has the derivative of
     |cos| / distance^2 at the emitter.
     """
     with dr.suspend_grad():
@@ -406,7 +406,7 @@ def next_event_again(
         mi.Spectrum(0), mi.Point2f(0), ds.p, si.to_local(ds.d), active, numbers,
         Le=mi.Spectrum(0), scale=mi.Float(0), ds=ds, through=mi.Spectrum(1), unseen=_unseen(samples),
     )  # fmt: skip
-    event.weight = event.radiance(samples.scene, si) * dr.select(on_surface, measure / dr.detach(measure), 1)
+    event.rest = event.radiance(samples.scene, si) * dr.select(on_surface, measure / dr.detach(measure), 1)
     return event
 
 
@@ -517,7 +517,7 @@ def _weigh(
         joined = m * e * cosine(si, ds.d) / (ds.pdf * g)
         rivals += dr.select(joined > 0, joined, 0)
     weight = dr.detach(dr.select(event.active, dr.rcp(1 + rivals), 0))
-    event.weight, event.scale = event.weight * weight, event.scale * weight
+    event.rest, event.scale = event.rest * weight, event.scale * weight
 
 
 def _behind(

@@ -132,14 +132,14 @@ def shading_correction(
 class Connection:
     """Geometry of one connection, without BSDF and visibility.
 
-    `weight` (C,) is c_i without BSDF and transmittance: sensor importance, geometry and Veach's correction. `u` is the
+    `rest` (C,) is c_i without BSDF and transmittance: sensor importance, geometry and Veach's correction. `u` is the
     film position in pixels relative to the crop window. `target` is the point on the aperture, or on the near clip
     plane if anything stands before that plane. A walk that evaluates connections sets `f` (C,) to bsdf * cos, and
     `through` (C,) to the transmittance. The walk also sets `c` to c_i (C,), and `active` to the lanes that the sensor
     sees.
     """
 
-    weight: mi.Spectrum
+    rest: mi.Spectrum
     u: mi.Point2f
     target: mi.Point3f
     wo: mi.Vector3f
@@ -217,7 +217,7 @@ def film_density(sensor: mi.Sensor, cos: mi.Float) -> mi.Float:
 
 
 @dataclass
-class Seen:
+class KnownVisibility:
     """Visibility of the sensor, found in an earlier walk. `visible` is valid in `known` lanes, or in all lanes if
     `known` is None.
     """
@@ -231,7 +231,7 @@ def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
     white surface.
     """
     f = dr.maximum(dr.abs(mi.Frame3f.cos_theta(connection.wo)), 1e-3) * dr.inv_pi
-    return f, connection.weight * f
+    return f, connection.rest * f
 
 
 def before_lamps(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
@@ -241,22 +241,22 @@ def before_lamps(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, activ
 
 def passage(
     plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection,
-    seen: Seen | None = None, loop_mode: str = "symbolic",
+    known: KnownVisibility | None = None, loop_mode: str = "symbolic",
 ) -> tuple[mi.Bool, mi.Spectrum]:  # fmt: skip
     """Trace the shadow ray. Returns the lanes that the sensor sees, and the transmittance (C,) of masks on the way.
 
-    If visibility is known (`seen`), no ray is traced. In scenes without null surfaces, no transmittance is computed. In
-    scenes with null surfaces, `seen` cannot be used. `loop_mode` is the mode of the loop, which must be evaluated for
+    If visibility is `known`, no ray is traced. In scenes without null surfaces, no transmittance is computed. In scenes
+    with null surfaces, `known` cannot be used. `loop_mode` is the mode of the loop, which must be evaluated for
     naive AD.
     """
     active, one = before_lamps(plan, scene, si, connection.active), mi.Spectrum(1)
     if plan.needs.has_null or plan.passes_lamps:
         through = transmittance(plan, scene, si, depth, replace(connection, active=active), loop_mode=loop_mode)
         return through.reached, through.value
-    if seen is None:
+    if known is None:
         return active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), one
-    if seen.known is None:
-        return active & seen.visible, one
-    unknown = active & ~seen.known
+    if known.known is None:
+        return active & known.visible, one
+    unknown = active & ~known.known
     traced = unknown & ~scene.ray_test(si.spawn_ray_to(connection.target), unknown)
-    return traced | (active & seen.known & seen.visible), one
+    return traced | (active & known.known & known.visible), one

@@ -97,7 +97,7 @@ def view_from_sensor(samples: Samples, aperture: mi.Point2f) -> Viewer:
         seen = connect(samples.plan, samples.sensor, here, None, aperture, active)
         ds, _ = samples.sensor.sample_direction(here, aperture, active)
         return EdgeView(
-            ds.p, ds.d, ds.dist, parallel=mi.Bool(False), weight=seen.weight, surface=mi.Normal3f(0), u=seen.u,
+            ds.p, ds.d, ds.dist, parallel=mi.Bool(False), weight=seen.rest, surface=mi.Normal3f(0), u=seen.u,
             active=active & seen.active, emitter=dr.zeros(mi.EmitterPtr),
         )  # fmt: skip
 

@@ -38,10 +38,10 @@ def used_numbers(samples: Samples) -> list[bool]:
     with dr.suspend_grad():
         chosen = mi.Float(np.tile(choice, len(cases)))
         e = emission_of(samples, mi.Float(0), chosen, mi.Point2f(x[0], x[1]), mi.Point2f(x[2], x[3]))
-        dr.eval(e.ray.o, e.ray.d, e.weight)
+        dr.eval(e.ray.o, e.ray.d, e.E)
     parts = [
         np.broadcast_to(np.array(part), (np.shape(part)[0], cases.shape[0] * PROBES))
-        for part in (e.ray.o, e.ray.d, e.weight)
+        for part in (e.ray.o, e.ray.d, e.E)
     ]
     found = np.concatenate(parts).reshape(-1, len(cases), PROBES)
     return [not np.array_equal(found[:, 0], found[:, case], equal_nan=True) for case in range(1, len(cases))]
@@ -49,15 +49,15 @@ def used_numbers(samples: Samples) -> list[bool]:
 
 @dataclass
 class Emission:
-    """Ray that leaves an emitter, and its weight E (C,). The weight is the radiance divided by the ray's density.
+    """Ray that leaves an emitter, and E (C,), the radiance divided by the ray's density.
 
-    If derivatives are enabled, `weight` tracks the derivatives of emission. If emitters move, ray and density track
-    derivatives as well. `guided` is the factor of `weight` from a guide, or None without a guide. `position` contains
+    If derivatives are enabled, `E` tracks the derivatives of emission. If emitters move, ray and density track
+    derivatives as well. `guided` is the factor of `E` from a guide, or None without a guide. `position` contains
     the random numbers of the place.
     """
 
     ray: mi.Ray3f
-    weight: mi.Spectrum
+    E: mi.Spectrum
     emitter: mi.EmitterPtr
     guided: mi.Float | None = None
     position: mi.Point2f | None = None
@@ -73,7 +73,7 @@ def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
     if drawn is None:
         return emission_of(samples, time, wavelength_sample, sample_2, sample_3)
     emission = emission_of(samples, time, drawn.choice, drawn.position, drawn.direction)
-    return replace(emission, weight=emission.weight * drawn.weight, guided=drawn.weight)
+    return replace(emission, E=emission.E * drawn.weight, guided=drawn.weight)
 
 
 def emission_of(

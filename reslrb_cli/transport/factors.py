@@ -9,8 +9,8 @@ is stored with the index of the zero factor.
     two or more:           d(f_0 ... f_k) = 0
 
 A tiny factor must not end a path, or prevent the selection of a connection. The derivative with respect to a tiny
-factor is as large as any other derivative. Roulette and selection therefore use `weight`, in which no factor is below
-DIM.
+factor is as large as any other derivative. Roulette and selection therefore use `magnitude`, in which no factor is
+below DIM.
 
 Roulette on throughput works as in `ptracer`. Learned roulette ends paths in directions where earlier paths contributed
 little. The bounding box of the scene is divided into cubes, and the directions in each cube into octants. A path leaves
@@ -43,7 +43,7 @@ from reslrb_cli.transport.plan import Plan
 Array = np.ndarray[Any, Any]
 NO_ZERO = -1  # no factor of this channel is zero
 MANY_ZEROS = -2  # two or more factors are zero: value and derivatives vanish
-DIM = 0.1  # minimum value of a factor in a weight, as a fraction of its stand-in
+DIM = 0.1  # minimum value of a factor in a magnitude, as a fraction of its stand-in
 
 
 def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
@@ -99,7 +99,7 @@ class Product:
         return Product(nonzero, zero, tracked, raised)
 
     def scaled(self, scale: mi.Float) -> Product:
-        """Return the product times a positive number without derivatives, such as a roulette weight."""
+        """Return the product times a positive number without derivatives, such as roulette's 1/q."""
         tracked, raised = ([value * scale for value in values] for values in (self.tracked, self.raised))
         return Product(self.nonzero * scale, self.zero, tracked, raised)
 
@@ -111,8 +111,8 @@ class Product:
         """Return the contribution: zero in every channel with a zero factor. Tracked under naive AD."""
         return self.tracked[0] if self.tracked else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
 
-    def weight(self) -> mi.Spectrum:
-        """Return the weight (C,) of this product for roulette and selection. The weight estimates the value and the
+    def magnitude(self) -> mi.Spectrum:
+        """Return the magnitude (C,) of this product for roulette and selection. It estimates the value and the
         derivative of the contribution.
         """
         return self._where(self.raised[0] if self.raised else self.nonzero, [z != MANY_ZEROS for z in self.zero])
@@ -209,9 +209,7 @@ def play(
     plan: Plan, survival: Survival | None, depth: mi.UInt32, throughput: mi.Float, eta: mi.Float, o: mi.Point3f,
     d: mi.Vector3f, number: mi.Float,
 ) -> tuple[mi.Bool, mi.Float]:  # fmt: skip
-    """Return whether a path survives at vertex `depth`, and the path's roulette weight. The path leaves the vertex with
-    the ray (o, d).
-    """
+    """Return whether a path survives at vertex `depth`, and 1/q. The path leaves the vertex with the ray (o, d)."""
     q, playing = mi.Float(1), mi.Bool(False)
     if plan.roulette:
         q = dr.minimum(throughput * dr.square(eta), LIMIT)

@@ -122,7 +122,7 @@ class Film:
         return mi.TensorXf(part, shape)
 
     def adjoint(self, image_gradient: mi.TensorXf) -> AdjointImage:
-        """Return dL/d(block) for lookups, given dL/d(developed image)."""
+        """Return the adjoint of splatting to a block, given dL/dI of the developed image (`image_gradient`)."""
         with dr.resume_grad():
             block = self.block()
             dr.enable_grad(block.tensor())
@@ -135,9 +135,10 @@ class Film:
 
 
 class AdjointImage:
-    """dL/dI on the film's pixels, looked up through the pixel filter at film positions.
+    """dL/dI for lookups at film positions, through the pixel filter.
 
-    `image` is a flat array, H * W * `channels` values, in the order of the film's block.
+    `image` is the derivative of L with respect to the film's block, in the block's order: H * W * `channels` values. It
+    differs from dL/dI of the developed image by the pixel format and, on a `whole` film, by a factor at the border.
     """
 
     def __init__(self, film: Film, image: mi.Float, channels: int) -> None:

@@ -100,5 +100,5 @@ def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, stream: i
     si.wi = connection.wo
     with dr.suspend_grad():
         active, through = passage(plan, samples.scene, si, mi.UInt32(0), connection)
-    weight = through * (cos * weight) * connection.weight * samples.scale
+    weight = through * (cos * weight) * connection.rest * samples.scale
     return LampPoints(emitter, si, connection.u, weight, active)

@@ -141,8 +141,8 @@ class Plan:
     # Whether the normalisation of the reconstruction filter has a derivative and the correction for shading normals has
     # none, as in finite differences; otherwise as in `ptracer`.
     attached_normalization: bool = True
-    # Whether camera paths are distributed over the pixels by need.
-    shares_out: bool = False
+    # Settings of the integrator that are on (`SamplingOptions.on`). `pixels` needs camera paths, and is off in motion.
+    on: frozenset[str] = frozenset()
     # The sphere that infinite emitters light.
     horizon: Horizon | None = None
     # The cells of guided emission, if emission is guided.

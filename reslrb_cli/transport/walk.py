@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from reslrb_cli.transport.aim import Pending, aims_from, choose
 from reslrb_cli.transport.bsdf import Aimed, EventNumbers, Hit, Scattering, begins_caustic, evaluate, scatter
-from reslrb_cli.transport.connection import Connection, Seen, connect, passage
+from reslrb_cli.transport.connection import Connection, KnownVisibility, connect, passage
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import Product, first_eta, play
 from reslrb_cli.transport.plan import Plan
@@ -46,8 +46,8 @@ class Hooks:
 
     - `numbers` is the number of random numbers that `vertex` gets at each vertex.
     - Without `connects`, no connection is evaluated, and `vertex` gets only the connection's geometry.
-    - With `replaying`, the path is known to continue as far as `goes_on` requests. The walk then does not compute
-        throughput and roulette.
+    - Without `needs_product`, the walk computes no throughput and no roulette. An earlier walk has then found that the
+        path continues as far as `goes_on` requests.
     - `tracked` hooks keep derivatives of the factors in the loop state. The loop is then evaluated vertex by vertex
         (naive AD). With `max_iterations`, the loop stays symbolic. Dr.Jit then reverses the loop from a record of the
         loop state in thread-local memory. If the hooks are also `attached`, the rays have derivatives, too.
@@ -55,7 +55,7 @@ class Hooks:
 
     numbers: int = 0
     connects: bool = True
-    replaying: bool = False
+    needs_product: bool = True
     tracked: bool = False
     attached: bool = False
     max_iterations: int | None = None
@@ -64,8 +64,8 @@ class Hooks:
         """Return the state before the first vertex. The state can be any PyTree. `product` is E."""
         return []
 
-    def seen(self, vertex: Vertex) -> Seen | None:
-        """Return the known visibility of the sensor from this vertex, or None."""
+    def known_visibility(self, vertex: Vertex) -> KnownVisibility | None:
+        """Return the visibility of the sensor from this vertex if an earlier walk has found it, otherwise None."""
         return None
 
     def wants(self, state: Any, vertex: Vertex) -> mi.Bool:
@@ -73,11 +73,13 @@ class Hooks:
         return mi.Bool(True)
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Return the lanes that the hooks continue from this vertex."""
+        """Return the lanes that scatter at this vertex and go on. In other lanes, this vertex is the last one. It still
+        connects to the sensor.
+        """
         return mi.Bool(True)
 
     def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Return the lanes that need their next vertex in a replay. Candidates are the lanes that scatter because of
+        """Return the lanes that need their next vertex, in a walk without `needs_product`. Candidates are the lanes of
         `goes_on`.
         """
         return mi.Bool(True)
@@ -91,9 +93,9 @@ class Hooks:
         """
         return state
 
-    def survived(self, state: Any, weight: mi.Float) -> Any:
-        """Return the state after roulette has multiplied the path's product by `weight`. Without roulette, the weight
-        is 1.
+    def survived(self, state: Any, factor: mi.Float) -> Any:
+        """Return the state after roulette has multiplied the path's product by `factor`, 1/q. Without roulette, the
+        factor is 1.
         """
         return state
 
@@ -164,11 +166,11 @@ class Path:
     depth: mi.UInt32  # index of the current vertex; the first after the emitter is 1
     ray: mi.Ray3f  # the ray that reaches this vertex
     pi: mi.PreliminaryIntersection3f  # the intersection of this ray
-    product: Product  # E s_1 ... s_{depth-1}, roulette weights included
+    product: Product  # P_depth = E s_1 ... s_{depth-1}, and roulette's factors 1/q
     eta: mi.Float  # accumulated relative index of refraction, only for roulette; starts larger if emission is dim
     early: list[EventNumbers]  # random numbers of the first vertices, if low-discrepancy; never changed
-    pending: list[Pending]  # how the last event was aimed, if any are; a replay does not use it
-    rivals: list[Rivals]  # if camera paths find the same light
+    pending: Pending | None = None  # how the last event was aimed, if events are and there is a product
+    rivals: Rivals | None = None  # if camera paths find the same light
 
 
 def walk(
@@ -193,21 +195,21 @@ def walk(
         if lamp.parallel:  # no camera path finds its light
             begins |= emission.emitter == mi.EmitterPtr(lamp.emitter)
     product, active, eta = Product.one(plan.track_zeros, hooks.tracked), mi.Bool(active), mi.Float(1)
-    if not hooks.replaying:
-        product = product.times(emission.weight, mi.Int32(0))
+    if hooks.needs_product:
+        product = product.times(emission.E, mi.Int32(0))
         active &= product.alive()
         if plan.roulette:
-            eta = first_eta(dr.max(product.weight()), emission.guided)
+            eta = first_eta(dr.max(product.magnitude()), emission.guided)
     state = hooks.start(product)
     depth = mi.UInt32(depth)
     active &= depth < plan.max_depth
     pi, active = intersect(plan, scene, emission.ray, active)
-    path = Path(active, depth, emission.ray, pi, product, eta, samples.early_numbers(), [], [])
-    if aim is not None and not hooks.replaying:
-        path.pending = [Pending(mi.Float(0), mi.Float(1), mi.Float(-1))]  # no vertex, so nothing is aimed
+    path = Path(active, depth, emission.ray, pi, product, eta, samples.early_numbers())
+    if aim is not None and hooks.needs_product:
+        path.pending = Pending(mi.Float(0), mi.Float(1), mi.Float(-1))  # no vertex, so nothing is aimed
     if plan.weighs:
         assert samples.emitters is not None
-        path.rivals = [leave_emitter(plan, samples.emitters, scene, emission)]
+        path.rivals = leave_emitter(plan, samples.emitters, scene, emission)
 
     def body(
         path: Path, state: Any, sampler: mi.Sampler, selection: mi.PCG32 | None
@@ -216,13 +218,13 @@ def walk(
         si, bsdf = hit.si, hit.bsdf
         numbers = Numbers.draw(sampler, path.active).of_early(path.early, path.depth)
         slot = None if aim is None else sampler.next_1d(path.active)
-        seen = None
-        for before in path.pending:  # one or none
+        known = None
+        if path.pending is not None:
             assert aim is not None
             here = connect(plan, sensor, si, None, numbers.aperture, path.active & aims_from(bsdf))
             visible = here.active & ~scene.ray_test(si.spawn_ray_to(here.target), here.active)
-            seen = Seen(visible)
-            r = before.factor(aim, sensor, si, path.ray, here, visible)
+            known = KnownVisibility(visible)
+            r = path.pending.factor(aim, sensor, si, path.ray, here, visible)
             path = replace(path, active=path.active & (r != 0), product=path.product.scaled(r))  # passes NaN on
             state = hooks.aimed(state, r)
         vertex = Vertex(si, bsdf, path.ray, path.pi, path.depth, path.product, path.active)
@@ -242,35 +244,36 @@ def walk(
         connection, scattering = this.connection, this.scattering
         if hooks.tracked and not hooks.attached:
             scattering.track(plan, vertex)
-        rivals = []
-        for before_here in path.rivals:  # one or none
-            arrived = before_here.arrive(si, path.ray)
+        rivals = None
+        if path.rivals is not None:
+            arrived = path.rivals.arrive(si, path.ray)
             ways, cos = scattering.ways, cosine(si, scattering.d)
             N = samples.ratio_at(connection.u)
-            connection.weight *= weight_of_connection(arrived, connection.p_cam, N, ways.ahead_back)
+            connection.rest *= weight_of_connection(arrived, connection.p_cam, N, ways.ahead_back)
             behind = arrived.after(mi.Float(0), arrived.M + arrived.V * ways.back, scattering, cos)
-            rivals = [dr.select(scattering.is_null, before_here.after_null(arrived), behind)]
+            rivals = dr.select(scattering.is_null, path.rivals.after_null(arrived), behind)
         chosen_by: list[mi.Float] = []
         if hooks.connects:
             if not (hooks.tracked or plan.track_zeros):
                 # No shadow ray if neither light nor its derivative would arrive.
                 connection.active = connection.active & ~dr.all(connection.f == 0)  # passes NaN on
             with dr.suspend_grad(when=not plan.differentiate_null):
-                shadow = passage(plan, scene, si, path.depth, connection, seen or hooks.seen(vertex), loop_mode)
+                known = known or hooks.known_visibility(vertex)
+                shadow = passage(plan, scene, si, path.depth, connection, known, loop_mode)
             connection.active, connection.through = shadow
             if hooks.tracked:
                 connection.f = evaluate(plan, si, bsdf, connection.wo, connection.active)
             else:
                 connection.f = dr.select(connection.active, connection.f, 0)
-            connection.c = connection.f * connection.through * connection.weight
+            connection.c = connection.f * connection.through * connection.rest
             chosen_by = [] if selection is None else [selection.next_float32() for _ in range(hooks.numbers)]
         state = hooks.vertex(state, vertex, connection, scattering, chosen_by)
-        if hooks.replaying:
+        if not hooks.needs_product:
             sampler.next_1d(active)  # the number of roulette
             active &= hooks.is_followed(state, vertex)
             path = replace(path, rivals=rivals)
             return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
-        product = path.product.times(scattering.weight, path.depth)
+        product = path.product.times(scattering.s, path.depth)
         eta = path.eta * dr.detach(scattering.eta)
         active = scattering.active & product.alive()
         if plan.by_class:
@@ -279,14 +282,14 @@ def walk(
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
         if plan.plays_roulette:
-            throughput = dr.max(dr.abs(product.weight()))
-            survives, weight = play(plan, survival, path.depth, throughput, eta, si.p, scattering.d, number)
+            throughput = dr.max(dr.abs(product.magnitude()))
+            survives, factor = play(plan, survival, path.depth, throughput, eta, si.p, scattering.d, number)
             active &= survives
-            product, state = product.scaled(weight), hooks.survived(state, weight)
+            product, state = product.scaled(factor), hooks.survived(state, factor)
 
-        pending = []
+        pending = None
         if aimed is not None:
-            pending = [Pending.of(aimed, si, scattering.pdf, scattering.is_delta | scattering.is_null)]
+            pending = Pending.of(aimed, si, scattering.pdf, scattering.is_delta | scattering.is_null)
         path = replace(path, product=product, eta=eta, pending=pending, rivals=rivals)
         return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
 

@@ -13,7 +13,7 @@ import pytest
 from config.test_config_bad_input import PARAMETER, changed
 from make_reference import DOCS, EXAMPLE, json_schema, markdown
 
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Prb, Reslrb
+from reslrb_cli.config.integrators import DECIDABLE, ESTIMATOR_OPTIONS, UNDECIDED, Prb, Reslrb
 from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
 from reslrb_cli.config.optimizers import SGD, Adam
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
@@ -69,9 +69,8 @@ def test_defaults(tmp_path: Path) -> None:
     assert isinstance(config.integrator, Reslrb)
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto",
-        "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
-        "paths": "auto", "light_share": 0.5,
-        "sequence": "auto", "pixels": "auto", "edges": "auto",
+        "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "light_share": 0.5,
+        **dict.fromkeys(DECIDABLE, "auto"),
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}
@@ -277,8 +276,7 @@ def test_the_table_names_every_estimator() -> None:
 def test_options_and_defaults_match_the_estimators(name: str) -> None:
     options = Reslrb(estimator=name).options()  # type: ignore[arg-type]
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator"}
-    shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence", "paths", "light_share"}
-    shared |= {"pixels", "edges"}
+    shared |= {"attached", "filter_normalization", "attached_sampling", *UNDECIDED}
     #: Options that are constant in every run.
     constants = {"stack_size", "jacobian_damping"}
     known = {key: value for key, value in options_of(name).items() if key not in constants}

@@ -185,7 +185,7 @@ FAULTS = [
     Fault("film_position_does_not_move", "slab", BACK,
                   "p.adjoint.lookup(there.u,", "p.adjoint.lookup(dr.detach(there.u),"),
     Fault("connection_without_geometry", "slab", BACK,
-                  "there.f * there.weight", "there.f * dr.detach(there.weight)"),
+                  "there.f * there.rest", "there.f * dr.detach(there.rest)"),
     Fault("rows_of_the_filter_detached", "slab", "transport.film:Film.taps",
                   "columns[x] * rows[y]", "columns[x] * dr.detach(rows[y])"),
     Fault("blocks_begin_anew", "stack_of_2", "estimators.stack:walk_back",

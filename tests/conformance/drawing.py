@@ -139,14 +139,14 @@ def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
 
 def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) -> None:
     """Let the replay use the table that `other` makes from its own table."""
-    right = Reslrb._replay
+    right = Reslrb._differentiate
 
     def wrong(self: Reslrb, parts: Any, gradient: Any, params: Any, state: Any = None) -> None:
         [samples] = parts
         again = replace(samples, guide=replace(samples.guide, table=other(samples.guide.table)))
         right(self, [again], gradient, params, state)
 
-    patch.setattr(Reslrb, "_replay", wrong)
+    patch.setattr(Reslrb, "_differentiate", wrong)
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     """The tables learn from an image's samples before these samples are replayed. The replay therefore uses another
     table.
     """
-    right = Reslrb._replay
+    right = Reslrb._differentiate
 
     def wrong(self: Reslrb, parts: Any, gradient: Any, params: Any, state: Any = None) -> None:
         tables = self.preparation.guiding
@@ -114,7 +114,7 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
         again = replace(samples, guide=replace(samples.guide, table=tables.table(0, Purpose.BOTH)))
         right(self, [again], gradient, params, state)
 
-    patch.setattr(Reslrb, "_replay", wrong)
+    patch.setattr(Reslrb, "_differentiate", wrong)
 
 
 #: Faults that bias the result.

@@ -135,7 +135,7 @@ class LightNotes(Hooks, Notes):
         s, si = self.samples, vertex.si
         alone = connect(replace(s.plan, paths="light"), s.sensor, si, vertex.ray, connection.sample, connection.active)
         f, b, ok = self.event(vertex, connection.wo, False)
-        self.note(lane, vertex.depth, connection.active, L=connection.weight[0] / alone.weight[0],
+        self.note(lane, vertex.depth, connection.active, L=connection.rest[0] / alone.rest[0],
                   to=si.to_world(connection.wo), to_f=f, to_b=b, to_ok=ok)  # fmt: skip
         self.scattered(lane, vertex, scattering, False)
         return lane
@@ -173,7 +173,7 @@ class Emission:
         delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
         light += emitter.sample_direction(before, mi.Point2f(0.5), delta)[1]
         which, d = number(emitter) + dr.zeros(mi.UInt32, samples.width), dr.normalize(ray.d)
-        values = which, z, nz, uv, d, e.weight[0], light[0]
+        values = which, z, nz, uv, d, e.E[0], light[0]
         dr.eval(values)
         return Emission(*(np.array(value, np.float64).T for value in values))
 

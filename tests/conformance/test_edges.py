@@ -329,8 +329,8 @@ def test_an_image_has_no_edges():
 def test_the_plugin_takes_the_option():
     register()
     chosen = mi.load_dict({"type": "reslrb", "estimator": "stack", "edges": "on"})
-    assert chosen.tracer.preparation.sampling.edges
-    assert not mi.load_dict({"type": "reslrb"}).tracer.preparation.sampling.edges
+    assert "edges" in chosen.tracer.preparation.sampling.on
+    assert "edges" not in mi.load_dict({"type": "reslrb"}).tracer.preparation.sampling.on
 
 
 def test_forward_mode_and_follow_refuse_edges():

@@ -13,13 +13,15 @@ from conformance.gradient_cases import FLOOR
 from conformance.operations import count, tracking, with_change
 from turns import a_few, taking_turns
 
+from reslrb_cli.config.integrators import DECIDABLE
 from reslrb_cli.estimators import gather, reservoir, stack
 from reslrb_cli.integrators.context import Preparation
-from reslrb_cli.integrators.plan_report import plan_rows
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, texture, transform
+from reslrb_cli.optimization.autotune.sampling import plan_rows
+from reslrb_cli.records.decisions import Decision
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -193,9 +195,16 @@ def test_emitters_alone_need_no_replay(estimator: str):
 def test_rows_explain_needed_features() -> None:
     case, ours = Case(through_a_lens(), (FLOOR,)), integrator("reslrb", 5, estimator="stack")
     with tracking(case.params, case.keys):
-        rows = plan_rows(ours.plan(case.scene, case.scene.sensors()[0], case.params))
+        rows = plan_rows(ours.plan(case.scene, case.scene.sensors()[0], case.params), [])
     assert {row.feature for row in rows if row.needed} == {"visible emitters", "derivatives of BSDFs"}
     assert all(row.reason for row in rows)
+
+
+def test_every_automatic_setting_has_a_row_with_the_reason_of_its_decision() -> None:
+    plan = integrator("reslrb", 5).plan(scene := Case(plain(), (FLOOR,)).scene, scene.sensors()[0])
+    decisions = [Decision(setting=setting, value="auto", why=f"reason {k}") for k, setting in enumerate(DECIDABLE)]
+    texts = [row.reason for row in plan_rows(plan, decisions)]
+    assert all(any(text.endswith(f"{each.setting}: auto, {each.why}") for text in texts) for each in decisions)
 
 
 def test_a_step_makes_two_plans(monkeypatch: pytest.MonkeyPatch) -> None:

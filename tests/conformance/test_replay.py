@@ -75,7 +75,7 @@ class Recording(ReservoirSelection):
 class Rewalk(Hooks):
     """Replay that differentiates nothing. The replay multiplies all factors up to the kept connection again."""
 
-    replaying = True
+    needs_product = False
     connects = True
 
     def __init__(self, samples: Any, kept: Any, emission: Any) -> None:
@@ -91,7 +91,7 @@ class Rewalk(Hooks):
         here = vertex.active & (vertex.depth == self.kept.I)
         found = [state[0] * connection.c * self.samples.scale, vertex.si.p, connection.u, vertex.depth]
         latest = [dr.select(here, new, old) for new, old in zip(found, state[1:], strict=True)]
-        return [state[0] * scattering.weight, *latest]
+        return [state[0] * scattering.s, *latest]
 
 
 @pytest.mark.parametrize("name", a_few(NAMES, FEW))
@@ -107,7 +107,7 @@ def test_a_replay_visits_the_same_vertices(name: str):
         kept = context.walk(Recording(context, 1, "luminance"))
         dr.eval(kept)
         slot, active = kept.state.slots[0], kept.state.W > 0
-        emission = sample_emission(samples, samples.sampler()).weight
+        emission = sample_emission(samples, samples.sampler()).E
         _, C, p, u, I = context.walk(Rewalk(samples, kept, emission), active)  # noqa: E741
         stored = slot.C.value()
         dr.eval(C, p, u, I, stored)

@@ -385,7 +385,7 @@ FAULTS = [
           "mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) & ~is_null", by_ways("HNL"), quick=True),
     Fault("null_is_a_vertex", "small", "transport.camera:_behind", "if plan.needs.has_null", "if False", by_ways("HN")),
     Fault("null_is_a_vertex_of_light", "small", "transport.walk:walk",
-          "before_here.after_null(arrived), behind", "behind, behind", by_ways("L")),
+          "path.rivals.after_null(arrived), behind", "behind, behind", by_ways("L")),
     Fault("null_restarts_distance", "small", "transport.weights:Rivals.after_null",
           "distance=arrived.distance", "distance=mi.Float(0)", by_ways("HNL")),
     Fault("sides_forgotten", "smooth", "transport.camera:_behind", "dr.select(ways.valid, m, 0)", "m",

@@ -328,7 +328,10 @@ def test_times_prevented_by_a_bias() -> None:
 def test_figures_of_the_table_are_fields_of_the_record() -> None:
     figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)", "s to 10%", "s to 3%", "s to 1%")
     assert method_columns([], []).titles == ("", "parameter", *figures)
-    record = MethodRecord(METHOD, "a", BenchStatus.OK, 0.5, 12000, None, 0.1, None, -0.5, Range(2, 1, 3), 1.5, 4.5)
+    record = MethodRecord(
+        METHOD, "a", BenchStatus.OK, step_s=0.5, repeats=12000, relative_rmse=0.1, slope=-0.5,
+        efficiency=Range(2, 1, 3), bias_z=1.5, bias_z_limit=4.5,
+    )  # fmt: skip
     assert method_cells(record)[2:8] == ("0.5", "12000", "0.1", "-0.5", "2 [1, 3]", "1.5 (4.5) open")
 
 

@@ -155,7 +155,7 @@ def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.
 
     def connect(*arguments):
         connection = right(*arguments)
-        connection.weight = connection.weight * 1.3
+        connection.rest = connection.rest * 1.3
         return connection
 
     monkeypatch.setattr(segment, "connect", connect)

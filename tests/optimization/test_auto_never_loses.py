@@ -27,7 +27,7 @@ from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.race import Finding, Turns
-from reslrb_cli.optimization.autotune.sampling import is_auto, settle
+from reslrb_cli.optimization.autotune.sampling import decide, is_auto
 from reslrb_cli.optimization.memory import check_step
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
@@ -51,7 +51,7 @@ PREFIX = "extreme/"
 #: Light paths in a step of these scenes.
 PATHS = 2**20
 #: Function that decides on the integrator.
-SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], Problem]] = {"settle": settle}
+DECIDE: dict[str, Callable[[Problem, Callable[[str], None]], Problem]] = {"decide": decide}
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +65,7 @@ def decided(config: Config, case: ExtremeCase | None) -> Problem:
     problem = assemble_scene(config, None if case is None else load_scene(case.scene()))
     check_step(problem)
     problem = make_targets(problem, lambda line: None)
-    return SETTLE["settle"](problem, lambda line: None)
+    return DECIDE["decide"](problem, lambda line: None)
 
 
 def extreme(case: ExtremeCase, folder: Path) -> str:
@@ -129,10 +129,10 @@ def test_losses_are_found(fault: str, tmp_path: Path, monkeypatch: pytest.Monkey
     else:
 
         def wrong(problem: Problem, say: Callable[[str], None]) -> Problem:
-            found = settle(problem, say)
+            found = decide(problem, say)
             on = is_auto(found.config, "guiding")
-            return dataclasses.replace(found, integrator=found.integrator.afresh(guided=True)) if on else found
+            return dataclasses.replace(found, integrator=found.integrator.afresh(guiding="on")) if on else found
 
-        monkeypatch.setitem(SETTLE, "settle", wrong)
+        monkeypatch.setitem(DECIDE, "decide", wrong)
     with pytest.raises(AssertionError):
         test_no_scene_loses("stiff/wall", tmp_path)

@@ -191,7 +191,7 @@ def seeds_of_parts(monkeypatch: pytest.MonkeyPatch, experiment: Path) -> tuple[s
     """
     drawn: dict[str, set[int]] = {"learn": set(), "take": set()}
     problem = assemble(load("tiny.yaml", AUTO[1:]))
-    plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
+    plain, guided = (problem.integrator.afresh(guiding=value) for value in ("off", "on"))
     trial, job = StepTrial(problem, "guiding", plain, guided), StepTrial._job
     part = "learn"
 

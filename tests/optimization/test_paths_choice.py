@@ -327,7 +327,7 @@ def test_auto_distributes_paths_only_for_l2(monkeypatch: pytest.MonkeyPatch):
         found = decision(problem, "pixels")
         assert (found is None) == (pixels == "measured")
         assert found is None or found.value == ("measured" if shared else "even")
-        assert problem.integrator.preparation.sampling.shares_out is shared
+        assert ("pixels" in problem.integrator.preparation.sampling.on) is shared
         densities += [problem.integrator.preparation.sampling.given[0]] if shared else []
         assert not shared or bool(densities[-1][:4].any()) == (mask not in settings)
     assert not np.allclose(densities[1], densities[2], rtol=0.1)

@@ -1,8 +1,9 @@
 """Automatic decisions about the sampling of a run, taken before its first iteration.
 
-`OPTIONS` has one entry for each setting of the integrator that may be `auto`. To add a setting, add its entry here, and
-allow `auto` in `config/integrators.py`, with its value before the decision in `UNDECIDED`. All other code (the printed
-line, manifest, checkpoints, page, `inspect`, resumed runs) reads the list of `Decision`s.
+`AUTOMATIC` has one entry for each setting of the integrator that may be `auto`. To add a setting, add its entry here,
+and the setting to `Reslrb` in `config/integrators.py`, marked `Undecided`. If the setting has another value than
+without a decision, `Plan.on` contains it. All other code (Mitsuba's plugin, the printed line, manifest, checkpoints,
+page, `inspect`, resumed runs) reads these tables and the list of `Decision`s.
 
 A decision follows a rule or a race. A rule uses facts of the scene and the configuration. A race compares steps of both
 ways (`race.py`), with dL/dI fixed at one image.
@@ -35,9 +36,11 @@ from typing import Any
 import mitsuba as mi
 
 from reslrb_cli.backend.doctor import device_name
+from reslrb_cli.config.integrators import DECIDABLE
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.pixels import noted_part
-from reslrb_cli.integrators.plan_report import EDGES, GUIDED, PATHS_FROM, PIXELS, SEQUENCE, PlanRow, with_reason
+from reslrb_cli.guiding.tables import sensor_bytes
+from reslrb_cli.integrators.plan_report import PlanRow, scene_rows, without_light
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sizes
@@ -49,6 +52,7 @@ from reslrb_cli.records.decisions import Decision, DecisionCache, key_of
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
+from reslrb_cli.transport.plan import Plan
 
 #: Maximum time of a guided step, and of a step of camera paths alone, relative to another.
 GUIDING_LONGER, PATHS_LONGER = 3.0, 2.0
@@ -105,7 +109,7 @@ class Tuner:
         if self._cache is not None:
             key = key_of({"setting": otherwise.setting, "of": of, **situation(self.problem)})
             kept = self._cache.get(key)
-            if kept is not None and kept.value in OPTIONS[otherwise.setting].values:
+            if kept is not None and kept.value in DECIDABLE[otherwise.setting]:
                 return replace(kept, setting=otherwise.setting, cached=True)
         share = self.problem.config.run.measuring
         if not share or (left_s := self._left_s(kernels)) is None:
@@ -250,7 +254,7 @@ def _measure_pixels(tuner: Tuner) -> None:
     problem, tracer = tuner.problem, tuner.problem.integrator
     if problem.moves or not isinstance(tracer, Tracer) or tracer.paths == "light":
         return
-    if not tracer.preparation.sampling.shares_out:
+    if "pixels" not in tracer.preparation.sampling.on:
         return
     problem.apply()
     scene, params = problem.scene, problem.selection.params
@@ -271,7 +275,7 @@ def _guiding(tuner: Tuner) -> None:
     if problem.integrator.paths == "camera" and not alone:
         return  # no path starts at an emitter
     off = Decision(setting="guiding", value="off", why="it pays in long runs")
-    independent = {"low_discrepancy": False} if is_auto(config, "sequence") else {}
+    independent = {"sequence": "independent"} if is_auto(config, "sequence") else {}
     if independent and problem.moves:
         tuner.take(replace(off, why="for moving light, low-discrepancy numbers help most"))
         return
@@ -279,7 +283,7 @@ def _guiding(tuner: Tuner) -> None:
 
     def measure(limit_s: float) -> Decision:
         plain, share = problem.integrator.afresh(), 1.0 if alone else None
-        guided = problem.integrator.afresh(guided=True, light_share=share, **independent)
+        guided = problem.integrator.afresh(guiding="on", light_share=share, **independent)
         found = StepTrial(problem, "guiding", plain, guided).race(plan, limit_s, guides=True)
         return _found(off, found, "on" if found.other else "off")
 
@@ -309,57 +313,61 @@ def _guides_light_alone(problem: Problem) -> bool:
 
 
 @dataclass(frozen=True)
-class Option:
-    """Automatic setting of the integrator.
+class Automatic:
+    """Automatic setting of the integrator. `DECIDABLE` has its values.
 
     - `decide` takes the decision.
-    - `values` are the possible decisions. `apply` returns an integrator with one of them.
     - `paths` are the kinds of paths that leave the setting open: those that can render the scene (`Problem.paths`).
-    - `feature` is the row of the plan that shows the reason.
+    - `row` returns the row of a plan that shows whether the setting has an effect, and why.
     - `prepare` measures what the value needs, decided or configured.
     """
 
     decide: Callable[[Tuner], None]
-    values: tuple[str, ...]
-    apply: Callable[[Any, str], Any]
     paths: tuple[str, ...]
-    feature: str
+    row: Callable[[Plan], PlanRow]
     prepare: Callable[[Tuner], None] = lambda tuner: None
 
 
-#: The options by setting, in the order of the decisions.
-OPTIONS = {
-    "sequence": Option(
-        _sequence, ("low_discrepancy", "independent"),
-        lambda tracer, value: tracer.afresh(low_discrepancy=value == "low_discrepancy"),
-        ("light", "both"), SEQUENCE,
-    ),
-    "paths": Option(
-        _paths, tuple(SHARES), lambda tracer, value: tracer.afresh(light_share=SHARES[value]), ("both",), PATHS_FROM
-    ),
-    "pixels": Option(
-        _pixels, ("even", "measured"), lambda tracer, value: tracer.afresh(shares_out=value == "measured"),
-        ("camera", "both"), PIXELS, _measure_pixels,
-    ),
-    "guiding": Option(
-        _guiding, ("off", "on"), lambda tracer, value: tracer.afresh(guided=value == "on"), ("light", "both"), GUIDED,
-    ),
-    "edges": Option(
-        lambda tuner: None, ("off", "on"), lambda tracer, value: tracer.afresh(edges=value == "on"), (), EDGES,
-    ),
+def _tables(plan: Plan) -> str:
+    if plan.grid is None:
+        return ""
+    size = f"{plan.grid.cells} cells, {sensor_bytes(plan.grid, plan.aims) / 2**20:.1f} MiB of tables"
+    return f"light paths start and continue where earlier ones contributed: {size}"
+
+
+#: The automatic settings, in the order of the decisions.
+AUTOMATIC = {
+    "sequence": Automatic(_sequence, ("light", "both"), lambda plan: PlanRow.of(
+        "low-discrepancy numbers", plan.sequence is not None,
+        "origins and first directions of paths are evenly distributed", without_light(plan) or "sequence: independent",
+    )),
+    "paths": Automatic(_paths, ("both",), lambda plan: PlanRow(
+        "camera paths", plan.paths != "light", f"paths: {plan.paths}",
+    )),
+    "pixels": Automatic(_pixels, ("camera", "both"), lambda plan: PlanRow.of(
+        "camera paths by pixel", "pixels" in plan.on, "most where noise affects the gradient most",
+        "no camera paths" if plan.paths == "light" else "pixels: even",
+    ), _measure_pixels),
+    "guiding": Automatic(_guiding, ("light", "both"), lambda plan: PlanRow.of(
+        "guided emission", plan.grid is not None, _tables(plan), without_light(plan) or "guiding: off",
+    )),
+    "edges": Automatic(lambda tuner: None, (), lambda plan: PlanRow.of(
+        "edges of moving shapes", plan.has_edges, "the light that they cover and uncover has a derivative",
+        "nothing moves, edges: off, or edges: auto before a run decides",
+    )),
 }  # fmt: skip
 
 
-def settle(problem: Problem, say: Say, cache: DecisionCache | None = None) -> Problem:
+def decide(problem: Problem, say: Say, cache: DecisionCache | None = None) -> Problem:
     """Return `problem` with all decisions on settings that are `auto`, and with the resulting integrator.
 
     The problem needs its targets. `say` receives lines about the decisions. `cache` has decisions of earlier runs.
     """
     tuner = Tuner(problem, say, cache)
-    for setting in OPTIONS:
+    for setting, automatic in AUTOMATIC.items():
         if setting in open_settings(problem.config, problem.paths):
-            OPTIONS[setting].decide(tuner)
-        OPTIONS[setting].prepare(tuner)
+            automatic.decide(tuner)
+        automatic.prepare(tuner)
     # The chosen paths may leave a setting without effect.
     unused = {"camera": "sequence", "light": "pixels"}.get(getattr(tuner.problem.integrator, "paths", ""))
     decisions = [each for each in tuner.problem.decisions if each.setting != unused]
@@ -370,14 +378,14 @@ def settle(problem: Problem, say: Say, cache: DecisionCache | None = None) -> Pr
 
 def open_settings(config: Config, paths: str) -> list[str]:
     """Return the settings that a run decides. `paths` are the kinds of paths that can render the scene."""
-    return [setting for setting, option in OPTIONS.items() if is_auto(config, setting) and paths in option.paths]
+    return [setting for setting, its in AUTOMATIC.items() if is_auto(config, setting) and paths in its.paths]
 
 
 def decided(config: Config, decisions: Iterable[Decision]) -> list[Decision]:
     """Return the decisions on settings that `config` leaves to `auto`. Raises TypeError for an unknown value."""
-    found = [each for each in decisions if each.setting in OPTIONS and is_auto(config, each.setting)]
+    found = [each for each in decisions if each.setting in AUTOMATIC and is_auto(config, each.setting)]
     for each in found:
-        if each.value not in (values := OPTIONS[each.setting].values):
+        if each.value not in (values := DECIDABLE[each.setting]):
             raise TypeError(f"{each.setting} is `{each.value}`; possible are {', '.join(values)}")
     return found
 
@@ -385,12 +393,15 @@ def decided(config: Config, decisions: Iterable[Decision]) -> list[Decision]:
 def as_decided(integrator: Any, decisions: Iterable[Decision]) -> Any:
     """Return `integrator` with the decided values."""
     for each in decisions:
-        integrator = OPTIONS[each.setting].apply(integrator, each.value)
+        change = {"light_share": SHARES[each.value]} if each.setting == "paths" else {each.setting: each.value}
+        integrator = integrator.afresh(**change)
     return integrator
 
 
-def explained(rows: list[PlanRow], decisions: Iterable[Decision]) -> list[PlanRow]:
-    """Return the rows of a plan with the reasons of decisions."""
+def plan_rows(plan: Plan, decisions: Iterable[Decision]) -> list[PlanRow]:
+    """Return all features of a plan, including those that it leaves out, with the reasons of decisions."""
+    rows = {setting: automatic.row(plan) for setting, automatic in AUTOMATIC.items()}
     for each in decisions:
-        rows = with_reason(rows, OPTIONS[each.setting].feature, f"{each.setting}: auto, {each.why}")
-    return rows
+        row, why = rows[each.setting], f"{each.setting}: auto, {each.why}"
+        rows[each.setting] = replace(row, reason=f"{row.reason}; {why}" if row.needed else why)
+    return [*scene_rows(plan), *rows.values()]
