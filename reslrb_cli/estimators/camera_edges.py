@@ -78,13 +78,6 @@ def differentiate_edges_of_camera_paths(p: Pass) -> None:
         samples = edge_samples(p.samples, stream, each)
         samples.plan = replace(samples.plan, camera=False, paths="light")
         side(Pass(samples, None, p.adjoint), samples.stream(stream))
-    if p.plan.needs.has_delta_lobes:
-        from reslrb_cli.estimators.chain_edges import differentiate_edges_behind_chains
-        samples = edge_samples(p.samples, 0xED6E4, PATHS_PER_OUTLINE)
-        plan = samples.plan
-        samples.plan = replace(plan, camera=True, paths="camera")
-        own = replace(p.samples, width=samples.width, seed=samples.seed, scale=samples.scale)
-        differentiate_edges_behind_chains(Pass(samples, None, p.adjoint), samples.stream(0xED6E4), Pass(own, None, p.adjoint))
 
 
 def _of_all_classes(samples: Samples) -> Samples:

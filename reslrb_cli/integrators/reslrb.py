@@ -21,7 +21,11 @@ from typing_extensions import Self
 from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.estimators.camera_edges import differentiate_edges_of_camera_paths
-from reslrb_cli.estimators.chain_edges import weigh_pixels
+from reslrb_cli.estimators.chain_edges import (
+    differentiate_edges_behind_chains,
+    has_edges_behind_chains,
+    weigh_cells,
+)
 from reslrb_cli.estimators.edges import differentiate_edges
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.pixels import wanted
@@ -156,8 +160,8 @@ class LightTracer(StepIntegrator):
         now = self.preparation.edges(plan).now()
         tables = [weigh_edges(side, now) for side in parts[0].sides()]
         for side, table in zip(parts[0].sides(), tables, strict=True):
-            if side.plan.camera and side.plan.needs.has_delta_lobes:
-                table.pixels = [weigh_pixels(side)]
+            if has_edges_behind_chains(side.plan):
+                table.cells = [weigh_cells(side)]
         return [part.with_edges(*tables) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
@@ -377,7 +381,10 @@ def backward(
             differentiate_camera_paths(p, estimator.stack_size)
     for side in samples.sides() if samples.edges is not None else ():
         terms = differentiate_edges_of_camera_paths if side.plan.camera else differentiate_edges
-        terms(Pass(side, None, adjoint))
+        p = Pass(side, None, adjoint)
+        terms(p)
+        if has_edges_behind_chains(side.plan):
+            differentiate_edges_behind_chains(p)
 
 
 def backward_stored(estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any) -> None:

@@ -1,0 +1,535 @@
+"""Edges behind specular chains: places where a mirror or a lens shows a jump of light.
+
+A specular chain begins with a ray of the sensor or of a lamp, at a place u of a plane: the film, or the square of the
+random numbers of a lamp's rays. With fixed choices between reflection and refraction, the chain is a function of u. Its
+first vertex that is not specular is x. y is a point on a lamp if the chain begins at the sensor, and a point of the
+sensor if the chain begins at a lamp. Along a line in the plane, light jumps at two kinds of places:
+
+- The next surface along the chain changes, or its flat normal. p is the point of the edge, and q the point of the
+    chain's ray at the distance of p.
+- The visibility of y from x changes. p is the point of the edge between x and y, and q = s x + (1 - s) y with
+    s = |p - y| / |x - y|.
+
+n is the normal of the edge, and points away from the surface of p. A jump satisfies <p - q(u), n> = 0, so that it moves
+along the line by <v_p - v_q, n> / <dq/du, n>.
+
+`sample_edge` tests a random interval of a random line. If the chains through both ends differ, bisection finds a jump.
+The lengths of the runs without a jump on both sides give the density of the jump. Lines run along both axes of the
+plane, and a jump counts along the axis in which it moves faster.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.scene.graph import sensor_rays
+from reslrb_cli.transport.bsdf import EventNumbers, Hit, Scattering, scatter
+from reslrb_cli.transport.camera import sample_lamp
+from reslrb_cli.transport.connection import connect
+from reslrb_cli.transport.emission import emission_of
+from reslrb_cli.transport.samples import Samples
+
+#: Length of an interval that is tested for a jump, in cells of the plane.
+INTERVAL = 0.5
+#: Least length of the places from which a jump is found, in cells. Rarer jumps have the weight of this length.
+NARROWEST = 0.02
+#: Bisections of an interval.
+BISECTIONS = 15
+#: Largest distance in cells between places whose difference gives dq/du.
+NEIGHBOUR = 0.06
+#: Radius of the circle that finds the direction of an edge, relative to the distance of the edge.
+CIRCLE = 4e-3
+#: Probability of reflection at a vertex that also refracts or scatters.
+REFLECTS = 0.3
+#: Most specular vertices of a chain.
+MOST_VERTICES = 8
+#: Cells of the square of a lamp's random numbers, along each axis.
+LAMP_CELLS = 64
+#: Streams of random numbers, mixed into the seed or into the key of a chain.
+LINES, EVENTS, APERTURE, TARGET, DIRECTION, PLACE = 0xC4A1, 0x5E1, 0xA9E, 0x1A4, 0x57E, 0x9C3
+
+_WITH_NORMALS = mi.RayFlags.All | mi.RayFlags.dNSdUV
+
+
+def _unit(word: mi.UInt32) -> mi.Float:
+    """Return a random number in [0, 1)."""
+    return mi.Float(word >> 8) * 2.0**-24
+
+
+def vertex_at(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> Hit:
+    """Return the vertex at an intersection, with the derivatives of its normal."""
+    si = pi.compute_surface_interaction(ray, _WITH_NORMALS, active)
+    return Hit(si, si.bsdf(), ray)
+
+
+def surface_code(hit: Hit, valid: mi.Bool) -> mi.UInt32:
+    """Return a number for the surface at a vertex, and for its normal if the surface is flat."""
+    si = hit.si
+    flat = dr.all(si.dn_du == 0) & dr.all(si.dn_dv == 0)
+    code = dr.reinterpret_array(mi.UInt32, si.shape) + 1
+    for part in si.n:
+        code = code * 31 + dr.select(flat, mi.UInt32(mi.Int32(dr.floor(part * 61.7 + 1000.37))), 0)
+    return dr.select(valid, code, 0xFFFFFFF)
+
+
+@dataclass
+class Chain:
+    """Specular chain. `count` vertices have been passed. `ray` leads to the next vertex, with the intersection `pi`.
+
+    `product` (C,) is the throughput. `code` identifies all surfaces and flat normals that the chain meets, and the
+    visibility of the points y.
+    """
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    product: mi.Spectrum
+    count: mi.UInt32
+    code: mi.UInt32
+
+    def vertex(self, active: mi.Bool) -> Hit:
+        """Return the vertex that the chain reaches."""
+        return vertex_at(self.ray, self.pi, active)
+
+
+@dataclass
+class Target:
+    """Point y of a lamp or of the sensor. If `distant` is true, y is infinitely far away. `weight` (C,) is the light or
+    the importance that arrives from y, divided by its density. `wo` is the local direction to y, and `u` its film
+    position if y belongs to the sensor.
+    """
+
+    y: mi.Point3f
+    distant: mi.Bool
+    wo: mi.Vector3f
+    weight: mi.Spectrum
+    u: mi.Point2f
+    active: mi.Bool
+
+
+@dataclass
+class Chains(ABC):
+    """Specular chains. `key` is a random seed for each lane. Equal keys make equal choices."""
+
+    samples: Samples
+    key: mi.UInt32
+
+    @property
+    @abstractmethod
+    def cells(self) -> tuple[int, int]:
+        """Number of cells of the plane along both axes."""
+
+    @abstractmethod
+    def begin(self, u: mi.Point2f) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Return the first ray of the chain from place `u`, and its weight (C,)."""
+
+    @abstractmethod
+    def target(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> Target:
+        """Return the point y of a vertex. Visibility is not tested."""
+
+    @property
+    @abstractmethod
+    def has_targets(self) -> bool:
+        """Whether vertices have points y."""
+
+    @property
+    @abstractmethod
+    def most(self) -> int:
+        """Most specular vertices of a chain."""
+
+    def random(self, number: mi.UInt32, stream: int) -> mi.Point2f:
+        """Return two random numbers of the chain."""
+        return mi.Point2f(*(_unit(word) for word in mi.sample_tea_32(self.key ^ stream, number)))
+
+    def start(self, u: mi.Point2f, active: mi.Bool) -> Chain:
+        """Return the chain before its first vertex."""
+        ray, weight = self.begin(u)
+        pi = self.samples.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        return Chain(ray, pi, weight, mi.UInt32(0), mi.UInt32(0))
+
+    def event(self, chain: Chain, active: mi.Bool) -> tuple[Hit, Scattering, mi.Bool, mi.Spectrum]:
+        """Return the vertex that the chain reaches, and its event. Also return the lanes that pass the vertex, and the
+        throughput behind it.
+
+        The event is reflection, or refraction and scattering, with a fixed probability. The first and the last random
+        number of a BSDF select these lobes.
+        """
+        hit = chain.vertex(active)
+        reflects = self.random(chain.count, EVENTS).x < REFLECTS
+        numbers = EventNumbers(mi.Point2f(0.5), dr.select(reflects, 0, dr.one_minus_epsilon(mi.Float)))
+        scattering, _ = scatter(self.samples.plan, hit, numbers, active, None)
+        flags = hit.bsdf.flags()
+        several = mi.has_flag(flags, mi.BSDFFlags.Smooth) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+        reflected = mi.Frame3f.cos_theta(scattering.wo) * mi.Frame3f.cos_theta(hit.si.wi) > 0
+        chance = dr.select(several, dr.select(reflects, REFLECTS, 1 - REFLECTS), 1)
+        # At total reflection, only the lanes that reflect continue.
+        passes = active & scattering.active & scattering.is_delta & (~several | (reflects == reflected))
+        return hit, scattering, passes, chain.product * scattering.s * (scattering.pdf / chance)
+
+    def onward(self, chain: Chain, hit: Hit, scattering: Scattering, passes: mi.Bool, product: mi.Spectrum) -> Chain:
+        """Return the chain behind a vertex, in the lanes `passes`."""
+        ray = dr.detach(hit.si.spawn_ray(scattering.d))
+        pi = self.samples.scene.ray_intersect_preliminary(ray, coherent=False, active=passes)
+        return dr.select(passes, Chain(ray, pi, product, chain.count + 1, chain.code), chain)
+
+    def lit(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> tuple[Target, mi.Bool]:
+        """Return the point y of a vertex, and the lanes in which a surface hides it."""
+        smooth = mi.has_flag(hit.bsdf.flags(), mi.BSDFFlags.Smooth)
+        target = self.target(hit, count, active & (count > 0) & smooth & (count + 2 <= self.samples.plan.max_depth))
+        target.active &= dr.any(target.weight > 0)
+        return target, self.samples.scene.ray_test(hit.si.spawn_ray_to(target.y), target.active)
+
+    def follow(self, u: mi.Point2f, active: mi.Bool | bool = True, end: mi.UInt32 | int = MOST_VERTICES) -> Chain:
+        """Return the chain from place `u`, up to vertex number `end` or its first vertex that is not specular."""
+
+        def body(active: mi.Bool, chain: Chain) -> tuple[mi.Bool, Chain]:
+            valid = chain.pi.is_valid()
+            hit, scattering, passes, product = self.event(chain, active & valid)
+            code = chain.code * 0x9E3779B1 + surface_code(hit, valid)
+            if self.has_targets:
+                target, hidden = self.lit(hit, chain.count, active & valid)
+                code += dr.select(target.active & ~hidden, mi.UInt32(77), 0)
+            # A chain without specular vertices has the code 0.
+            chain = dr.select(active & ((chain.count > 0) | passes), replace(chain, code=code), chain)
+            passes &= chain.count < self.most
+            chain = self.onward(chain, hit, scattering, passes, product)
+            return passes & (chain.count < end), chain
+
+        active = mi.Bool(active) & (mi.UInt32(end) > 0)
+        state = active, self.start(u, active)
+        return dr.while_loop(state, lambda active, chain: active, body, label="specular chain")[1]
+
+
+class SensorChains(Chains):
+    """Chains that begin at the sensor. The plane is the film, and its cells are pixels."""
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        return int(self.samples.film.size[0]), int(self.samples.film.size[1])
+
+    def begin(self, u: mi.Point2f) -> tuple[mi.Ray3f, mi.Spectrum]:
+        samples = self.samples
+        aperture = self.random(mi.UInt32(0), APERTURE) if samples.plan.needs.thin_lens else mi.Point2f(0.5)
+        time = samples.time(lambda: mi.Float(0.5))
+        return dr.detach(sensor_rays(samples.sensor, time, u / mi.Vector2f(self.cells), aperture))
+
+    def target(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> Target:
+        ds, weight = sample_lamp(self.samples, hit.si, self.random(count, TARGET), active)
+        distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        active = active & (ds.pdf > 0) & dr.isfinite(ds.pdf)
+        return Target(ds.p, distant, hit.si.to_local(ds.d), weight, mi.Point2f(0), active)
+
+    @property
+    def has_targets(self) -> bool:
+        return bool(self.samples.plan.samples_emitters)
+
+    @property
+    def most(self) -> int:
+        return min(self.samples.plan.max_depth - 1, MOST_VERTICES)
+
+
+class LampChains(Chains):
+    """Chains that begin at lamps. The plane is the square of the random numbers of a ray's direction, or of its place if
+    the lamp has only one direction.
+    """
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        return LAMP_CELLS, LAMP_CELLS
+
+    def begin(self, u: mi.Point2f) -> tuple[mi.Ray3f, mi.Spectrum]:
+        samples, zero = self.samples, mi.UInt32(0)
+        there, other = u / LAMP_CELLS, self.random(zero, PLACE)
+        choice, time = self.random(zero, APERTURE).x, samples.time(lambda: mi.Float(0.5))
+        index, _, _ = samples.scene.sample_emitter(choice, True)
+        emitter = dr.gather(mi.EmitterPtr, samples.scene.emitters_dr(), index)
+        # Point lamps and directional lamps use only one of the numbers.
+        place = dr.select(mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta), there, other)
+        inside = dr.all((there >= 0) & (there < 1))
+        emission = emission_of(samples, time, choice, place, there)
+        return dr.detach(mi.Ray3f(emission.ray)), dr.select(inside, dr.detach(emission.E), 0)
+
+    def target(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> Target:
+        samples = self.samples
+        aperture = self.random(mi.UInt32(1), APERTURE) if samples.plan.needs.thin_lens else mi.Point2f(0.5)
+        there = connect(samples.plan, samples.sensor, hit.si, hit.ray, aperture, active)
+        return Target(there.target, mi.Bool(False), there.wo, there.rest, there.u, active & there.active)
+
+    @property
+    def has_targets(self) -> bool:
+        return True
+
+    @property
+    def most(self) -> int:
+        return min(max(self.samples.plan.max_depth - 2, 0), MOST_VERTICES)
+
+
+# ---- Jumps along a line ----
+
+
+@dataclass
+class Line:
+    """Line in a cell of the plane: places `u` + `along` t for t in [0, 1]. `across` is perpendicular to `along`. `place`
+    is a random number, and `chance` the probability of the cell.
+    """
+
+    u: mi.Point2f
+    along: mi.Vector2f
+    across: mi.Vector2f
+    place: mi.Float
+    chance: mi.Float
+
+    def at(self, t: mi.Float) -> mi.Point2f:
+        """Return the place at distance `t` along the line."""
+        return self.u + self.along * t
+
+
+def random_lines(chains: Chains, weights: mi.Float | None, number: mi.UInt32, count: mi.UInt32) -> Line:
+    """Return line `number` of `count` lines. Half of the lines run along each axis.
+
+    `weights` are the cumulative weights of the cells. If `weights` is None, line number k lies in cell number k.
+    """
+    seed, (width, height) = chains.samples.seed, chains.cells
+    total = width * height
+    first, second = mi.sample_tea_32(seed, mi.UInt32(LINES))
+    third, fourth = mi.sample_tea_32(seed, mi.UInt32(LINES + 1))
+    y, place, axis = (
+        _unit(word) for word in (number * 3242174889 + first, number * 2447445414 + second, dr.brev(number) + third)
+    )
+    if weights is None:
+        cell, chance = number % total, mi.Float(1 / total)
+    else:
+        end = dr.gather(mi.Float, weights, total - 1)
+        position = (mi.Float(number) + _unit(mi.sample_tea_32(number, fourth)[0])) / mi.Float(count)
+        position = dr.minimum(position, dr.one_minus_epsilon(mi.Float)) * end
+        cell = dr.binary_search(0, total - 1, lambda i: dr.gather(mi.Float, weights, i) <= position)
+        below = dr.select(cell > 0, dr.gather(mi.Float, weights, dr.maximum(cell, 1) - 1), 0)
+        chance = (dr.gather(mi.Float, weights, cell) - below) / end
+    along = dr.select(axis < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
+    across = mi.Vector2f(along.y, along.x)
+    return Line(mi.Point2f(cell % width, cell // width) + across * y, along, across, place, chance)
+
+
+def _search(
+    chains: Chains, line: Line, inner: mi.Float, outer: mi.Float, code: mi.UInt32, active: mi.Bool
+) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+    """Return both ends of a small interval between `inner` and `outer` in which the chain's code changes from `code`.
+    If the code at `outer` is `code`, return `outer` twice.
+    """
+
+    def body(step: mi.UInt32, inner: mi.Float, outer: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        middle = 0.5 * (inner + outer)
+        same = chains.follow(line.at(middle), active).code == code
+        return step + 1, dr.select(same, middle, inner), dr.select(same, outer, middle)
+
+    changes = active & (chains.follow(line.at(outer), active).code != code)
+    state = mi.UInt32(0), dr.select(changes, inner, outer), mi.Float(outer)
+    return dr.while_loop(state, lambda step, *_: changes & (step < BISECTIONS), body, label="bisection")[1:]
+
+
+@dataclass
+class Jump:
+    """Jump in a line. `inner` and `outer` are places beside it, with the codes `before` and `after`. `back` and `ahead`
+    are the distances to the jumps beside it. `places` is the length of the places from which the jump is found.
+    """
+
+    inner: mi.Float
+    outer: mi.Float
+    back: mi.Float
+    ahead: mi.Float
+    places: mi.Float
+    active: mi.Bool
+
+
+def _find_jump(chains: Chains, line: Line) -> Jump:
+    """Return the first jump from one end of a random interval of the line."""
+    begin = (1 + INTERVAL) * line.place - INTERVAL
+    forward = mi.sample_tea_32(chains.key, mi.UInt32(DIRECTION))[0] % 2 == 0
+    begin, step = dr.select(forward, begin, begin + INTERVAL), dr.select(forward, mi.Float(INTERVAL), -INTERVAL)
+    before, last = (chains.follow(line.at(begin + end)).code for end in (0, step))
+    active = before != last
+    inner, outer = _search(chains, line, begin, begin + step, before, active)
+    active &= (inner >= 0) & (inner < 1)
+    after = chains.follow(line.at(outer), active).code
+
+    def run(begin: mi.Float, step: mi.Float, code: mi.UInt32, other: mi.UInt32) -> tuple[mi.Float, mi.Bool]:
+        """Return the length of the run with the `code`, at most INTERVAL. Also return the lanes in which a run with the
+        code `other` follows.
+        """
+        near, far = _search(chains, line, begin, begin + step, code, active)
+        length = dr.abs(near - begin)
+        ends = active & (length < INTERVAL)
+        return length, ends & (chains.follow(line.at(far), ends).code == other)
+
+    back, back_returns = run(inner, -step, before, after)
+    ahead, ahead_returns = run(outer, step, after, before)
+    both = dr.maximum(back + ahead - INTERVAL, 0)
+    places = 0.5 * (dr.select(ahead_returns, both, back) + dr.select(back_returns, both, ahead))
+    return Jump(inner, outer, back, ahead, dr.maximum(places, NARROWEST), active & (places > 0))
+
+
+# ---- The edge at a jump ----
+
+
+@dataclass
+class EdgePoint:
+    """Point p of an edge: intersection `pi` of `ray`. `end` is the vertex that the chain reaches. `hides` lanes hide the
+    point y of `target`.
+    """
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    end: Hit
+    target: Target
+    hides: mi.Bool
+
+    @property
+    def p(self) -> mi.Point3f:
+        """The point."""
+        return self.ray(self.pi.t)
+
+
+@dataclass
+class ChainEdge:
+    """Random point of an edge behind a specular chain.
+
+    `over` is the chain that reaches the edge, and `past` the chain that misses it. `here` is p, `n` its normal, and `s`
+    its place between y and x. `weight` (C,) is the throughput divided by |<dq/du, n>| and by the density of the line.
+    """
+
+    over: Chain
+    past: Chain
+    u: mi.Point2f
+    here: EdgePoint
+    n: mi.Vector3f
+    s: mi.Float
+    weight: mi.Spectrum
+    active: mi.Bool
+
+
+@dataclass
+class Pair:
+    """Chains from both sides of a jump, at the first vertex at which they differ. In the lanes `edge`, their surfaces
+    differ. In the lanes `shadow`, a surface hides y from one of them. `inner_hides` lanes hide y from `inner`.
+    """
+
+    inner: Chain
+    outer: Chain
+    edge: mi.Bool
+    shadow: mi.Bool
+    inner_hides: mi.Bool
+
+
+def _compare(chains: Chains, inner: mi.Point2f, outer: mi.Point2f, active: mi.Bool) -> Pair:
+    """Return the chains from two places at the first vertex at which they differ."""
+
+    def body(active: mi.Bool, pair: Pair) -> tuple[mi.Bool, Pair]:
+        ends = pair.inner, pair.outer
+        valid = [end.pi.is_valid() for end in ends]
+        events = [chains.event(end, active & there) for end, there in zip(ends, valid, strict=True)]
+        codes = [surface_code(event[0], there) for event, there in zip(events, valid, strict=True)]
+        edge = active & (codes[0] != codes[1])
+        shadow, hides = mi.Bool(False), mi.Bool(False)
+        if chains.has_targets:
+            lit = [chains.lit(event[0], ends[0].count, active & valid[0] & ~edge) for event in events]
+            hides = lit[0][1]
+            shadow = lit[0][0].active & lit[1][0].active & (hides != lit[1][1])
+        passes = events[0][2] & events[1][2] & ~edge & ~shadow & (ends[0].count < chains.most)
+        inner, outer = (
+            chains.onward(end, hit, scattering, passes, product)
+            for end, (hit, scattering, _, product) in zip(ends, events, strict=True)
+        )
+        return passes, Pair(inner, outer, pair.edge | edge, pair.shadow | shadow, dr.select(active, hides, pair.inner_hides))
+
+    first = Pair(chains.start(inner, active), chains.start(outer, active), mi.Bool(False), mi.Bool(False), mi.Bool(False))
+    return dr.while_loop((active, first), lambda active, pair: active, body, label="chains beside a jump")[1]
+
+
+def _edge_point(chains: Chains, chain: Chain, shadow: mi.Bool, active: mi.Bool) -> EdgePoint:
+    """Return the point of the edge that the chain's next segment reaches, or in the lanes `shadow` the segment from its
+    end to y.
+    """
+    end = chain.vertex(active)
+    target = chains.target(end, chain.count, active & shadow)
+    to_target = end.si.spawn_ray_to(target.y)
+    pi = chains.samples.scene.ray_intersect_preliminary(to_target, coherent=False, active=active & shadow)
+    ray = dr.select(shadow, mi.Ray3f(to_target), mi.Ray3f(chain.ray))
+    return EdgePoint(dr.detach(ray), dr.select(shadow, pi, chain.pi), end, target, shadow)
+
+
+def _normal(chains: Chains, edge: EdgePoint, outwards: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+    """Return the normal of an edge. `outwards` points away from the surface, and is not parallel to the edge.
+
+    The edge crosses a small circle around its point twice. Both crossings give its direction.
+    """
+    ray, radius = edge.ray, CIRCLE * edge.pi.t
+    first = dr.normalize(outwards - ray.d * dr.dot(outwards, ray.d))
+    second = dr.cross(ray.d, first)
+    code = surface_code(vertex_at(ray, edge.pi, active), edge.pi.is_valid())
+
+    def leaves(angle: mi.Float) -> mi.Bool:
+        sin, cos = dr.sincos(angle)
+        there = mi.Ray3f(ray.o, dr.normalize(edge.p + (cos * first + sin * second) * radius - ray.o), ray.time, [])
+        pi = chains.samples.scene.ray_intersect_preliminary(there, coherent=False, active=active)
+        return surface_code(vertex_at(there, pi, active), pi.is_valid()) != code
+
+    def body(
+        step: mi.UInt32, up: mi.Float, down: mi.Float, half: mi.Float
+    ) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Float]:
+        up = dr.select(leaves(up + half), up + half, up)
+        down = dr.select(leaves(-down - half), down + half, down)
+        return step + 1, up, down, 0.5 * half
+
+    state = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5 * dr.pi)
+    _, up, down, _ = dr.while_loop(state, lambda step, *_: active & (step < BISECTIONS), body, label="edge direction")
+    along = (dr.cos(up) - dr.cos(down)) * first + (dr.sin(up) + dr.sin(down)) * second
+    n = dr.normalize(dr.cross(along, ray.d))
+    return dr.mulsign(n, dr.dot(n, outwards))
+
+
+def sample_edge(chains: Chains, line: Line) -> ChainEdge:
+    """Return the edge of a jump in a random interval of the line."""
+    jump = _find_jump(chains, line)
+    pair = _compare(chains, line.at(jump.inner), line.at(jump.outer), jump.active)
+    count, shadow = pair.inner.count, pair.shadow
+    active = jump.active & (count > 0) & (shadow | pair.edge)
+    # p belongs to the nearer surface.
+    distances = [dr.select(end.pi.is_valid(), end.pi.t, dr.inf) for end in (pair.inner, pair.outer)]
+    from_inner = dr.select(shadow, pair.inner_hides, distances[0] <= distances[1])
+    over, past = (dr.select(from_inner, *ends) for ends in ((pair.inner, pair.outer), (pair.outer, pair.inner)))
+    here = _edge_point(chains, over, shadow, active)
+    active &= here.pi.is_valid()
+    s = 1 - here.pi.t / dr.norm(here.target.y - here.end.si.p)
+    s = dr.select(shadow & ~here.target.distant, s, 1)
+
+    # ---- dq/du, along the line and across it ----
+    d, p, end_code = here.ray.d, here.p, surface_code(here.end, mi.Bool(True))
+    distance = dr.minimum(NEIGHBOUR, 0.2 * dr.minimum(jump.back, jump.ahead))
+    code = chains.follow(line.at(jump.inner), active, count).code
+
+    def probe(
+        step: mi.UInt32, same: mi.Bool, along: mi.Vector3f, across: mi.Vector3f
+    ) -> tuple[mi.UInt32, mi.Bool, mi.Vector3f, mi.Vector3f]:
+        change, is_across = dr.select(step % 2 == 0, distance, -distance), step >= 2
+        u = line.at(jump.inner) + dr.select(is_across, line.across, line.along) * change
+        chain = chains.follow(u, active, count)
+        end = chain.vertex(active & shadow)
+        target = chains.target(end, count, active & shadow)
+        q = chain.ray.o + chain.ray.d * (dr.dot(p - chain.ray.o, d) / dr.dot(chain.ray.d, d))
+        q = dr.select(shadow, s * end.si.p + dr.select(s < 1, (1 - s) * target.y, 0), q) / (2 * change)
+        same &= (chain.count == count) & (chain.code == code)
+        same &= ~shadow | (target.active & (surface_code(end, mi.Bool(True)) == end_code))
+        return step + 1, same, along + dr.select(is_across, 0, q), across + dr.select(is_across, q, 0)
+
+    state = mi.UInt32(0), active, mi.Vector3f(0), mi.Vector3f(0)
+    _, active, along, across = dr.while_loop(state, lambda step, *_: active & (step < 4), probe, label="neighbours")
+
+    n = _normal(chains, here, along * dr.select((jump.outer > jump.inner) == from_inner, 1, -1), active)
+    slope = dr.abs(dr.dot(n, along))
+    active &= (slope > 0) & (slope >= dr.abs(dr.dot(n, across)))
+    density = jump.places * line.chance * (chains.cells[0] * chains.cells[1] / (2 * (1 + INTERVAL)))
+    weight = over.product * dr.select(active, dr.rcp(slope * density), 0)
+    return ChainEdge(over, past, line.at(0.5 * (jump.inner + jump.outer)), here, n, s, weight, active)
