@@ -39,6 +39,8 @@ from reslrb_cli.transport.chains import (
     Chains,
     LampChains,
     SensorChains,
+    pick,
+    random_interval,
     random_lines,
     sample_edge,
 )
@@ -50,8 +52,8 @@ from reslrb_cli.transport.walk import Vertex, find_vertex, walk
 
 #: Rays per cell that look for specular surfaces, and for lamps behind them.
 PROBES = 16
-#: Paths of a step per sampled line.
-PATHS_PER_LINE = 4
+#: Paths of a step per tested interval, and per sampled edge.
+PATHS_PER_INTERVAL, PATHS_PER_EDGE = 1, 16
 #: Streams of random numbers, mixed into the seed.
 CHAIN_EDGES, CELLS, SIDE = 0xED6E4, 0xED6E5, 0x0E4
 
@@ -61,9 +63,9 @@ def has_edges_behind_chains(plan: Plan) -> bool:
     return bool(plan.needs.has_delta_lobes) and (plan.camera or not plan.moving_emission)
 
 
-def _samples_of(samples: Samples, stream: int) -> Samples:
-    """Return samples of edges for the paths `samples`."""
-    edges = edge_samples(samples, stream, PATHS_PER_LINE)
+def _samples_of(samples: Samples, stream: int, each: int) -> Samples:
+    """Return samples of edges for the paths `samples`, one for `each` paths."""
+    edges = edge_samples(samples, stream, each)
     if samples.plan.camera:
         return for_camera(edges)
     return replace(edges, plan=replace(edges.plan, by_class=False, paths="light"))
@@ -96,40 +98,33 @@ def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Spectrum:
     return showing(dr.select(edge.here.hides, -0.5 * lost, dr.select(over, found, -found))) * p.scale
 
 
-class Ones:
-    """An adjoint image of ones."""
-
-    def lookup(self, u: mi.Point2f, active: mi.Bool) -> mi.Spectrum:
-        """Return 1."""
-        return mi.Spectrum(1)
-
-
-def weigh_cells(own: Samples) -> mi.Float:
-    """Return cumulative sampling weights of the cells of chains that begin at the sensor or at lamps. One line per cell
-    looks for edges, and the weights are smoothed over neighbours.
+def choose_intervals(own: Samples) -> list[mi.Float]:
+    """Return cumulative sampling weights of the cells of chains that begin at the sensor or at lamps, and of random
+    intervals in which a chain changes.
     """
-    samples = _samples_of(own, CELLS)
+    samples = _samples_of(own, CELLS, 1)
     width, height = _chains(samples, mi.UInt32(0)).cells
     cell = dr.arange(mi.UInt32, width * height)
     samples = replace(samples, width=width * height)
-    chains = _chains(samples, cell)
-    edge = sample_edge(chains, random_lines(chains, None, cell, mi.UInt32(width * height)))
-    over = mi.sample_tea_32(chains.key, mi.UInt32(SIDE))[0] % 2 == 0
-    size = dr.select(edge.active, dr.abs(_light(Pass(samples, None, Ones()), edge, over)), 0)
-    found, seen = _behind_chains(samples, cell)
-    around = dr.zeros(mi.Float, width * height), dr.zeros(mi.Float, width * height)
+    lit, seen = _behind_chains(samples, cell)
+    around = dr.zeros(mi.Float, width * height)
     for i in range(-1, 2):
         for k in range(-1, 2):
             x, y = mi.Int32(cell % width) + i, mi.Int32(cell // width) + k
             inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            for total, value in zip(around, (size, seen), strict=True):
-                dr.scatter_reduce(dr.ReduceOp.Add, total, value, mi.UInt32(y * width + x), inside)
-    # One line does not find all edges.
-    found = found * dr.sum(size) / dr.maximum(dr.sum(found), 1e-30) + around[0]
-    floor = dr.sum(found) / dr.maximum(dr.sum(around[1]), 1e-30)
-    weights = dr.cumsum(found + dr.select(floor > 0, floor, 1) * around[1])
-    dr.make_opaque(weights)
-    return weights
+            dr.scatter_reduce(dr.ReduceOp.Add, around, seen, mi.UInt32(y * width + x), inside)
+    # Half of the samples go to lamps that are seen.
+    total = dr.sum(around)
+    cells = around + lit * dr.select(total > 0, total / dr.maximum(dr.sum(lit), 1e-30), 0)
+    cells = dr.cumsum(cells + dr.select(total > 0, 0, mi.Float(1)))
+    dr.make_opaque(cells)
+    samples = _samples_of(own, CHAIN_EDGES, PATHS_PER_INTERVAL)
+    number = dr.arange(mi.UInt32, samples.width)
+    chains = _chains(samples, number)
+    line = random_lines(chains, cells, number, dr.opaque(mi.UInt32, samples.width))
+    found = dr.cumsum(dr.select(random_interval(chains, line).differs, mi.Float(1), 0))
+    dr.make_opaque(found)
+    return [cells, found]
 
 
 def _behind_chains(samples: Samples, cell: mi.UInt32) -> tuple[mi.Float, mi.Float]:
@@ -149,7 +144,7 @@ def _behind_chains(samples: Samples, cell: mi.UInt32) -> tuple[mi.Float, mi.Floa
 
     state = mi.UInt32(0), dr.zeros(mi.Float, dr.width(cell)), dr.zeros(mi.Float, dr.width(cell))
     _, total, seen = dr.while_loop(state, lambda number, *_: number < PROBES, probe, label="probes")
-    return total / PROBES if samples.plan.camera else mi.Float(0), seen / PROBES
+    return total / PROBES if samples.plan.camera else dr.zeros(mi.Float, dr.width(cell)), seen / PROBES
 
 
 @dataclass
@@ -194,13 +189,18 @@ def _stack_of(p: Pass, chains: Chains, edge: ChainEdge, ring: Ring) -> StackStat
 
 def differentiate_edges_behind_chains(own: Pass) -> None:
     """Add the derivatives of the edges behind specular chains. dL/dI must be known."""
-    samples = _samples_of(own.samples, CHAIN_EDGES)
+    candidates, samples = (_samples_of(own.samples, CHAIN_EDGES, each) for each in (PATHS_PER_INTERVAL, PATHS_PER_EDGE))
     assert samples.edges is not None
+    cells, found = samples.edges.chains
     p = Pass(samples, None, own.adjoint)
     lane, ring = dr.arange(mi.UInt32, samples.width), Ring(MOST_VERTICES + 1, False)
-    chains = _chains(samples, lane // 2)  # two lanes share an edge
-    count = dr.opaque(mi.UInt32, (samples.width + 1) // 2)
-    edge = sample_edge(chains, random_lines(chains, samples.edges.cells[0], lane // 2, count))
+    pairs = dr.opaque(mi.Float, (samples.width + 1) // 2)  # two lanes share an edge
+    offset = mi.Float(mi.sample_tea_32(samples.seed, mi.UInt32(SIDE))[0] >> 8) * 2.0**-24
+    number, chance = pick(found, candidates.width, (mi.Float(lane // 2) + offset) / pairs)
+    count = dr.opaque(mi.UInt32, candidates.width)
+    chains = _chains(samples, number)
+    edge = sample_edge(chains, random_lines(chains, cells, number, count))
+    edge.weight *= dr.select(chance > 0, dr.rcp(chance * mi.Float(count)), 0)
     shadow = edge.here.hides
     # If the edge touches the surface in its shadow, the chain itself meets it.
     touches = shadow & (edge.here.pi.t < 2 * AROUND * mi.math.RayEpsilon * (1 + dr.max(dr.abs(edge.here.p))))

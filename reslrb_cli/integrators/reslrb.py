@@ -22,9 +22,9 @@ from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.estimators.camera_edges import differentiate_edges_of_camera_paths
 from reslrb_cli.estimators.chain_edges import (
+    choose_intervals,
     differentiate_edges_behind_chains,
     has_edges_behind_chains,
-    weigh_cells,
 )
 from reslrb_cli.estimators.edges import differentiate_edges
 from reslrb_cli.guiding.collect import hear
@@ -161,7 +161,7 @@ class LightTracer(StepIntegrator):
         tables = [weigh_edges(side, now) for side in parts[0].sides()]
         for side, table in zip(parts[0].sides(), tables, strict=True):
             if has_edges_behind_chains(side.plan):
-                table.cells = [weigh_cells(side)]
+                table.chains = choose_intervals(side)
         return [part.with_edges(*tables) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:

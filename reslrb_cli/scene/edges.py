@@ -89,7 +89,7 @@ class EdgeTable(_Rows):
     - `lamp`, `sensor` and `anywhere` are cumulative sampling weights: for outlines and creases seen from lamps, and for
         outlines seen from the sensor and from all directions.
 
-    `balls` contain the moving shapes. `cells` has the cumulative sampling weights of chains, if the scene has mirrors or
+    `balls` contain the moving shapes. `chains` has the cumulative sampling weights of chains, if the scene has mirrors or
     glass (`transport/chains.py`).
     """
 
@@ -98,7 +98,7 @@ class EdgeTable(_Rows):
     sensor: mi.Float
     anywhere: mi.Float
     balls: list[Ball]
-    cells: list[mi.Float]
+    chains: list[mi.Float]
 
 
 def _number(shape: mi.Shape) -> int:
@@ -298,7 +298,7 @@ class EdgeSet:
             free = 4 * (dr.pi - turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a))
             free = dr.select(rows.kind == SEGMENT, dr.select(dr.isfinite(free), free, 0), 4 * dr.pi)
             return EdgeTable(**vars(rows), moves=dr.concat(moves), lamp=length, sensor=length, anywhere=length * free,
-                             balls=balls, cells=[])  # fmt: skip
+                             balls=balls, chains=[])  # fmt: skip
 
 
 def across(along: mi.Vector3f, corner: mi.Vector3f) -> mi.Vector3f:

@@ -287,30 +287,30 @@ class Line:
         return self.u + self.along * t
 
 
-def random_lines(chains: Chains, weights: mi.Float | None, number: mi.UInt32, count: mi.UInt32) -> Line:
-    """Return line `number` of `count` lines. Half of the lines run along each axis.
-
-    `weights` are the cumulative weights of the cells. If `weights` is None, line number k lies in cell number k.
+def random_lines(chains: Chains, weights: mi.Float, number: mi.UInt32, count: mi.UInt32) -> Line:
+    """Return line `number` of `count` lines. Half of the lines run along each axis. `weights` are the cumulative weights
+    of the cells.
     """
     seed, (width, height) = chains.samples.seed, chains.cells
-    total = width * height
     first, second = mi.sample_tea_32(seed, mi.UInt32(LINES))
     third, fourth = mi.sample_tea_32(seed, mi.UInt32(LINES + 1))
     y, place, axis = (
         _unit(word) for word in (number * 3242174889 + first, number * 2447445414 + second, dr.brev(number) + third)
     )
-    if weights is None:
-        cell, chance = number % total, mi.Float(1 / total)
-    else:
-        end = dr.gather(mi.Float, weights, total - 1)
-        position = (mi.Float(number) + _unit(mi.sample_tea_32(number, fourth)[0])) / mi.Float(count)
-        position = dr.minimum(position, dr.one_minus_epsilon(mi.Float)) * end
-        cell = dr.binary_search(0, total - 1, lambda i: dr.gather(mi.Float, weights, i) <= position)
-        below = dr.select(cell > 0, dr.gather(mi.Float, weights, dr.maximum(cell, 1) - 1), 0)
-        chance = (dr.gather(mi.Float, weights, cell) - below) / end
+    position = (mi.Float(number) + _unit(mi.sample_tea_32(number, fourth)[0])) / mi.Float(count)
+    cell, chance = pick(weights, width * height, position)
     along = dr.select(axis < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
     across = mi.Vector2f(along.y, along.x)
     return Line(mi.Point2f(cell % width, cell // width) + across * y, along, across, place, chance)
+
+
+def pick(weights: mi.Float, count: int, number: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """Return the entry of `count` cumulative `weights` that a random `number` selects, and its probability."""
+    total = dr.gather(mi.Float, weights, count - 1)
+    number = dr.minimum(number, dr.one_minus_epsilon(mi.Float)) * total
+    entry = mi.UInt32(dr.binary_search(0, count - 1, lambda i: dr.gather(mi.Float, weights, i) <= number))
+    below = dr.select(entry > 0, dr.gather(mi.Float, weights, dr.maximum(entry, 1) - 1), 0)
+    return entry, (dr.gather(mi.Float, weights, entry) - below) / total
 
 
 def _search(
@@ -344,13 +344,32 @@ class Jump:
     active: mi.Bool
 
 
-def _find_jump(chains: Chains, line: Line) -> Jump:
-    """Return the first jump from one end of a random interval of the line."""
+@dataclass
+class Interval:
+    """Random interval of a line, from `begin` to `begin` + `step`. The code at its begin is `before`. In the lanes
+    `differs`, the code at its end is another one, and the chain at its begin has a specular vertex.
+    """
+
+    begin: mi.Float
+    step: mi.Float
+    before: mi.UInt32
+    differs: mi.Bool
+
+
+def random_interval(chains: Chains, line: Line) -> Interval:
+    """Return a random interval of the line."""
     begin = (1 + INTERVAL) * line.place - INTERVAL
     forward = mi.sample_tea_32(chains.key, mi.UInt32(DIRECTION))[0] % 2 == 0
     begin, step = dr.select(forward, begin, begin + INTERVAL), dr.select(forward, mi.Float(INTERVAL), -INTERVAL)
-    before, last = (chains.follow(line.at(begin + end)).code for end in (0, step))
-    active = before != last
+    first = chains.follow(line.at(begin))
+    differs = (first.count > 0) & (chains.follow(line.at(begin + step), first.count > 0).code != first.code)
+    return Interval(begin, step, first.code, differs)
+
+
+def _find_jump(chains: Chains, line: Line) -> Jump:
+    """Return the first jump from the begin of a random interval of the line."""
+    interval = random_interval(chains, line)
+    begin, step, before, active = interval.begin, interval.step, interval.before, interval.differs
     inner, outer = _search(chains, line, begin, begin + step, before, active)
     active &= (inner >= 0) & (inner < 1)
     after = chains.follow(line.at(outer), active).code
