@@ -1,6 +1,6 @@
 """Derivatives of the light that moving edges cover and uncover behind mirrors and glass.
 
-The terms and their symbols are those of `edges.py` and `camera_edges.py`. `transport/chains.py` samples the edges: jumps
+The terms and their symbols are those of `edges.py` and `camera_edges.py`. `transport/jumps.py` samples the edges: jumps
 of the light behind a specular chain that begins at the sensor or at a lamp. P is the throughput of the chain, v_q the
 velocity of q for a fixed first ray, and g = P |<dq/du, n>|^-1 divided by the density of the sample.
 
@@ -32,20 +32,10 @@ from reslrb_cli.estimators.edges import AROUND, MAY_LACK, Contribution, edge_sam
 from reslrb_cli.estimators.stack import Ring, StackState, pop
 from reslrb_cli.transport.bsdf import EventNumbers, evaluate, scatter
 from reslrb_cli.transport.camera import FilmRay, camera_walk
-from reslrb_cli.transport.chains import (
-    MOST_VERTICES,
-    Chain,
-    ChainEdge,
-    Chains,
-    LampChains,
-    SensorChains,
-    pick,
-    random_interval,
-    random_lines,
-    sample_edge,
-)
+from reslrb_cli.transport.chains import MOST_VERTICES, Chain, Chains, LampChains, SensorChains
 from reslrb_cli.transport.emission import Emission
-from reslrb_cli.transport.factors import showing
+from reslrb_cli.transport.factors import Product, showing
+from reslrb_cli.transport.jumps import ChainEdge, pick, random_interval, random_lines, sample_edge
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex, find_vertex, walk
@@ -77,8 +67,9 @@ def _chains(samples: Samples, number: mi.UInt32) -> Chains:
 
 
 def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Spectrum:
-    """Return <delta, g L_p> or W_p in the lanes `over`, otherwise minus the value for x. At the edge of a shadow, return
-    minus half of the value for x in all lanes.
+    """Return <delta, g L_p> or W_p in the lanes `over`. In other lanes, return minus the value for x.
+
+    At the edge of a shadow, return minus half of the value for x in all lanes.
     """
     samples, camera = p.samples, p.plan.camera
     continues, shadow = edge.active & ~edge.here.hides, edge.active & edge.here.hides
@@ -88,7 +79,9 @@ def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Spectrum:
     f = evaluate(p.plan, x.si, x.bsdf, target.wo, shadow)
     lost = edge.weight * f * target.weight
     if camera:
-        _, L = camera_walk(samples, Radiance(tracked=False), continues, FilmRay(ray, edge.u, mi.Spectrum(1), depth=depth))
+        _, L = camera_walk(
+            samples, Radiance(tracked=False), continues, FilmRay(ray, edge.u, mi.Spectrum(1), depth=depth)
+        )
         delta = p.delta(edge.u, edge.active)
         found, lost = dr.dot(delta * edge.weight, L), dr.dot(delta, lost)
     else:
@@ -164,7 +157,9 @@ class SpecularFrame:
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
             hit = find_vertex(ray, pi, active)
-            scattering, _ = scatter(p.plan, hit, EventNumbers(mi.Point2f(0.5), self.sample), active, None, attached=True)
+            scattering, _ = scatter(
+                p.plan, hit, EventNumbers(mi.Point2f(0.5), self.sample), active, None, attached=True
+            )
             following = hit.si.spawn_ray(scattering.d)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             dr.backward_from(dr.select(active, moved, 0), flags=MAY_LACK)
@@ -177,7 +172,8 @@ def _stack_of(p: Pass, chains: Chains, edge: ChainEdge, ring: Ring) -> StackStat
 
     def body(active: mi.Bool, chain: Chain, stack: StackState) -> tuple[mi.Bool, Chain, StackState]:
         hit, scattering, passes, product = chains.event(chain, active)
-        vertex = Vertex(hit.si, hit.bsdf, chain.ray, chain.pi, chain.count, None, active)
+        one = Product.one(False, False)
+        vertex = Vertex(hit.si, hit.bsdf, chain.ray, chain.pi, chain.count, one, active)
         stack = stack.pushed(SpecularFrame(SurfacePoint.of(p.plan, vertex), scattering.sample_1), ring, passes, passes)
         chain = chains.onward(chain, hit, scattering, passes, product)
         return passes & (chain.count < edge.over.count), chain, stack

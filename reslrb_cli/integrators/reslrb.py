@@ -159,9 +159,9 @@ class LightTracer(StepIntegrator):
             return parts
         now = self.preparation.edges(plan).now()
         tables = [weigh_edges(side, now) for side in parts[0].sides()]
-        for side, table in zip(parts[0].sides(), tables, strict=True):
+        for side, edges in zip(parts[0].sides(), tables, strict=True):
             if has_edges_behind_chains(side.plan):
-                table.chains = choose_intervals(side)
+                edges.chains = choose_intervals(side)
         return [part.with_edges(*tables) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:

@@ -89,8 +89,8 @@ class EdgeTable(_Rows):
     - `lamp`, `sensor` and `anywhere` are cumulative sampling weights: for outlines and creases seen from lamps, and for
         outlines seen from the sensor and from all directions.
 
-    `balls` contain the moving shapes. `chains` has the cumulative sampling weights of chains, if the scene has mirrors or
-    glass (`transport/chains.py`).
+    `balls` contain the moving shapes. If the scene has mirrors or glass, `chains` has the cumulative sampling weights of
+    specular chains (`estimators/chain_edges.py`).
     """
 
     moves: mi.Bool

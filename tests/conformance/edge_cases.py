@@ -34,6 +34,7 @@ PLACES = ("to_world", "position", "vertex_positions")
 #: hide a moving one.
 STEP, SMALLER, SMALLEST = 0.03, 0.01, 0.005
 OWN = diffuse(0.6, 0.6, 0.8)
+GLASS, MIRROR = {"type": "dielectric"}, {"type": "twosided", "bsdf": {"type": "conductor"}}
 TWO_SIDED = {"type": "twosided", "bsdf": OWN}
 
 
@@ -114,10 +115,10 @@ def recorded(case: EdgeCase) -> np.ndarray:
 # ---- Moving shapes ----
 
 
-def mesh(positions: np.ndarray, faces: np.ndarray) -> mi.Mesh:
+def mesh(positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any] = OWN) -> mi.Mesh:
     """Return a mesh with flat faces."""
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(OWN)
+    properties["bsdf"] = mi.load_dict(bsdf)
     made = mi.Mesh("shape", len(positions), len(faces), properties)
     params = mi.traverse(made)
     params["vertex_positions"] = np.asarray(positions, np.float32).ravel()
@@ -204,6 +205,10 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
                     "plate": rectangle(TWO_SIDED, transform(translate=[0.1, 0, 0.5], scale=0.7))},
     **dict.fromkeys(("hidden", "behind", "shaded"), lambda: {"shape": _box(0.1, -0.1, 0.9)}),
     "reflector": lambda: {"shape": rectangle(TWO_SIDED, transform(translate=[0, 0, 2.6], scale=0.5))},
+    "slab": lambda: {"shape": mesh(*split_box((0.1, 0, 0.5), (0.6, 0.6, 0.1)), GLASS)},
+    "mirror": lambda: {"shape": rectangle(MIRROR, transform(translate=[0.2, 0.8, 0.8], rotate=([1, 0, 0], 75),
+                                                            scale=0.7))},
+    "reflected": lambda: {"shape": _sphere(0.1, 0, 0.6)},
     "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
                      for n, name in enumerate(FLAT)},
 }  # fmt: skip
@@ -222,6 +227,9 @@ STILL: dict[str, Callable[[], dict[str, Any]]] = {
     # The shadow of the sheet falls on the box.
     "shaded": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.35, 0.05, 1.7], scale=0.2))},
     "reflector": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.1, 0.1, 1.2], scale=0.4))},
+    # The camera sees the sphere and its shadow in a mirror, too.
+    "reflected": lambda: {"sheet": rectangle(MIRROR, transform(translate=[0.2, 1.6, 1], rotate=([1, 0, 0], 80),
+                                                               scale=1.3))},
 }  # fmt: skip
 
 # ---- Lamps, and surfaces that do not move ----
@@ -299,6 +307,7 @@ def standing(lamp: str, depth: int, **options: Any) -> EdgeCase:
     return EdgeCase("standing", lamp, depth, ("x", "y", "turn"), (0, 0, 1), **options)
 
 
+BOTH = {"paths": "both"}
 #: Cases of which finite differences are on file. Under the near lamp, the sphere moves along x only, because the offset
 #: of rays beside its outline biases the other derivatives slightly.
 RECORDED = [
@@ -311,6 +320,9 @@ RECORDED = [
     EdgeCase("shaded", "point", step=SMALLEST, reference_spp=8192),
     *(EdgeCase("box", lamp, lamp_moves=True, spp=1024) for lamp in ("area", "spot")),
     EdgeCase("none", "room", 3, lamp_moves=True, spp=1024),
+    EdgeCase("reflected", "area", 3, spp=512, reference_spp=8192, options=BOTH),
+    EdgeCase("mirror", "constant", 3, reference_spp=8192, options=BOTH),
+    EdgeCase("slab", "area", 4, spp=768, reference_spp=16384, step=0.02, options=BOTH),
 ]  # fmt: skip
 CASES = [
     *RECORDED,
