@@ -89,7 +89,7 @@ class EdgeTable(_Rows):
     - `lamp`, `sensor` and `anywhere` are cumulative sampling weights: for outlines and creases seen from lamps, and for
         outlines seen from the sensor and from all directions.
 
-    `balls` contain the moving shapes. If the scene has mirrors or glass, `chains` has the cumulative sampling weights of
+    `balls` contain the moving shapes. If the scene has mirrors or glass, `chains` has cumulative sampling weights of
     specular chains (`estimators/chain_edges.py`).
     """
 
