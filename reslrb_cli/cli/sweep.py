@@ -147,7 +147,7 @@ def _run(folder: Path, sweep: SweepPlan, number: int) -> int:
     from reslrb_cli.records.measurement_files import LivePage, write_lines
     from reslrb_cli.records.sweeps import PAGE_FILE, RESULTS_FILE, config_file, label
     from reslrb_cli.report.page import write_page
-    from reslrb_cli.report.page.sweep import lines, run_records
+    from reslrb_cli.report.page.sweep import FIGURES, lines, objective, ranked, run_records
     from reslrb_cli.report.sources import read_sweep_runs
     from reslrb_cli.runs.search import Remaining
     from reslrb_cli.runs.sweep import command as command_of
@@ -199,6 +199,9 @@ def _run(folder: Path, sweep: SweepPlan, number: int) -> int:
     interrupted = interrupts.requested and done + failed < sweep.size
     if sweep.search and not interrupted and len(sweep.combinations) < sweep.search.trials:
         echo(f"the search ends after {len(sweep.combinations)} trials: it finds no further combinations")
+    if of := sweep.search and objective(sweep, records):
+        best = config_file(folder, ranked(sweep, records).combinations[0])
+        echo(f"the best trial by {FIGURES[of]}: {os.path.relpath(best)}")
     ended = "interrupted" if interrupted else "finished"
     more = f"; {again} repeats the failed runs" if failed and not sweep.search else ""
     more = f"; {go_on}" if interrupted else more

@@ -41,7 +41,8 @@ def check_search(plan: Plan) -> None:
     if not plan.sweep.keys:
         raise ConfigError("--search", "", f"needs settings to choose, such as --vary 'optimizer.learning_rate={RANGE}'")
     load_optuna()
-    known = all(config.target.render is not None for config in plan.configs.values())
+    targets = [config.target for config in plan.configs.values()]
+    known = all(target.render is not None or target.truth for target in targets)
     if incomparable(plan.sweep, "loss") and (incomparable(plan.sweep, "error") or not known):
         raise _not_comparable(plan.sweep)
 
