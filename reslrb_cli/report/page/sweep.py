@@ -286,25 +286,32 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
 
 
 def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
-    """Return diagrams of the loss and, if known, the parameter error. Medians with bands are drawn over iteration and
-    time.
-    """
+    """Return the diagrams of the first combinations."""
     own = [_runs(source, combination) for combination in drawn]
-    if not any(run.records for runs in own for run in runs):
+    more = len(source.sweep.combinations) - len(drawn)
+    line = soft(f"{more} more combinations are not drawn." if more else "")
+    parts = curves([label(each.settings) for each in drawn], own)
+    return parts + line if parts else parts
+
+
+def curves(titles: Sequence[str], own: Sequence[Sequence[ShownRun]]) -> Markup:
+    """Return diagrams of the loss and, if known, the parameter error, over iteration and time. Each title has a curve,
+    the median of its runs with a band. Runs have at least one iteration.
+    """
+    if not any(own):
         return Markup()
-    parts = lay_out("legend", [label(each.settings) if runs else "" for each, runs in zip(drawn, own, strict=True)])
+    parts = lay_out("legend", [title if runs else "" for title, runs in zip(titles, own, strict=True)])
     kinds = {"loss": "loss"}
     if not any(units_differ(run.results) for runs in own for run in runs):
         kinds["parameter_rmse"] = "parameter RMSE"
     for name, title in kinds.items():
         both = []
         for against, caption in ((_by_iteration, "iteration"), (_by_time, "time in steps and updates (s)")):
-            curves = [_median(label(each.settings), place, *against(runs, name))
-                      for place, (each, runs) in enumerate(zip(drawn, own, strict=True)) if runs]  # fmt: skip
-            both.append(("", diagram(curves, caption, title)))
+            drawn = [_median(each, place, *against(runs, name))
+                     for place, (each, runs) in enumerate(zip(titles, own, strict=True)) if runs]  # fmt: skip
+            both.append(("", diagram(drawn, caption, title)))
         parts += lay_out("diagrams", both)
-    more = len(source.sweep.combinations) - len(drawn)
-    return parts + soft(f"{more} more combinations are not drawn." if more else "")
+    return parts
 
 
 def _runs(source: SweepRuns, combination: Combination) -> list[ShownRun]:
