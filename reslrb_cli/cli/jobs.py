@@ -49,7 +49,7 @@ End = tuple[int, str]
 
 
 @dataclass
-class Job:
+class RunSlot:
     """Place for one run at a time: the cores and the GPU of its process. If empty, the process may use all.
 
     `line` is the last progress of the current run, and `show` is called when it may have changed. `peak` and `resident`
@@ -79,12 +79,12 @@ class Jobs:
         gpus = visible_gpus() if number > 1 and variant.startswith("cuda") else []
         self.number = min(number, len(cores) or os.cpu_count() or 1, len(gpus) or number)
         share = len(cores) // self.number
-        self.jobs = [Job(show=self.show) for _ in range(self.number)]
+        self.jobs = [RunSlot(show=self.show) for _ in range(self.number)]
         if self.number > 1:
             for n, job in enumerate(self.jobs):
                 job.cores, job.gpu = set(cores[n * share : (n + 1) * share]), gpus[n] if gpus else ""
         self._free = list(self.jobs)
-        self._ended: dict[Future[End], tuple[str, Job]] = {}
+        self._ended: dict[Future[End], tuple[str, RunSlot]] = {}
         self._pool = ThreadPoolExecutor(self.number)
         self._has_begun, self._peak = False, 0
 
@@ -111,7 +111,7 @@ class Jobs:
         coming = sum(max(self._peak - job.resident, 0) for job in at_work)
         return self._has_begun and free_bytes("llvm") >= coming + self._peak
 
-    def start(self, name: str, call: Callable[[Job], End]) -> None:
+    def start(self, name: str, call: Callable[[RunSlot], End]) -> None:
         """Start the run `name` by `call`, which returns at its end. A single job runs in the calling thread."""
         job, future = self._free.pop(), Future[End]()
         if self.number > 1:
@@ -157,14 +157,14 @@ def visible_gpus() -> list[str]:
     return ask_gpu("uuid") if given is None else [each.strip() for each in given.split(",") if each.strip()]
 
 
-def _bound(job: Job, call: Callable[[Job], End]) -> End:
+def _bound(job: RunSlot, call: Callable[[RunSlot], End]) -> End:
     """Call `call(job)` in a thread that has the cores of `job`. Its processes inherit these cores."""
     if job.cores:
         os.sched_setaffinity(0, job.cores)
     return call(job)
 
 
-def call(arguments: Sequence[str], interrupts: Interrupts, job: Job, fresh: bool = False) -> End:
+def call(arguments: Sequence[str], interrupts: Interrupts, job: RunSlot, fresh: bool = False) -> End:
     """Run `reslrb` with these arguments in its own process. Returns its exit code and its last line.
 
     The first signal in `interrupts` is passed on to the process. The run folder contains the warnings of the process. A

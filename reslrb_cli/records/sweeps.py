@@ -52,7 +52,7 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Search:
+class SweepSearch:
     """Search for the best combination, in `trials` combinations.
 
     `space` maps each varied key to its values as the user wrote them: a list, or a mapping with `low`, `high` and
@@ -80,7 +80,7 @@ class SweepPlan:
     failures: dict[str, Failure] = field(default_factory=dict)
     codes: dict[str, str] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
-    search: Search | None = None
+    search: SweepSearch | None = None
     version: int = VERSION
     program: str = __version__
 

@@ -31,8 +31,8 @@ from reslrb_cli.records.lock import FolderLock, InUse
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.records.sweeps import (
     Combination,
-    Search,
     SweepPlan,
+    SweepSearch,
     config_file,
     in_words,
     is_sweep,
@@ -183,7 +183,7 @@ def make_plan(
     if trials is not None:  # later trials read the file again
         path = path.absolute()
         files.add(path)
-        combinations, search = [], Search(trials, {each.key: each.given for each in varied})
+        combinations, search = [], SweepSearch(trials, {each.key: each.given for each in varied})
     digests = file_digests({str(file): file for file in sorted(files)})
     codes = {str(file): digests.pop(str(file)) for file in sorted(own)}
     run_seeds = list(range(first, first + seeds))

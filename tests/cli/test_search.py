@@ -291,7 +291,7 @@ def test_each_run_has_a_gpu(folder, monkeypatch, four_cores):
     assert [job.gpu for job in jobs.Jobs(2, "llvm_ad_rgb").jobs] == ["", ""]
     assert [job.gpu for job in jobs.Jobs(1, "cuda_ad_rgb").jobs] == [""]
     monkeypatch.setattr(jobs, "_PROGRAM", f"import os; print(os.environ[{jobs.GPUS!r}])")
-    assert jobs.call([], sweep.Interrupts(), jobs.Job(gpu="GPU-b")) == (0, "GPU-b")
+    assert jobs.call([], sweep.Interrupts(), jobs.RunSlot(gpu="GPU-b")) == (0, "GPU-b")
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs affinities")
@@ -302,7 +302,7 @@ def test_a_process_has_the_cores_of_its_place(monkeypatch):
     ends = []
     thread = threading.Thread(
         target=lambda: ends.append(
-            jobs._bound(jobs.Job(cores={core}), lambda job: jobs.call([], sweep.Interrupts(), job))
+            jobs._bound(jobs.RunSlot(cores={core}), lambda job: jobs.call([], sweep.Interrupts(), job))
         )
     )
     thread.start()

@@ -350,14 +350,14 @@ def test_a_crashed_process_is_reported_by_its_last_message(monkeypatch):
         monkeypatch.setattr(jobs, "_PROGRAM", f"import os, sys, time; {end}")
         interrupts = Interrupts()
         interrupts.requested = code == 130  # a run that does not handle signals yet
-        assert jobs.call(["optimize"], interrupts, jobs.Job()) == (code, said)
+        assert jobs.call(["optimize"], interrupts, jobs.RunSlot()) == (code, said)
 
 
 def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
     monkeypatch.undo()  # use the real `call`
     monkeypatch.setattr(jobs, "_PROGRAM", "import os; print(*map(os.environ.get, ('DRJIT_CACHE_DIR', 'RESLRB_CACHE')))")
-    plain = jobs.call([], Interrupts(), jobs.Job())[1]
-    kernels, decisions = jobs.call([], Interrupts(), jobs.Job(), fresh=True)[1].split()
+    plain = jobs.call([], Interrupts(), jobs.RunSlot())[1]
+    kernels, decisions = jobs.call([], Interrupts(), jobs.RunSlot(), fresh=True)[1].split()
     assert kernels == decisions
     assert kernels not in plain
     assert not Path(kernels).exists()
