@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -18,6 +19,7 @@ from runs.going_on import begin_alone
 import reslrb_cli as rl
 from reslrb_cli.records.images import as_bytes
 from reslrb_cli.runs import log, loggers
+from reslrb_cli.runs.callbacks import Calls
 from reslrb_cli.runs.sweep import make_plan
 
 SET = {"run.certainty": False, "run.iterations": 3}
@@ -332,6 +334,43 @@ def test_the_manifest_names_the_commit_of_the_configuration(experiment: Path) ->
     assert manifest("runs/b")["commit"] == commit
     list(rl.optimize(resume="runs/b", overrides={"run.iterations": 4}))
     assert manifest("runs/b")["commit"] == commit
+
+
+# --- the time of callbacks --------------------------------------------------------------------------------------------
+
+
+class Reader(rl.Callback):
+    """Reads all values after each iteration."""
+
+    def iteration(self, run: rl.RunInfo, record: rl.Record) -> None:
+        for key in run.shapes:
+            run.value(key)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["reader", "tensorboard"])
+def test_callbacks_take_less_than_a_millisecond_or_a_hundredth(
+    experiment: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time in the calls of an iteration of about 10 ms. It includes the wait for the values of the update. To be
+    measured on an idle machine: `scripts/test -n 0 -s -m long tests/runs/test_callbacks.py -k millisecond`.
+    """
+    if name == "tensorboard":
+        pytest.importorskip("tensorboardX")
+    spent, ends, real = [], [], Calls.iteration
+
+    def timed(self: Calls, record: rl.Record) -> None:
+        start = time.perf_counter()
+        real(self, record)
+        ends.append(time.perf_counter())
+        spent.append(ends[-1] - start)
+
+    monkeypatch.setattr(Calls, "iteration", timed)
+    callback = Reader() if name == "reader" else name
+    list(rl.optimize("tiny.yaml", "runs/a", overrides=SET | {"run.iterations": 300}, callbacks=[callback]))
+    call, iteration = np.median(spent[50:]), np.median(np.diff(ends)[50:])
+    print(f"{name}: {1e3 * call:.3f} ms (mean {1e3 * np.mean(spent[50:]):.3f}) of {1e3 * iteration:.3f} ms")
+    assert call < max(1e-3, 0.01 * iteration)
 
 
 # --- the packages -----------------------------------------------------------------------------------------------------
