@@ -36,17 +36,15 @@ DEPTH = 2
 
 @dataclass(frozen=True)
 class Served:
-    """Run or sweep on the list: its path relative to the served folder, and the file of its page, or None."""
+    """Run or sweep on the list: its path relative to the served folder, the file of its page, and the address of the
+    page. A run without a page has no file, and the address is empty.
+    """
 
     name: str
     folder: Path
     file: Path | None
+    page: str
     is_run: bool
-
-    @property
-    def page(self) -> str:
-        """The address of the page. The result is empty without one."""
-        return "" if self.file is None else quote(f"/{self.name}/{self.file.name}")
 
 
 @click.command("serve")
@@ -101,7 +99,9 @@ def find_served(root: Path) -> list[Served]:
         if (is_run or SWEEP_FILE in files) and all(path.resolve().is_relative_to(root) for path in inside):
             page = folder / ("report.html" if is_run else PAGE_FILE)
             file = page if page.is_file() and not page.is_symlink() else None
-            found.append(Served(folder.relative_to(root).as_posix(), folder, file, is_run))
+            address = "" if file is None else quote(f"/{file.relative_to(root).as_posix()}")
+            name = root.name if folder == root else folder.relative_to(root).as_posix()
+            found.append(Served(name, folder, file, address, is_run))
     return found
 
 

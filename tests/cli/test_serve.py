@@ -183,6 +183,13 @@ def test_nothing_is_changed(served, runs):
     assert after == before
 
 
+@pytest.mark.parametrize("name", ["a <b>", "s"])
+def test_the_folder_may_be_one_run_or_sweep(runs, name):
+    (page,) = (each for each in serve.find_served(runs / name) if each.file is not None)
+    assert (page.name, page.page) == (name, f"/{page.file.name}")
+    assert len(serve.find_served(runs / name)) == (1 if name != "s" else 2)
+
+
 def test_it_listens_on_this_machine_alone(runs):
     with serve.make_server(runs, 0) as server:
         assert server.server_address[0] == "127.0.0.1"

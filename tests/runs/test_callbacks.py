@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli.tiny import manifest, outcome, settings
+from cli.tiny import ROOT, manifest, outcome, settings
 from runs.going_on import begin_alone
 
 import reslrb_cli as rl
@@ -402,6 +403,27 @@ def test_tensorboard_reads_the_events(experiment: Path) -> None:
     assert scalars[f"value/{LAMP}/1"][-1] == run.parameters[LAMP][1]
     assert set(images) == {"image/target", "image/initial", "image/final", f"value/{POSTER}"}
     np.testing.assert_array_equal(pixels(images[f"value/{POSTER}"]), as_bytes(run.parameters[POSTER]))
+
+
+@pytest.mark.long
+def test_the_tutorial_ends_with_recovered_values_in_tensorboard(
+    llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tensorboardX")
+    from tensorboardX.proto.event_pb2 import Event
+
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs/tensorboard.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    exec(compile("\n".join(blocks), "tutorial.py", "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out.splitlines()[-1].startswith("finished ")
+    (file,) = Path("runs/room").glob("events.out.tfevents.*")
+    values = {value.tag: value for content in tf_records(file.read_bytes())
+              for value in Event.FromString(content).summary.value}  # fmt: skip
+    red, green, blue = (values[f"value/wall.bsdf.reflectance.value/{n}"].simple_value for n in range(3))
+    np.testing.assert_allclose([red, green, blue], [0.8, 0.3, 0.2], atol=0.02)
+    assert values["error/floor.bsdf.reflectance.data"].simple_value < 0.03
+    assert values["value/floor.bsdf.reflectance.data"].HasField("image")
 
 
 def tf_records(data: bytes) -> Iterator[bytes]:
