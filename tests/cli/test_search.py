@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import sys
 import threading
 import time
@@ -200,6 +201,34 @@ def test_errors_are_reported_before_any_run(folder, arguments, line):
     assert result.exit_code == 2
     assert line in result.output
     assert not Path("s").exists()
+
+
+def test_the_commands_of_the_docs_run(folder):
+    page = (tiny.ROOT / "docs/sweeps.md").read_text(encoding="utf-8")
+    block = page[page.index("## Search") : page.index("`--search optuna` looks")].replace("room.yaml", "tiny.yaml")
+    commands = [shlex.split(line, comments=True) for line in block.replace("\\\n", " ").splitlines()]
+    first, again = (words for words in commands if words[:1] == ["reslrb"])
+    assert "40 of 40 runs done" in tiny.done(*first[1:]).output
+    assert "80 of 80 runs done" in tiny.done(*again[1:]).output
+
+
+@pytest.mark.long
+def test_a_search_of_real_runs(llvm, tmp_path):
+    """Two at once, in processes of their own."""
+    pytest.importorskip("optuna")
+    tiny.write_experiment(tmp_path)
+    quick = tiny.settings("run.measuring=0", "run.certainty=false", "run.iterations=3", "run.final_spp=4")
+    words = [*quick, *VARY[:2], "--search", "optuna", "--trials", "4", "--jobs", "2", "-o", "s"]
+    process = tiny.start(tmp_path, *words, command="sweep")
+    out, err = process.communicate(timeout=300)
+    assert (process.returncode, err) == (0, "")
+    assert "finished, 4 of 4 runs done; look at s/sweep.html" in out
+    found = [each[RATE] for each in trials(tmp_path / "s")]
+    results = [json.loads(line) for line in (tmp_path / "s/results.jsonl").read_text().splitlines()]
+    errors = {each["settings"][RATE]: each["error"] for each in results if each["kind"] == "sweep_run"}
+    assert set(errors) == set(found)
+    assert len(set(errors.values())) > 1
+    assert f"learning_rate={min(found, key=lambda rate: errors[rate]):g}.yaml" in out
 
 
 def test_a_missing_optuna_is_named(folder, monkeypatch):
