@@ -69,9 +69,9 @@ class RunSlot:
 class Jobs:
     """Runs at the same time, at most one for each core and, under CUDA, one for each GPU.
 
-    The first run begins alone, and the others after its first iteration: they then find compiled kernels and automatic
-    settings in the caches. A run begins only if the free memory is larger than the memory that the largest run has
-    needed so far. At the end of the context, all runs are interrupted and have ended.
+    The first run begins alone, and the others after its first line of progress: they then find compiled kernels and
+    automatic settings in the caches. A run begins only if the free memory is larger than the memory that the largest
+    run has needed so far. At the end of the context, all runs are interrupted and have ended.
     """
 
     def __init__(self, number: int, variant: str) -> None:
@@ -79,11 +79,11 @@ class Jobs:
         gpus = visible_gpus() if number > 1 and variant.startswith("cuda") else []
         self.number = min(number, len(cores) or os.cpu_count() or 1, len(gpus) or number)
         share = len(cores) // self.number
-        self.jobs = [RunSlot(show=self.show) for _ in range(self.number)]
+        self.slots = [RunSlot(show=self.show) for _ in range(self.number)]
         if self.number > 1:
-            for n, job in enumerate(self.jobs):
-                job.cores, job.gpu = set(cores[n * share : (n + 1) * share]), gpus[n] if gpus else ""
-        self._free = list(self.jobs)
+            for n, slot in enumerate(self.slots):
+                slot.cores, slot.gpu = set(cores[n * share : (n + 1) * share]), gpus[n] if gpus else ""
+        self._free = list(self.slots)
         self._ended: dict[Future[End], tuple[str, RunSlot]] = {}
         self._pool = ThreadPoolExecutor(self.number)
         self._has_begun, self._peak = False, 0
@@ -92,8 +92,8 @@ class Jobs:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for job in self.jobs:
-            job.must_end = True
+        for slot in self.slots:
+            slot.must_end = True
         self._pool.shutdown()
 
     @property
@@ -103,42 +103,42 @@ class Jobs:
 
     def may_start(self) -> bool:
         """Whether another run may start now."""
-        at_work = [job for _, job in self._ended.values()]
-        self._peak = max([self._peak, *(job.peak for job in at_work)])
+        at_work = [slot for _, slot in self._ended.values()]
+        self._peak = max([self._peak, *(slot.peak for slot in at_work)])
         if not self._free or not at_work:
             return not at_work
-        self._has_begun = self._has_begun or any(job.line for job in at_work)
-        coming = sum(max(self._peak - job.resident, 0) for job in at_work)
+        self._has_begun = self._has_begun or any(slot.line for slot in at_work)
+        coming = sum(max(self._peak - slot.resident, 0) for slot in at_work)
         return self._has_begun and free_bytes("llvm") >= coming + self._peak
 
     def start(self, name: str, call: Callable[[RunSlot], End]) -> None:
-        """Start the run `name` by `call`, which returns at its end. A single job runs in the calling thread."""
-        job, future = self._free.pop(), Future[End]()
+        """Start the run `name` by `call`, which returns at its end. A single slot runs in the calling thread."""
+        slot, future = self._free.pop(), Future[End]()
         if self.number > 1:
-            future = self._pool.submit(_bound, job, call)
+            future = self._pool.submit(_bound, slot, call)
         else:
-            future.set_result(call(job))
-        self._ended[future] = (name, job)
+            future.set_result(call(slot))
+        self._ended[future] = (name, slot)
 
     def ended(self) -> Iterator[tuple[str, End]]:
         """Wait a moment for runs to end, and yield their names and ends."""
         for future in wait(self._ended, _POLL_SECONDS, FIRST_COMPLETED).done:
-            name, job = self._ended.pop(future)
-            self._has_begun, job.line, job.resident = True, "", 0
-            self._free.append(job)
+            name, slot = self._ended.pop(future)
+            self._has_begun, slot.line, slot.resident = True, "", 0
+            self._free.append(slot)
             yield name, future.result()
 
     def show(self) -> None:
         """Show the progress of all runs in place of the terminal's last line. Without a terminal, show nothing."""
         if sys.stderr.isatty():
-            line = "; ".join(job.line for job in self.jobs if job.line)
+            line = "; ".join(slot.line for slot in self.slots if slot.line)
             text = shorten(f"  {line}" if line else "", shutil.get_terminal_size().columns - 1)
             click.echo(f"\r\x1b[K{text}", err=True, nl=False)
 
     def end(self) -> None:
         """End all runs at once with a repeated signal. The manifests of the runs then record the end."""
         processes, latest = (
-            [job.process for job in self.jobs if job.process is not None],
+            [slot.process for slot in self.slots if slot.process is not None],
             time.monotonic() + END_SECONDS,
         )
         for process in 2 * processes:
@@ -157,21 +157,21 @@ def visible_gpus() -> list[str]:
     return ask_gpu("uuid") if given is None else [each.strip() for each in given.split(",") if each.strip()]
 
 
-def _bound(job: RunSlot, call: Callable[[RunSlot], End]) -> End:
-    """Call `call(job)` in a thread that has the cores of `job`. Its processes inherit these cores."""
-    if job.cores:
-        os.sched_setaffinity(0, job.cores)
-    return call(job)
+def _bound(slot: RunSlot, call: Callable[[RunSlot], End]) -> End:
+    """Call `call(slot)` in a thread that has the cores of `slot`. Its processes inherit these cores."""
+    if slot.cores:
+        os.sched_setaffinity(0, slot.cores)
+    return call(slot)
 
 
-def call(arguments: Sequence[str], interrupts: Interrupts, job: RunSlot, fresh: bool = False) -> End:
+def call(arguments: Sequence[str], interrupts: Interrupts, slot: RunSlot, fresh: bool = False) -> End:
     """Run `reslrb` with these arguments in its own process. Returns its exit code and its last line.
 
     The first signal in `interrupts` is passed on to the process. The run folder contains the warnings of the process. A
     `fresh` process has no cached kernels or decisions. Runs with equal time limits therefore start under equal
     conditions.
     """
-    environment = dict(os.environ) | ({GPUS: job.gpu} if job.gpu else {})
+    environment = dict(os.environ) | ({GPUS: slot.gpu} if slot.gpu else {})
     with (
         tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder,
         tempfile.TemporaryFile() as output,
@@ -179,7 +179,7 @@ def call(arguments: Sequence[str], interrupts: Interrupts, job: RunSlot, fresh: 
         if fresh:
             environment |= dict.fromkeys(("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE"), folder)
             environment["CUDA_CACHE_DISABLE"] = "1"
-        process = job.process = subprocess.Popen(
+        process = slot.process = subprocess.Popen(
             [*python_command(_PROGRAM), *arguments],
             stdin=subprocess.PIPE,  # closes when this process ends
             stdout=output,
@@ -190,17 +190,17 @@ def call(arguments: Sequence[str], interrupts: Interrupts, job: RunSlot, fresh: 
         told, code = False, None
         try:
             while code is None:
-                if (interrupts.requested or job.must_end) and not told:
+                if (interrupts.requested or slot.must_end) and not told:
                     process.terminate()
                     told = True
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     code = process.wait(_POLL_SECONDS)
-                job.line = next(filter(_PROGRESS.match, reversed(_last_lines(output))), "")
-                job.resident, job.peak = (_memory(process.pid, name) for name in ("VmRSS", "VmHWM"))
-                job.show()
+                slot.line = next(filter(_PROGRESS.match, reversed(_last_lines(output))), "")
+                slot.resident, slot.peak = (_memory(process.pid, name) for name in ("VmRSS", "VmHWM"))
+                slot.show()
         finally:
-            job.process, job.line = None, ""
-            job.show()
+            slot.process, slot.line = None, ""
+            slot.show()
             process.kill()
             process.wait()
             if process.stdin is not None:

@@ -169,7 +169,7 @@ def _run(folder: Path, sweep: SweepPlan, number: int) -> int:
         echo(f"{place}: {label(combination.settings)}, seed {seed}")
         arguments = command_of(folder, remaining.sweep, combination, seed)
         fresh = config.run.max_seconds is not None
-        jobs.start(name, lambda job: call(arguments, interrupts, job, fresh))
+        jobs.start(name, lambda slot: call(arguments, interrupts, slot, fresh))
 
     variant = choose(remaining.variant)[0] if number > 1 else ""
     with Interrupts(notice=NOTICE) as interrupts, Jobs(number, variant) as jobs:

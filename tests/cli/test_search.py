@@ -51,7 +51,7 @@ def run_of(arguments):
     return folder, load(arguments[1])
 
 
-def pretend(arguments, interrupts, job=None, fresh=False, errors=True):
+def pretend(arguments, interrupts, slot=None, fresh=False, errors=True):
     folder, config = run_of(arguments)
     value = figure(config.optimizer.learning_rate, config.run.spp, config.optimizer.type)
     results = {"image_loss": {"final": 2 * value}, "rmse": {"final": value if errors else None}}
@@ -103,7 +103,7 @@ def test_a_search_that_continues_is_the_same_search(folder, monkeypatch):
     whole = trials()
     calls = []
 
-    def interrupted(arguments, interrupts, job=None, fresh=False):
+    def interrupted(arguments, interrupts, slot=None, fresh=False):
         calls.append(arguments)
         return pretend(arguments, interrupts) if len(calls) % 6 else (130, "interrupted")
 
@@ -126,7 +126,7 @@ def test_failed_trials_do_not_end_the_search(folder, monkeypatch):
     """Diverging runs count as the worst, so that the search leaves their settings. Other failures say nothing."""
     called = []
 
-    def failing(arguments, interrupts, job=None, fresh=False):
+    def failing(arguments, interrupts, slot=None, fresh=False):
         called.append(arguments)
         _, config = run_of(arguments)
         if config.optimizer.learning_rate > 0.01:
@@ -246,16 +246,16 @@ class Together:
     """Pretended runs that last a moment. Notes how many were at work at each start, and which places they had."""
 
     def __init__(self, peak=0):
-        self.lock, self.at_work, self.most, self.starts, self.jobs = threading.Lock(), 0, 0, [], set()
+        self.lock, self.at_work, self.most, self.starts, self.places = threading.Lock(), 0, 0, [], set()
         self.peak = peak
 
-    def __call__(self, arguments, interrupts, job, fresh=False):
+    def __call__(self, arguments, interrupts, slot, fresh=False):
         with self.lock:
             self.starts.append(self.at_work)
             self.at_work += 1
-            self.jobs.add((tuple(sorted(job.cores)), job.gpu))
+            self.places.add((tuple(sorted(slot.cores)), slot.gpu))
         time.sleep(0.3)
-        job.line, job.peak, job.resident = "1/5: ", self.peak, self.peak
+        slot.line, slot.peak, slot.resident = "1/5: ", self.peak, self.peak
         time.sleep(0.3)
         with self.lock:
             self.at_work -= 1
@@ -275,7 +275,7 @@ def test_runs_at_once_share_the_cores(folder, monkeypatch, four_cores):
     output = tiny.done(*WORDS, "--trials", 8, "--jobs", 2).output
     assert together.starts[:2] == [0, 1]
     assert set(together.starts) == {0, 1}
-    assert together.jobs == {((4, 5), ""), ((6, 7), "")}
+    assert together.places == {((4, 5), ""), ((6, 7), "")}
     assert {4, 5} in four_cores
     assert "8 of 8 runs done" in output
     words = ["sweep", "tiny.yaml", "--vary", f"{SPP}=[1, 2, 3, 4, 5, 6]", "-o", "t", "--jobs", "9"]
@@ -287,12 +287,12 @@ def test_runs_at_once_share_the_cores(folder, monkeypatch, four_cores):
 
 
 def test_the_first_run_begins_alone(folder, monkeypatch, four_cores):
-    """Until it has made an iteration, or has ended."""
+    """Until it has printed a line of progress, or has ended."""
     seen = []
 
-    def noting(arguments, interrupts, job, fresh=False):
+    def noting(arguments, interrupts, slot, fresh=False):
         seen.append(time.monotonic())
-        return Together()(arguments, interrupts, job)
+        return Together()(arguments, interrupts, slot)
 
     monkeypatch.setattr(sweep, "call", noting)
     tiny.done("sweep", "tiny.yaml", "--vary", f"{SPP}=[1, 2, 3]", "-o", "t", "--jobs", "3")
@@ -313,12 +313,12 @@ def test_runs_at_once_fit_into_memory(folder, monkeypatch, four_cores):
 def test_each_run_has_a_gpu(folder, monkeypatch, four_cores):
     monkeypatch.setattr(jobs, "ask_gpu", lambda query: ["GPU-a", "GPU-b", "GPU-c"])
     monkeypatch.delenv(jobs.GPUS, raising=False)
-    assert [job.gpu for job in jobs.Jobs(2, "cuda_ad_rgb").jobs] == ["GPU-a", "GPU-b"]
-    assert [job.gpu for job in jobs.Jobs(9, "cuda_ad_rgb").jobs] == ["GPU-a", "GPU-b", "GPU-c"]
+    assert [slot.gpu for slot in jobs.Jobs(2, "cuda_ad_rgb").slots] == ["GPU-a", "GPU-b"]
+    assert [slot.gpu for slot in jobs.Jobs(9, "cuda_ad_rgb").slots] == ["GPU-a", "GPU-b", "GPU-c"]
     monkeypatch.setenv(jobs.GPUS, "3, 1")
-    assert [job.gpu for job in jobs.Jobs(9, "cuda_ad_rgb").jobs] == ["3", "1"]
-    assert [job.gpu for job in jobs.Jobs(2, "llvm_ad_rgb").jobs] == ["", ""]
-    assert [job.gpu for job in jobs.Jobs(1, "cuda_ad_rgb").jobs] == [""]
+    assert [slot.gpu for slot in jobs.Jobs(9, "cuda_ad_rgb").slots] == ["3", "1"]
+    assert [slot.gpu for slot in jobs.Jobs(2, "llvm_ad_rgb").slots] == ["", ""]
+    assert [slot.gpu for slot in jobs.Jobs(1, "cuda_ad_rgb").slots] == [""]
     monkeypatch.setattr(jobs, "_PROGRAM", f"import os; print(os.environ[{jobs.GPUS!r}])")
     assert jobs.call([], sweep.Interrupts(), jobs.RunSlot(gpu="GPU-b")) == (0, "GPU-b")
 
@@ -331,7 +331,7 @@ def test_a_process_has_the_cores_of_its_place(monkeypatch):
     ends = []
     thread = threading.Thread(
         target=lambda: ends.append(
-            jobs._bound(jobs.RunSlot(cores={core}), lambda job: jobs.call([], sweep.Interrupts(), job))
+            jobs._bound(jobs.RunSlot(cores={core}), lambda slot: jobs.call([], sweep.Interrupts(), slot))
         )
     )
     thread.start()
@@ -343,8 +343,8 @@ def test_a_process_has_the_cores_of_its_place(monkeypatch):
 def test_ctrl_c_ends_all_runs_after_their_iterations(folder, monkeypatch, four_cores):
     asked = []
 
-    def waiting(arguments, interrupts, job, fresh=False):
-        job.line = "1/5: "
+    def waiting(arguments, interrupts, slot, fresh=False):
+        slot.line = "1/5: "
         if len(asked) == 1:
             interrupts.requested = True
         asked.append(arguments)
@@ -365,13 +365,13 @@ def test_ctrl_c_ends_all_runs_after_their_iterations(folder, monkeypatch, four_c
 def test_a_fault_of_one_run_interrupts_the_others(folder, monkeypatch, four_cores):
     ends = []
 
-    def faulty(arguments, interrupts, job, fresh=False):
-        job.line = "1/5: "
+    def faulty(arguments, interrupts, slot, fresh=False):
+        slot.line = "1/5: "
         if ends == []:
             ends.append("fault")
             time.sleep(0.5)
             return 6, "the disk is full"
-        while not job.must_end:
+        while not slot.must_end:
             time.sleep(0.01)
         ends.append("interrupted")
         return 130, "interrupted"

@@ -57,7 +57,7 @@ def folder(llvm, tmp_path, monkeypatch):
     return tmp_path
 
 
-def call(arguments, interrupts, job, fresh=False):
+def call(arguments, interrupts, slot, fresh=False):
     """Call the command in this process, in place of `sweep.call`."""
     result = CliRunner().invoke(main, list(arguments))
     return result.exit_code, result.output.strip().splitlines()[-1]
@@ -224,11 +224,11 @@ def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
             copy("over-final-images")
         end(self)
 
-    def calling(arguments, interrupts, job, fresh=False):
+    def calling(arguments, interrupts, slot, fresh=False):
         calls.append(arguments)
         if len(calls) == 4:
             copy("between-runs")
-        return call(arguments, interrupts, job)
+        return call(arguments, interrupts, slot)
 
     monkeypatch.setattr(Progress, "show", showing)
     monkeypatch.setattr(recording.Recording, "_begin", beginning)
@@ -257,11 +257,11 @@ def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
     ends = {"learning_rate=0.02-seed=1": (5, "the loss is not finite"), "learning_rate=0.2-seed=0": (-9, "killed")}
     called = []
 
-    def failing(arguments, interrupts, job, fresh=False):
+    def failing(arguments, interrupts, slot, fresh=False):
         called.append(arguments)
         name = next(word for word in ends if any(word in each for each in arguments)) if any(
             word in each for word in ends for each in arguments) else None  # fmt: skip
-        return ends[name] if name else call(arguments, interrupts, job)
+        return ends[name] if name else call(arguments, interrupts, slot)
 
     monkeypatch.setattr(sweep, "call", failing)
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "2", "-o", "s"]
@@ -313,7 +313,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_complete_folders(folder, monkey
 def test_a_sweep_locks_its_folder(folder, monkeypatch):
     said = []
 
-    def another(arguments, interrupts, job, fresh=False):
+    def another(arguments, interrupts, slot, fresh=False):
         said.append(reslrb("sweep", "--resume", "s").output)
         return 130, ""
 
@@ -367,9 +367,9 @@ def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
 def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
     asked = []
 
-    def noting(arguments, interrupts, job, fresh=False):
+    def noting(arguments, interrupts, slot, fresh=False):
         asked.append(fresh)
-        return call(arguments, interrupts, job)
+        return call(arguments, interrupts, slot)
 
     monkeypatch.setattr(sweep, "call", noting)
     result = tiny.done("sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "run.max_seconds=[null, 0.001]",
