@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from cli import tiny
 from cli.tiny import reslrb
-from report.chromium import Chromium, find_chromium
 from report.measured import make_run
 
 import reslrb_cli.report.page as page_module
@@ -225,16 +224,6 @@ def test_the_command(llvm, tmp_path, monkeypatch):
 
 
 # --- in a browser -----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def chromium(tmp_path):
-    executable = find_chromium()
-    if executable is None:
-        pytest.skip("needs Chromium")
-    browser = Chromium(executable, tmp_path / "profile")
-    yield browser
-    browser.close()
 
 
 def test_the_pages_in_a_browser(served, runs, chromium, monkeypatch):
