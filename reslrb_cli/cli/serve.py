@@ -22,13 +22,16 @@ import click
 
 from reslrb_cli.cli.options import FOLDER
 from reslrb_cli.cli.terminal import echo
-from reslrb_cli.errors import ConfigError, ReslrbError
+from reslrb_cli.errors import ConfigError, ReslrbError, one_line
 
 #: Names of this machine in the header `Host`.
 LOCAL = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?", re.IGNORECASE)
 
 #: Number of last bytes of a file of metrics in which the last line is searched.
 LAST_BYTES = 1 << 16
+
+#: Names of folders need not be UTF-8.
+_BYTES = "surrogateescape"
 
 #: Folders within folders in which runs are found: the runs of a sweep, in a folder of sweeps.
 DEPTH = 2
@@ -99,7 +102,7 @@ def find_served(root: Path) -> list[Served]:
         if (is_run or SWEEP_FILE in files) and all(path.resolve().is_relative_to(root) for path in inside):
             page = folder / ("report.html" if is_run else PAGE_FILE)
             file = page if page.is_file() and not page.is_symlink() else None
-            address = "" if file is None else quote(f"/{file.relative_to(root).as_posix()}")
+            address = "" if file is None else quote(f"/{file.relative_to(root).as_posix()}", errors=_BYTES)
             name = root.name if folder == root else folder.relative_to(root).as_posix()
             found.append(Served(name, folder, file, address, is_run))
     return found
@@ -116,7 +119,7 @@ def _row(run: Served, first: str) -> dict[str, Any]:
     return {
         "name": run.name, "page": run.page, "status": manifest.get("status", ""), "started": manifest.get("started"),
         "iterations": last.get("iteration", -1) + 1, "loss": last.get("loss"), "error": last.get("parameter_rmse"),
-        "compare": "" if run.name == first else f"/{target}?{urlencode(query, doseq=True)}",
+        "compare": "" if run.name == first else f"/{target}?{urlencode(query, doseq=True, errors=_BYTES)}",
     }  # fmt: skip
 
 
@@ -161,12 +164,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, with_body: bool) -> None:
         if not LOCAL.fullmatch(self.headers.get("Host", "")):
-            self.send_error(HTTPStatus.FORBIDDEN, "this server answers only to 127.0.0.1 and localhost")
+            self.send_error(HTTPStatus.FORBIDDEN, explain="This server answers only to 127.0.0.1 and localhost.")
             return
         try:
             page = self._page()
         except (ReslrbError, OSError) as error:
-            self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).splitlines()[0][:200])
+            self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR, explain=one_line(error))
             return
         if page is None:
             self.send_error(HTTPStatus.NOT_FOUND)
@@ -192,7 +195,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _page(self) -> bytes | None:
         """Return the page at the requested address, or None if there is none."""
         address = urlsplit(self.path)
-        path, query = unquote(address.path), parse_qs(address.query)
+        path, query = unquote(address.path, errors=_BYTES), parse_qs(address.query, errors=_BYTES)
         served = find_served(self._root)
         runs = [each for each in served if each.is_run]
         if path == "/":
@@ -201,7 +204,7 @@ class _Handler(BaseHTTPRequestHandler):
             chosen = [each for name in query.get("run", []) for each in runs if each.name == name]
             return self._compare(chosen) if len(chosen) == 2 else None
         for each in served:
-            if each.file is not None and path == unquote(each.page):
+            if each.file is not None and path == unquote(each.page, errors=_BYTES):
                 with os.fdopen(os.open(each.file, os.O_RDONLY | os.O_NOFOLLOW), "rb") as file:
                     return file.read()
         return None

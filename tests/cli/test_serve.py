@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import shutil
 import socket
 import subprocess
 import threading
 from pathlib import Path
+from urllib.parse import quote
 
 import pytest
 from cli import tiny
@@ -189,15 +191,25 @@ def test_the_folder_may_be_one_run_or_sweep(runs, name):
     assert len(serve.find_served(runs / name)) == (1 if name != "s" else 2)
 
 
+def test_names_need_not_be_utf_8(served, runs):
+    os.rename(runs / "a <b>", os.fsencode(runs) + b"/\xff")
+    _, text = ask(served)
+    assert 'href="/%FF/report.html"' in text
+    assert ask(served, "/%FF/report.html")[0].status == 200
+    assert 'href="/?with=%FF"' in text
+    assert ask(served, "/compare?run=%FF&run=b")[0].status == 200
+
+
 def test_it_listens_on_this_machine_alone(runs):
     with serve.make_server(runs, 0) as server:
         assert server.server_address[0] == "127.0.0.1"
 
 
 def test_damage_is_one_line(served, runs):
-    (runs / "b" / "metrics.jsonl").write_text("damaged\n")
+    (runs / "b").rename(runs / "ä€")
+    (runs / "ä€" / "metrics.jsonl").write_text("damaged\n")
     assert ask(served)[0].status == 200
-    answer, text = ask(served, "/compare?run=b&run=a+%3Cb%3E")
+    answer, text = ask(served, f"/compare?run={quote('ä€')}&run=a+%3Cb%3E")
     assert answer.status == 500
     assert "metrics.jsonl: line 1: is damaged" in text
 
