@@ -1,6 +1,7 @@
 """Settings of the documentation site. `scripts/docs` builds the site in build/docs."""
 
 from importlib.metadata import version as installed_version
+from importlib.util import find_spec
 
 project = "reslrb"
 author = "The reslrb developers"
@@ -26,6 +27,8 @@ nb_execution_mode = "auto"
 nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
+# The extra `docs` does not install PyTorch
+nb_execution_excludepatterns = [] if find_spec("torch") else ["notebooks/network.ipynb"]
 # Progress bars and log lines of the notebooks
 nb_output_stderr = "remove"
 

@@ -140,7 +140,9 @@ def load_with(
     source: object = "scene"
     if scene is None and isinstance(experiment, Mapping):
         given = experiment.get("scene")
-        if (isinstance(given, Mapping) and "type" in given) or type(given).__module__.startswith("mitsuba"):
+        objects = list(given.values()) if isinstance(given, Mapping) else []
+        is_dictionary = any("type" in each for each in [given, *objects] if isinstance(each, Mapping))
+        if is_dictionary or type(given).__module__.startswith("mitsuba"):
             scene, source = given, NAMELESS
             experiment = {name: value for name, value in experiment.items() if name != "scene"}
     if scene is None:

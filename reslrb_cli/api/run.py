@@ -142,6 +142,8 @@ class Run:
                 recording = Recording(course, place, self._begun.manifest, calls, self._begun.said)
                 try:
                     yield from recording.records()
+                    for line in self._begun.manifest.results.get("warnings") or ():
+                        logger.warning("%s", line)  # a script prints no last line, as the command does
                 finally:
                     self._status = Status(self._begun.manifest.status)
 

@@ -36,6 +36,7 @@ _SUMMARIES = {
     "gradcheck": "Compare gradients with references.",
     "convergence": "Measure error against run time.",
     "report": "Write one page about runs and measurements.",
+    "serve": "Show runs in a browser, while they are running.",
     "doctor": "Say which backend is in use, and what is missing.",
 }
 

@@ -153,11 +153,11 @@ def _write(folder: Path, content: Mapping[str, Any]) -> None:
 REASON = "its process ended before the run did"
 
 
-def read_manifest(folder: Path) -> dict[str, Any] | None:
+def read_manifest(folder: Path, mend: bool = True) -> dict[str, Any] | None:
     """Return the manifest in `folder`, or None if there is none written by `reslrb`.
 
-    If the status is `running` but the process has certainly ended, the status becomes `interrupted`. If the folder is
-    writable, the correction is saved and unfinished files are removed.
+    If the status is `running` but the process has certainly ended, the status becomes `interrupted`. With `mend`, and
+    if the folder is writable, the correction is saved and unfinished files are removed.
     """
     content = read_content(folder)
     if content is None or content.get("status") != Status.RUNNING:
@@ -167,6 +167,8 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         return content
     ended = _last_sign(folder) or content.get("ended")
     right = content | {"status": Status.INTERRUPTED.value, "ended": ended, "error": REASON}
+    if not mend:
+        return right
     with contextlib.suppress(InUse, OSError), FolderLock(folder, READER_WAIT_SECONDS):
         if read_content(folder) == content:  # unchanged by any other process
             metrics.mend(folder)

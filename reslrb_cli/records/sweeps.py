@@ -52,8 +52,22 @@ class Failure:
 
 
 @dataclass(frozen=True)
+class SweepSearch:
+    """Search for the best combination, in `trials` combinations.
+
+    `space` maps each varied key to its values as the user wrote them: a list, or a mapping with `low`, `high` and
+    perhaps `log`.
+    """
+
+    trials: int
+    space: dict[str, Any]
+
+
+@dataclass(frozen=True)
 class SweepPlan:
     """Plan of a sweep: every combination with every seed, and the failed runs by name.
+
+    With a `search`, the combinations are those of the trials so far.
 
     `config` is the configuration file and `overrides` the values of `--set`, both as the user wrote them. `codes` holds
     the digests of the user's code files by path. `files` holds the digests of all other files.
@@ -66,18 +80,28 @@ class SweepPlan:
     failures: dict[str, Failure] = field(default_factory=dict)
     codes: dict[str, str] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
+    search: SweepSearch | None = None
     version: int = VERSION
     program: str = __version__
 
     @property
     def keys(self) -> list[str]:
         """The varied settings."""
-        return list(self.combinations[0].settings) if self.combinations else []
+        return list(self.search.space if self.search else self.combinations[0].settings if self.combinations else [])
 
     @property
     def runs(self) -> Iterator[tuple[Combination, int]]:
-        """Combination and seed of each run, in order: all combinations with the first seed, then with the next."""
+        """Combination and seed of each run, in order: all combinations with the first seed, then with the next. A
+        search has one combination after the other.
+        """
+        if self.search:
+            return ((combination, seed) for combination in self.combinations for seed in self.seeds)
         return ((combination, seed) for seed in self.seeds for combination in self.combinations)
+
+    @property
+    def size(self) -> int:
+        """The number of runs, including those of trials that are still to be chosen."""
+        return len(self.seeds) * (self.search.trials if self.search else len(self.combinations))
 
     def write(self, folder: Path) -> None:
         """Write `sweep.json` into `folder`, atomically. Raises OSError."""

@@ -122,14 +122,15 @@ def read_sources(paths: Sequence[Path]) -> list[Source]:
     return found
 
 
-def read_run(folder: Path, name: str | None = None) -> ShownRun:
-    """Read the run in `folder` as far as possible. For any other folder, return an empty run.
+def read_run(folder: Path, name: str | None = None, mend: bool = True) -> ShownRun:
+    """Read the run in `folder` as far as possible. For any other folder, return an empty run. `mend` is as in
+    `read_manifest`.
 
     Raises ConfigError, located in the metrics.
     """
     metrics = folder / METRICS_FILE
     records = [_DEFAULTS | entry for entry in read_lines(metrics)] if metrics.exists() else []
-    return ShownRun(folder, name or folder.absolute().name, read_manifest(folder) or {}, records)
+    return ShownRun(folder, name or folder.absolute().name, read_manifest(folder, mend) or {}, records)
 
 
 def read_sweep_runs(folder: Path, name: str | None = None) -> SweepRuns:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 import os
 import shutil
 import time
@@ -31,6 +32,7 @@ from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.records.sweeps import (
     Combination,
     SweepPlan,
+    SweepSearch,
     config_file,
     in_words,
     is_sweep,
@@ -57,86 +59,148 @@ OWN: dict[Location, str] = {
 }
 
 
+#: An example of a search, and the form of a range.
+SEARCH = "--search optuna --trials 20"
+RANGE = "{low: 0.01, high: 0.3, log: true}"
+
+
 @dataclass(frozen=True)
 class Varied:
-    """Varied setting, with one override per value."""
+    """Varied setting, with one override per value. The values of a range (`is_range`) are its two ends. `given` is the
+    list or the range as the user wrote it.
+    """
 
     key: str
     location: Location
     overrides: tuple[Override, ...]
+    given: Any
+    is_range: bool = False
+
+    def at(self, value: Any) -> Override:
+        """Return the override that sets `value`."""
+        label = f"--vary {one_line(f'{self.key}={in_words(value)}', 100)}"
+        return Override(label, self.location, value)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Checked sweep. `configs` maps each combination's name to its configuration with the first seed."""
+    """Checked sweep. `configs` maps each combination's name to its configuration with the first seed. Those of a search
+    are combinations that were only checked.
+    """
 
     sweep: SweepPlan
     configs: dict[str, Config]
 
 
-def parse_vary(text: str) -> Varied:
-    """Parse a varied setting such as `a.b=[1, 2]`. Raises ConfigError if `text` has another form."""
+def parse_vary(text: str, search: bool = False) -> Varied:
+    """Parse a varied setting such as `a.b=[1, 2]`, or in a search also a range. Raises ConfigError if `text` has
+    another form.
+    """
     given = parse_override(text, "--vary", "KEY=[VALUE, ...], such as run.spp=[16, 32]")
     key = format_location(given.location)
-    if not isinstance(given.value, list) or not given.value:
-        raise ConfigError(given.label, "", f"must be a list of values, such as {key}=[16, 32]")
     if reason := OWN.get(given.location[:2]):
         raise ConfigError(given.label, "", f"cannot be varied: {reason}")
-    overrides = [
-        Override(f"--vary {one_line(f'{key}={in_words(value)}', 100)}", given.location, value) for value in given.value
-    ]
+    is_range = isinstance(given.value, dict)
+    if is_range and not search:
+        raise ConfigError(given.label, "", f"must be a list of values; a range needs --search, as in {SEARCH}")
+    if is_range:
+        _check_range(given.label, given.value)
+    elif not isinstance(given.value, list) or not given.value:
+        wanted = f", or a range such as {key}={RANGE}" if search else ""
+        raise ConfigError(given.label, "", f"must be a list of values, such as {key}=[16, 32]{wanted}")
+    values = [given.value["low"], given.value["high"]] if is_range else given.value
     seen: list[str] = []
-    for value in given.value:
+    for value in values:
         if (kept := json.dumps(value, sort_keys=True)) in seen:
             raise ConfigError(given.label, "", f"has {one_line(in_words(value), 100)} twice")
         seen.append(kept)
-    return Varied(key, given.location, tuple(overrides))
+    varied = Varied(key, given.location, (), given.value, is_range)
+    return replace(varied, overrides=tuple(map(varied.at, values)))
 
 
-def make_plan(path: Path, vary: Sequence[str], seeds: int, overrides: Sequence[str], allow_code: bool = False) -> Plan:
+def _check_range(label: str, given: dict[str, Any]) -> None:
+    """Raise ConfigError if `given` is not a range."""
+    low, high, log = given.get("low"), given.get("high"), given.get("log", False)
+    numbers = [end for end in (low, high) if isinstance(end, (int, float)) and not isinstance(end, bool)]
+    if len(numbers) < 2 or not isinstance(log, bool) or set(given) - {"low", "high", "log"}:
+        raise ConfigError(label, "", f"must be a list of values, or a range such as {RANGE}")
+    if not numbers[0] < numbers[1] < math.inf or (log and numbers[0] <= 0):
+        positive = ", and above 0 with log: true" if log else ""
+        raise ConfigError(label, "", f"must have a low end below the high end{positive}")
+
+
+def make_plan(
+    path: Path,
+    vary: Sequence[str],
+    seeds: int,
+    overrides: Sequence[str],
+    allow_code: bool = False,
+    trials: int | None = None,
+) -> Plan:
     """Make every combination of the varied settings, check its configuration, and plan `seeds` seeds for each.
+
+    With `trials`, plan a search with this number of combinations. It checks every value of every list, and both ends of
+    every range.
 
     The seeds start at the configuration's `run.seed`. Raises a ConfigError that names the first wrong setting, or the
     first setting with code that is not allowed. Also raises it for a missing scene file.
     """
-    varied = [parse_vary(text) for text in vary]
+    varied = [parse_vary(text, trials is not None) for text in vary]
     for place, each in enumerate(varied):
         if reason := replaces(each.location, {f"--vary {other.key}": other.location for other in varied[:place]}):
             raise ConfigError(f"--vary {each.key}", "", reason)
-    sizes = [len(each.overrides) for each in varied]
-    count = seeds
-    for size in sizes:
-        count *= size
+    sizes = [len(each.overrides) for each in varied] if trials is None else [trials]
+    count = math.prod(sizes) * seeds
     if count > MOST_RUNS:
         product = " x ".join(map(str, [*sizes, f"{seeds} seeds"]))
-        raise ConfigError("--vary", "", f"{product} are {count} runs; a sweep has at most {MOST_RUNS}")
+        raise ConfigError(
+            "--vary" if trials is None else "--trials",
+            "",
+            f"{product} are {count} runs; a sweep has at most {MOST_RUNS}",
+        )
     text = read_text(path)
-    first = _with_chosen(text, path, overrides, [each.overrides[0] for each in varied], allow_code).run.seed
+    first = with_chosen(text, path, overrides, [each.overrides[0] for each in varied], allow_code).run.seed
     if first + seeds > SEED_END:
         raise ConfigError("--seeds", "", f"exceeds the last seed, {SEED_END - 1}, from run.seed: {first}")
-    combinations, configs = [], {}
-    names = _names(varied)
-    for name, chosen in zip(names, itertools.product(*(each.overrides for each in varied)), strict=True):
-        config = _with_chosen(text, path, overrides, chosen, allow_code)
+    combinations: list[Combination] = []
+    configs: dict[str, Config] = {}
+    for chosen in itertools.product(*(each.overrides for each in varied)) if trials is None else _one_by_one(varied):
+        config = with_chosen(text, path, overrides, chosen, allow_code)
         check_code(config)
         check_code(config, config.run.code_callbacks)
         open_file(config.scene.file).close()
         if config.run.seed != first:
             reason = f"is {config.run.seed}, but {first} in the first combination; {OWN['run', 'seed']}"
             raise ConfigError("--vary", "run.seed", reason)
-        settings = {each.key: override.value for each, override in zip(varied, chosen, strict=True)}
-        combinations.append(Combination(name, settings))
-        configs[name] = config
+        combinations.append(
+            named({each.key: override.value for each, override in zip(varied, chosen, strict=True)}, combinations)
+        )
+        configs[combinations[-1].name] = config
     own = {one.path for config in configs.values() for one in config.codes.values() if one.path is not None}
     own |= {code_file(place) for config in configs.values() for place in config.run.code_callbacks.values()}
     files = own.union(*(files_of(config).values() for config in configs.values()))
+    search = None
+    if trials is not None:  # later trials read the file again
+        path = path.absolute()
+        files.add(path)
+        combinations, search = [], SweepSearch(trials, {each.key: each.given for each in varied})
     digests = file_digests({str(file): file for file in sorted(files)})
     codes = {str(file): digests.pop(str(file)) for file in sorted(own)}
     run_seeds = list(range(first, first + seeds))
-    return Plan(SweepPlan(str(path), list(overrides), combinations, run_seeds, codes=codes, files=digests), configs)
+    plan = SweepPlan(str(path), list(overrides), combinations, run_seeds, codes=codes, files=digests, search=search)
+    return Plan(plan, configs)
 
 
-def _with_chosen(
+def _one_by_one(varied: Sequence[Varied]) -> Iterator[tuple[Override, ...]]:
+    """Yield the combination of the first values, and those that differ from it in one value."""
+    first = tuple(each.overrides[0] for each in varied)
+    yield first
+    for place, each in enumerate(varied):
+        for override in each.overrides[1:]:
+            yield (*first[:place], override, *first[place + 1 :])
+
+
+def with_chosen(
     text: str, path: Path, overrides: Sequence[str], chosen: Sequence[Override], allow_code: bool
 ) -> Config:
     """Return the experiment with one value of each varied setting. Raises ConfigError.
@@ -155,23 +219,16 @@ def _with_chosen(
     return config
 
 
-def _names(varied: Sequence[Varied]) -> list[str]:
-    """Return the name of each combination, in the order of the Cartesian product. Names are unique regardless of
-    case.
-    """
-    short = short_keys([each.key for each in varied])
-    names: list[str] = []
-    taken: set[str] = set()
-    for chosen in itertools.product(*(each.overrides for each in varied)):
-        parts = [f"{short[each.key]}={_named(override.value)}" for each, override in zip(varied, chosen, strict=True)]
-        name = wanted = _bounded("-".join(parts))
-        for number in itertools.count(2):
-            if name.casefold() not in taken:
-                break
-            name = f"{wanted}-{number}"
-        taken.add(name.casefold())
-        names.append(name)
-    return names
+def named(settings: dict[str, Any], others: Sequence[Combination]) -> Combination:
+    """Return the combination of `settings`. Its name differs from those of the `others`, regardless of case."""
+    short = short_keys(list(settings))
+    taken = {other.name.casefold() for other in others}
+    name = wanted = _bounded("-".join(f"{short[key]}={_named(value)}" for key, value in settings.items()))
+    for number in itertools.count(2):
+        if name.casefold() not in taken:
+            break
+        name = f"{wanted}-{number}"
+    return Combination(name, settings)
 
 
 def _named(value: Any) -> str:
@@ -213,10 +270,13 @@ def started(folder: Path, plan: Plan) -> Iterator[SweepPlan]:
 
 
 @contextlib.contextmanager
-def resumed(folder: Path, seeds: int | None = None, allow_code: bool = False) -> Iterator[SweepPlan]:
+def resumed(
+    folder: Path, seeds: int | None = None, allow_code: bool = False, trials: int | None = None
+) -> Iterator[SweepPlan]:
     """Open the sweep in `folder`, and lock it while the block runs.
 
-    `seeds` may add more seeds to the sweep. Runs that failed count as not yet done.
+    `seeds` may add more seeds to the sweep, and `trials` more trials to a search. Runs that failed count as not yet
+    done, except in a search.
 
     Raises ConfigError if the folder holds no sweep, or if user code is not allowed to run, or has changed since the
     start of the sweep.
@@ -226,7 +286,8 @@ def resumed(folder: Path, seeds: int | None = None, allow_code: bool = False) ->
     with _locked(folder):
         kept = read_sweep(folder)
         _check_files(folder, kept, allow_code)
-        sweep = replace(_grown(kept, seeds), failures={})
+        sweep = _grown(kept, seeds, trials)
+        sweep = sweep if sweep.search else replace(sweep, failures={})
         _write(folder, sweep)
         yield sweep
 
@@ -280,16 +341,24 @@ def _check_files(folder: Path, kept: SweepPlan, allowed: bool) -> None:
             raise ConfigError(file, "", reason)
 
 
-def _grown(kept: SweepPlan, seeds: int | None) -> SweepPlan:
-    """Return the sweep extended to `seeds` seeds, if given. Raises ConfigError if the sweep has more seeds already."""
-    if seeds is None or seeds == len(kept.seeds):
-        return kept
-    if seeds < len(kept.seeds):
+def _grown(kept: SweepPlan, seeds: int | None, trials: int | None) -> SweepPlan:
+    """Return the sweep extended to `seeds` seeds and `trials` trials, if given. Raises ConfigError if the sweep has
+    more already.
+    """
+    if trials is not None:
+        if kept.search is None:
+            raise ConfigError("--trials", "", "the sweep in the folder is not a search")
+        if trials < kept.search.trials:
+            raise ConfigError("--trials", "", f"is {trials}; the search has {kept.search.trials} trials already")
+        kept = replace(kept, search=replace(kept.search, trials=trials))
+    if seeds is not None and seeds < len(kept.seeds):
         raise ConfigError("--seeds", "", f"is {seeds}; the sweep has {len(kept.seeds)} seeds already")
-    if seeds * len(kept.combinations) > MOST_RUNS or kept.seeds[0] + seeds > SEED_END:
-        reason = f"{len(kept.combinations)} x {seeds} seeds: a sweep has at most {MOST_RUNS} runs"
-        raise ConfigError("--seeds", "", reason)
-    return replace(kept, seeds=list(range(kept.seeds[0], kept.seeds[0] + seeds)))
+    count = seeds or len(kept.seeds)
+    grown = replace(kept, seeds=list(range(kept.seeds[0], kept.seeds[0] + count)))
+    if grown.size > MOST_RUNS or grown.seeds[-1] >= SEED_END:
+        reason = f"{grown.size // count} x {count} seeds: a sweep has at most {MOST_RUNS} runs"
+        raise ConfigError("--seeds" if trials is None else "--trials", "", reason)
+    return grown
 
 
 # --- runs still to be done --------------------------------------------------------------------------------------------

@@ -41,6 +41,20 @@ def as_json(record: rl.Record) -> dict[str, Any]:
     return {key: value for key, value in json.loads(record.to_json()).items() if key not in TIMES}
 
 
+def test_a_loop_ends_with_the_warnings_of_the_run(experiment: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Only if it has come to its end."""
+    run = rl.optimize("tiny.yaml", "runs/a", overrides={"run.iterations": 30, "optimizer.learning_rate": 1e-3})
+    for _ in run:
+        break
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert not any("not converged" in line for line in said)
+    list(run)
+    warnings = json.loads(Path("runs/a/manifest.json").read_text())["results"]["warnings"]
+    assert any("not converged, still moving" in line for line in warnings)
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert said[-len(warnings) :] == warnings
+
+
 def values_equal(first: dict[str, Any], second: dict[str, Any]) -> bool:
     return first.keys() == second.keys() and all(first[key].tobytes() == second[key].tobytes() for key in first)
 

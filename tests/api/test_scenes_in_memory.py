@@ -240,6 +240,7 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: rl.load(experiment(), scene=room(a={"type": "diffuze"})), "scene: scene.a: there is no plugin `diffuze` "
      "in Mitsuba 3; did you mean `diffuse`?"),
     (lambda: rl.load(experiment(), scene=room(a={"b": 1})), "scene: scene.a: has no `type`"),
+    (lambda: rl.load(experiment() | {"scene": {"a": {"type": "sphere"}}}), "<dict>: scene: has no `type`; each object"),
     (lambda: rl.load(experiment(), scene=room(a=None)), "scene: scene.a: is None; leave it out"),
     (lambda: rl.load(experiment(), scene=room(a=mi.load_dict({"type": "sphere"}))), "scene: scene.a: is an object of "
      "Mitsuba (Shape); give its dictionary, or load the scene with `mi.load_dict(..., optimize=False)`"),

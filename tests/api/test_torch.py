@@ -7,6 +7,7 @@ import logging
 import re
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -310,6 +311,43 @@ def test_wrong_parameters_are_refused(torch: Any, key: str, shape: tuple[int, ..
     with pytest.raises(rl.ConfigError) as caught:
         rl.torch.render(room(), {key: torch.ones(shape)}, integrator=reslrb(), spp=SPP)
     assert str(caught.value).startswith(message), str(caught.value)
+
+
+@pytest.mark.long
+def test_a_step_takes_little_longer_than_that_of_reslrb(torch: Any) -> None:
+    """At most 1.1 times as long, if torch's threads do not keep the cores busy. To be measured on an idle machine:
+    `scripts/test -n 0 -s -m long tests/api/test_torch.py -k longer`.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    scenes = [rl.load_scene(str(ROOT / "scenes/cornell_floor/scene.xml"), resx=128, resy=128) for _ in range(2)]
+    key, integrator = "floor.reflectance.data", reslrb()
+    params = mi.traverse(scenes[0])
+    dr.enable_grad(params[key])
+    params.update()
+    tensor = torch.full((64, 64, 3), 0.5, requires_grad=True)
+
+    def ours(seed: int) -> None:
+        rl.step(integrator, scenes[0], 0, objective, seed=seed, spp=16, adjoint="independent", params=params)
+        assert np.array(dr.grad(params[key])).any()
+        dr.clear_grad(params[key])
+
+    def by_torch(seed: int) -> None:
+        image = rl.torch.render(scenes[1], {key: tensor}, integrator=integrator, seed=seed, spp=16)
+        l2(image).backward()
+        assert tensor.grad.any()
+        tensor.grad = None
+
+    taken: dict[Any, list[float]] = {ours: [], by_torch: []}
+    for seed in range(40):
+        for step, times in taken.items():
+            start = time.perf_counter()
+            step(seed)
+            times.append(time.perf_counter() - start)
+    torch.set_num_threads(threads)
+    first, second = (1e3 * np.median(times[10:]) for times in taken.values())
+    print(f"rl.step {first:.1f} ms, torch {second:.1f} ms")
+    assert second < 1.1 * first
 
 
 @pytest.mark.long

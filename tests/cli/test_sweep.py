@@ -18,7 +18,7 @@ from cli import tiny
 from cli.tiny import reslrb
 from click.testing import CliRunner
 
-from reslrb_cli.cli import main, sweep
+from reslrb_cli.cli import jobs, main, sweep
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.cli.terminal import Interrupts
 from reslrb_cli.errors import ConfigError
@@ -57,7 +57,7 @@ def folder(llvm, tmp_path, monkeypatch):
     return tmp_path
 
 
-def call(arguments, interrupts, fresh=False):
+def call(arguments, interrupts, slot, fresh=False):
     """Call the command in this process, in place of `sweep.call`."""
     result = CliRunner().invoke(main, list(arguments))
     return result.exit_code, result.output.strip().splitlines()[-1]
@@ -169,7 +169,10 @@ def test_a_folder_has_one_sweep(folder):
     more = tiny.done("sweep", "--resume", "s", "--seeds", 2)
     assert "2 of 2 runs done" in more.output
     assert "--seeds: is 1; the sweep has 2 seeds already" in reslrb("sweep", "--resume", "s", "--seeds", 1).output
-    assert "add only --seeds or --allow-code" in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
+    assert (
+        "add only --seeds, --trials, --jobs or --allow-code"
+        in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
+    )
 
 
 def test_damage_is_located(folder):
@@ -221,11 +224,11 @@ def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
             copy("over-final-images")
         end(self)
 
-    def calling(arguments, interrupts, fresh=False):
+    def calling(arguments, interrupts, slot, fresh=False):
         calls.append(arguments)
         if len(calls) == 4:
             copy("between-runs")
-        return call(arguments, interrupts)
+        return call(arguments, interrupts, slot)
 
     monkeypatch.setattr(Progress, "show", showing)
     monkeypatch.setattr(recording.Recording, "_begin", beginning)
@@ -254,11 +257,11 @@ def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
     ends = {"learning_rate=0.02-seed=1": (5, "the loss is not finite"), "learning_rate=0.2-seed=0": (-9, "killed")}
     called = []
 
-    def failing(arguments, interrupts, fresh=False):
+    def failing(arguments, interrupts, slot, fresh=False):
         called.append(arguments)
         name = next(word for word in ends if any(word in each for each in arguments)) if any(
             word in each for word in ends for each in arguments) else None  # fmt: skip
-        return ends[name] if name else call(arguments, interrupts)
+        return ends[name] if name else call(arguments, interrupts, slot)
 
     monkeypatch.setattr(sweep, "call", failing)
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", RATES, "--seeds", "2", "-o", "s"]
@@ -310,7 +313,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_complete_folders(folder, monkey
 def test_a_sweep_locks_its_folder(folder, monkeypatch):
     said = []
 
-    def another(arguments, interrupts, fresh=False):
+    def another(arguments, interrupts, slot, fresh=False):
         said.append(reslrb("sweep", "--resume", "s").output)
         return 130, ""
 
@@ -344,19 +347,17 @@ def test_a_crashed_process_is_reported_by_its_last_message(monkeypatch):
         ("sys.exit(4)", 4, "ended with exit code 4, without a message"),
         ("time.sleep(60)", 130, "ended by SIGTERM: "),
     ):  # fmt: skip
-        monkeypatch.setattr(sweep, "_PROGRAM", f"import os, sys, time; {end}")
+        monkeypatch.setattr(jobs, "_PROGRAM", f"import os, sys, time; {end}")
         interrupts = Interrupts()
         interrupts.requested = code == 130  # a run that does not handle signals yet
-        assert sweep.call(["optimize"], interrupts) == (code, said)
+        assert jobs.call(["optimize"], interrupts, jobs.RunSlot()) == (code, said)
 
 
 def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
     monkeypatch.undo()  # use the real `call`
-    monkeypatch.setattr(
-        sweep, "_PROGRAM", "import os; print(*map(os.environ.get, ('DRJIT_CACHE_DIR', 'RESLRB_CACHE')))"
-    )
-    plain = sweep.call([], Interrupts())[1]
-    kernels, decisions = sweep.call([], Interrupts(), fresh=True)[1].split()
+    monkeypatch.setattr(jobs, "_PROGRAM", "import os; print(*map(os.environ.get, ('DRJIT_CACHE_DIR', 'RESLRB_CACHE')))")
+    plain = jobs.call([], Interrupts(), jobs.RunSlot())[1]
+    kernels, decisions = jobs.call([], Interrupts(), jobs.RunSlot(), fresh=True)[1].split()
     assert kernels == decisions
     assert kernels not in plain
     assert not Path(kernels).exists()
@@ -366,9 +367,9 @@ def test_runs_of_equal_time_use_no_earlier_results(folder, monkeypatch):
 def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
     asked = []
 
-    def noting(arguments, interrupts, fresh=False):
+    def noting(arguments, interrupts, slot, fresh=False):
         asked.append(fresh)
-        return call(arguments, interrupts)
+        return call(arguments, interrupts, slot)
 
     monkeypatch.setattr(sweep, "call", noting)
     result = tiny.done("sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "run.max_seconds=[null, 0.001]",

@@ -146,17 +146,17 @@ def write_photo(path: Path, image: Any) -> None:
 
 
 def start(
-    folder: Path, *args: str, command: str = "optimize", details: bool = False, **options: Any
+    folder: Path, *args: str, command: str = "optimize", details: bool = False, config: bool = True, **options: Any
 ) -> subprocess.Popen[str]:
     """Start `reslrb COMMAND tiny.yaml` in its own process, with `folder` as its working directory. With `details`, it
-    prints all messages.
+    prints all messages. Without `config`, `tiny.yaml` is left out.
     """
     # Start the program like its entry point, so that its name is `reslrb` from the first line on.
     script = "import logging, sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import LogLines, run; "
     if details:  # without the tracebacks of --debug
         script += "log = logging.getLogger('reslrb_cli'); log.addHandler(LogLines()); log.setLevel('DEBUG'); "
     script += "run()"
-    words = [sys.executable, "-c", script, command, "tiny.yaml", *args]
+    words = [sys.executable, "-c", script, command, *(["tiny.yaml"] if config else []), *args]
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
     return subprocess.Popen(words, cwd=folder, env=environment, **pipes)

@@ -271,6 +271,7 @@ def test_moving_scenes_are_refused_with_a_reason(name: str, options: dict[str, s
 
 
 MEDIUM = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.5}}
+FOGGED = {"inside": {"type": "homogeneous"}}
 VEIL = {"type": "rectangle", "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}}
 HAIR = {"type": "sphere", "radius": 0.2, "bsdf": {"type": "hair"}}
 MIRRORS = {key: {"type": "conductor"} for key in ("floor", "wall", "side")}
@@ -281,6 +282,14 @@ ORTHOGRAPHIC = {"type": "orthographic", "film": {"type": "hdrfilm", "width": 8, 
 REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
     ({"fog": MEDIUM}, {}, "", "shape fog bounds a participating medium; no integrator here supports media"),
     ({"fog": MEDIUM}, {}, FLOOR, "shape fog bounds a participating medium"),
+    (
+        {"camera": ORTHOGRAPHIC | {"type": "perspective"} | FOGGED},
+        {},
+        FLOOR,
+        "sensor camera is inside a participating medium; no integrator here",
+    ),
+    ({"bulb": {"type": "point"} | FOGGED}, {}, "", "emitter bulb is inside a participating medium; no integrator here"),
+    ({"sky": {"type": "timed_sunsky"}}, {}, "", "emitter sky is a `timed_sunsky`"),
     ({"camera": ORTHOGRAPHIC}, {}, "", "sensor camera is a OrthographicCamera; light paths connect to"),
     ({}, {}, "camera.to_world", "camera.to_world: light tracing has derivatives of surfaces and emitters, not of the"),
     ({}, {"estimator": "event"}, "lamp.to_world", "estimator event has no derivatives of moving light: it would need"),

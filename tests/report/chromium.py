@@ -59,14 +59,14 @@ class Chromium:
         for domain in ("Page", "Network", "Log"):
             self._call(f"{domain}.enable")
 
-    def open(self, path: Path, width: int, scripts: bool = True, dark: bool = False) -> None:
-        """Open the page at `path` with a width in pixels, and wait until the page is fully loaded."""
+    def open(self, path: Path | str, width: int, scripts: bool = True, dark: bool = False) -> None:
+        """Open the page at a path or an address with a width in pixels, and wait until the page is fully loaded."""
         self._call("Emulation.setScriptExecutionDisabled", value=not scripts)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._call("Emulation.setEmulatedMedia", features=[scheme])
         self._call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=True)
         self.events.clear()
-        self._call("Page.navigate", url=path.absolute().as_uri())
+        self._call("Page.navigate", url=path if isinstance(path, str) else path.absolute().as_uri())
         self._wait(lambda: any(event["method"] == "Page.loadEventFired" for event in self.events))
 
     def evaluate(self, expression: str) -> Any:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -12,12 +14,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli.tiny import manifest, outcome, settings
+from cli.tiny import ROOT, manifest, outcome, settings
 from runs.going_on import begin_alone
 
 import reslrb_cli as rl
 from reslrb_cli.records.images import as_bytes
 from reslrb_cli.runs import log, loggers
+from reslrb_cli.runs.callbacks import Calls
 from reslrb_cli.runs.sweep import make_plan
 
 SET = {"run.certainty": False, "run.iterations": 3}
@@ -334,6 +337,43 @@ def test_the_manifest_names_the_commit_of_the_configuration(experiment: Path) ->
     assert manifest("runs/b")["commit"] == commit
 
 
+# --- the time of callbacks --------------------------------------------------------------------------------------------
+
+
+class Reader(rl.Callback):
+    """Reads all values after each iteration."""
+
+    def iteration(self, run: rl.RunInfo, record: rl.Record) -> None:
+        for key in run.shapes:
+            run.value(key)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["reader", "tensorboard"])
+def test_callbacks_take_less_than_a_millisecond_or_a_hundredth(
+    experiment: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time in the calls of an iteration of about 10 ms. It includes the wait for the values of the update. To be
+    measured on an idle machine: `scripts/test -n 0 -s -m long tests/runs/test_callbacks.py -k millisecond`.
+    """
+    if name == "tensorboard":
+        pytest.importorskip("tensorboardX")
+    spent, ends, real = [], [], Calls.iteration
+
+    def timed(self: Calls, record: rl.Record) -> None:
+        start = time.perf_counter()
+        real(self, record)
+        ends.append(time.perf_counter())
+        spent.append(ends[-1] - start)
+
+    monkeypatch.setattr(Calls, "iteration", timed)
+    callback = Reader() if name == "reader" else name
+    list(rl.optimize("tiny.yaml", "runs/a", overrides=SET | {"run.iterations": 300}, callbacks=[callback]))
+    call, iteration = np.median(spent[50:]), np.median(np.diff(ends)[50:])
+    print(f"{name}: {1e3 * call:.3f} ms (mean {1e3 * np.mean(spent[50:]):.3f}) of {1e3 * iteration:.3f} ms")
+    assert call < max(1e-3, 0.01 * iteration)
+
+
 # --- the packages -----------------------------------------------------------------------------------------------------
 
 
@@ -363,6 +403,27 @@ def test_tensorboard_reads_the_events(experiment: Path) -> None:
     assert scalars[f"value/{LAMP}/1"][-1] == run.parameters[LAMP][1]
     assert set(images) == {"image/target", "image/initial", "image/final", f"value/{POSTER}"}
     np.testing.assert_array_equal(pixels(images[f"value/{POSTER}"]), as_bytes(run.parameters[POSTER]))
+
+
+@pytest.mark.long
+def test_the_tutorial_ends_with_recovered_values_in_tensorboard(
+    llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tensorboardX")
+    from tensorboardX.proto.event_pb2 import Event
+
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs/tensorboard.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    exec(compile("\n".join(blocks), "tutorial.py", "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out.splitlines()[-1].startswith("finished ")
+    (file,) = Path("runs/room").glob("events.out.tfevents.*")
+    values = {value.tag: value for content in tf_records(file.read_bytes())
+              for value in Event.FromString(content).summary.value}  # fmt: skip
+    red, green, blue = (values[f"value/wall.bsdf.reflectance.value/{n}"].simple_value for n in range(3))
+    np.testing.assert_allclose([red, green, blue], [0.8, 0.3, 0.2], atol=0.02)
+    assert values["error/floor.bsdf.reflectance.data"].simple_value < 0.03
+    assert values["value/floor.bsdf.reflectance.data"].HasField("image")
 
 
 def tf_records(data: bytes) -> Iterator[bytes]:

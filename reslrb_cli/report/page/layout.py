@@ -50,11 +50,20 @@ def document(title: str, head: Markup, parts: Iterable[tuple[str, Markup]], refr
     With `refresh_s`, the page reloads itself after this number of seconds. Control characters, which a page must not
     contain, become replacement characters.
     """
-    page, script = _environment().get_template("page.html.j2"), _script()
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    names = {"title": title, "head": head, "parts": parts, "refresh_s": refresh_s, "script": script, "digest": digest}
+    page = _environment().get_template("page.html.j2")
+    names = {"title": title, "head": head, "parts": parts, "refresh_s": refresh_s, "script": _script(),
+             "policy": Markup(policy())}  # fmt: skip
     text = page.render(names) + "\n"
     return text.translate({ord(c): "\ufffd" for c in set(text) if not c.isprintable() and c not in "\n\t"})
+
+
+@cache
+def policy() -> str:
+    """Return the content policy of a page. A page may load only its own content and run only its own script, so that
+    markup injected through a name has no effect.
+    """
+    digest = base64.b64encode(hashlib.sha256(_script().encode()).digest()).decode()
+    return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
 
 
 @cache

@@ -49,7 +49,7 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 def fabrication(run: ShownRun) -> Markup:
     """Return the workshop sheet for the run's solid. The result is empty without one."""
-    text = _read(run.path / FABRICATION_FILE)
+    text = read_text(run.path / FABRICATION_FILE)
     if not text:
         return Markup()
     numbers = json.loads(text)
@@ -105,7 +105,7 @@ def run_parts(run: ShownRun) -> dict[str, Markup]:
             soft(Decision.from_json(each).line(cost=True)) for each in manifest.get("decisions") or ()
         ),
         "Scale of the parameters": lambda: lay_out("run.scaling", manifest.get("scaling") or []),
-        "Configuration": lambda: lay_out("pre", _read(run.path / "config.yaml")),
+        "Configuration": lambda: lay_out("pre", read_text(run.path / "config.yaml")),
     }
     return {title: guarded(make) for title, make in parts.items()}
 
@@ -121,7 +121,8 @@ def guarded(make: Callable[[], Markup]) -> Markup:
         return lay_out("note", [DAMAGED])
 
 
-def _read(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """Return the text of a file. The result is empty without one."""
     from reslrb_cli.config.files import read_file
 
     try:

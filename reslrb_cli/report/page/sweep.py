@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from reslrb_cli.config.files import duration
+from reslrb_cli.errors import ExitCode
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.measurements import Band
@@ -50,16 +52,20 @@ VALUE_WIDTH, LABEL_WIDTH = 32, 60
 #: Maximum number of combinations named in a line.
 MOST_NAMED = 4
 
+#: Maximum number of trials of a search in the table on the terminal.
+MOST_TRIALS = 20
+
 #: Titles of the columns of results.
 FIGURES = {"loss": "final loss", "error": "parameter RMSE", "elapsed_s": "time", "peak_mib": "peak memory"}
 
 
 def run_records(source: SweepRuns) -> list[SweepRunRecord]:
     """Return the result of each run, in order. Runs that have not started are `waiting`."""
-    return [_run_record(source, combination, seed) for combination, seed in source.sweep.runs]
+    return [run_record(source, combination, seed) for combination, seed in source.sweep.runs]
 
 
-def _run_record(source: SweepRuns, combination: Combination, seed: int) -> SweepRunRecord:
+def run_record(source: SweepRuns, combination: Combination, seed: int) -> SweepRunRecord:
+    """Return the result of one run."""
     name = run_name(combination, seed)
     run, failure = source.runs.get(name), source.sweep.failures.get(name)
     if run is None or failure is not None:
@@ -118,6 +124,44 @@ def best_records(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[Sweep
             pairs = list(zip(values[best], values[second], strict=True))
             found.append(SweepBestRecord(of, best, second, len(pairs), sum(one < other for one, other in pairs)))
     return found
+
+
+def objective(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> str:
+    """Return the figure that the best combination of a search has the lowest of: `error` if the true values are known,
+    otherwise `loss`. The result is empty if neither can be compared, or if no run has finished.
+    """
+    done = [run for run in runs if run.is_done]
+    known = (of for of in reversed(OTHERS) if not incomparable(sweep, of))
+    return next((of for of in known if done and all(getattr(run, of) is not None for run in done)), "")
+
+
+def trial_values(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> dict[str, float | None]:
+    """Return the figure of each finished trial of a search by its name, the median over its seeds. The figure is
+    infinite if a run diverged, and None if a run failed for another reason.
+    """
+    of, found = objective(sweep, runs), dict[str, float | None]()
+    for combination in sweep.combinations:
+        done = [run for run in runs if run.settings == combination.settings and run.is_done]
+        names = [run_name(combination, seed) for seed in sweep.seeds]
+        if failures := [sweep.failures[name] for name in names if name in sweep.failures]:
+            diverged = any(each.code == ExitCode.NON_FINITE for each in failures)
+            found[combination.name] = math.inf if diverged else None
+        elif of and len(done) == len(names):
+            found[combination.name] = float(np.median([getattr(run, of) for run in done]))
+    return found
+
+
+def ranked(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> SweepPlan:
+    """Return the plan of a search with its best trials first. Other sweeps keep their order."""
+    if sweep.search is None:
+        return sweep
+    values = trial_values(sweep, runs)
+
+    def rank(combination: Combination) -> float:
+        value = values.get(combination.name)
+        return math.inf if value is None else value
+
+    return replace(sweep, combinations=sorted(sweep.combinations, key=rank))
 
 
 def incomparable(sweep: SweepPlan, of: str) -> str:
@@ -179,14 +223,16 @@ def figures_of(runs: Sequence[SweepRunRecord]) -> dict[str, str]:
 
 
 def lines(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
-    """Return the table with one line per combination, and the notes."""
+    """Return the table with one line per combination, and the notes. The table of a search has its best trials."""
     keys, figures, short = sweep.keys, figures_of(runs), short_keys(sweep.keys)
     rows: list[tuple[str, ...]] = [(*(short[key] for key in keys), "runs", *figures.values())]
-    for row in row_records(sweep, runs):
+    for row in row_records(ranked(sweep, runs), runs)[: MOST_TRIALS if sweep.search else None]:
         values = [shorten(in_words(row.settings[key]), VALUE_WIDTH) for key in keys]
         bands = [_cell(name, getattr(row, name)) for name in figures]
         rows.append((*values, f"{row.runs} of {row.of}" + (f", {row.failed} failed" if row.failed else ""), *bands))
-    return [*table(rows), "medians over the seeds, in brackets the least and the greatest", *notes(sweep, runs)]
+    more = len(sweep.combinations) - len(rows) + 1
+    rest = [f"and {more} more trials, on the page"] if more > 0 else []
+    return [*table(rows), *rest, "medians over the seeds, in brackets the least and the greatest", *notes(sweep, runs)]
 
 
 def _cell(name: str, band: Band | None) -> str:
@@ -209,7 +255,9 @@ CAPTION_WIDTH, PAGE_WIDTH = 80, 60
 
 def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
     """Return the parts of a sweep, by title and in order. Parts that do not apply are empty."""
-    sweep, runs = source.sweep, run_records(source)
+    runs = run_records(source)
+    sweep = ranked(source.sweep, runs)
+    source = replace(source, sweep=sweep)
     figures, short = figures_of(runs), short_keys(sweep.keys)
     drawn = sweep.combinations[:MOST_CURVES]
 
@@ -221,7 +269,8 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
             for place, record in enumerate(row_records(sweep, runs))
         ]  # fmt: skip
         done = sum(run.is_done for run in runs)
-        told = f"{count(len(sweep.combinations), 'combination')} with {count(len(sweep.seeds), 'seed')}: "
+        of = f"{len(sweep.combinations)} of {count(sweep.search.trials, 'trial')}" if sweep.search else ""
+        told = f"{of or count(len(sweep.combinations), 'combination')} with {count(len(sweep.seeds), 'seed')}: "
         told += f"{done} of {count(len(runs), 'run')} finished."
         return lay_out("sweep.rows", rows, [short[name] for name in sweep.keys], figures, told, notes(sweep, runs))
 
@@ -237,25 +286,32 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
 
 
 def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
-    """Return diagrams of the loss and, if known, the parameter error. Medians with bands are drawn over iteration and
-    time.
-    """
+    """Return the diagrams of the first combinations."""
     own = [_runs(source, combination) for combination in drawn]
-    if not any(run.records for runs in own for run in runs):
+    more = len(source.sweep.combinations) - len(drawn)
+    line = soft(f"{more} more combinations are not drawn." if more else "")
+    parts = curves([label(each.settings) for each in drawn], own)
+    return parts + line if parts else parts
+
+
+def curves(titles: Sequence[str], own: Sequence[Sequence[ShownRun]]) -> Markup:
+    """Return diagrams of the loss and, if known, the parameter error, over iteration and time. Each title has a curve,
+    the median of its runs with a band. Runs have at least one iteration.
+    """
+    if not any(own):
         return Markup()
-    parts = lay_out("legend", [label(each.settings) if runs else "" for each, runs in zip(drawn, own, strict=True)])
+    parts = lay_out("legend", [title if runs else "" for title, runs in zip(titles, own, strict=True)])
     kinds = {"loss": "loss"}
     if not any(units_differ(run.results) for runs in own for run in runs):
         kinds["parameter_rmse"] = "parameter RMSE"
     for name, title in kinds.items():
         both = []
         for against, caption in ((_by_iteration, "iteration"), (_by_time, "time in steps and updates (s)")):
-            curves = [_median(label(each.settings), place, *against(runs, name))
-                      for place, (each, runs) in enumerate(zip(drawn, own, strict=True)) if runs]  # fmt: skip
-            both.append(("", diagram(curves, caption, title)))
+            drawn = [_median(each, place, *against(runs, name))
+                     for place, (each, runs) in enumerate(zip(titles, own, strict=True)) if runs]  # fmt: skip
+            both.append(("", diagram(drawn, caption, title)))
         parts += lay_out("diagrams", both)
-    more = len(source.sweep.combinations) - len(drawn)
-    return parts + soft(f"{more} more combinations are not drawn." if more else "")
+    return parts
 
 
 def _runs(source: SweepRuns, combination: Combination) -> list[ShownRun]:

@@ -1,0 +1,383 @@
+"""Tests of `reslrb sweep --search`, and of several runs at once."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shlex
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli import tiny
+from cli.tiny import reslrb
+
+from reslrb_cli.cli import jobs, sweep
+from reslrb_cli.config.loader import load
+from reslrb_cli.records.manifest import PROGRAM, Status
+from reslrb_cli.records.sweeps import read_sweep
+from reslrb_cli.report.page.sweep import best_records, ranked, run_records
+from reslrb_cli.report.sources import read_sweep_runs
+
+RATE, SPP = "optimizer.learning_rate", "run.spp"
+SPACE = (f"{RATE}={{low: 0.001, high: 1, log: true}}", f"{SPP}={{low: 2, high: 40}}", "optimizer.type=[adam, sgd]")
+VARY = [word for each in SPACE for word in ("--vary", each)]
+WORDS = ["sweep", "tiny.yaml", *VARY, "--search", "optuna", "-o", "s"]
+
+
+def figure(rate, spp, kind):
+    """Return the pretended error of a run; its least value is 0.1."""
+    return 0.1 + abs(math.log10(rate / 0.03)) + abs(spp - 20) / 20 + (kind == "sgd")
+
+
+@pytest.fixture
+def folder(llvm, tmp_path, monkeypatch):
+    """Working directory with `tiny.yaml`. Runs are pretended: they write only a manifest with the figure above."""
+    pytest.importorskip("optuna")
+    tiny.write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sweep, "call", pretend)
+    return tmp_path
+
+
+def run_of(arguments):
+    """Return the folder of the run that `arguments` start, and its configuration."""
+    sets = dict(word.partition("=")[::2] for word in arguments if word.startswith("run."))
+    folder = Path(json.loads(sets["run.output"])) / json.loads(sets["run.name"])
+    return folder, load(arguments[1])
+
+
+def pretend(arguments, interrupts, slot=None, fresh=False, errors=True):
+    folder, config = run_of(arguments)
+    value = figure(config.optimizer.learning_rate, config.run.spp, config.optimizer.type)
+    results = {"image_loss": {"final": 2 * value}, "rmse": {"final": value if errors else None}}
+    folder.mkdir()
+    (folder / "manifest.json").write_text(
+        json.dumps({"program": PROGRAM, "status": Status.FINISHED, "results": results})
+    )
+    return 0, "finished"
+
+
+def trials(folder="s"):
+    return [each.settings for each in read_sweep(Path(folder)).combinations]
+
+
+def test_a_search_finds_the_best_settings(folder):
+    output = tiny.done(*WORDS, "--trials", 60).output
+    tried = trials()
+    values = [figure(*each.values()) for each in tried]
+    assert min(values) < 0.25
+    first, last = values[:10], values[-20:]
+    assert sum(last) / 20 < 0.5 * sum(first) / 10  # random numbers would not improve
+    assert len({json.dumps(each) for each in tried}) == 60
+    for each in tried:
+        assert 0.001 <= each[RATE] <= 1
+        assert each[RATE] == float(f"{each[RATE]:.4g}")
+        assert each[SPP] in range(2, 41)
+    source = read_sweep_runs(Path("s"))
+    runs = run_records(source)
+    order = [figure(*each.settings.values()) for each in ranked(source.sweep, runs).combinations]
+    assert order == sorted(values)
+    best = next(each for each in best_records(source.sweep, runs) if each.of == "error").best
+    assert f"the best trial by parameter RMSE: s/configs/{best}.yaml" in output
+    assert load(f"s/configs/{best}.yaml").optimizer.learning_rate == tried[values.index(min(values))][RATE]
+    assert "and 40 more trials, on the page" in output
+    assert "finished, 60 of 60 runs done" in output
+    assert "60 of 60 trials with 1 seed" in Path("s/sweep.html").read_text()
+
+
+def test_a_search_that_continues_is_the_same_search(folder, monkeypatch):
+    tiny.done(*WORDS, "--trials", 14)
+    whole = trials()
+    assert "add only --seeds, --trials" in reslrb("sweep", "--resume", "s", "--search", "optuna").output
+    assert (
+        "--trials: is 13; the search has 14 trials already" in reslrb("sweep", "--resume", "s", "--trials", 13).output
+    )
+    monkeypatch.chdir(folder / "s")  # the path of the configuration is absolute
+    assert "20 of 20 runs done" in tiny.done("sweep", "--resume", ".", "--trials", 20).output
+    monkeypatch.chdir(folder)
+    whole = trials()
+    calls = []
+
+    def interrupted(arguments, interrupts, slot=None, fresh=False):
+        calls.append(arguments)
+        return pretend(arguments, interrupts) if len(calls) % 6 else (130, "interrupted")
+
+    monkeypatch.setattr(sweep, "call", interrupted)
+    words = [*WORDS[:-1], "t"]
+    result = reslrb(*words, "--trials", 20)
+    assert result.exit_code == 130
+    assert "interrupted, 5 of 6 runs done; look at t/sweep.html; `reslrb sweep --resume t` continues" in result.output
+    for _ in range(3):
+        result = reslrb("sweep", "--resume", "t")
+    assert result.exit_code == 0
+    assert trials("t") == whole
+    text = Path("tiny.yaml").read_text()
+    Path("tiny.yaml").write_text(text + "# another\n")
+    result = reslrb("sweep", "--resume", "t", "--trials", 30)
+    assert (result.exit_code, "tiny.yaml: has changed since the sweep in t began" in result.output) == (2, True)
+
+
+def test_failed_trials_do_not_end_the_search(folder, monkeypatch):
+    """Diverging runs count as the worst, so that the search leaves their settings. Other failures say nothing."""
+    called = []
+
+    def failing(arguments, interrupts, slot=None, fresh=False):
+        called.append(arguments)
+        _, config = run_of(arguments)
+        if config.optimizer.learning_rate > 0.01:
+            return 5, "the loss is not finite"
+        return (4, "no memory") if config.run.spp > 30 else pretend(arguments, interrupts)
+
+    monkeypatch.setattr(sweep, "call", failing)
+    result = reslrb(*WORDS, "--trials", 40)
+    assert result.exit_code == 0
+    failures = read_sweep(Path("s")).failures
+    assert {failure.code for failure in failures.values()} == {4, 5}
+    assert f"{40 - len(failures)} of 40 runs done, {len(failures)} failed; look at s/sweep.html\n" in result.output
+    diverged = [each[RATE] > 0.01 for each in trials()]
+    assert sum(diverged[20:]) <= 10  # 14 to 17 if they said nothing either
+    called.clear()
+    tiny.done("sweep", "--resume", "s")
+    assert called == []
+    monkeypatch.setattr(sweep, "call", lambda *given: (4, "no memory"))
+    result = reslrb(*WORDS[:-1], "t", "--trials", 2, "--seeds", 2)
+    assert result.exit_code == 1  # no trial has finished
+    assert "0 of 4 runs done, 2 failed" in result.output  # other seeds of a failed trial are left out
+
+
+def test_a_trial_whose_settings_do_not_fit_has_failed(folder):
+    """The samples must be a multiple of the four batches, as both ends of the range are."""
+    words = ["sweep", "tiny.yaml", "--set", "run.adjoint=batched", "--vary", f"{SPP}={{low: 4, high: 8}}", "-o", "s"]
+    result = reslrb(*words, "--search", "optuna", "--trials", 9)
+    assert result.exit_code == 0
+    assert sorted(each[SPP] for each in trials()) == [4, 5, 6, 7, 8]
+    assert {failure.code for failure in read_sweep(Path("s")).failures.values()} == {2}
+    assert "the search ends after 5 trials: it finds no further combinations" in result.output
+    assert "2 of 5 runs done, 3 failed" in result.output
+
+
+def test_the_loss_counts_if_true_values_are_unknown(folder, monkeypatch):
+    monkeypatch.setattr(sweep, "call", lambda *given: pretend(*given, errors=False))
+    assert "the best trial by final loss: s/configs/" in tiny.done(*WORDS, "--trials", 3).output
+    vary = ["--vary", "loss.type=[l1, l2]", "--search", "optuna", "--trials", "3"]
+    result = reslrb("sweep", "tiny.yaml", *vary, "-o", "t")
+    assert result.exit_code == 2  # found with the first result, because a rendered target usually has true values
+    assert "--search: losses of different `loss.type` are not of the same" in result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--vary", f"{SPP}={{low: 2, high: 4}}"], "a range needs --search, as in --search optuna --trials 20"),
+        (["--search", "optuna"], "a search needs both --search optuna and --trials N"),
+        (["--trials", "3"], "a search needs both --search optuna and --trials N"),
+        (["--search", "optuna", "--trials", "3"], "--search: needs settings to choose, such as --vary"),
+        (["--search", "grid", "--trials", "3"], "'grid' is not 'optuna'"),
+        (["@", f"{RATE}={{low: 0, high: 1, log: true}}"], "a low end below the high end, and above 0 with log: true"),
+        (["@", f"{RATE}={{low: 1, high: 1}}"], "must have a low end below the high end"),
+        (["@", f"{RATE}={{low: 0.1, hi: 1}}"], "or a range such as {low: 0.01, high: 0.3, log: true}"),
+        (["@", f"{RATE}={{low: 0.1, high: x}}"], "or a range such as"),
+        (["@", f"{RATE}={{low: 0.1, high: 1, log: 1}}"], "or a range such as"),
+        (["@", f"{RATE}=0.1"], f"must be a list of values, such as {RATE}=[16, 32], or a range such as {RATE}={{low"),
+        (["@", f"{SPP}={{low: 0.5, high: 4}}"], f"--vary {SPP}=0.5: run.spp: must be an integer"),
+        (["@", f"{SPP}={{low: -1, high: 4}}"], f"--vary {SPP}=-1: run.spp: must be"),
+        (["@", f"{RATE}={{low: 0.1, high: 1}}", "--seeds", "400"], "--trials: 3 x 400 seeds are 1200 runs"),
+        (
+            ["@", "loss.type=[l1, l2]", "--set", "target={file: a.png}"],
+            "losses of different `loss.type` are not of the",
+        ),
+    ],
+)
+def test_errors_are_reported_before_any_run(folder, arguments, line):
+    tiny.write_photo(folder / "a.png", np.full((8, 8, 3), 0.5))
+    if arguments[0] == "@":
+        arguments = ["--search", "optuna", "--trials", "3", "--vary", *arguments[1:]]
+    result = reslrb("sweep", "tiny.yaml", "-o", "s", *arguments)
+    assert result.exit_code == 2
+    assert line in result.output
+    assert not Path("s").exists()
+
+
+def test_the_commands_of_the_docs_run(folder):
+    page = (tiny.ROOT / "docs/sweeps.md").read_text(encoding="utf-8")
+    block = page[page.index("## Search") : page.index("`--search optuna` looks")].replace("room.yaml", "tiny.yaml")
+    commands = [shlex.split(line, comments=True) for line in block.replace("\\\n", " ").splitlines()]
+    first, again = (words for words in commands if words[:1] == ["reslrb"])
+    assert "40 of 40 runs done" in tiny.done(*first[1:]).output
+    assert "80 of 80 runs done" in tiny.done(*again[1:]).output
+
+
+@pytest.mark.long
+def test_a_search_of_real_runs(llvm, tmp_path):
+    """Two at once, in processes of their own."""
+    pytest.importorskip("optuna")
+    tiny.write_experiment(tmp_path)
+    quick = tiny.settings("run.measuring=0", "run.certainty=false", "run.iterations=3", "run.final_spp=4")
+    words = [*quick, *VARY[:2], "--search", "optuna", "--trials", "4", "--jobs", "2", "-o", "s"]
+    process = tiny.start(tmp_path, *words, command="sweep")
+    out, err = process.communicate(timeout=300)
+    assert (process.returncode, err) == (0, "")
+    assert "finished, 4 of 4 runs done; look at s/sweep.html" in out
+    found = [each[RATE] for each in trials(tmp_path / "s")]
+    results = [json.loads(line) for line in (tmp_path / "s/results.jsonl").read_text().splitlines()]
+    errors = {each["settings"][RATE]: each["error"] for each in results if each["kind"] == "sweep_run"}
+    assert set(errors) == set(found)
+    assert len(set(errors.values())) > 1
+    assert f"learning_rate={min(found, key=lambda rate: errors[rate]):g}.yaml" in out
+
+
+def test_a_missing_optuna_is_named(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    result = reslrb(*WORDS, "--trials", 3)
+    assert result.exit_code == 2
+    assert "search: needs the package optuna (" in result.output
+    assert "; `pip install 'reslrb[search]'` installs it" in result.output
+
+
+# --- several runs at once ---------------------------------------------------------------------------------------------
+
+
+class Together:
+    """Pretended runs that last a moment. Notes how many were at work at each start, and which places they had."""
+
+    def __init__(self, peak=0):
+        self.lock, self.at_work, self.most, self.starts, self.places = threading.Lock(), 0, 0, [], set()
+        self.peak = peak
+
+    def __call__(self, arguments, interrupts, slot, fresh=False):
+        with self.lock:
+            self.starts.append(self.at_work)
+            self.at_work += 1
+            self.places.add((tuple(sorted(slot.cores)), slot.gpu))
+        time.sleep(0.3)
+        slot.line, slot.peak, slot.resident = "1/5: ", self.peak, self.peak
+        time.sleep(0.3)
+        with self.lock:
+            self.at_work -= 1
+        return pretend(arguments, interrupts)
+
+
+@pytest.fixture
+def four_cores(monkeypatch):
+    bound = []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {4, 5, 6, 7}, raising=False)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: bound.append(cores), raising=False)
+    return bound
+
+
+def test_runs_at_once_share_the_cores(folder, monkeypatch, four_cores):
+    monkeypatch.setattr(sweep, "call", together := Together())
+    output = tiny.done(*WORDS, "--trials", 8, "--jobs", 2).output
+    assert together.starts[:2] == [0, 1]
+    assert set(together.starts) == {0, 1}
+    assert together.places == {((4, 5), ""), ((6, 7), "")}
+    assert {4, 5} in four_cores
+    assert "8 of 8 runs done" in output
+    words = ["sweep", "tiny.yaml", "--vary", f"{SPP}=[1, 2, 3, 4, 5, 6]", "-o", "t", "--jobs", "9"]
+    monkeypatch.setattr(sweep, "call", together := Together())
+    output = tiny.done(*words).output
+    assert "4 runs at once: this machine has no more GPUs, or cores" in output
+    assert max(together.starts) == 3
+    assert "6 of 6 runs done" in output
+
+
+def test_the_first_run_begins_alone(folder, monkeypatch, four_cores):
+    """Until it has printed a line of progress, or has ended."""
+    seen = []
+
+    def noting(arguments, interrupts, slot, fresh=False):
+        seen.append(time.monotonic())
+        return Together()(arguments, interrupts, slot)
+
+    monkeypatch.setattr(sweep, "call", noting)
+    tiny.done("sweep", "tiny.yaml", "--vary", f"{SPP}=[1, 2, 3]", "-o", "t", "--jobs", "3")
+    assert seen[1] - seen[0] > 0.3
+    assert seen[2] - seen[1] < 0.3
+
+
+def test_runs_at_once_fit_into_memory(folder, monkeypatch, four_cores):
+    monkeypatch.setattr(jobs, "free_bytes", lambda variant: 6500)
+    monkeypatch.setattr(sweep, "call", together := Together(peak=7000))
+    tiny.done("sweep", "tiny.yaml", "--vary", f"{SPP}=[1, 2, 3]", "-o", "t", "--jobs", "3")
+    assert together.starts == [0, 0, 0]
+    monkeypatch.setattr(sweep, "call", together := Together(peak=2000))
+    tiny.done("sweep", "tiny.yaml", "--vary", f"{SPP}=[1, 2, 3]", "-o", "u", "--jobs", "3")
+    assert max(together.starts) == 2
+
+
+def test_each_run_has_a_gpu(folder, monkeypatch, four_cores):
+    monkeypatch.setattr(jobs, "ask_gpu", lambda query: ["GPU-a", "GPU-b", "GPU-c"])
+    monkeypatch.delenv(jobs.GPUS, raising=False)
+    assert [slot.gpu for slot in jobs.Jobs(2, "cuda_ad_rgb").slots] == ["GPU-a", "GPU-b"]
+    assert [slot.gpu for slot in jobs.Jobs(9, "cuda_ad_rgb").slots] == ["GPU-a", "GPU-b", "GPU-c"]
+    monkeypatch.setenv(jobs.GPUS, "3, 1")
+    assert [slot.gpu for slot in jobs.Jobs(9, "cuda_ad_rgb").slots] == ["3", "1"]
+    assert [slot.gpu for slot in jobs.Jobs(2, "llvm_ad_rgb").slots] == ["", ""]
+    assert [slot.gpu for slot in jobs.Jobs(1, "cuda_ad_rgb").slots] == [""]
+    monkeypatch.setattr(jobs, "_PROGRAM", f"import os; print(os.environ[{jobs.GPUS!r}])")
+    assert jobs.call([], sweep.Interrupts(), jobs.RunSlot(gpu="GPU-b")) == (0, "GPU-b")
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs affinities")
+def test_a_process_has_the_cores_of_its_place(monkeypatch):
+    monkeypatch.setattr(jobs, "_PROGRAM", "import os; print(os.sched_getaffinity(0))")
+    core = min(os.sched_getaffinity(0))
+    before = os.sched_getaffinity(0)
+    ends = []
+    thread = threading.Thread(
+        target=lambda: ends.append(
+            jobs._bound(jobs.RunSlot(cores={core}), lambda slot: jobs.call([], sweep.Interrupts(), slot))
+        )
+    )
+    thread.start()
+    thread.join()
+    assert ends == [(0, f"{{{core}}}")]
+    assert os.sched_getaffinity(0) == before
+
+
+def test_ctrl_c_ends_all_runs_after_their_iterations(folder, monkeypatch, four_cores):
+    asked = []
+
+    def waiting(arguments, interrupts, slot, fresh=False):
+        slot.line = "1/5: "
+        if len(asked) == 1:
+            interrupts.requested = True
+        asked.append(arguments)
+        while not interrupts.requested:
+            time.sleep(0.01)
+        time.sleep(0.2)
+        return 130, "interrupted"
+
+    monkeypatch.setattr(sweep, "call", waiting)
+    result = reslrb(*WORDS, "--trials", 9, "--jobs", 2)
+    assert result.exit_code == 130
+    assert "interrupted, 0 of 2 runs done" in result.output
+    assert len(asked) == 2
+    monkeypatch.setattr(sweep, "call", pretend)
+    assert "9 of 9 runs done" in tiny.done("sweep", "--resume", "s", "--jobs", 2).output
+
+
+def test_a_fault_of_one_run_interrupts_the_others(folder, monkeypatch, four_cores):
+    ends = []
+
+    def faulty(arguments, interrupts, slot, fresh=False):
+        slot.line = "1/5: "
+        if ends == []:
+            ends.append("fault")
+            time.sleep(0.5)
+            return 6, "the disk is full"
+        while not slot.must_end:
+            time.sleep(0.01)
+        ends.append("interrupted")
+        return 130, "interrupted"
+
+    monkeypatch.setattr(sweep, "call", faulty)
+    result = reslrb(*WORDS, "--trials", 9, "--jobs", 2)
+    assert result.exit_code == 6
+    assert "the disk is full; `reslrb sweep --resume s` continues" in result.output
+    assert ends == ["fault", "interrupted"]

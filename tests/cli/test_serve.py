@@ -1,0 +1,262 @@
+"""Tests of `reslrb serve`: what it shows, that it only reads, and that nothing outside of the folder is reached."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import shutil
+import socket
+import subprocess
+import threading
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+from cli import tiny
+from cli.tiny import reslrb
+from report.measured import make_run
+
+import reslrb_cli.report.page as page_module
+from reslrb_cli.cli import serve
+from reslrb_cli.records.lock import Holder
+from reslrb_cli.report.page import write_report
+
+SECRET = "the secret outside of the folder"
+
+
+def change_manifest(folder, **fields):
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+
+
+@pytest.fixture
+def runs(llvm, tmp_path):
+    """Folder with the finished runs `a <b>` and `b`, and the sweep `s` with a run."""
+    root = tmp_path / "runs"
+    a, b = make_run(root / "a <b>", iterations=30), make_run(root / "b", iterations=12)
+    for folder, rate in ((a, 0.1), (b, 0.2)):
+        text = f"optimizer: {{learning_rate: {rate}}}\nrun: {{spp: 4, name: {folder.name}}}\nparameters: [{{key: k}}]\n"
+        (folder / "config.yaml").write_text(text)
+    write_report(a)
+    make_run(root / "s" / "rate=1-seed=0", iterations=3)
+    (root / "s" / "sweep.json").write_text("{}")
+    (root / "s" / "sweep.html").write_text("the page of the sweep")
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "report.html").write_text(SECRET)
+    return root
+
+
+@pytest.fixture
+def served(runs):
+    """The address of a server of `runs`."""
+    with serve.make_server(runs, 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server.server_port
+        server.shutdown()
+        thread.join()
+
+
+def ask(port, path="/", method="GET", host="127.0.0.1"):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.putrequest(method, path, skip_host=True)
+    for name in [host] if host is not None else []:
+        connection.putheader("Host", name)
+    connection.endheaders()
+    answer = connection.getresponse()
+    text = answer.read().decode()
+    connection.close()
+    return answer, text
+
+
+def test_the_first_page_lists_runs_and_sweeps(served, runs):
+    answer, text = ask(served)
+    assert answer.status == 200
+    assert 'href="/a%20%3Cb%3E/report.html"' in text
+    assert "<b>" not in text
+    assert text.count(">compare</a>") == 3
+    assert 'href="/s/sweep.html"' in text
+    assert 'http-equiv="refresh"' in text
+    assert '<td data-label="iterations"><div>12</div>' in text
+    assert ask(served, "/a%20%3Cb%3E/report.html")[1] == (runs / "a <b>" / "report.html").read_text()
+    assert ask(served, "/s/sweep.html")[1] == "the page of the sweep"
+    with (runs / "b" / "metrics.jsonl").open("a") as file:  # it grows
+        last = json.loads((runs / "b" / "metrics.jsonl").read_text().splitlines()[-1])
+        file.write(json.dumps(last | {"iteration": 12}) + "\n" + '{"iteration": 13, "lo')
+        file.flush()
+    assert "<div>13</div>" in ask(served)[1]
+
+
+def test_two_runs_are_compared(served, runs):
+    _, text = ask(served, "/?with=b")
+    assert "Choose a run to compare with b." in text
+    address = "/compare?run=b&amp;run=a+%3Cb%3E"
+    assert f'href="{address}"' in text
+    assert text.count(">compare</a>") == 2
+    answer, text = ask(served, address.replace("&amp;", "&"))
+    assert answer.status == 200
+    assert 'http-equiv="refresh"' not in text
+    assert text.count("<svg") == 2
+    assert "cannot be shown" not in text
+    assert text.count('alt="target: ') == text.count('alt="final: ') == 2
+    rows = text[text.index("Settings that differ") : text.index("Convergence")]
+    assert "<wbr>learning_<wbr>rate" in rows
+    assert "0.1" in rows
+    assert "spp" not in rows
+    assert "name" not in rows
+    change_manifest(runs / "b", status="running", process=vars(Holder.here(False)))
+    shutil.rmtree(runs / "b" / "images")
+    assert 'http-equiv="refresh"' in ask(served, address.replace("&amp;", "&"))[1]
+    for query in ("run=b", "run=b&run=no", "run=b&run=b&run=b", "run=b&run=../outside", ""):
+        assert ask(served, f"/compare?{query}")[0].status == 404
+    assert "Choose" not in ask(served, "/?with=no")[1]
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT"])
+def test_there_are_no_methods_that_write(served, method):
+    assert ask(served, method=method)[0].status == 501
+
+
+def test_head_has_the_headers_alone(served):
+    answer, text = ask(served, method="HEAD")
+    assert (answer.status, text) == (200, "")
+    assert int(answer.headers["Content-Length"]) > 1000
+    for path in ("/", "/no"):
+        headers = ask(served, path)[0].headers
+        assert headers["Content-Security-Policy"].startswith("default-src 'none'; img-src data:; style-src")
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert headers["X-Frame-Options"] == "DENY"
+        assert "Access-Control-Allow-Origin" not in headers
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [("127.0.0.1", 200), ("localhost:8000", 200), ("LOCALHOST", 200), ("[::1]:80", 200), ("evil.example", 403),
+     ("127.0.0.1.evil.example", 403), ("evil.example:8000", 403), ("localhost@evil.example", 403), ("", 403),
+     (None, 403), ("127.0.0.1\tevil", 403)],
+)  # fmt: skip
+def test_only_names_of_this_machine_are_answered(served, host, status):
+    """A page of another site could let its own name lead to 127.0.0.1."""
+    answer, text = ask(served, host=host)
+    assert answer.status == status
+    assert ("compare" in text) == (status == 200)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/../outside/report.html", "/%2e%2e/outside/report.html", "/..%2foutside/report.html",
+     "/b/../../outside/report.html", "/b/..%2f..%2foutside%2freport.html", "//outside/report.html", "/link/report.html",
+     "/c/report.html", "/d/report.html", "/..%5coutside%5creport.html", "/outside/report.html", "/b/config.yaml", "/b/",
+     "/b", "/s",
+     "/.hidden/report.html", "/b/report.html%00", "/deep/er/still/report.html", "/latest/report.html", "*", "/%ff"],
+)  # fmt: skip
+def test_no_path_leaves_the_folder(served, runs, path):
+    outside = runs.parent / "outside"
+    (runs / "link").symlink_to(outside)
+    (outside / "manifest.json").write_text((runs / "b" / "manifest.json").read_text())
+    for name in ("c", "d"):
+        shutil.copytree(runs / "a <b>", runs / name)
+    (runs / "c" / "report.html").unlink()
+    (runs / "c" / "report.html").symlink_to(outside / "report.html")
+    (runs / "d" / "config.yaml").unlink()
+    (runs / "d" / "config.yaml").symlink_to(outside / "report.html")
+    for name in (".hidden", "deep/er/still"):
+        shutil.copytree(runs / "a <b>", runs / name)
+    (runs / "latest").symlink_to("a <b>")
+    answer, text = ask(served, path)
+    assert answer.status == 404
+    assert SECRET not in text
+    _, text = ask(served)
+    assert text.count(">compare</a>") == 3  # the folders above are not listed
+
+
+def test_nothing_is_changed(served, runs):
+    """Not even the status of a run whose process has ended."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    holder = vars(Holder.here(True)) | {"pid": gone.pid}
+    change_manifest(runs / "b", status="running", process=holder)
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in runs.rglob("*") if path.is_file()}
+    assert ">interrupted</" in ask(served)[1].replace("</div>", "</")
+    assert ask(served, "/compare?run=b&run=a+%3Cb%3E")[0].status == 200
+    after = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in runs.rglob("*") if path.is_file()}
+    assert after == before
+
+
+@pytest.mark.parametrize("name", ["a <b>", "s"])
+def test_the_folder_may_be_one_run_or_sweep(runs, name):
+    (page,) = (each for each in serve.find_served(runs / name) if each.file is not None)
+    assert (page.name, page.page) == (name, f"/{page.file.name}")
+    assert len(serve.find_served(runs / name)) == (1 if name != "s" else 2)
+
+
+def test_names_need_not_be_utf_8(served, runs):
+    os.rename(runs / "a <b>", os.fsencode(runs) + b"/\xff")
+    _, text = ask(served)
+    assert 'href="/%FF/report.html"' in text
+    assert ask(served, "/%FF/report.html")[0].status == 200
+    assert 'href="/?with=%FF"' in text
+    assert ask(served, "/compare?run=%FF&run=b")[0].status == 200
+
+
+def test_it_listens_on_this_machine_alone(runs):
+    with serve.make_server(runs, 0) as server:
+        assert server.server_address[0] == "127.0.0.1"
+
+
+def test_damage_is_one_line(served, runs):
+    (runs / "b").rename(runs / "ä€")
+    (runs / "ä€" / "metrics.jsonl").write_text("damaged\n")
+    assert ask(served)[0].status == 200
+    answer, text = ask(served, f"/compare?run={quote('ä€')}&run=a+%3Cb%3E")
+    assert answer.status == 500
+    assert "metrics.jsonl: line 1: is damaged" in text
+
+
+def test_the_command(llvm, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "runs: no such folder; give the folder that contains the run folders" in reslrb("serve").output
+    Path("runs").mkdir()
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        result = reslrb("serve", "--port", other.getsockname()[1])
+    assert result.exit_code == 2
+    assert "--port: " in result.output
+    assert "in use; give another port, or 0 for a free one" in result.output
+    shown = tiny.start(tmp_path, "--port", "0", command="serve", config=False)
+    try:
+        line = shown.stdout.readline()
+        assert line.startswith("http://127.0.0.1:")
+        assert "No run yet." in ask(int(line.split("/")[2].rpartition(":")[2]))[1]
+    finally:
+        shown.terminate()
+    assert (shown.wait(30), shown.stderr.read()) == (130, "interrupted\n")
+
+
+# --- in a browser -----------------------------------------------------------------------------------------------------
+
+
+def test_the_pages_in_a_browser(served, runs, chromium, monkeypatch):
+    """Links lead to the pages and back, nothing is blocked, and a list that reloads keeps its place."""
+    monkeypatch.setattr(page_module, "REFRESH_SECONDS", 1)
+    for number in range(30):
+        make_run(runs / f"more-{number}", iterations=1)
+    address = f"http://127.0.0.1:{served}/"
+    chromium.open(address, 1280)
+    chromium.evaluate("scrollTo(0, 500); window.seen = 1; document.scrollingElement.scrollTop")
+    for _ in range(2):
+        assert chromium.wait_for("window.seen != 1", 10)
+        assert chromium.evaluate("window.seen = 1; scrollY") == 500
+    click = "[...document.querySelectorAll('a')].find(a => decodeURI(a.href).includes('%s')).click()"
+    chromium.evaluate(click % "with=b")
+    assert chromium.wait_for("document.body?.textContent.includes('to compare with b')", 10)
+    chromium.evaluate(click % "run=a")
+    assert chromium.wait_for("document.querySelectorAll('svg').length == 2", 10)
+    assert chromium.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+    assert chromium.evaluate("document.images.length") >= 4
+    assert chromium.evaluate("document.documentElement.scrollWidth") <= 1280
+    chromium.open(address + "a%20%3Cb%3E/report.html", 1280)
+    assert chromium.evaluate("document.querySelectorAll('.compare').length") == 1  # the script of the page runs
+    assert [event for event in chromium.events if event["method"] == "Log.entryAdded"] == []
