@@ -28,7 +28,6 @@ from reslrb_cli.cli.options import (
     json_option,
     optional_experiment_arguments,
     origin_of,
-    read_earlier,
     read_or_box,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
@@ -36,7 +35,7 @@ from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import PATHS_OPTIONS, kept_settings, parse_checked
+from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_checked
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
 if TYPE_CHECKING:
@@ -81,13 +80,11 @@ def _given(options: dict[str, str]) -> str | None:
 
 def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
     """Measure, print and write; return the exit code. `variant` must be set."""
-    from reslrb_cli.measure.missing import KIND, MissingCheck
+    from reslrb_cli.measure.missing import MissingCheck
 
-    json_file, seeds, spp = options.json_file, options.seeds, options.spp
-    to_keep = kept_settings(config, {}, variant, device_name(variant), spp=spp)
-    check = MissingCheck(config, options.budget, seeds, spp, read_earlier(KIND, json_file, to_keep))
+    check = MissingCheck(config, options.budget, options.seeds, options.spp)
     echo(check.conditions())
-    keeper = Keeper(json_file, origin_of(variant), check.known, lambda: check.kept(to_keep))
+    keeper = Keeper(options.json_file, origin_of(variant), check.known)
     with Interrupts() as interrupts:
         for record in check.run(lambda: interrupts.requested, keeper.refresh):
             echo(record.line())
@@ -96,47 +93,35 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
 
 
 def run_suite(options: GradcheckOptions) -> int:
-    """Run the named cases, or all cases without names. Print a line for each case and write the file.
-
-    Cases in the file are not run again.
-    """
+    """Run the named cases, or all cases without names. Print a line for each case and write the file."""
     chosen = None if options.integrators is None else _estimators(options.integrators)
     variant = set_variant("auto")
 
-    from reslrb_cli.measure.extreme import CASES, case_records, suite
+    from reslrb_cli.measure.extreme import CASES, case_records
     from reslrb_cli.report.tables import summary_lines
 
-    seeds, json_file, listed = options.seeds, options.json_file, str(options.suite).partition(":")[2]
+    listed = str(options.suite).partition(":")[2]
     names = [name.strip() for name in listed.split(",")] if listed else []
     for name in names:
         if name not in CASES:
             near = difflib.get_close_matches(name, CASES, n=1) or ["furnace"]
             raise ConfigError("--suite", "", f"there is no case `{name}`; did you mean {near[0]}?")
-    to_keep = suite.settings(chosen, seeds, variant, device_name(variant))
-    earlier = read_earlier(suite.KIND, json_file, to_keep)
-    done = {} if earlier is None else suite.restore(earlier)
-    to_do = [name for name in names or CASES if name not in done]
     echo(f"{device_name(variant)}, {variant}")
-    for case, rows in done.items():
-        echo(_case_line(case, rows))
-
-    def lines() -> list[GradcheckRecord]:
-        return [record for rows in done.values() for record in rows]
-
-    keeper = Keeper(json_file, origin_of(variant), lines, lambda: suite.kept(to_keep, done))
+    records: list[GradcheckRecord] = []
+    keeper = Keeper(options.json_file, origin_of(variant), lambda: records)
     with Interrupts() as interrupts:
-        for name in to_do:
-            rows = case_records(lambda: interrupts.requested, name, chosen, seeds)
+        for name in names or CASES:
+            rows = case_records(lambda: interrupts.requested, name, chosen, options.seeds)
             if interrupts.requested:  # this case may be incomplete
                 break
-            done[name] = rows
+            records += rows
             keeper.refresh()
             echo(_case_line(name, rows))
         interrupted = interrupts.requested
         keeper.finish()
-    for line in summary_lines(lines()):
+    for line in summary_lines(records):
         echo(line)
-    return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
+    return ExitCode.INTERRUPTED if interrupted else _exit_code(records)
 
 
 def _estimators(text: str) -> list[str]:
@@ -207,8 +192,6 @@ def command(**given: Any) -> int:
     from reslrb_cli.measure.gradcheck import Gradcheck
     from reslrb_cli.measure.own import look_into
     from reslrb_cli.measure.participants import settings_of
-    from reslrb_cli.measure.sampling import KIND
-    from reslrb_cli.measure.sampling import settings as settings_to_keep
     from reslrb_cli.report.tables import summary_lines
 
     options.check()
@@ -225,11 +208,10 @@ def command(**given: Any) -> int:
         config, options.integrators, options.budget, options.seeds, options.spp, time.monotonic() - began
     )
     variant = set_variant(config.variant)
-    to_keep = settings_to_keep(checked, variant, device_name(variant))
-    check = Gradcheck(checked, earlier=read_earlier(KIND, options.json_file, to_keep))
+    check = Gradcheck(checked)
     echo(f"{device_name(variant)}, {variant}; {allowance(options.budget, options.seeds, 'seed')}")
     echo(check.conditions())
-    records, interrupted = _run(check, variant, to_keep, options)
+    records, interrupted = _run(check, variant, options)
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
         echo(line)
@@ -247,15 +229,12 @@ def _exit_code(records: Iterable[GradcheckRecord]) -> int:
     return ExitCode.CHECK_FAILED if any(record.holds is False for record in records) else ExitCode.DONE
 
 
-def _run(
-    check: Gradcheck, variant: str, to_keep: dict[str, Any], options: GradcheckOptions
-) -> tuple[list[GradcheckRecord], bool]:
+def _run(check: Gradcheck, variant: str, options: GradcheckOptions) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write. Return all records, and True if the user interrupted."""
     from reslrb_cli.report.tables import cells, gradcheck_columns
 
     records: list[GradcheckRecord] = []
-    origin = origin_of(variant)
-    keeper = Keeper(options.json_file, origin, lambda: records, lambda: check.sampling.kept(to_keep))
+    keeper = Keeper(options.json_file, origin_of(variant), lambda: records)
     with Interrupts() as interrupts:
         table = gradcheck_columns(check.expected())
         echo(table.head())

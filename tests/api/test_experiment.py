@@ -271,7 +271,7 @@ class Played(Session):
 
     def __init__(self, plan: Plan, folder: Path, stop: Callable[[], bool], say: Callable[[str], None], **given: Any):
         stage = Stage()
-        super().__init__(plan, folder, stop, say, stage.start, stage.clock, earlier=given.get("earlier"))
+        super().__init__(plan, folder, stop, say, stage.start, stage.clock)
 
 
 def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

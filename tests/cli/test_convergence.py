@@ -112,29 +112,9 @@ def test_bad_input_is_one_located_line(folder: Path, args: tuple[str, ...], line
     assert line in err
 
 
-def test_steps_that_cannot_be_continued(folder: Path) -> None:
-    (folder / "c.jsonl").write_text("kept\n")
-    (folder / "c.samples.npz").write_bytes(b"PK\x03\x04 cut off")
-    code, _, err = outcome("convergence", "tiny.yaml", "--json", "c.jsonl")
-    assert (code, "c.samples.npz: " in err) == (2, True)
-    assert (folder / "c.jsonl").read_text() == "kept\n"
-
-
 @pytest.mark.long
 def test_the_image(folder: Path) -> None:
     words = ("--objective", "image", "--rounds", "4", "--json", "c.jsonl", "--integrators", "prb")
     done("convergence", "tiny.yaml", *words)
     methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method"]
     assert [(line["label"], line["parameter"], line["biased"]) for line in methods] == [("prb", "image", False)]
-
-
-@pytest.mark.long
-def test_continuing(folder: Path) -> None:
-    args = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack", "--json", "c.jsonl", "--rounds"]
-    done(*args, "4")
-    done(*args, "8")
-    assert {line["repeats"] for line in read(folder / "c.jsonl") if line["kind"] == "method"} == {16}
-    code, _, err = outcome(*args, "9", "--set", "run.spp=8")
-    reason = "run.spp is 4 there, 8 here; remove the file, or use another one"
-    assert (code, err) == (2, f"--json: c.jsonl belongs to another measurement: {reason}\n")
-    assert len(read(folder / "c.jsonl")) > 2  # file is unchanged

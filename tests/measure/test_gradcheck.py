@@ -1,4 +1,4 @@
-"""Gradcheck holds for the unchanged code, finds planted faults, and continues an earlier check."""
+"""Gradcheck holds for the unchanged code, and finds planted faults."""
 
 from __future__ import annotations
 
@@ -43,11 +43,9 @@ from reslrb_cli.measure.references import (
     ptracer_gradient,
     ptracer_image,
 )
-from reslrb_cli.measure.sampling import KIND, settings
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
 from reslrb_cli.measure.scenes.small import room as corner
-from reslrb_cli.records.measurement_files import Earlier, read_samples, write_samples
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
 from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior
@@ -515,44 +513,3 @@ def test_smooth_directions():
     weights = smooth_weights(16, 24)
     assert weights.mean() == pytest.approx(1)
     assert weights[0].max() == weights[:, -1].max() == 0
-
-
-# A gradcheck that continues an earlier one gives the results of a single check at the same seeds.
-
-
-def check_again(
-    seeds: int, file: Path, earlier: Earlier | None = None, after: int = 10**6
-) -> tuple[list[GradcheckRecord], Earlier]:
-    """Return the records and the check's kept content, which is written to a file and read back. The check stops after
-    `after` looks at the clock.
-    """
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
-    what = CheckSettings(config, estimators_of("stack"), 0, seeds)
-    made, looks = Gradcheck(what, earlier=earlier), iter(range(10**6))
-    records = list(made.run(lambda: next(looks) > after, lambda line: None))
-    kept = made.sampling.kept(settings(what, "llvm_ad_rgb", ""))
-    assert kept is not None
-    write_samples(file, *kept)
-    return records, Earlier(KIND, Path("g.jsonl"), *read_samples(file))
-
-
-@pytest.mark.long
-def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The earlier check stopped after two of its differences."""
-    whole, _ = check_again(6, tmp_path / "a.npz")
-    part, earlier = check_again(4, tmp_path / "b.npz", after=17)
-    assert {record.seeds for record in part if record.reference is Reference.FINITE_DIFFERENCE} < {3, 4}
-    assert earlier.head["steps"]
-    more, _ = check_again(6, tmp_path / "c.npz", earlier)
-    assert [(r.reference, r.verdict, r.seeds) for r in more] == [(r.reference, r.verdict, r.seeds) for r in whole]
-    for one, other in zip(more, whole, strict=True):
-        # If gradients differ only by rounding, these statistics are not reproducible.
-        noisy = one.reference is Reference.PTRACER
-        for name in ("relative_l2", "z_max", "z_rms", "variance_ratio") if noisy else ("relative_l2",):
-            assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-2, abs=1e-4), (one.reference, name)
-    assert {record.verdict for record in more} == {Verdict.HOLDS}
-    # A seed in the file is not taken again.
-    monkeypatch.setattr(Participants, "sample", None)
-    monkeypatch.setattr(Participants, "choose_steps", None)
-    same, _ = check_again(6, tmp_path / "d.npz", Earlier(KIND, Path("g.jsonl"), *read_samples(tmp_path / "c.npz")))
-    assert [record.to_json() for record in same] == [record.to_json() for record in more]

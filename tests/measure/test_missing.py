@@ -212,31 +212,18 @@ run: {{iterations: 3, spp: 16}}
 """
 
 
-def test_the_command_and_more_seeds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    """A second call adds seeds, and takes none again. The command refuses to continue another measurement."""
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setattr(missing_check, "IMAGE_PATHS", 2**16)  # noisier dL/dI, which is the same for all
     config = tmp_path / "lamp.yaml"
     config.write_text(LAMP.format(folder=Path(__file__).parent))
-    part, again = tmp_path / "part.jsonl", ["--missing", "--spp", "4"]
-    assert call(str(config), *again, "--seeds", "3", "--json", str(part)) == 0
+    part = tmp_path / "part.jsonl"
+    assert call(str(config), "--missing", "--spp", "4", "--seeds", "3", "--json", str(part)) == 0
     origin, row = map(json.loads, part.read_text().splitlines())
     assert origin["kind"] == "origin"
     assert (row["kind"], row["parameter"], row["directions"], row["seeds"]) == ("missing", "lamp.position", 3, 3)
     shown = capsys.readouterr().out.splitlines()
     assert shown[-1].startswith("lamp.position: ")
     assert "dL/dI of the loss at the initial values" in shown[-2]
-    assert call(str(config), *again, "--seeds", "6", "--json", str(part)) == 0
-    other = json.loads(part.read_text().splitlines()[-1])
-    assert (other["seeds"], other["share"] != row["share"]) == (6, True)
-    capsys.readouterr()
-    with monkeypatch.context() as patch:
-        patch.setattr(Missing, "take", None)
-        assert call(str(config), *again, "--seeds", "6", "--json", str(part)) == 0
-    assert json.loads(part.read_text().splitlines()[-1]) == other
-    assert call(str(config), "--missing", "--seeds", "9", "--spp", "8", "--json", str(part)) == 2
-    assert "belongs to another measurement: spp is 4 there, 8 here" in capsys.readouterr().err
 
 
 def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
