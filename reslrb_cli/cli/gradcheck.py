@@ -162,9 +162,9 @@ logger = logging.getLogger(__name__)
 @click.option("--integrators", metavar="LIST",
               help=
         "Check these, separated by commas: estimators, reslrb:ESTIMATOR[(OPTION=VALUE,...)], or your own Mitsuba "
-        "integrators, FILE.py:CLASS[(OPTION=VALUE,...)], which need --allow-code; the last lines say where to look "
-        "if one of these is wrong. Default: all four estimators, with the options of CONFIG, and "
-        "reslrb:stack(paths=both) if CONFIG leaves the paths open and the scene allows both.")  # fmt: skip
+        "integrators, FILE.py:CLASS[(OPTION=VALUE,...)], which need --allow-code. Default: all four estimators, with "
+        "the options of CONFIG, and reslrb:stack(paths=both) if CONFIG leaves the paths open and the scene allows "
+        "both.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
               help=
         "Time limit, including loading and compiling; it determines the number of seeds. Comparisons without "
@@ -190,7 +190,6 @@ def command(**given: Any) -> int:
     began, options = time.monotonic(), GradcheckOptions(**given)
     load_packages()  # before the imports below need them
     from reslrb_cli.measure.gradcheck import Gradcheck
-    from reslrb_cli.measure.own import look_into
     from reslrb_cli.measure.participants import settings_of
     from reslrb_cli.report.tables import summary_lines
 
@@ -215,10 +214,6 @@ def command(**given: Any) -> int:
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
         echo(line)
-    if records and not interrupted:
-        with Interrupts() as interrupts:
-            for line in look_into(check, records, lambda: interrupts.requested, logger.info):
-                echo(line)
     nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)
     if interrupted:
         return ExitCode.INTERRUPTED
