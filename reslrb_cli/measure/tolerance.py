@@ -1,5 +1,5 @@
-"""Images of a finished lens or mirror: where the light goes, and how errors of light, position, glass or tool change
-the images.
+"""Images of a finished lens or mirror: where the light goes, and how errors of light, position or glass change the
+images.
 
 For each error, a stock integrator of Mitsuba renders the scene with the changed part. If a rotation shifts the whole
 picture, the shift is reported, and removed before images are compared.
@@ -18,7 +18,7 @@ import scipy.ndimage
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.lens.solid import Array, Sheet
+from reslrb_cli.lens.solid import Array
 from reslrb_cli.records.images import luminance
 
 #: Assumed errors of the distance, of the index, and of rotations in degrees.
@@ -31,23 +31,6 @@ RAYS, BOUNCES = 2**19, 8
 #: squared distance of an even disc (one half).
 _DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) ** 0.5)
                              for a in np.arange(6) * np.pi / 3)]  # fmt: skip
-
-
-def closed_by_ball(heights: Array, pitch: Sequence[float], radius: float) -> Array:
-    """Return the heights (ny, nx) that a ball-end cutter of this `radius` leaves. The cut is a grey closing with the
-    ball.
-
-    `pitch` has the spacing of columns and the spacing of rows, in the unit of the heights.
-    """
-    relief = float(np.ptp(heights))
-    widest = radius if relief >= radius else (2 * radius * relief - relief**2) ** 0.5  # parts that can touch
-    reach = [max(1, int(widest / step)) for step in pitch]
-    y, x = np.mgrid[-reach[1] : reach[1] + 1, -reach[0] : reach[0] + 1]
-    far = (x * pitch[0]) ** 2 + (y * pitch[1]) ** 2
-    ball = np.sqrt(np.maximum(radius**2 - far, 0)) - radius
-    lifted = np.pad(heights, [(reach[1],) * 2, (reach[0],) * 2], mode="edge")
-    closed = scipy.ndimage.grey_closing(lifted, footprint=far <= radius**2, structure=ball)
-    return np.asarray(closed[reach[1] : -reach[1], reach[0] : -reach[0]])
 
 
 def figures(image: Array, target: Array) -> dict[str, float]:
@@ -212,18 +195,6 @@ class OpticalBench:
         """Return the ids of the face and of the flat back."""
         return [self.plan.face, "back"]
 
-    def tooled(self, sheet: Sheet, radius: float) -> dict[str, Any]:
-        """Return the vertex positions of the face after cutting with a ball-end cutter of this `radius`."""
-        pitch = [float(np.diff(line).mean()) for line in (sheet.x, sheet.y)]
-        key = f"{sheet.name}.vertex_positions"
-        points = np.array(self.params[key]).reshape(-1, 3)
-        column, row = (
-            np.rint((points[:, axis] - line[0]) / step).astype(int)
-            for axis, (line, step) in enumerate(zip((sheet.x, sheet.y), pitch, strict=True))
-        )
-        points[:, 2] = closed_by_ball(sheet.z, pitch, radius)[row, column]
-        return {key: mi.Float(points.astype(np.float32).ravel())}
-
     def image(self, values: dict[str, Any], spp: int, seed: int = 0) -> Array:
         """Render the scene with these parameters."""
         with self._changed(values):
@@ -241,7 +212,6 @@ class OpticalBench:
 
 def tolerances(
     bench: OpticalBench,
-    sheet: Sheet,
     planned: Array,
     target: Array,
     spp: int,
@@ -286,6 +256,4 @@ def tolerances(
             if ids:
                 turned = bench.image(bench.turned(ids, axis, TURN), spp)
                 tell(f"{what} turned by {TURN:g} degree about {name}", turned, turned=True)
-    if plan.tool_radius is not None:
-        tell(f"cut by a ball of {plan.tool_radius:g} mm", bench.image(bench.tooled(sheet, plan.tool_radius), spp))
     return found

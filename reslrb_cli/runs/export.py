@@ -101,7 +101,7 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
                 except ConfigError as error:
                     raise ConfigError(config.source, error.key, error.message) from None
                 pictures |= add_tolerances(
-                    numbers, bench, sheet, luminance(image), luminance(target), config.run.final_spp, say
+                    numbers, bench, luminance(image), luminance(target), config.run.final_spp, say
                 )
         pictures |= pictures_of(solid)
         beside = solid_files(plan, sheet, solid, numbers, pictures)

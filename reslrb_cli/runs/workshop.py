@@ -36,15 +36,6 @@ ALLOWED_LOSS = 0.05
 #: Errors that a careful workshop keeps: distance in mm, rotations in degrees, index of refraction.
 TOLERANCES = {"distance": 1.0, "light turned": 0.5, "solid turned": 0.5, "index": 0.002}
 
-#: Share of the darkest pixels of a picture, and the brightness up to which they count as black, in means.
-DARKEST, BLACK = 0.05, 0.2
-
-#: Brightness in means by which black may be brighter than in the picture.
-GREY = 0.05
-
-#: Side of a corner as a fraction of the picture, and the least share of its light. Darker corners count as black.
-CORNER, LIT = 0.1, 0.5
-
 
 def add_sheet(
     numbers: dict[str, Any],
@@ -55,7 +46,7 @@ def add_sheet(
     thrown: Array,
     wanted: Array,
 ) -> dict[str, Array]:
-    """Add quality, light, set-up and warnings of a solid to `numbers`. Returns the original picture and the caustic.
+    """Add quality, light and set-up of a solid to `numbers`. Returns the original picture and the caustic.
 
     `thrown` (H, W) is the luminance of the image of the sensor with index `sensor`. `wanted` (H, W) is the luminance of
     the sensor's target.
@@ -69,16 +60,12 @@ def add_sheet(
         numbers["setup"] = setup_of(scene, scene.sensors()[sensor], plan, sheet, wanted)
     shown = wanted if original is None else original
     inside = picture_within(wanted)
-    numbers["blacks"] = blacks(thrown[inside], shown[inside])
-    corners = unlit_corners(thrown[inside], shown[inside])
-    numbers["warnings"] = numbers["warnings"] + light_warnings(numbers["blacks"], corners)
     return {"picture": as_picture(shown, shown, inside), "caustic": as_picture(thrown, shown, inside)}
 
 
 def add_tolerances(
     numbers: dict[str, Any],
     bench: OpticalBench,
-    sheet: Sheet,
     planned: Array,
     wanted: Array,
     spp: int,
@@ -92,7 +79,7 @@ def add_tolerances(
     def keep(name: str, image: Array) -> None:
         pictures[name] = as_picture(image, shown, inside)
 
-    found = tolerances(bench, sheet, planned, wanted, spp, say, original, keep)
+    found = tolerances(bench, planned, wanted, spp, say, original, keep)
     setup = numbers.get("setup")
     deviations = {"turn": TURN, "index": INDEX}
     if setup is not None:
@@ -123,7 +110,7 @@ def as_picture(image: Array, original: Array, inside: tuple[slice, slice]) -> Ar
     return np.asarray(scaled, dtype=np.float32)[:, :, None]
 
 
-# --- allowed errors, grey blacks and unlit corners --------------------------------------------------------------------
+# --- allowed errors ---------------------------------------------------------------------------------------------------
 
 
 def allowed_errors(
@@ -169,52 +156,6 @@ def allowed_error(fall: float, deviation: float) -> float:
     measured.
     """
     return deviation * min(1.0, ALLOWED_LOSS / fall) if fall > 0 else deviation
-
-
-def blacks(image: Array, picture: Array) -> dict[str, float]:
-    """Return the mean brightness of the darkest 5 % of a `picture` (H, W). Also return the mean brightness of the same
-    pixels of an `image`.
-
-    Both images are divided by their means.
-    """
-    seen, wanted = (each / max(float(each.mean()), 1e-30) for each in (image, picture))
-    dark = wanted <= np.quantile(wanted, DARKEST)
-    return {"image": float(seen[dark].mean()), "picture": float(wanted[dark].mean())}
-
-
-def unlit_corners(image: Array, picture: Array) -> list[str]:
-    """Return the names of the corners in which an `image` (H, W) has less than half the light of the `picture` (H, W).
-
-    A corner spans a tenth of the width and a tenth of the height. Both images are divided by their means. Black corners
-    of the picture do not count.
-    """
-    seen, wanted = (each / max(float(each.mean()), 1e-30) for each in (image, picture))
-    height, width = (max(1, round(CORNER * size)) for size in picture.shape)
-    rows = {"top": slice(None, height), "bottom": slice(-height, None)}
-    columns = {"left": slice(None, width), "right": slice(-width, None)}
-    return [
-        f"{row} {column}"
-        for row, of_row in rows.items()
-        for column, of_column in columns.items()
-        if (light := float(wanted[of_row, of_column].mean())) > GREY
-        and float(seen[of_row, of_column].mean()) < LIT * light
-    ]
-
-
-def light_warnings(dark: Mapping[str, float], corners: list[str]) -> list[str]:
-    """Return a warning sentence if black comes out grey. Return another sentence if `corners` are unlit. `dark` is a
-    result of `blacks`.
-    """
-    lines = []
-    if dark["picture"] <= BLACK and dark["image"] > dark["picture"] + GREY:
-        lines.append(f"Black parts of the picture come out at {100 * dark['image']:.0f} % of the mean brightness "
-                     f"({100 * dark['picture']:.0f} % in the picture), so they look grey")  # fmt: skip
-    if corners:
-        named = ", ".join(corners[:-1]) + " and " + corners[-1] if len(corners) > 1 else corners[0]
-        lines.append(f"The {named} corner{'s' if len(corners) > 1 else ''} of the picture "
-                     f"get{'' if len(corners) > 1 else 's'} less than half of {'their' if len(corners) > 1 else 'its'} "
-                     "light")  # fmt: skip
-    return lines
 
 
 # --- the set-up -------------------------------------------------------------------------------------------------------

@@ -1,6 +1,4 @@
-"""Tolerances: displaced parts match a scene file with the same displacement, and are put back afterwards. Tool balls
-cut the hollows that they fit into.
-"""
+"""Tolerances: displaced parts match a scene file with the same displacement, and are put back afterwards."""
 
 from __future__ import annotations
 
@@ -17,11 +15,9 @@ from lens.test_experiment import picture
 from skimage.metrics import structural_similarity
 
 from reslrb_cli.config.schema import Fabrication
-from reslrb_cli.lens.solid import as_sheet
 from reslrb_cli.measure import tolerance
 from reslrb_cli.measure.tolerance import (
     OpticalBench,
-    closed_by_ball,
     figures,
     shift_between,
     where_light_goes,
@@ -32,21 +28,6 @@ from reslrb_cli.runs import export
 
 PTRACER = {"type": "ptracer", "max_depth": 4}
 FLAT = Fabrication(thickness=25.0)
-
-
-def test_a_ball_fits_into_wide_hollows_and_fills_narrow_ones() -> None:
-    x = np.linspace(-20, 20, 81)
-    wide = np.tile(30 - np.sqrt(30**2 - x**2), (5, 1))  # a trough with a radius of 30 mm
-    pitch = (float(x[1] - x[0]), 20.0)
-    middle = slice(16, -16)  # the trough ends at the edges of the grid
-    assert closed_by_ball(wide, pitch, 10)[2, middle] == pytest.approx(wide[2, middle], abs=0.02)
-    filled = closed_by_ball(np.minimum(wide, 2), pitch, 60)[2]
-    # A ball with a radius of 60 mm lies on the brims of the 2 mm deep trough, which are at 11 mm.
-    assert filled.min() == pytest.approx(2 - (60 - np.sqrt(60**2 - 11**2)), abs=1e-6)
-    slit = np.zeros((5, 81))
-    slit[:, 40] = -5
-    left = closed_by_ball(slit, pitch, 3)[2, 40]
-    assert left == pytest.approx(np.sqrt(9 - pitch[0] ** 2) - 3, abs=1e-6)  # brims are one pitch off its middle
 
 
 def test_shift_and_figures_match_a_known_change_of_a_picture() -> None:
@@ -71,8 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "32")
     done("optimize", folder / "lens/lens.yaml", "--set", f"run.output={folder}/runs", "--set", "run.iterations=1",
          "--set", "run.spp=4", "--set", "run.final_spp=64", "--set", "run.certainty=false")  # fmt: skip
-    said = done("export", folder / "runs/lens", "-o", folder / "out", "--tolerances", "--set",
-                "fabrication.tool_radius=40").output  # fmt: skip
+    said = done("export", folder / "runs/lens", "-o", folder / "out", "--tolerances").output
     (folder / "said.txt").write_text(said)
     return folder
 
@@ -214,27 +194,12 @@ def test_a_wide_light_is_the_mean_of_rotated_ones(folder: Path) -> None:
     assert wide.sum() == pytest.approx(planned.sum(), rel=0.05)
 
 
-def test_a_tool_ball_touches_the_vertices_of_the_face(folder: Path) -> None:
-    made = bench(folder)
-    before = np.array(made.params["face.vertex_positions"]).reshape(-1, 3)
-    sheet = as_sheet("face", before, np.array(made.params["face.faces"]).reshape(-1, 3))
-    after = np.array(made.tooled(sheet, 1e-3)["face.vertex_positions"]).reshape(-1, 3)
-    assert after == pytest.approx(before, abs=1e-4)  # this ball fits everywhere
-    before[np.argsort(np.hypot(before[:, 0] - 10, before[:, 1]))[:2], 2] -= (
-        0.5  # two pits that a ball of 60 mm cannot enter
-    )
-    sheet = as_sheet("face", before, np.array(made.params["face.faces"]).reshape(-1, 3))
-    rough = np.array(made.tooled(sheet, 60.0)["face.vertex_positions"]).reshape(-1, 3)
-    assert np.all(rough[:, 2] >= before[:, 2] - 1e-4)
-    assert np.max(rough[:, 2] - before[:, 2]) == pytest.approx(0.5, abs=0.05)
-
-
 def test_the_command_reports_all_figures(folder: Path) -> None:
     told = json.loads((folder / "out/fabrication.json").read_text())["tolerances"]
     assert list(told) == [
         "as planned", "light of 0.53 degrees", "distance +2 %", "distance -2 %", "index +0.005", "index -0.005",
         "light turned by 1 degree about x", "light turned by 1 degree about y", "lens turned by 1 degree about x",
-        "lens turned by 1 degree about y", "cut by a ball of 40 mm",
+        "lens turned by 1 degree about y",
     ]  # fmt: skip
     said = (folder / "said.txt").read_text()
     light = json.loads((folder / "out/fabrication.json").read_text())["light"]
