@@ -18,7 +18,6 @@ from pydantic_core import to_jsonable_python
 
 from reslrb_cli.cli.options import overrides_option, start_variant
 from reslrb_cli.cli.terminal import echo, fill
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.parameters import is_named
 from reslrb_cli.config.schema import Config
@@ -30,7 +29,6 @@ from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanRow
-    from reslrb_cli.optimization.sensitivity import Conditioning
     from reslrb_cli.scene.catalog import ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.parameters import Selection
 
@@ -188,10 +186,6 @@ def _flags(info: ParameterInfo) -> str:
     return ("" if info.differentiable else "not ") + "differentiable" + ", discontinuous" * info.discontinuous
 
 
-#: Number of gradients for `--conditioning`, each of run.spp samples per pixel.
-SAMPLES = 8
-
-
 @click.command("inspect")
 @click.argument("path", metavar="PATH", type=click.Path(path_type=Path))
 @overrides_option
@@ -202,16 +196,12 @@ SAMPLES = 8
     is_flag=True,
     help="Find the first value that was not finite in the run in folder PATH: trace that step again.",
 )
-@click.option(
-    "--conditioning", is_flag=True, help="Measure the sensitivity of image and loss to each parameter (renders)."
-)
 def command(
     path: Path,
     overrides: tuple[str, ...],
     everything: bool,
     as_json: bool,
     nonfinite: bool,
-    conditioning: bool,
 ) -> int | None:
     """List the parameters of a scene that can be recovered, with their current values, and the contents of the scene.
 
@@ -219,17 +209,10 @@ def command(
     lists the parameter keys that `parameters` of a configuration may use. For all other keys, the command gives the
     reason why a configuration cannot use the key. If the configuration has `parameters`, the plan of a step lists the
     features that its kernels contain or leave out, and why.
-
-    --conditioning measures how different the sensitivities of the parameters are at their initial values: for each
-    parameter the root mean square of its values, its gradient and the noise of one step's gradient, the relative change
-    of the image per unit, and the length by which it would have to change to explain the
-    image. `optimizer.scale: auto` compensates for the parameters' different sensitivities.
     """
 
     subject = read_subject(path, overrides)
     config = subject.config
-    if conditioning and subject.missing:
-        raise ConfigError(path, subject.missing[0], "missing; --conditioning needs a complete experiment")
     if nonfinite:
         if overrides:
             raise ConfigError("--set", "", "has no effect with --nonfinite, which repeats a step of the run")
@@ -243,18 +226,13 @@ def command(
     selection = None if "parameters" in subject.missing else select(config, scene)
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
     plan = None if selection is None else make_plan(subject, scene, selection)
-    measured = measure(config) if conditioning else None
     if as_json:
         known = {"run": subject.run, **vars(summary)}
         known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan and {"rows": plan}, "edges": edges}
-        if measured is not None:
-            known["conditioning"] = measured.to_json()
         # Objects of the scene are written as their ids.
         data = to_jsonable_python(known, inf_nan_mode="constants", fallback=lambda item: item.id())
         click.echo(json.dumps(finite(data, str), indent=2, allow_nan=False))
         return None
-    from reslrb_cli.report.tables import conditioning_lines
-
     wanted = [] if "parameters" in subject.missing else [key for spec in config.parameters for key in spec.keys]
     parameters = parameter_lines(summary.parameters, wanted, everything)
     text = fill(
@@ -263,7 +241,6 @@ def command(
             "counted": _counted,
             "sized": _sized,
             "shares": lambda view: ", ".join(f"{name} {100 * share:.0f} %" for name, share in vars(view).items()),
-            "conditioning": conditioning_lines,
         },
         path=path,
         run=None if subject.run is None else run_words(subject.run),
@@ -273,8 +250,7 @@ def command(
         plan=[f"none: {plan}"] if isinstance(plan, str) else plan and plan_lines(plan),
         parameters=[*parameters, *moving_lines(summary.movable, everything)],
         edges=edges,
-        measured=measured,
-        next=None if measured else next_step(subject, summary),
+        next=next_step(subject, summary),
     )
     click.echo(text, nl=False)
     return None
@@ -330,18 +306,6 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
     if missing:
         return f"add {missing} to {subject.path}, then run `reslrb optimize {subject.path}`"
     return f"`reslrb optimize {subject.config.source}`" + (" runs it again" if subject.run else " runs it")
-
-
-def measure(config: Config) -> Conditioning:
-    """Measure the conditioning of the experiment. The conditioning does not depend on settings that a run decides, so
-    these are off.
-    """
-    from reslrb_cli.optimization.assemble import assemble
-    from reslrb_cli.optimization.sensitivity import measure_conditioning
-
-    if isinstance(config.integrator, ReslrbConfig):
-        config = config.model_copy(update={"integrator": config.integrator.undecided_off()})
-    return measure_conditioning(assemble(config, logging.getLogger(__name__).info), SAMPLES)
 
 
 def select(config: Config, scene: Any) -> Selection | str:

@@ -161,7 +161,8 @@ REMOVED = {
         ("render", "--spp", "use --set run.spp=N"),
         ("init lens", "--force", "remove or rename the files that exist"),
         ("init", "--recover", "all other parameters are comments of the file; remove the # of those that you want"),
-        ("inspect", "--samples", "--conditioning takes 8 gradients"),
+        ("inspect", "--conditioning", "`reslrb optimize CONFIG --set optimizer.scale=auto --set run.iterations=1` "
+         "measures it; the page of the run has the table"),
         ("doctor", "--json", "the lines of `reslrb doctor` have the same content"),
         ("lens", "--both", "the back is flat: a second free face made pictures worse"),
         ("lens", "--margin", "the film sees an eighth of the picture's longer side around it"),
