@@ -7,9 +7,8 @@ the scene, its sensors, the plan of a step and the parameters (`templates/inspec
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,12 +16,12 @@ import click
 from pydantic_core import to_jsonable_python
 
 from reslrb_cli.cli.options import overrides_option, start_variant
-from reslrb_cli.cli.terminal import echo, fill
+from reslrb_cli.cli.terminal import fill
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.parameters import is_named
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
-from reslrb_cli.errors import ConfigError, ExitCode, UnsupportedScene
+from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.records.manifest import MANIFEST_FILE, read_manifest
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.format import table
@@ -191,17 +190,11 @@ def _flags(info: ParameterInfo) -> str:
 @overrides_option
 @click.option("--all", "everything", is_flag=True, help="Also list parameters that cannot be recovered.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object with all data instead of lines.")
-@click.option(
-    "--nonfinite",
-    is_flag=True,
-    help="Find the first value that was not finite in the run in folder PATH: trace that step again.",
-)
 def command(
     path: Path,
     overrides: tuple[str, ...],
     everything: bool,
     as_json: bool,
-    nonfinite: bool,
 ) -> int | None:
     """List the parameters of a scene that can be recovered, with their current values, and the contents of the scene.
 
@@ -213,10 +206,6 @@ def command(
 
     subject = read_subject(path, overrides)
     config = subject.config
-    if nonfinite:
-        if overrides:
-            raise ConfigError("--set", "", "has no effect with --nonfinite, which repeats a step of the run")
-        return show_nonfinite(subject, as_json)
     start_variant(config)
     from reslrb_cli.optimization.loading import load_configured
     from reslrb_cli.scene.catalog import summarise
@@ -254,35 +243,6 @@ def command(
     )
     click.echo(text, nl=False)
     return None
-
-
-def show_nonfinite(subject: Subject, as_json: bool) -> int:
-    """Print the origin of the run's first value that is not finite. Return exit code 1 if all values are finite now."""
-    from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME
-    from reslrb_cli.records.run_folder import RunFolder
-
-    config = subject.config
-    run = config.source.parent
-    if subject.run is None:
-        raise ConfigError(config.source, "--nonfinite", "is not in a run folder; give the config.yaml of a run")
-    if not (RunFolder(run).checkpoint / NONFINITE_FILE_NAME).exists():
-        raise ConfigError(config.source, "--nonfinite", "all values of this run were finite")
-    if config.codes:
-        own = next(iter(config.codes))
-        raise ConfigError(config.source, "--nonfinite", f"does not run your own code, which {own} names")
-    from reslrb_cli.measure.nonfinite_trace import find_offenders
-    from reslrb_cli.runs.resume import problem_before_nonfinite
-
-    problem, iteration = problem_before_nonfinite(run, logging.getLogger(__name__).info)
-    found = find_offenders(problem, iteration)
-    if as_json:
-        report = {"iteration": iteration, "offenders": [asdict(entry) for entry in found]}
-        click.echo(json.dumps(finite(report, str), indent=2, allow_nan=False))
-    else:
-        lines = [line for entry in found for line in entry.lines(iteration)]
-        for line in lines or [f"iteration {iteration}: all values are finite now"]:
-            echo(line)
-    return ExitCode.DONE if found else ExitCode.CHECK_FAILED
 
 
 def run_words(run: Mapping[str, Any]) -> str:

@@ -161,6 +161,7 @@ REMOVED = {
         ("render", "--spp", "use --set run.spp=N"),
         ("init lens", "--force", "remove or rename the files that exist"),
         ("init", "--recover", "all other parameters are comments of the file; remove the # of those that you want"),
+        ("inspect", "--nonfinite", "a run names the first pixel of dL/dI, and the parameters, that are not finite"),
         ("inspect", "--conditioning", "`reslrb optimize CONFIG --set optimizer.scale=auto --set run.iterations=1` "
          "measures it; the page of the run has the table"),
         ("doctor", "--json", "the lines of `reslrb doctor` have the same content"),

@@ -28,7 +28,7 @@ from turns import a_few, taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plugin import make_integrator
-from reslrb_cli.integrators.step import gradient_step, known_step, render_image, sample_sets
+from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room, texture, transform
 
@@ -485,20 +485,3 @@ def test_batches_that_do_not_divide_are_refused(case_of_two: Case, reference: tu
         ValueError, match='"batches" must be an integer from 2' if batches < 2 else "multiple of the batches"
     ):
         case_of_two.gradient(integrator("reslrb"), 1, SPP, l2(reference[0]), adjoint="batched", batches=batches)
-
-
-@pytest.mark.parametrize("name", ["correlated", "independent", "four batches"])
-def test_sample_sets_equal_those_of_a_step(case_of_two: Case, name: str):
-    tracer, results = integrator("reslrb", estimator="stack"), []
-
-    def step(*args, **options):
-        results.append(gradient_step(*args, **options))
-
-    gradient = case_of_two.gradient(tracer, 3, SPP, step=step, **ADJOINTS[name])
-    sets = [(int(seed[0]), spp) for _, seed, spp in sample_sets(3, {"spp": SPP, "batches": 4, **ADJOINTS[name]})]
-    images = [np.array(render_image(tracer, case_of_two.scene, 0, seed, spp)) for seed, spp in sets]
-    expected = np.mean(images, axis=0) if name == "four batches" else images[0]
-    np.testing.assert_allclose(np.array(results[0].image), expected, rtol=1e-4, atol=1e-5)
-    # the objective is linear, so that dL/dI is the same for all samples, and the first batch gives only an image
-    own = [case_of_two.gradient(tracer, seed, spp) for seed, spp in (sets[1:] or sets)]
-    np.testing.assert_allclose(gradient, np.mean(own, axis=0), rtol=1e-3, atol=1e-5 * np.abs(gradient).max())
