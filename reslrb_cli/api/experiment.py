@@ -160,7 +160,7 @@ def load_with(
     if not isinstance(scene, mi.Scene):
         what = "one of another variant" if type(scene).__name__ == "Scene" else one_line(repr(scene), 60)
         raise ConfigError(source, "", f"must be a Mitsuba dictionary or an mi.Scene, not {what}")
-    from reslrb_cli.scene.in_memory import SceneInMemory
+    from reslrb_cli.scene.load import SceneInMemory
 
     return config.with_scene(SceneInMemory(scene, source))
 

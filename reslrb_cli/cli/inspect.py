@@ -27,7 +27,7 @@ from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
-    from reslrb_cli.integrators.plan_report import PlanRow
+    from reslrb_cli.integrators.plans import PlanRow
     from reslrb_cli.scene.catalog import ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.parameters import Selection
 
@@ -295,7 +295,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
     """
     import drjit as dr
 
-    from reslrb_cli.integrators.plan_report import plan_rows
+    from reslrb_cli.integrators.plans import plan_rows
     from reslrb_cli.integrators.reslrb import Reslrb
     from reslrb_cli.optimization.autotune.sampling import as_decided, decided, explained, open_settings
     from reslrb_cli.optimization.loading import choose_sensors, make_configured, pass_spp, paths_of, what_moves

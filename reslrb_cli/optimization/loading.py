@@ -27,8 +27,7 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.scene.deformation import Moves, where_moved
-from reslrb_cli.scene.in_memory import INSTEAD
-from reslrb_cli.scene.load import load_scene, make_grid, warn_once
+from reslrb_cli.scene.load import INSTEAD, load_scene, make_grid, warn_once
 from reslrb_cli.scene.needs import (
     camera_finds_all,
     camera_finds_nothing,

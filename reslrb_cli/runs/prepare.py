@@ -24,7 +24,7 @@ from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
-from reslrb_cli.integrators.plan_report import plan_rows
+from reslrb_cli.integrators.plans import plan_rows
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble

@@ -15,7 +15,7 @@ from turns import a_few, taking_turns
 
 from reslrb_cli.estimators import gather, reservoir, stack
 from reslrb_cli.integrators.context import Preparation
-from reslrb_cli.integrators.plan_report import plan_rows
+from reslrb_cli.integrators.plans import plan_rows
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import gradient_step, known_step
 from reslrb_cli.measure.gradients import Case, integrator, seeds

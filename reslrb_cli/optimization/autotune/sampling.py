@@ -37,7 +37,7 @@ import mitsuba as mi
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.pixels import noted_part
-from reslrb_cli.integrators.plan_report import EDGES, GUIDED, PATHS_FROM, PIXELS, SEQUENCE, PlanRow, with_reason
+from reslrb_cli.integrators.plans import EDGES, GUIDED, PATHS_FROM, PIXELS, SEQUENCE, PlanRow, with_reason
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sizes
