@@ -38,6 +38,7 @@ _EXPECTED = {
 
 #: Advice for removed settings, by the last two names of the key, with the value if other values remain.
 REMOVED = {
+    "heightmap.grid": "write the shape as a mesh with about one vertex for each texel, as `reslrb lens` does",
     "fabrication.faces": "name the mesh by fabrication.face; the back is flat",
     "fabrication.min_thickness": "`reslrb export` prints the smallest thickness of the solid; remove it",
     "fabrication.receiver": "give the receiver the id `screen` in the scene file, and remove it",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import logging
 import os
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -22,7 +21,6 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.graph import bounds
-from reslrb_cli.scene.values import Place
 from reslrb_cli.scene.xml.build import Owners, build, resize_films
 from reslrb_cli.scene.xml.dictionary import write_dictionary
 from reslrb_cli.scene.xml.mend import Note, mend, warnings
@@ -120,43 +118,6 @@ def load_for_script(
         return load_scene(write_dictionary(file, NAMELESS, Path.cwd()), options, keys=wanted)
     path = as_path(file, "file", "the path of a scene file, or a Mitsuba dictionary")
     return load_scene(path, options, keys=wanted)
-
-
-def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
-    """Replace the rectangle `id` of a description by a mesh, before the scene is built. `size` has the vertex counts
-    along the rectangle's edges.
-
-    The shape's position and material do not change. Raises ConfigError at `place` for any other shape.
-    """
-    element = description.root.by_id().get(id)
-    if element is None or element.tag != "shape":
-        return  # the selection of the parameter reports the reason
-    if element.type != "rectangle":
-        how = "remove `grid`, and write the shape as a rectangle, or as a mesh that is as fine as the map"
-        raise place.fail("heightmap.grid", f"`{id}` is not a `rectangle`; {how}")
-    kept = [item for item in element.children if not item.is_value or item.name in _KEPT_OF_GRID]
-    element.attributes["type"] = "ply"
-    element.children[:] = [element.new("string", name="filename", value=str(_grid_file(*size))), *kept]
-
-
-#: Parameters that a rectangle passes to its grid.
-_KEPT_OF_GRID = ("to_world", "flip_normals", "face_normals")
-
-
-@functools.cache
-def _grid_file(width: int, height: int) -> Path:
-    """Return a temporary file with a grid over [-1, 1] x [-1, 1], facing up. It exists until the process ends."""
-    from reslrb_cli.lens.experiment import face_ply  # late, because SciPy takes a while to load
-    from reslrb_cli.lens.surface import Setting
-
-    path = Path(_grid_folder().name) / f"grid_{width}x{height}.ply"
-    path.write_bytes(face_ply(Setting(size=(2.0, 2.0)), width, height))
-    return path
-
-
-@functools.cache
-def _grid_folder() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="reslrb-")
 
 
 def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
