@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from cli.tiny import KEY, done
+from cli.tiny import KEY, done, measured
 from measure.pretended_steps import Stage
 from runs.going_on import LAMP, work_alone, write_experiment
 
@@ -247,17 +247,12 @@ def test_arguments_are_named_in_errors(folder: Path, call: Callable[[], Any], li
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
-def lines_of(file: str) -> list[dict[str, Any]]:
-    """Return the lines of a `--json` file without the first line, which describes the origin of the measurement."""
-    return [json.loads(line) for line in Path(file).read_text().splitlines()][1:]
-
-
 def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
     done("gradcheck", "tiny.yaml", "--integrators", "reslrb:stack", "--seeds", "3", "--spp", "4", "--json", "g.jsonl")
     records = rl.gradcheck("tiny.yaml", "reslrb:stack", seeds=3, spp=4)
     found = [json.loads(record.to_json()) for record in records]
     assert [record.parameter for record in records if record.reference.value == "walk_ad"] == [KEY, LAMP]
-    told = lines_of("g.jsonl")
+    told = measured("g.jsonl")
     assert [{**one, **dict.fromkeys(other)} for one, other in zip(told, found, strict=True)] == [
         dict.fromkeys(each) for each in found
     ]
@@ -279,7 +274,7 @@ def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch
     done("convergence", "tiny.yaml", *given, "--json", "c.jsonl")
     records = rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
     found = [json.loads(record.to_json()) for record in records]
-    assert found == lines_of("c.jsonl")
+    assert found == measured("c.jsonl")
     assert {"point", "method", "reference", "summary"} <= {each["kind"] for each in found}
 
     class Interrupted(Played):

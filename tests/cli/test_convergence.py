@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
-from cli.tiny import KEY, done, outcome, write_experiment
+from cli.tiny import KEY, done, measured, outcome, write_experiment
 
 from reslrb_cli.records.measurements import TARGETS
 
@@ -23,19 +22,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def read(path: Path) -> list[dict]:
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert lines[0]["kind"] == "origin"
-    return lines[1:]
-
-
 def test_a_scene_end_to_end(folder: Path) -> None:
     """The bias of each method stays below its limit, and the error of averages falls at the expected rate."""
     names = ["reslrb:reservoir(capacity=2)"]
     args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16"]
     (folder / "out").mkdir()
     printed = done("convergence", "tiny.yaml", *args).stdout.splitlines()
-    lines = read(folder / "out/c.jsonl")
+    lines = measured(folder / "out/c.jsonl")
     methods = [line for line in lines if line["kind"] == "method"]
     assert [(line["label"], line["parameter"]) for line in methods] == [(n, KEY) for n in names]
     assert [line["capacity"] for line in methods] == [2]
@@ -66,7 +59,7 @@ def test_the_loss_reveals_correlated_samples(folder: Path) -> None:
     args = ["--objective", "loss", "--rounds", "64", "--json", "c.jsonl", "--set", "run.spp=4", "--set", "loss.type=l2"]
     cases = "reslrb:stack(adjoint=correlated),reslrb:stack(adjoint=independent)"
     sentence = done("convergence", "tiny.yaml", *args, "--integrators", cases).stdout.splitlines()[-1]
-    methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method"]
+    methods = [line for line in measured(folder / "c.jsonl") if line["kind"] == "method"]
     assert [(line["adjoint"], line["biased"]) for line in methods] == [("correlated", True), ("independent", False)]
     assert methods[0]["slope"] > -0.4
     assert -0.65 < methods[1]["slope"] < -0.4
@@ -109,5 +102,5 @@ def test_bad_input_is_one_located_line(folder: Path, args: tuple[str, ...], line
 def test_the_image(folder: Path) -> None:
     words = ("--objective", "image", "--rounds", "4", "--json", "c.jsonl", "--integrators", "prb")
     done("convergence", "tiny.yaml", *words)
-    methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method"]
+    methods = [line for line in measured(folder / "c.jsonl") if line["kind"] == "method"]
     assert [(line["label"], line["parameter"], line["biased"]) for line in methods] == [("prb", "image", False)]

@@ -10,16 +10,17 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import pytest
+from cli.tiny import ended, measured
 from kit import diffuse, ref, scene, sensor, shape
 from measure.faults import room
 
-from reslrb_cli.cli import main
 from reslrb_cli.measure import methods
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
@@ -35,22 +36,13 @@ KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "
 SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--rounds", "3"]
 
 
-def call(*args: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["bench", *args], prog_name="reslrb")
-    return int(ended.value.code or 0)
-
-
-def read(path: Path) -> list[dict]:
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert lines[0]["kind"] == "origin"
-    return lines[1:]
+call = partial(ended, "bench")
 
 
 def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     assert call(*SMALL, "--max-depth", "4", "--integrators", "reslrb:stack", "--json", str(file)) == 0
-    rows = read(file)
+    rows = measured(file)
     assert [list(row) for row in rows] == [KEYS] * 2
     assert [(row["integrator"], row["estimator"], row["capacity"], row["max_depth"]) for row in rows] == [
         ("reslrb", "stack", None, depth) for depth in (2, 4)
@@ -80,7 +72,7 @@ def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str], m
     monkeypatch.setattr(methods, "memory_bytes", lambda variant: 100 * 2**20)
     args = ["--max-depth", "4", "--integrators", "ptracer", "--json", str(file)]
     assert call(*SMALL, *args) == 4
-    rows = read(file)
+    rows = measured(file)
     assert [list(row) for row in rows] == [KEYS] * 2
     assert [row["status"] for row in rows] == ["out_of_memory"] * 2
     assert rows[0]["step_ms"] is None
@@ -99,7 +91,7 @@ def test_a_failing_case_gives_its_reason(
     )
     args = ["--max-depth", "2", "--integrators", "prb,trajectory", "--json", str(file)]
     assert call(str(tmp_path / "x.yaml"), *args, "--set", "run.spp=1", "--rounds", "3") == 0
-    rows = read(file)
+    rows = measured(file)
     assert [(row["integrator"], row["status"]) for row in rows] == [("prb", "ok"), ("trajectory", "failed")]
     assert rows[0]["scratch_bytes"] == 0
     assert not (tmp_path / "kernels").exists()
@@ -170,7 +162,7 @@ def test_ctrl_c_keeps_finished_measurements(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=30)
     assert process.returncode == 130
-    rows = read(file)
+    rows = measured(file)
     assert rows
     origin = json.loads(file.read_text().partition("\n")[0])
     assert origin["command"] == ["reslrb", *command[3:], "--integrators", "reslrb:stack", "--json", str(file)]

@@ -7,19 +7,20 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import numpy as np
 import pytest
+from cli.tiny import ended
 from measure.analytic_motion import centre_of_gravity, parallel
 from measure.differenced import AttachedScene, Differenced, compare_with_differences
 from measure.faults import room
 from measure.moving_light import ROOMS_SCENES as ROOMS
 from measure.moving_light import SCENES, setting
 
-from reslrb_cli.cli import main
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure import missing as missing_check
@@ -196,10 +197,7 @@ def test_errors_are_correct():
     assert 0.8 < np.std(z) < 1.3
 
 
-def call(*args: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["gradcheck", *args], prog_name="reslrb")
-    return int(ended.value.code or 0)
+call = partial(ended, "gradcheck")
 
 
 LAMP = """

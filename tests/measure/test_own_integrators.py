@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
+from cli.tiny import ended
 from kit import area, diffuse, scene, sensor, shape
 from turns import a_few
 
-from reslrb_cli.cli import main
 from reslrb_cli.errors import ExitCode
 
 FILE = Path(__file__).with_name("own_replay.py")
@@ -62,19 +62,11 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def call(words: list[str]) -> int:
-    """Run a command, and return its exit code."""
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    return int(ended.value.code or 0)
-
-
 def checked(options: str, *more: str) -> int:
     """Check the integrator with these options, and return the exit code."""
     name = f"own_replay.py:Replay({options})" if options else "own_replay.py:Replay"
-    return call(
-        ["gradcheck", "room.yaml", "--integrators", name, "--allow-code", "--seeds", "24", "--spp", "64", *more]
-    )
+    words = ("gradcheck", "room.yaml", "--integrators", name, "--allow-code", "--seeds", "24", "--spp", "64", *more)
+    return ended(*words)
 
 
 @pytest.mark.long
@@ -115,7 +107,7 @@ def test_correct_integrators_of_mitsuba_hold(capsys: pytest.CaptureFixture[str])
     def check(config: str, name: str, *settings: str) -> int:
         sets = [word for each in settings for word in ("--set", each)]
         words = ["gradcheck", config, "--integrators", f"mine.py:{name}", "--allow-code", *sets]
-        return call([*words, "--seeds", "24", "--spp", "64"])
+        return ended(*words, "--seeds", "24", "--spp", "64")
 
     assert check(FURNACE, "BasicPRBIntegrator") == 0
     assert "analytic" in capsys.readouterr().out
@@ -157,7 +149,7 @@ def test_silhouettes_are_compared_with_differences(triangles: list[str], project
     Path("mine.py").write_text(MITSUBAS)
     names = [f"mine.py:{each}Integrator" for each in ("DirectProjective", "BasicPRB")]
     words = ["gradcheck", "moving.yaml", "--integrators", ",".join(names), "--allow-code", "--json", "found.jsonl"]
-    assert call([*words, "--seeds", "24", "--spp", "1024"]) == ExitCode.CHECK_FAILED
+    assert ended(*words, "--seeds", "24", "--spp", "1024") == ExitCode.CHECK_FAILED
     found = [json.loads(line) for line in Path("found.jsonl").read_text().splitlines()]
     holds = {each["integrator"]: each["holds"] for each in found if each.get("parameter") == "thing.translation"}
     assert holds == {names[0]: projective_holds, names[1]: False}
@@ -182,7 +174,7 @@ def test_silhouettes_are_compared_with_differences(triangles: list[str], project
 )
 def test_invalid_integrators_are_one_line(capsys: pytest.CaptureFixture[str], name: str, said: str) -> None:
     allowed = [] if "would run" in said else ["--allow-code"]
-    code = call(["gradcheck", "room.yaml", "--integrators", name, *allowed, "--seeds", "3", "--spp", "4"])
+    code = ended("gradcheck", "room.yaml", "--integrators", name, *allowed, "--seeds", "3", "--spp", "4")
     error = capsys.readouterr().err
     assert code == ExitCode.USAGE, error
     assert said in error
@@ -191,8 +183,8 @@ def test_invalid_integrators_are_one_line(capsys: pytest.CaptureFixture[str], na
 
 @pytest.mark.long
 def test_a_nan_image_fails(capsys: pytest.CaptureFixture[str]) -> None:
-    code = call(["gradcheck", "room.yaml", "--integrators", "own_replay.py:Replay(primal_fault=nan)", "--allow-code",
-                 "--seeds", "3", "--spp", "4", "--set", "integrator.max_depth=2"])  # fmt: skip
+    code = ended("gradcheck", "room.yaml", "--integrators", "own_replay.py:Replay(primal_fault=nan)", "--allow-code",
+                 "--seeds", "3", "--spp", "4", "--set", "integrator.max_depth=2")  # fmt: skip
     said = capsys.readouterr().out
     assert code == ExitCode.CHECK_FAILED
     assert "image: own_replay.py:Replay(primal_fault=nan)" in said
@@ -205,17 +197,17 @@ def test_own_integrators_need_permission_and_unchanged_files(capsys: pytest.Capt
     own = "integrator={type: custom, file: own_replay.py:Replay, max_depth: 3}"
     words = ["optimize", "room.yaml", "--set", own, "--set", "run.name=own", "--set", "run.certainty=false"]
     words += ["--set", "target.render.integrator={type: prb, max_depth: 3}"]
-    assert call(words) == ExitCode.USAGE
+    assert ended(*words) == ExitCode.USAGE
     assert "--allow-code permits it" in capsys.readouterr().err
-    assert call([*words, "--allow-code"]) == 0
+    assert ended(*words, "--allow-code") == 0
     capsys.readouterr()
-    assert call(["optimize", "--resume", "runs/own", "--set", "run.iterations=3"]) == ExitCode.USAGE
+    assert ended("optimize", "--resume", "runs/own", "--set", "run.iterations=3") == ExitCode.USAGE
     assert "--allow-code permits it" in capsys.readouterr().err
-    assert call(["optimize", "--resume", "runs/own", "--set", "run.iterations=3", "--allow-code"]) == 0
-    assert call(["report", "runs/own"]) == 0
+    assert ended("optimize", "--resume", "runs/own", "--set", "run.iterations=3", "--allow-code") == 0
+    assert ended("report", "runs/own") == 0
     with Path("own_replay.py").open("a") as file:
         file.write("\n# changed\n")
-    assert call(["optimize", "--resume", "runs/own", "--set", "run.iterations=4", "--allow-code"]) == ExitCode.USAGE
+    assert ended("optimize", "--resume", "runs/own", "--set", "run.iterations=4", "--allow-code") == ExitCode.USAGE
     assert "integrator.file: has changed since runs/own began" in capsys.readouterr().err
 
 
@@ -229,7 +221,7 @@ def test_own_integrators_need_permission_and_unchanged_files(capsys: pytest.Capt
 )
 def test_bench_and_convergence_accept_one(capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
     name = "own_replay.py:Replay"
-    code = call([words[0], "room.yaml", "--integrators", name, "--allow-code", *words[1:]])
+    code = ended(words[0], "room.yaml", "--integrators", name, "--allow-code", *words[1:])
     said = capsys.readouterr().out
     assert code == 0, said
     assert name in said
