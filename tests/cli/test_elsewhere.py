@@ -135,8 +135,6 @@ TRUE = {
 #: Largest error of a colour channel above `BRIGHT`, that limit, and the largest error of the exposure. Errors are
 #: shares of the true value.
 COLOUR, BRIGHT, FACTOR = 0.1, 0.1, 0.05
-#: Largest error of colours after few iterations. The initial guesses are up to 230 % off.
-SHORT_COLOUR = 0.15
 
 
 def room(left: str, right: str, seat: str, size: int) -> str:
@@ -228,18 +226,6 @@ def test_colours_and_exposure_from_a_photograph(tmp_path: Path, monkeypatch: pyt
     shutil.rmtree("runs/room")
     done("optimize", "room.yaml", *without)
     assert {"exposure", *TRUE} & set(misses(run)) > {"exposure"}
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("llvm")
-def test_the_same_in_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run has fewer pixels, and fewer but larger iterations."""
-    write_room(tmp_path, 20, 1024)
-    monkeypatch.chdir(tmp_path)
-    few = ("run.iterations=60", "run.spp=64", "run.final_spp=8", "run.certainty=false", "integrator.estimator=stack")
-    run = three_commands(*few)
-    check_mask(run, mirror=True)  # with a named estimator, all paths are light paths
-    assert misses(run, SHORT_COLOUR) == []
 
 
 # The three commands on another user's room, with an 8-bit photograph.  Most of the room's light comes through windows,

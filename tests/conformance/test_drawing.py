@@ -307,19 +307,12 @@ def test_without_a_way_its_code_is_not_compiled(way: str) -> None:
 # Moving light: the random numbers of the emission are held, so that the weight of guided emission is a constant.
 
 MOTIONS = ("latents", "spot", "mesh", "bounces_4")
-#: The default suite: a moving lamp. test_survival.py has learned roulette where light bounces.
-QUICK = {"guided-spot-stack", "sequence-spot-stack"}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("way", "name", "estimator"),
-    [
-        pytest.param(way, name, estimator, id=f"{way}-{name}-{estimator}",
-                     marks=() if f"{way}-{name}-{estimator}" in QUICK else pytest.mark.long)
-        for way in ("guided", "roulette", "sequence") for name in MOTIONS for estimator in ("stack", "reservoir")
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("estimator", ["stack", "reservoir"])
+@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("way", ["guided", "roulette", "sequence"])
 def test_means_with_moving_light_are_those_of_plain_samples(way: str, name: str, estimator: str) -> None:
     moving, found = MOVING[name].moving(), []
     own = {"sequence": "low_discrepancy"} if way == "sequence" else {"guiding": "on"}

@@ -15,7 +15,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.lens.solid import SCALLOP, cutter, stepover
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import luminance, write_file
-from reslrb_cli.report.page.workshop import material, setup_facts, sketch
+from reslrb_cli.report.page.workshop import material, setup_facts
 from reslrb_cli.runs.export import read_solid
 from reslrb_cli.runs.workshop import allowed_errors, setup_of
 
@@ -73,9 +73,6 @@ def test_a_set_up_matches_the_options_of_the_command(name: str, tmp_path: Path, 
     assert setup["picture_size"] == pytest.approx([40, 60], rel=2e-3)
     assert words in " ".join(setup_facts(setup).values())
     assert setup["picture_up"][1] > 0.9
-    drawn = sketch(setup, config.fabrication.thickness)
-    assert "300 mm" in drawn
-    assert "NaN" not in drawn.replace("nan", "NaN")
 
 
 def test_a_material_is_named_by_its_index() -> None:

@@ -1,8 +1,7 @@
-"""`reslrb bench`: the command line, its processes, and scenes where parameters move light."""
+"""`reslrb bench`: the command line and its processes."""
 
 from __future__ import annotations
 
-import gc
 import io
 import json
 import os
@@ -19,13 +18,10 @@ import mitsuba as mi
 import pytest
 from cli.tiny import ended, measured
 from kit import diffuse, ref, scene, sensor, shape
-from measure.faults import room
 
 from reslrb_cli.measure import methods
-from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
-from reslrb_cli.measure.steps import Stepper, scratch_bytes
-from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.measure.steps import scratch_bytes
 from reslrb_cli.records.measurements import BenchStatus
 
 # `reslrb bench` from the command line, on a scene of 16x16 pixels.
@@ -176,34 +172,6 @@ MASKED = scene(
     shape("rectangle", "", ref("veil")),
     '<emitter type="point"><point name="position" x="0" y="1" z="3"/></emitter>',
 )
-
-
-# What `bench` measures if parameters move light: all capable integrators take steps, and memory stays constant.
-
-
-def peak(name: str, depth: int) -> float:
-    """Return the memory peak of a cold step in MiB, without the memory of the scene and of everything loaded before."""
-    [case] = parse_cases(name)
-    stepper = Stepper(case.at(room("wavy_glass.xml", "top.vertex_positions"), depth, known=True))
-    gc.collect()
-    dr.flush_malloc_cache()
-    reset_peak()
-    before = peak_mib(dr.backend_v(mi.Float))
-    cold = stepper.step(0, True)
-    warm = stepper.step(1, False)
-    assert warm["kernel_ms"] > 0
-    return float(cold["peak_mib"]) - before
-
-
-def peaks(name: str) -> list[float]:
-    return [peak(name, depth) for depth in (4, 16)]
-
-
-@pytest.mark.long
-def test_memory_of_stack_does_not_grow_with_depth():
-    shallow, deep = peaks("reslrb:stack")
-    assert 0 < shallow  # otherwise the watermark shows nothing
-    assert deep < 1.1 * shallow  # sizes are so small that allocator rounding shows
 
 
 # How the end of a process is interpreted, and what kernels report about thread-local memory.
