@@ -170,7 +170,7 @@ logger = logging.getLogger(__name__)
         "Time limit, including loading and compiling; it determines the number of seeds. Comparisons without "
         "time are named.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
-              help="Number of seeds, including those in the file of --json, for any time.")  # fmt: skip
+              help="Number of seeds, for any time.")  # fmt: skip
 @allow_code_option
 @json_option
 @click.option("--spp", type=COUNT,

@@ -28,13 +28,12 @@ from reslrb_cli.lens.solid import (
     within,
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-from reslrb_cli.measure.tolerance import OpticalBench
 from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of, what_moves
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.records.run_folder import FABRICATION_FILE, exposures, workshop_file
-from reslrb_cli.runs.workshop import add_sheet, add_tolerances
+from reslrb_cli.runs.workshop import OpticalBench, add_sheet, add_tolerances
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.scene.images import read_photo

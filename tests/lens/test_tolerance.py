@@ -15,16 +15,10 @@ from lens.test_experiment import picture
 from skimage.metrics import structural_similarity
 
 from reslrb_cli.config.schema import Fabrication
-from reslrb_cli.measure import tolerance
-from reslrb_cli.measure.tolerance import (
-    OpticalBench,
-    figures,
-    shift_between,
-    where_light_goes,
-)
 from reslrb_cli.records.images import luminance, write_file
 from reslrb_cli.report.format import number
-from reslrb_cli.runs import export
+from reslrb_cli.runs import export, workshop
+from reslrb_cli.runs.workshop import OpticalBench, figures, shift_between, where_light_goes
 
 PTRACER = {"type": "ptracer", "max_depth": 4}
 FLAT = Fabrication(thickness=25.0)
@@ -87,9 +81,7 @@ def with_face(folder: Path, heights: Callable[[np.ndarray], np.ndarray]) -> Opti
 def light_of(made: OpticalBench) -> dict[str, float]:
     target = np.zeros((40, 40))
     target[4:36, 4:36] = 1  # the margin, an eighth of 32 pixels, counts as beside
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tolerance, "RAYS", 2**16)  # the error of a share is at most 2e-3
-        return where_light_goes(made.scene, made.scene.sensors()[0], made.plan, target)
+    return where_light_goes(made.scene, made.scene.sensors()[0], made.plan, target)
 
 
 def test_light_is_classified_by_its_destination(folder: Path) -> None:
@@ -208,7 +200,7 @@ def test_the_command_reports_all_figures(folder: Path) -> None:
     # Turned light shifts the image by the distance times the angle. The distance is 200 mm, and a pixel has 100 / 32
     # mm.
     for axis in "xy":
-        shift = told[f"light turned by {tolerance.TURN:g} degree about {axis}"]["shift"]
+        shift = told[f"light turned by {workshop.TURN:g} degree about {axis}"]["shift"]
         assert np.hypot(*shift) == pytest.approx(200 * np.tan(np.radians(1)) / (100 / 32), abs=0.15)
     bare = ("--set", "fabrication=null")
     result = reslrb("export", folder / "runs/lens", "-o", folder / "bare", "--tolerances", *bare)
@@ -266,7 +258,7 @@ def test_the_page_of_a_run_has_the_figures_for_the_maker(
     off, allowed = found["tolerances"], found["allowed_errors"]
     assert allowed.keys() == {"distance", "light turned", "solid turned", "index"}
     assert off.keys() >= {"as planned", "distance +2 %", "index -0.005"}
-    images = len(off) - 1 + len(tolerance._DIRECTIONS)  # a wide light averages these directions
+    images = len(off) - 1 + len(workshop._DIRECTIONS)  # a wide light averages these directions
     images += len(export.DIRECTIONS)  # views of the solid
     assert called == [tmp_path / "l/target.exr", *["image"] * images]  # nothing is read or rendered twice
     assert json.loads((run / "fabrication.json").read_text()) == numbers  # the run is left as it was

@@ -19,7 +19,6 @@ import pytest
 from cli.tiny import ended, measured
 from kit import diffuse, ref, scene, sensor, shape
 
-from reslrb_cli.measure import methods
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
 from reslrb_cli.measure.steps import scratch_bytes
 from reslrb_cli.records.measurements import BenchStatus
@@ -60,19 +59,6 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert rows[1]["scratch_bytes"] == 2 * rows[0]["scratch_bytes"] > 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines[3:5]] == [[str(depth), "reslrb:stack"] for depth in (2, 4)]
-
-
-@pytest.mark.long
-def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "bench.json"
-    monkeypatch.setattr(methods, "memory_bytes", lambda variant: 100 * 2**20)
-    args = ["--max-depth", "4", "--integrators", "ptracer", "--json", str(file)]
-    assert call(*SMALL, *args) == 4
-    rows = measured(file)
-    assert [list(row) for row in rows] == [KEYS] * 2
-    assert [row["status"] for row in rows] == ["out_of_memory"] * 2
-    assert rows[0]["step_ms"] is None
-    assert "depth 2, ptracer: " in capsys.readouterr().out
 
 
 def test_a_failing_case_gives_its_reason(

@@ -163,27 +163,6 @@ def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.
     assert failures(check(*SMALLER, estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
 
 
-@pytest.mark.long
-def test_rows_are_printed_as_they_are_measured():
-    """The first row is available before the last estimator takes a step, and later rows reuse the measurements of
-    earlier rows.
-    """
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
-    made = Gradcheck(CheckSettings(config, estimators_of("event,stack"), 0, 3))
-    said: list[str] = []
-    rows = made.run(lambda: False, said.append)
-    next(rows)
-    assert [line.partition(":")[0] for line in said] == ["image walk_ad", "image ptracer"]
-    next(rows)
-    assert not any("reslrb:stack" in line for line in said)
-    list(rows)
-    assert len(said) == len(set(said)) == 8
-    expected, found = made.expected(), list(made.run(lambda: False, said.append))
-    assert [(r.parameter, r.estimator, r.reference) for r in expected] == [
-        (r.parameter, r.estimator, r.reference) for r in found
-    ]
-
-
 def test_unmeasured_comparisons_are_named():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *SMALLER])
     ticks = iter(range(10_000))

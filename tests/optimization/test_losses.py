@@ -61,15 +61,6 @@ def test_values_and_gradients(name):
 
 
 @pytest.mark.parametrize("name", POINTWISE)
-def test_a_loss_does_not_depend_on_the_resolution(name):
-    image, target = images()
-    loss = make_loss(name, **options(name))
-    sizes = [[np.tile(array, (n, n, 1)).astype(np.float32) for array in (image, target)] for n in (1, 3)]
-    values = [float(np.array(loss(mi.TensorXf(i), mi.TensorXf(t))).item()) for i, t in sizes]
-    assert values[0] == pytest.approx(values[1], rel=1e-5)
-
-
-@pytest.mark.parametrize("name", POINTWISE)
 def test_black_and_negative_pixels_stay_finite(name):
     image = mi.TensorXf(np.array([[[0.0], [-0.3], [2.0]]], dtype=np.float32))
     dr.enable_grad(image)
