@@ -289,8 +289,8 @@ def differences(case: ZeroCase, scene: Case, along: np.ndarray, count: int, bloc
     ])  # fmt: skip
 
 
-#: The cases of the default suite: zeros of texels and lamps once.
-QUICK_ZERO = ("texel_zero_in_one_channel", "lamp_texture_zero_in_all")
+#: The case of the default suite. test_extreme.py has a black lamp.
+QUICK_ZERO = ("texel_zero_in_one_channel",)
 
 
 def parameters() -> list:

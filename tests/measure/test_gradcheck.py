@@ -127,12 +127,10 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
 
 
 def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
-    """Only the reservoir is wrong, by a fifth. All of its references fail, and no reference of the other estimator
-    fails.
-    """
+    """The reservoir is wrong by a fifth. All of its references fail."""
     right = reservoir.slot_adjoint
     monkeypatch.setattr(reservoir, "slot_adjoint", lambda p, W, *rest: right(p, W * 1.2, *rest))
-    found = failures(check(*SMALLER, estimators="reservoir,stack", seeds=16))
+    found = failures(check(*SMALLER, estimators="reservoir", seeds=16))
     assert found == {("reservoir", name) for name in ("walk_ad", "ptracer", "finite_difference", "forward_mode")}
 
 

@@ -71,7 +71,7 @@ FAIL = [
     Toy("a lamp that lights nothing", {HIDDEN: FAST, LEFT: FAST}, {HIDDEN: NONE}, ("run.spp=64",)),
     Toy("alike", {TWIN: "initial: 2.0, bounds: [0, 1000], learning_rate: 0.05",
                   OTHER_TWIN: "initial: 5.0, bounds: [0, 1000], learning_rate: 0.05"},
-        {TWIN: UNDETERMINED, OTHER_TWIN: UNDETERMINED}, ("run.spp=128",)),
+        {TWIN: UNDETERMINED, OTHER_TWIN: UNDETERMINED}, ("run.spp=128", "run.iterations=50")),
     Toy("alike, too bright", {TWIN: "initial: 8.0, bounds: [0, 1000], learning_rate: 0.1",
                               OTHER_TWIN: "initial: 3.0, bounds: [0, 1000], learning_rate: 0.1"},
         {TWIN: UNDETERMINED, OTHER_TWIN: UNDETERMINED}, ("run.spp=256",)),
