@@ -162,7 +162,7 @@ def load_with(
     if not isinstance(scene, mi.Scene):
         what = "one of another variant" if type(scene).__name__ == "Scene" else one_line(repr(scene), 60)
         raise ConfigError(source, "", f"must be a Mitsuba dictionary or an mi.Scene, not {what}")
-    from reslrb_cli.scene.in_memory import SceneInMemory
+    from reslrb_cli.scene.load import SceneInMemory
 
     return config.with_scene(SceneInMemory(scene, source))
 
@@ -287,8 +287,6 @@ def gradcheck(
     - `spp`: samples per pixel of one gradient.
     - `allow_code`: permit running the code of the integrators' files.
 
-    If your own integrator is wrong, the log (`logging.INFO`) gives hints.
-
     An interrupt stops the check after the current gradient and raises KeyboardInterrupt. Sets the experiment's Mitsuba
     variant if none is set. Raises ConfigError and UnsupportedScene.
     """
@@ -301,17 +299,13 @@ def gradcheck(
                 raise ConfigError(name, "", f"is {value}; at least {least} are needed")
         keep_variant(config.variant, config.source)
         from reslrb_cli.measure.gradcheck import Gradcheck
-        from reslrb_cli.measure.own import look_into
         from reslrb_cli.measure.participants import settings_of
 
         gc.collect()  # earlier scenes and the gradients of their parameters would otherwise take part in the check
         checked = settings_of(config, integrators, budget, seeds, spp, time.monotonic() - began)
         check = Gradcheck(checked)
         with _scene_given_back(config):
-            records = list(check.run(stop, logger.info))
-            for line in look_into(check, records, stop, logger.debug):
-                logger.info(line)
-        return records
+            return list(check.run(stop, logger.info))
 
 
 #: Scenes of `check_estimator`: factors of zero, roulette, emission, a closed sphere, glossy surfaces, masks, glass, a

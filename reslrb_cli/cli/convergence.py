@@ -19,7 +19,6 @@ from reslrb_cli.cli.options import (
     experiment_arguments,
     measuring,
     origin_of,
-    read_earlier,
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.optimizers import loss_words
@@ -66,8 +65,7 @@ def command(**given: Any) -> int:
 
     The methods take turns. Each method runs in its own process and takes steps of run.spp samples per pixel. Errors are
     relative to the size of the estimated quantity. With independent samples, the slope is -1/2. Efficiency is 1 /
-    (relative variance * seconds). Ctrl-C keeps finished results. To continue after any interruption, repeat the command
-    with the same --json file. docs/convergence.md explains the columns.
+    (relative variance * seconds). Ctrl-C keeps finished results. docs/convergence.md explains the columns.
     """
     began, options = time.monotonic(), ConvergenceOptions(**given)
     from reslrb_cli.backend.installation import load_packages
@@ -91,7 +89,7 @@ def command(**given: Any) -> int:
 
 def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write. Return the results, and True if the user interrupted."""
-    from reslrb_cli.measure.convergence import KIND, Role, Session
+    from reslrb_cli.measure.convergence import Role, Session
     from reslrb_cli.measure.judgement import Judgement
     from reslrb_cli.report.tables import (
         closing_sentence,
@@ -101,10 +99,8 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceR
         result_lines,
     )
 
-    earlier = read_earlier(KIND, json_file)
-    with measuring(Session, plan, began, earlier=earlier) as (session, interrupts):
-        origin = origin_of(plan.variant)
-        keeper = Keeper(json_file, origin, lambda: result_lines(Judgement(session).results()), session.kept)
+    with measuring(Session, plan, began) as (session, interrupts):
+        keeper = Keeper(json_file, origin_of(plan.variant), lambda: result_lines(Judgement(session).results()))
         table: Columns | None = None
         for rounds in session.run():
             keeper.refresh()

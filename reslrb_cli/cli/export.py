@@ -18,7 +18,7 @@ from reslrb_cli.cli.terminal import echo
     help="Folder to create, which must not exist yet.",
 )  # fmt: skip
 @click.option("--tolerances", is_flag=True, help=
-        "For a lens or a mirror, also render its image with errors of light, distance, index and tool; takes "
+        "For a lens or a mirror, also render its image with errors of light, distance and index; takes "
         "about 15 images of run.final_spp.")  # fmt: skip
 def command(run: Path, overrides: tuple[str, ...], output: Path, tolerances: bool) -> None:
     """Write the scene of a run with the recovered values. RUN is the run folder.

@@ -28,7 +28,6 @@ from reslrb_cli.cli.options import (
     json_option,
     optional_experiment_arguments,
     origin_of,
-    read_earlier,
     read_or_box,
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
@@ -36,7 +35,7 @@ from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import PATHS_OPTIONS, kept_settings, parse_checked
+from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_checked
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
 if TYPE_CHECKING:
@@ -81,13 +80,11 @@ def _given(options: dict[str, str]) -> str | None:
 
 def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
     """Measure, print and write; return the exit code. `variant` must be set."""
-    from reslrb_cli.measure.missing import KIND, MissingCheck
+    from reslrb_cli.measure.missing import MissingCheck
 
-    json_file, seeds, spp = options.json_file, options.seeds, options.spp
-    to_keep = kept_settings(config, {}, variant, device_name(variant), spp=spp)
-    check = MissingCheck(config, options.budget, seeds, spp, read_earlier(KIND, json_file, to_keep))
+    check = MissingCheck(config, options.budget, options.seeds, options.spp)
     echo(check.conditions())
-    keeper = Keeper(json_file, origin_of(variant), check.known, lambda: check.kept(to_keep))
+    keeper = Keeper(options.json_file, origin_of(variant), check.known)
     with Interrupts() as interrupts:
         for record in check.run(lambda: interrupts.requested, keeper.refresh):
             echo(record.line())
@@ -96,47 +93,35 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
 
 
 def run_suite(options: GradcheckOptions) -> int:
-    """Run the named cases, or all cases without names. Print a line for each case and write the file.
-
-    Cases in the file are not run again.
-    """
+    """Run the named cases, or all cases without names. Print a line for each case and write the file."""
     chosen = None if options.integrators is None else _estimators(options.integrators)
     variant = set_variant("auto")
 
-    from reslrb_cli.measure.extreme import CASES, case_records, suite
+    from reslrb_cli.measure.extreme import CASES, case_records
     from reslrb_cli.report.tables import summary_lines
 
-    seeds, json_file, listed = options.seeds, options.json_file, str(options.suite).partition(":")[2]
+    listed = str(options.suite).partition(":")[2]
     names = [name.strip() for name in listed.split(",")] if listed else []
     for name in names:
         if name not in CASES:
             near = difflib.get_close_matches(name, CASES, n=1) or ["furnace"]
             raise ConfigError("--suite", "", f"there is no case `{name}`; did you mean {near[0]}?")
-    to_keep = suite.settings(chosen, seeds, variant, device_name(variant))
-    earlier = read_earlier(suite.KIND, json_file, to_keep)
-    done = {} if earlier is None else suite.restore(earlier)
-    to_do = [name for name in names or CASES if name not in done]
     echo(f"{device_name(variant)}, {variant}")
-    for case, rows in done.items():
-        echo(_case_line(case, rows))
-
-    def lines() -> list[GradcheckRecord]:
-        return [record for rows in done.values() for record in rows]
-
-    keeper = Keeper(json_file, origin_of(variant), lines, lambda: suite.kept(to_keep, done))
+    records: list[GradcheckRecord] = []
+    keeper = Keeper(options.json_file, origin_of(variant), lambda: records)
     with Interrupts() as interrupts:
-        for name in to_do:
-            rows = case_records(lambda: interrupts.requested, name, chosen, seeds)
+        for name in names or CASES:
+            rows = case_records(lambda: interrupts.requested, name, chosen, options.seeds)
             if interrupts.requested:  # this case may be incomplete
                 break
-            done[name] = rows
+            records += rows
             keeper.refresh()
             echo(_case_line(name, rows))
         interrupted = interrupts.requested
         keeper.finish()
-    for line in summary_lines(lines()):
+    for line in summary_lines(records):
         echo(line)
-    return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
+    return ExitCode.INTERRUPTED if interrupted else _exit_code(records)
 
 
 def _estimators(text: str) -> list[str]:
@@ -177,15 +162,15 @@ logger = logging.getLogger(__name__)
 @click.option("--integrators", metavar="LIST",
               help=
         "Check these, separated by commas: estimators, reslrb:ESTIMATOR[(OPTION=VALUE,...)], or your own Mitsuba "
-        "integrators, FILE.py:CLASS[(OPTION=VALUE,...)], which need --allow-code; the last lines say where to look "
-        "if one of these is wrong. Default: all four estimators, with the options of CONFIG, and "
-        "reslrb:stack(paths=both) if CONFIG leaves the paths open and the scene allows both.")  # fmt: skip
+        "integrators, FILE.py:CLASS[(OPTION=VALUE,...)], which need --allow-code. Default: all four estimators, with "
+        "the options of CONFIG, and reslrb:stack(paths=both) if CONFIG leaves the paths open and the scene allows "
+        "both.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
               help=
         "Time limit, including loading and compiling; it determines the number of seeds. Comparisons without "
         "time are named.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
-              help="Number of seeds, including those in the file of --json, for any time.")  # fmt: skip
+              help="Number of seeds, for any time.")  # fmt: skip
 @allow_code_option
 @json_option
 @click.option("--spp", type=COUNT,
@@ -205,10 +190,7 @@ def command(**given: Any) -> int:
     began, options = time.monotonic(), GradcheckOptions(**given)
     load_packages()  # before the imports below need them
     from reslrb_cli.measure.gradcheck import Gradcheck
-    from reslrb_cli.measure.own import look_into
     from reslrb_cli.measure.participants import settings_of
-    from reslrb_cli.measure.sampling import KIND
-    from reslrb_cli.measure.sampling import settings as settings_to_keep
     from reslrb_cli.report.tables import summary_lines
 
     options.check()
@@ -225,18 +207,13 @@ def command(**given: Any) -> int:
         config, options.integrators, options.budget, options.seeds, options.spp, time.monotonic() - began
     )
     variant = set_variant(config.variant)
-    to_keep = settings_to_keep(checked, variant, device_name(variant))
-    check = Gradcheck(checked, earlier=read_earlier(KIND, options.json_file, to_keep))
+    check = Gradcheck(checked)
     echo(f"{device_name(variant)}, {variant}; {allowance(options.budget, options.seeds, 'seed')}")
     echo(check.conditions())
-    records, interrupted = _run(check, variant, to_keep, options)
+    records, interrupted = _run(check, variant, options)
     none = "interrupted before there were enough seeds to compare"
     for line in summary_lines(records) if records else [none]:
         echo(line)
-    if records and not interrupted:
-        with Interrupts() as interrupts:
-            for line in look_into(check, records, lambda: interrupts.requested, logger.info):
-                echo(line)
     nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)
     if interrupted:
         return ExitCode.INTERRUPTED
@@ -247,15 +224,12 @@ def _exit_code(records: Iterable[GradcheckRecord]) -> int:
     return ExitCode.CHECK_FAILED if any(record.holds is False for record in records) else ExitCode.DONE
 
 
-def _run(
-    check: Gradcheck, variant: str, to_keep: dict[str, Any], options: GradcheckOptions
-) -> tuple[list[GradcheckRecord], bool]:
+def _run(check: Gradcheck, variant: str, options: GradcheckOptions) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write. Return all records, and True if the user interrupted."""
     from reslrb_cli.report.tables import cells, gradcheck_columns
 
     records: list[GradcheckRecord] = []
-    origin = origin_of(variant)
-    keeper = Keeper(options.json_file, origin, lambda: records, lambda: check.sampling.kept(to_keep))
+    keeper = Keeper(options.json_file, origin_of(variant), lambda: records)
     with Interrupts() as interrupts:
         table = gradcheck_columns(check.expected())
         echo(table.head())

@@ -7,9 +7,8 @@ the scene, its sensors, the plan of a step and the parameters (`templates/inspec
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,20 +16,18 @@ import click
 from pydantic_core import to_jsonable_python
 
 from reslrb_cli.cli.options import overrides_option, start_variant
-from reslrb_cli.cli.terminal import echo, fill
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.cli.terminal import fill
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.parameters import is_named
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
-from reslrb_cli.errors import ConfigError, ExitCode, UnsupportedScene
+from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.records.manifest import MANIFEST_FILE, read_manifest
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
-    from reslrb_cli.integrators.plan_report import PlanRow
-    from reslrb_cli.optimization.sensitivity import Conditioning
+    from reslrb_cli.integrators.plans import PlanRow
     from reslrb_cli.scene.catalog import ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.parameters import Selection
 
@@ -188,30 +185,16 @@ def _flags(info: ParameterInfo) -> str:
     return ("" if info.differentiable else "not ") + "differentiable" + ", discontinuous" * info.discontinuous
 
 
-#: Number of gradients for `--conditioning`, each of run.spp samples per pixel.
-SAMPLES = 8
-
-
 @click.command("inspect")
 @click.argument("path", metavar="PATH", type=click.Path(path_type=Path))
 @overrides_option
 @click.option("--all", "everything", is_flag=True, help="Also list parameters that cannot be recovered.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object with all data instead of lines.")
-@click.option(
-    "--nonfinite",
-    is_flag=True,
-    help="Find the first value that was not finite in the run in folder PATH: trace that step again.",
-)
-@click.option(
-    "--conditioning", is_flag=True, help="Measure the sensitivity of image and loss to each parameter (renders)."
-)
 def command(
     path: Path,
     overrides: tuple[str, ...],
     everything: bool,
     as_json: bool,
-    nonfinite: bool,
-    conditioning: bool,
 ) -> int | None:
     """List the parameters of a scene that can be recovered, with their current values, and the contents of the scene.
 
@@ -219,21 +202,10 @@ def command(
     lists the parameter keys that `parameters` of a configuration may use. For all other keys, the command gives the
     reason why a configuration cannot use the key. If the configuration has `parameters`, the plan of a step lists the
     features that its kernels contain or leave out, and why.
-
-    --conditioning measures how different the sensitivities of the parameters are at their initial values: for each
-    parameter the root mean square of its values, its gradient and the noise of one step's gradient, the relative change
-    of the image per unit, and the length by which it would have to change to explain the
-    image. `optimizer.scale: auto` compensates for the parameters' different sensitivities.
     """
 
     subject = read_subject(path, overrides)
     config = subject.config
-    if conditioning and subject.missing:
-        raise ConfigError(path, subject.missing[0], "missing; --conditioning needs a complete experiment")
-    if nonfinite:
-        if overrides:
-            raise ConfigError("--set", "", "has no effect with --nonfinite, which repeats a step of the run")
-        return show_nonfinite(subject, as_json)
     start_variant(config)
     from reslrb_cli.optimization.loading import load_configured
     from reslrb_cli.scene.catalog import summarise
@@ -243,18 +215,13 @@ def command(
     selection = None if "parameters" in subject.missing else select(config, scene)
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
     plan = None if selection is None else make_plan(subject, scene, selection)
-    measured = measure(config) if conditioning else None
     if as_json:
         known = {"run": subject.run, **vars(summary)}
         known |= {"plan": {"obstacle": plan} if isinstance(plan, str) else plan and {"rows": plan}, "edges": edges}
-        if measured is not None:
-            known["conditioning"] = measured.to_json()
         # Objects of the scene are written as their ids.
         data = to_jsonable_python(known, inf_nan_mode="constants", fallback=lambda item: item.id())
         click.echo(json.dumps(finite(data, str), indent=2, allow_nan=False))
         return None
-    from reslrb_cli.report.tables import conditioning_lines
-
     wanted = [] if "parameters" in subject.missing else [key for spec in config.parameters for key in spec.keys]
     parameters = parameter_lines(summary.parameters, wanted, everything)
     text = fill(
@@ -263,7 +230,6 @@ def command(
             "counted": _counted,
             "sized": _sized,
             "shares": lambda view: ", ".join(f"{name} {100 * share:.0f} %" for name, share in vars(view).items()),
-            "conditioning": conditioning_lines,
         },
         path=path,
         run=None if subject.run is None else run_words(subject.run),
@@ -273,40 +239,10 @@ def command(
         plan=[f"none: {plan}"] if isinstance(plan, str) else plan and plan_lines(plan),
         parameters=[*parameters, *moving_lines(summary.movable, everything)],
         edges=edges,
-        measured=measured,
-        next=None if measured else next_step(subject, summary),
+        next=next_step(subject, summary),
     )
     click.echo(text, nl=False)
     return None
-
-
-def show_nonfinite(subject: Subject, as_json: bool) -> int:
-    """Print the origin of the run's first value that is not finite. Return exit code 1 if all values are finite now."""
-    from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME
-    from reslrb_cli.records.run_folder import RunFolder
-
-    config = subject.config
-    run = config.source.parent
-    if subject.run is None:
-        raise ConfigError(config.source, "--nonfinite", "is not in a run folder; give the config.yaml of a run")
-    if not (RunFolder(run).checkpoint / NONFINITE_FILE_NAME).exists():
-        raise ConfigError(config.source, "--nonfinite", "all values of this run were finite")
-    if config.codes:
-        own = next(iter(config.codes))
-        raise ConfigError(config.source, "--nonfinite", f"does not run your own code, which {own} names")
-    from reslrb_cli.measure.nonfinite_trace import find_offenders
-    from reslrb_cli.runs.resume import problem_before_nonfinite
-
-    problem, iteration = problem_before_nonfinite(run, logging.getLogger(__name__).info)
-    found = find_offenders(problem, iteration)
-    if as_json:
-        report = {"iteration": iteration, "offenders": [asdict(entry) for entry in found]}
-        click.echo(json.dumps(finite(report, str), indent=2, allow_nan=False))
-    else:
-        lines = [line for entry in found for line in entry.lines(iteration)]
-        for line in lines or [f"iteration {iteration}: all values are finite now"]:
-            echo(line)
-    return ExitCode.DONE if found else ExitCode.CHECK_FAILED
 
 
 def run_words(run: Mapping[str, Any]) -> str:
@@ -330,18 +266,6 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
     if missing:
         return f"add {missing} to {subject.path}, then run `reslrb optimize {subject.path}`"
     return f"`reslrb optimize {subject.config.source}`" + (" runs it again" if subject.run else " runs it")
-
-
-def measure(config: Config) -> Conditioning:
-    """Measure the conditioning of the experiment. The conditioning does not depend on settings that a run decides, so
-    these are off.
-    """
-    from reslrb_cli.optimization.assemble import assemble
-    from reslrb_cli.optimization.sensitivity import measure_conditioning
-
-    if isinstance(config.integrator, ReslrbConfig):
-        config = config.model_copy(update={"integrator": config.integrator.undecided_off()})
-    return measure_conditioning(assemble(config, logging.getLogger(__name__).info), SAMPLES)
 
 
 def select(config: Config, scene: Any) -> Selection | str:

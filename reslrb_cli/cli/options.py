@@ -12,7 +12,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,18 +25,7 @@ from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.records.measurement_files import (
-    Earlier,
-    Kept,
-    Line,
-    LivePage,
-    Origin,
-    are_kept,
-    is_stream,
-    samples_file,
-    write_lines,
-    write_samples,
-)
+from reslrb_cli.records.measurement_files import Line, LivePage, Origin, is_stream, write_lines
 from reslrb_cli.records.measurements import BenchStatus
 
 if TYPE_CHECKING:
@@ -50,26 +39,19 @@ def origin_of(variant: str) -> Origin:
 
 
 class Keeper:
-    """Writer of a JSON file and of a file of samples. If the process is killed, only seconds of work are lost.
+    """Writer of a JSON file. If the process is killed, only seconds of work are lost.
 
-    `origin` is the first line. `lines` returns the current state of all other lines. `kept` returns the data for a
-    later session, or None if there is none yet. Without `kept`, there is no file of samples. Without a file, the writer
-    does nothing.
+    `origin` is the first line. `lines` returns the current state of all other lines. Without a file, the writer does
+    nothing.
     """
 
-    def __init__(
-        self,
-        json_file: Path | None,
-        origin: Line,
-        lines: Callable[[], Sequence[Line]],
-        kept: Callable[[], Kept | None] | None = None,
-    ) -> None:
+    def __init__(self, json_file: Path | None, origin: Line, lines: Callable[[], Sequence[Line]]) -> None:
         self._file, self._is_live = json_file, json_file is not None and not is_stream(json_file)
-        self._origin, self._lines, self._kept = origin, lines, kept
+        self._origin, self._lines = origin, lines
         self._live = LivePage(self._write, "the file of --json")
 
     def refresh(self) -> None:
-        """Write the files every few seconds. Writing takes only a small share of the time. Call this method between
+        """Write the file every few seconds. Writing takes only a small share of the time. Call this method between
         steps.
         """
         if self._is_live:  # a stream gets only the final lines
@@ -77,22 +59,12 @@ class Keeper:
 
     def finish(self) -> None:
         """Write all lines in their final state. Raises OSError."""
-        if self._file is not None and not self._write():
-            echo("the samples are too large to save: the same command will measure everything again")
+        if self._file is not None:
+            self._write()
 
-    def _write(self) -> bool:
-        """Write both files. Return True if the samples were small enough to save."""
+    def _write(self) -> None:
         assert self._file is not None
-        fits = True
-        if self._is_live and self._kept is not None:
-            kept, samples = self._kept(), samples_file(self._file)
-            fits = kept is None or are_kept(kept[1])
-            if kept is not None and fits:
-                write_samples(samples, *kept)
-            else:  # an existing file belongs to other lines
-                samples.unlink(missing_ok=True)
         write_lines(self._file, [self._origin, *self._lines()])
-        return fits
 
 
 A = TypeVar("A", bound="Arena[Any, Any, Any]")
@@ -121,14 +93,6 @@ def measuring(
             session = kind(plan, Path(name), lambda: interrupts.requested, say, spent_s=spent_s, **options)
             echo(f"{plan.device}, {plan.variant}; {allowance(plan.budget_s, plan.rounds, 'round')}")
             yield session, interrupts
-
-
-def read_earlier(kind: str, json_file: Path | None, now: Mapping[str, Any] | None = None) -> Earlier | None:
-    """Return the saved samples (`Earlier.read`), and print that the command uses the samples."""
-    earlier = Earlier.read(kind, json_file, now)
-    if earlier is not None:
-        echo(f"using the samples in {samples_file(earlier.source)}")
-    return earlier
 
 
 def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCode:
@@ -176,7 +140,7 @@ REMOVED = {
          "`reslrb report FILE -o page.html` shows the table of results of --json FILE"),
         ("bench gradcheck convergence", "--plot", "`reslrb report FILE -o page.html` plots results of --json FILE"),
         ("bench", "--resume", "--values LIST measures the values that are missing"),
-        ("gradcheck convergence", "--resume", "--json FILE continues from the results in FILE"),
+        ("gradcheck convergence", "--resume", "a larger --budget, --seeds or --rounds takes more samples"),
         ("bench convergence", "--memory-limit", "the shell's `ulimit -v KIB` limits every process of the command"),
         ("bench", "--objective", "`reslrb convergence CONFIG --objective loss` measures steps of the loss"),
         ("optimize", "--force", "remove the folder of the earlier run; without that, the new folder has a number"),
@@ -188,16 +152,18 @@ REMOVED = {
         ("sweep", "--json", "results.jsonl in the folder of the sweep has the results"),
         ("sweep", "--dry-run", "`reslrb optimize CONFIG --dry-run` measures one of the runs"),
         ("sweep", "--quiet", "redirect the output, as in > sweep.log"),
-        ("gradcheck", "--cluster", "a check runs in one process; --json FILE continues it"),
+        ("gradcheck", "--cluster", "a check runs in one process; --budget limits its time"),
         ("gradcheck", "--estimators", "name them by --integrators, such as reslrb:stack,reslrb:gather"),
         ("gradcheck", "--case", "name the case after the suite, as in --suite extreme:furnace"),
-        ("gradcheck", "--images", "--json FILE keeps the gradients of each seed in FILE.samples.npz"),
+        ("gradcheck", "--images", "in Python, `rl.gradient` returns the gradients of each seed"),
         ("gradcheck", "--directions", "each parameter has three directions"),
         ("render", "--run", "name the folder of the run in place of CONFIG, as in `reslrb render RUN -o IMAGE`"),
         ("render", "--spp", "use --set run.spp=N"),
         ("init lens", "--force", "remove or rename the files that exist"),
         ("init", "--recover", "all other parameters are comments of the file; remove the # of those that you want"),
-        ("inspect", "--samples", "--conditioning takes 8 gradients"),
+        ("inspect", "--nonfinite", "a run names the first pixel of dL/dI, and the parameters, that are not finite"),
+        ("inspect", "--conditioning", "`reslrb optimize CONFIG --set optimizer.scale=auto --set run.iterations=1` "
+         "measures it; the page of the run has the table"),
         ("doctor", "--json", "the lines of `reslrb doctor` have the same content"),
         ("lens", "--both", "the back is flat: a second free face made pictures worse"),
         ("lens", "--margin", "the film sees an eighth of the picture's longer side around it"),
@@ -224,8 +190,7 @@ overrides_option = click.option(
 json_option = click.option(
     "--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help=
-        "Write one JSON object per line as results come. gradcheck and convergence also write their samples beside "
-        "the file, and take no sample again that is there.",
+        "Write one JSON object per line as results come.",
 )  # fmt: skip
 
 #: `--allow-code` (`allow_code`) of a command that runs users' own code.
@@ -282,8 +247,7 @@ def comparison_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `ComparisonOptions` to a command, except CONFIG, `--set` and `--integrators`."""
     rounds = click.option(
         "--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-        help="Number of steps of each integrator, for any time: the same steps on every machine. Steps in the file of "
-        "--json count.",
+        help="Number of steps of each integrator, for any time: the same steps on every machine.",
     )  # fmt: skip
     return allow_code_option(budget_option(rounds(json_option(function))))
 

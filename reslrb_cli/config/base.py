@@ -230,17 +230,12 @@ Seed = Annotated[int, Field(ge=0, lt=SEED_END)]
 Size = Annotated[tuple[Count, Count], Field(strict=False)]
 
 
-def size_of(size: int | tuple[int, int]) -> tuple[int, int]:
-    """Return a size as (width, height). One number stands for both width and height."""
-    return (size, size) if isinstance(size, int) else size
-
-
 def few(what: str, least: int = 1) -> AfterValidator:
     """Return a validator that limits the product of the two numbers in a size, and each number to at least `least`.
     `what` names the unit in errors.
     """
     start = "must have" if least == 1 else f"must be at least {least}, and have"
     return must(
-        lambda size: min(size_of(size)) >= least and math.prod(size_of(size)) <= PIXELS,
-        lambda size: f"{start} at most {PIXELS} {what}, not {math.prod(size_of(size))}",
+        lambda size: min(size) >= least and math.prod(size) <= PIXELS,
+        lambda size: f"{start} at most {PIXELS} {what}, not {math.prod(size)}",
     )

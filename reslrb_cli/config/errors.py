@@ -38,9 +38,11 @@ _EXPECTED = {
 
 #: Advice for removed settings, by the last two names of the key, with the value if other values remain.
 REMOVED = {
+    "heightmap.grid": "write the shape as a mesh with about one vertex for each texel, as `reslrb lens` does",
     "fabrication.faces": "name the mesh by fabrication.face; the back is flat",
     "fabrication.min_thickness": "`reslrb export` prints the smallest thickness of the solid; remove it",
     "fabrication.receiver": "give the receiver the id `screen` in the scene file, and remove it",
+    "fabrication.tool_radius": "the sheet names the largest ball cutter and the smallest hollow; remove it",
     "fabrication.size": "it is the size of the mesh; remove it",
     "integrator.sppc": "each part has as many samples as the step; remove it",
     "integrator.sppp": "each part has as many samples as the step; remove it",

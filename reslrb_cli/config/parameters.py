@@ -21,7 +21,6 @@ from reslrb_cli.config.base import (
     ByType,
     Choice,
     ConfigPath,
-    Count,
     Positive,
     Section,
     Size,
@@ -116,12 +115,6 @@ _EACH_ONCE = must(each_once, lambda _: "must name each once")
 #: One name, or a list of names.
 Names = Annotated[list[Name], Field(min_length=1), BeforeValidator(list_of_one), _EACH_ONCE, _NAMES]
 
-_Grid = Annotated[
-    Annotated[Count, mark("number")] | Annotated[Size, mark("list")],
-    by_kind("a number or [width, height]"),
-    few("vertices", least=2),
-]
-
 
 class HeightmapSpec(Section):
     """Displacement of a mesh along its initial normals, in scene units. The map is a texture over the mesh's texture
@@ -133,10 +126,6 @@ class HeightmapSpec(Section):
     resolution: Annotated[Size, few("texels", least=2)]
     """[width, height] of the map in texels, at least 2 each. Lookups are bilinear, and constant beyond the centres of
     the outermost texels."""
-    grid: _Grid | None = None
-    """Number of vertices along each edge, or [width, height]. Replaces a `rectangle` by a mesh of this size. The
-    vertices reach from edge to edge. Their texture coordinates are the centres of as many texels. null: the mesh stays
-    as it is."""
 
 
 _POINT = must(

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from numbers import Integral
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, get_args
 
 import drjit as dr
 import mitsuba as mi
@@ -253,20 +253,6 @@ def derivative_of(
     loss, gradient = dr.detach(loss), refused.take(dr.detach(gradient))
     dr.eval(loss, gradient, refused)
     return loss, gradient
-
-
-def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, mi.UInt32, int]]:
-    """Return the sample sets of a step with these `options` (`Config.step_options`). Each set has a name, a seed, and a
-    number of samples per pixel.
-    """
-    spp, adjoint = options["spp"], options["adjoint"]
-    if adjoint == "batched":
-        seeds = batch_seeds(seed, options["batches"])
-        return [(f"batch {b + 1}", batch, spp // len(seeds)) for b, batch in enumerate(seeds)]
-    first = dr.opaque(mi.UInt32, seed)
-    if adjoint == "correlated":
-        return [("image and gradient", first, spp)]
-    return [("image", first, spp), ("gradient", second_seed(first), spp)]
 
 
 def batch_seeds(seed: mi.UInt32 | int, batches: int) -> list[mi.UInt32]:

@@ -336,16 +336,13 @@ def stepover(radius: float, scallop: float = SCALLOP) -> float:
     return float(2 * np.sqrt(2 * radius * height - height**2))
 
 
-def cutter(curvature: Array, radius: float | None) -> dict[str, float | None]:
+def cutter(curvature: Array) -> dict[str, float | None]:
     """Return the largest radius of a ball cutter for a face, and the step between passes of the cutter, in mm.
 
-    `radius` is the radius of the cutter. If `radius` is None, the largest radius is used. `curvature` is as in
-    `largest_ball_radius`.
+    `curvature` is as in `largest_ball_radius`.
     """
     largest = largest_ball_radius(curvature)
-    used = largest if radius is None else radius
-    step = None if used is None else stepover(used)
-    return {"largest_radius": largest, "radius": used, "stepover": step, "scallop": SCALLOP}
+    return {"largest_radius": largest, "stepover": None if largest is None else stepover(largest), "scallop": SCALLOP}
 
 
 def steepest(sheet: Sheet, plan: Fabrication) -> float:
@@ -375,16 +372,8 @@ def measured(solid: Solid, sheet: Sheet, plan: Fabrication) -> dict[str, Any]:
         "relief": float(np.ptp(sheet.z[within(sheet, plan)])),
         "smallest_concave_radius": 1 / sharpest if sharpest > 1e-9 else None,
         "steepest_slope_degrees": steepest(sheet, plan),
-        "cutter": cutter(curvature, plan.tool_radius),
+        "cutter": cutter(curvature),
     }
-    if plan.tool_radius is not None:
-        narrow = float(np.mean(curvature > 1 / plan.tool_radius)) if curvature.size else 0.0
-        face["share_narrower_than_tool"] = narrow
-        if narrow > 0:
-            warnings.append(
-                f"the tool does not reach {100 * narrow:.2g} % of `{sheet.name}`: its radius is "
-                f"{plan.tool_radius:g} mm, and hollows have radii from {1 / sharpest:.3g} mm"
-            )
     if sheet.smooth:
         warnings.append(f"`{sheet.name}` was shaped with interpolated normals, which a solid does not have, so its "
                         'picture will differ; add <boolean name="face_normals" value="true"/> to the mesh in the '
@@ -400,7 +389,6 @@ def measured(solid: Solid, sheet: Sheet, plan: Fabrication) -> dict[str, Any]:
         "rim": plan.rim,
         "volume_mm3": solid.volume,
         "triangles": len(solid.triangles),
-        "tool_radius": plan.tool_radius,
         "faces": {sheet.name: face},
         "warnings": warnings,
     }

@@ -73,8 +73,7 @@ class Pace:
     """Divides the time among depths. Each depth gets GROWTH times as much time as the previous depth.
 
     Time that one depth leaves unused goes to the remaining depths. While there is time, each depth gets at least
-    MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time does not count. Rounds of earlier sessions
-    count.
+    MIN_ROUNDS rounds. The maximum is `most` rounds. With `rounds`, time does not count.
     """
 
     def __init__(
@@ -88,7 +87,6 @@ class Pace:
         self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
         self._rounds_start = now()
         self._depth_end = self._end
-        self._before = 0
 
     def over(self) -> bool:
         """Whether the time is up."""
@@ -104,15 +102,15 @@ class Pace:
         self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
         self._left -= 1
 
-    def begin_rounds(self, before: int = 0) -> None:
-        """Start the rounds after the warm-up. Earlier sessions have done `before` rounds."""
-        self._rounds_start, self._before = self._now(), before
+    def begin_rounds(self) -> None:
+        """Start the rounds after the warm-up."""
+        self._rounds_start = self._now()
 
     def another(self, done: int) -> bool:
-        """Whether there is time for another round after `done` rounds of this session."""
+        """Whether there is time for another round after `done` rounds."""
         if self._rounds is not None:
-            return self._before + done < self._rounds
-        if self._before + done >= self._most:
+            return done < self._rounds
+        if done >= self._most:
             return False
         if done == 0:
             return True
@@ -223,11 +221,11 @@ class Arena(Generic[Measured, Worker, Item]):
                 break
         return answer
 
-    def _take_rounds(self, before: int = 0) -> Iterator[int]:
-        """Yield the number of completed rounds after each round. Earlier sessions completed `before` rounds."""
-        tight, round = self._tight(), before
-        self._pace.begin_rounds(before)
-        while (workers := self._alive()) and self._pace.another(round - before):
+    def _take_rounds(self) -> Iterator[int]:
+        """Yield the number of completed rounds after each round."""
+        tight, round = self._tight(), 0
+        self._pace.begin_rounds()
+        while (workers := self._alive()) and self._pace.another(round):
             start = round % len(workers)  # the first worker changes from round to round
             for worker in [*workers[start:], *workers[:start]]:
                 worker.process.ask(worker.question(round) | {"cold": False, "release": tight})

@@ -176,4 +176,4 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
                 self.size = {name: answer[name] for name in SIZES}
         for run in self._alive():
             self._warm_up(run)
-        return self._take_rounds(0)
+        return self._take_rounds()

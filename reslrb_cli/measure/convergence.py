@@ -1,7 +1,6 @@
 """Members of a `convergence`: the compared methods, the reference, and the tests for bias.
 
-All members take turns (`Arena`). Each member has separate seeds, so no two members share noise. A session may continue
-from the steps of an earlier one, with the same dL/dI.
+All members take turns (`Arena`). Each member has separate seeds, so no two members share noise.
 """
 
 from __future__ import annotations
@@ -15,18 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.arena import NO_TIME, Arena, Contestant
 from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Ended, Refused
-from reslrb_cli.records.measurement_files import Earlier, Kept, kept
+from reslrb_cli.measure.processes import Refused
 from reslrb_cli.records.measurements import BenchStatus, Method
-
-#: The kind of measurement in stored samples.
-KIND = "convergence"
 
 #: The module of the functions that processes run.
 STEPS = "reslrb_cli.measure.steps"
@@ -109,42 +103,16 @@ class Member(Contestant):
         times = answer["step_ms"]
         self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
 
-    def kept(self, rounds: int) -> tuple[dict[str, Any], np.ndarray]:
-        """Return the data of the first `rounds` rounds for a later session: a JSON object, and the samples (N, P).
-
-        An interrupted round is left out. The next session repeats the interrupted round with other seeds.
-        """
-        turns = [turn for turn in self.turns if turn < rounds]
-        entry = {"name": self.name, "config": dump(self.config), "taken": self.taken, "turns": turns,
-                 "seconds": self.seconds[: len(set(turns))], "message": self.message, "cold": self.cold,
-                 "end": self.end and vars(self.end)}  # fmt: skip
-        return entry, np.array(self.rows[: len(turns)], np.float32)
-
-    def restore(self, entry: dict[str, Any], rows: np.ndarray) -> None:
-        """Restore the result of `kept`. Members that have ended are not tried again."""
-        for name in ("taken", "turns", "seconds", "message", "cold"):
-            setattr(self, name, entry[name])
-        self.rows, self.end = list(rows), entry["end"] and Ended(**entry["end"])
-        if self.end is not None:
-            self.close()
-
 
 class Session(Arena[Plan, Member, int]):
-    """Running processes and their samples (see `Arena`). The session continues from the samples of an `earlier` one, if
-    given. Raises ConfigError if they belong to another measurement.
+    """Running processes and their samples (see `Arena`).
 
     `judges` maps names of independent stock integrators to their members. `facts` are those of `survey`, which an
     additional process, the referee, finds before the members start. If the referee fails, nothing is measured.
     """
 
-    def __init__(self, plan: Plan, *others: Any, earlier: Earlier | None = None, **more: Any) -> None:
-        self.settings, self._earlier = plan.settings(), earlier
-        if earlier is not None:
-            earlier.check(self.settings)
-        super().__init__(plan, *others, **more)
-
     def _set_up(self) -> int:
-        self.rounds = self._before = 0 if self._earlier is None else self._earlier.head["rounds"]
+        self.rounds = 0
         self.judges: dict[str, Member] = {}
         self.facts: dict[str, Any] = {}
         return 1
@@ -165,34 +133,6 @@ class Session(Arena[Plan, Member, int]):
             yield from self._take_turns()
         self._say_what_lacks()
 
-    def kept(self) -> Kept | None:
-        """Return the data for a later session, or None if nothing has been sampled.
-
-        The data do not record that a method was left out or never took a step. A later session therefore tries the
-        method again.
-        """
-        if not self.rounds or not any(member.rows for member in self.members):
-            return None
-        entries, samples = [], dict[tuple[str, ...], Any]()
-        for member in self.members:
-            entry, samples[("rows", member.name)] = member.kept(self.rounds)
-            entries.append(entry)
-        with np.load(self._arrays) as survey:
-            samples |= {("survey", name): survey[name] for name in survey.files}
-        content = {"facts": self.facts, "rounds": self.rounds, "members": entries}
-        return kept(KIND, self.settings, samples, **content)
-
-    def _restore(self, earlier: Earlier) -> None:
-        """Give the members their earlier steps. Raises ConfigError if they differ."""
-        entries = earlier.head["members"]
-        if [member.name for member in self.members] != [entry["name"] for entry in entries]:
-            raise earlier.other("its methods differ: " + ", ".join(entry["name"] for entry in entries))
-        samples = earlier.samples
-        for member, entry in zip(self.members, entries, strict=True):
-            if entry["config"] != dump(member.config):
-                raise earlier.other(f"its settings differ from those of {member.label} here")
-            member.restore(entry, samples.get(("rows", member.name), np.empty(0)))
-
     @property
     def _arrays(self) -> Path:
         """File of the survey's arrays."""
@@ -203,11 +143,6 @@ class Session(Arena[Plan, Member, int]):
     def _survey(self) -> bool:
         """Find the references, and make dL/dI. Returns false if time is up."""
         plan = self.plan
-        if self._earlier is not None:
-            found = {name: array for (what, name), array in self._earlier.samples.items() if what == "survey"}
-            np.savez(self._arrays, **found)  # type: ignore[arg-type]
-            self.facts = self._earlier.head["facts"]
-            return True
         first = plan.first(plan.reference_config) | {"arrays": str(self._arrays), "objective": plan.objective}
         referee = Contestant(process=self._start(first, f"{STEPS}:begin_survey"), may_refuse=False)
         with contextlib.closing(referee):
@@ -247,8 +182,6 @@ class Session(Arena[Plan, Member, int]):
             self.judges[name] = (
                 same[0] if same else self._add(Role.INDEPENDENT, Case(name, name, {}), config, self._noise_free)
             )
-        if self._earlier is not None:
-            self._restore(self._earlier)
         for key, reason in facts["why"].items():
             if facts["independent"][key] is None:
                 self._say(f"{key}: no independent reference ({reason}); biases are judged by {reference.label}")
@@ -267,9 +200,8 @@ class Session(Arena[Plan, Member, int]):
             "mode": objective,
             "purpose": f"convergence, {role.value} {method.label}",
         }
-        has_all = plan.rounds is not None and self._before >= plan.rounds
         member = Member(
-            process=None if has_all else self._start(first, f"{STEPS}:begin_sampling"),
+            process=self._start(first, f"{STEPS}:begin_sampling"),
             may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
             role=role,
             method=method,
@@ -302,11 +234,11 @@ class Session(Arena[Plan, Member, int]):
         if not {Role.CASE, Role.REFERENCE} <= {member.role for member in alive}:
             return
         round_s = sum(member.count * member.step_s for member in alive)
-        if not self._pace.fits(max(FEWEST - self._before, 1) * round_s):
+        if not self._pace.fits(FEWEST * round_s):
             return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
-        rounds = self._take_rounds(self._before)
+        rounds = self._take_rounds()
         while self.rounds < most and (now := next(rounds, None)) is not None:
             self.rounds = now
             yield now
@@ -316,6 +248,5 @@ class Session(Arena[Plan, Member, int]):
         late = [member.label for member in self.members if member.late]
         if late:
             self._say(f"not measured: {', '.join(late)}: {NO_TIME}")
-        elif self.plan.rounds is None and self.rounds - self._before < max(FEWEST - self._before, 1):
-            lacking = f"results need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
-            self._say(f"{lacking}: {NO_TIME}")
+        elif self.plan.rounds is None and self.rounds < FEWEST:
+            self._say(f"results need {FEWEST} rounds: {NO_TIME}")

@@ -7,14 +7,13 @@ is the plan of the command `convergence`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
 from reslrb_cli.backend.doctor import device_name, memory_bytes
 from reslrb_cli.backend.variant import choose
-from reslrb_cli.config.base import code_file, is_code
 from reslrb_cli.config.integrators import (
     AUTO_ESTIMATOR,
     ESTIMATOR_OPTIONS,
@@ -27,7 +26,6 @@ from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.measurement_files import FILES, program
 from reslrb_cli.records.measurements import Method
 
 #: Options that a case inherits from the configuration's integrator if its own integrator has them.
@@ -238,32 +236,6 @@ def with_run(config: Config, **changes: Any) -> Config:
     return config.model_copy(update={"run": config.run.model_copy(update=changes)})
 
 
-def code_files(cases: Iterable[Case]) -> dict[str, Path]:
-    """Return the files of the user's own integrators and estimators among `cases`, by label."""
-    places = {case.label: str(case.options.get("file") or case.options.get("estimator", "")) for case in cases}
-    return {label: code_file(place) for label, place in places.items() if is_code(place)}
-
-
-def kept_settings(
-    config: Config, codes: Mapping[str, Path], variant: str, device: str, **options: Any
-) -> dict[str, Any]:
-    """Return the settings that must be the same in all sessions of a measurement, as JSON.
-
-    `codes` are the files of integrators that the command names. `options` are the command's options. Files are compared
-    by their contents. The variant and the device are included, because times of all sessions are compared.
-    """
-    from reslrb_cli.scene.files import file_digests, files_of  # which loads Mitsuba
-
-    return {
-        "config": parse(dump(config), str(config.source)),
-        **options,
-        "variant": variant,
-        "device": device,
-        "versions": program(),
-        FILES: file_digests({**files_of(config), **codes}),
-    }
-
-
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
     """The settings common to all measurements that use processes.
@@ -390,15 +362,6 @@ class Plan(Measurement):
         plan = cls(**machine_of(config), **own, config=config, objective=objective, **others)
         plan.check()
         return plan
-
-    def settings(self) -> dict[str, Any]:
-        """Return the settings that must be the same in all sessions, as JSON (`kept_settings`)."""
-        codes = code_files([*self.cases, self.reference])
-        return kept_settings(
-            self.config, codes, self.variant, self.device, integrators=[case.label for case in self.cases],
-            objective=self.objective, reference=self.reference.label, spp=list(self.spps),
-            **{"memory limit": self.memory_limit},
-        )  # fmt: skip
 
     @property
     def known(self) -> bool:

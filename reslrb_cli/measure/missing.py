@@ -21,7 +21,7 @@ is limited to a part of the run's samples, and uses one or two finite-difference
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -55,7 +55,6 @@ from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
 from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.decisions import Decision
-from reslrb_cli.records.measurement_files import Earlier, Kept, kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.edges import has_edges
@@ -164,9 +163,6 @@ def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 #: Light paths of the image at which dL/dI is taken.
 IMAGE_PATHS = 2**22
 
-#: Kind of measurement in the file of samples.
-KIND = "gradcheck --missing"
-
 #: Estimator of the checked gradient: exact, and attached if anything moves.
 ESTIMATOR = "reslrb:stack"
 
@@ -174,13 +170,11 @@ ESTIMATOR = "reslrb:stack"
 class MissingCheck:
     """The measurement of missing terms on a loaded experiment. A variant must be set.
 
-    dL/dI is that of the experiment's loss at the initial values, and stays fixed. New seeds are added to the seeds of
-    an `earlier` session. `count` is the total number of seeds. Raises ConfigError and UnsupportedScene.
+    dL/dI is that of the experiment's loss at the initial values, and stays fixed. `count` is the number
+    of seeds. Raises ConfigError and UnsupportedScene.
     """
 
-    def __init__(
-        self, config: Config, budget_s: float, count: int | None, spp: int | None, earlier: Earlier | None = None
-    ) -> None:
+    def __init__(self, config: Config, budget_s: float, count: int | None, spp: int | None) -> None:
         self._budget, self._count, self._start = budget_s, count, time.perf_counter()
         depth = config.integrator.max_depth
         own_paths = config.integrator.options().get("paths", "auto")
@@ -200,7 +194,7 @@ class MissingCheck:
         self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
         self._directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, MOVING_DIRECTIONS)
         #: By parameter, in the order of `case.keys`, as far as measured.
-        self._found: dict[str, Missing] = {} if earlier is None else self._restore(earlier)
+        self._found: dict[str, Missing] = {}
 
     def conditions(self) -> str:
         """Describe the measurement in one line."""
@@ -224,27 +218,9 @@ class MissingCheck:
         least = min(FEWEST, self._count or FEWEST)
         return [self._record(key) for key, found in self._found.items() if found.count >= least]
 
-    def kept(self, settings: Mapping[str, Any]) -> Kept | None:
-        """Return the state for a later session with the same `settings`, or None if there are no samples."""
-        taken = {key: found for key, found in self._found.items() if found.count}
-        steps = {key: [direction.step for direction in found.directions] for key, found in taken.items()}
-        samples = {("ours", key): found.ours for key, found in taken.items()}
-        samples |= {("differences", key): found.differences for key, found in taken.items()}
-        return kept(KIND, settings, samples, steps=steps)
-
-    def _restore(self, earlier: Earlier) -> dict[str, Missing]:
-        """Return the results of an earlier session, with the steps of the earlier session."""
-        found, samples = {}, earlier.samples
-        for key, steps in earlier.head["steps"].items():
-            along = [replace(one, step=float(h)) for one, h in zip(self._directions[key], steps, strict=True)]
-            found[key] = Missing(along, list(samples["ours", key]), list(samples["differences", key]))
-        return found
-
     def _measure(self, key: str, end: float, stop: Callable[[], bool], between: Callable[[], None]) -> None:
-        if key not in self._found:
-            self._found[key] = Missing.of(self.case, self._differenced, self._directions[key], self.spp)
-        found = self._found[key]
-        for seed in seeds(self._count or 10**6)[found.count :]:
+        found = self._found[key] = Missing.of(self.case, self._differenced, self._directions[key], self.spp)
+        for seed in seeds(self._count or 10**6):
             enough = found.count >= FEWEST and (stop() or (self._count is None and time.perf_counter() > end))
             if enough:
                 break

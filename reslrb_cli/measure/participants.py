@@ -22,7 +22,6 @@ from reslrb_cli.measure.methods import Case as Listed
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
-    bsdfs_of,
     choose,
     divides_by_film,
     ends,
@@ -37,7 +36,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import check_integrator
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.measurements import Reference
-from reslrb_cli.scene.catalog import parameter_kind, value_shape
+from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
 
 #: Light paths of one gradient, rounded to whole samples per pixel.
@@ -189,7 +188,6 @@ class Participants:
 
     def __init__(self, settings: CheckSettings) -> None:
         config, configs, self.known = settings.config, settings.configs(), settings.known
-        self._configs = configs
         # If objects move, the experiment has an estimator with derivatives of moving light.
         follows = [case.type == "reslrb" and case.options["estimator"] in ATTACHED for case in settings.integrators]
         first = configs[settings.integrators[follows.index(True) if any(follows) else 0].label].with_exposures_fixed()
@@ -321,25 +319,6 @@ class Participants:
                 if options | alike != options:
                     made[_alike(label, reference)] = make_integrator(kind, **options | alike)
         return made
-
-    def options_of(self, label: str) -> dict[str, Any]:
-        """Return `max_depth`, `rr_depth` and `hide_emitters` of an integrator."""
-        options = self._configs[label].integrator.options()
-        return {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
-
-    def own_with(self, label: str, **other: int) -> StepIntegrator:
-        """Return the user's own integrator with the label `label`. The arguments `other` replace the integrator's
-        depths.
-        """
-        config = self._configs[label]
-        return OwnIntegrator(**config.integrator.options() | other, allowed=config.allows_code)
-
-    def bsdfs_of(self, key: str) -> list[mi.BSDF]:
-        """Return all BSDFs that a parameter belongs to, including nested and enclosing BSDFs. The list is empty if the
-        parameter belongs to no BSDF.
-        """
-        is_bsdf = key in self.case.params.properties and parameter_kind(self.case.params, key) == "bsdf"
-        return bsdfs_of(self._situation, key) if is_bsdf else []
 
     def references(self, key: str, listed: Listed) -> list[Reference]:
         """Return the references that the scene allows for the gradient of a parameter by an integrator."""

@@ -12,7 +12,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.base import size_of
 from reslrb_cli.config.integrators import Integrator, Own, WalkAdConfig
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import check_code
@@ -27,8 +26,7 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.scene.deformation import Moves, where_moved
-from reslrb_cli.scene.in_memory import INSTEAD
-from reslrb_cli.scene.load import load_scene, make_grid, warn_once
+from reslrb_cli.scene.load import INSTEAD, load_scene, warn_once
 from reslrb_cli.scene.needs import (
     camera_finds_all,
     camera_finds_nothing,
@@ -39,7 +37,6 @@ from reslrb_cli.scene.needs import (
     stock_clip,
 )
 from reslrb_cli.scene.parameters import Selection
-from reslrb_cli.scene.values import Place
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.seeds import seed
 
@@ -110,17 +107,7 @@ def load_configured(
     keys = selected_keys(config) if selects else []
     if scene.file.name == IN_MEMORY:
         return _lent_scene(config, keys, config.parameters if selects else [])
-
-    def see(description: Description) -> None:
-        for number, spec in enumerate(config.parameters if selects else ()):
-            if spec.heightmap is not None and spec.heightmap.grid is not None:
-                place = Place(config.source, f"parameters[{number}]")
-                for id in spec.heightmap.mesh:
-                    make_grid(description, id, size_of(spec.heightmap.grid), place)
-        if look is not None:
-            look(description)
-
-    return load_scene(scene.file, scene.options, scene.size, scene.cameras, see, keys)
+    return load_scene(scene.file, scene.options, scene.size, scene.cameras, look, keys)
 
 
 def _lent_scene(config: Config, keys: list[str], specs: Sequence[ParameterSpec]) -> mi.Scene:
@@ -132,10 +119,6 @@ def _lent_scene(config: Config, keys: list[str], specs: Sequence[ParameterSpec])
     changed = next((name for name in ("options", "size", "cameras") if getattr(scene, name)), None)
     if changed is not None:
         raise ConfigError(config.source, f"scene.{changed}", f"cannot change an mi.Scene; {INSTEAD}")
-    for number, spec in enumerate(specs):
-        if spec.heightmap is not None and spec.heightmap.grid is not None:
-            reason = f"cannot replace a shape of an mi.Scene; {INSTEAD}"
-            raise ConfigError(config.source, f"parameters[{number}].heightmap.grid", reason)
     moved = [name for spec in specs for _, _, name in spec.objects()]
     own.check_merged([key for key in keys if key.rpartition(".")[0] not in moved], moved, config.source)
     return own.restore()

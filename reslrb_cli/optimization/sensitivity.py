@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -97,42 +97,6 @@ AIM, LEAST, MOST = 0.03, 0.003, 0.3
 TRIALS = 8
 #: Gradient samples of a run.
 SAMPLES = 4
-#: Quantities whose spread is measured.
-QUANTITIES = ("gradient", "change", "length")
-
-
-@dataclass(frozen=True)
-class Conditioning:
-    """Measured sensitivities of all parameters. The sensitivities come from `samples` gradients of `spp` samples per
-    pixel, with the run's `seed`.
-    """
-
-    rows: list[Sensitivity]
-    samples: int
-    spp: int
-    seed: int
-
-    def spread(self, quantity: str) -> float | None:
-        """Return the ratio of the largest to the smallest value of `quantity`, which is one of QUANTITIES. Returns None
-        for fewer than two positive values.
-        """
-        values = [getattr(row, quantity) for row in self.rows]
-        positive = [value for value in values if value is not None and value > 0]
-        return max(positive) / min(positive) if len(positive) > 1 else None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the content as a mapping for JSON."""
-        values = asdict(self)
-        rows, spread = values.pop("rows"), map(self.spread, QUANTITIES)
-        return values | {"parameters": rows, "spread": dict(zip(QUANTITIES, spread, strict=True))}
-
-
-def measure_conditioning(problem: Problem, samples: int) -> Conditioning:
-    """Measure every parameter of `problem` at its current value. The problem needs its targets. `samples` must be at
-    least 2.
-    """
-    run = problem.config.run
-    return Conditioning(measure_sensitivities(problem, samples), samples, run.spp, run.seed)
 
 
 def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:

@@ -5,7 +5,6 @@ The folder `checkpoint/` of a run holds:
 `state.npz`      the newest state: `iteration`, `parameter/<key>`, the other arrays of the optimisation, and `state`,
                  the remaining values as JSON
 `previous.npz`   the state saved before that
-`nonfinite.npz`  the state before the first iteration with a value that was not finite
 """
 
 from __future__ import annotations
@@ -54,7 +53,6 @@ def open_archive(path: Path) -> Iterator[Mapping[str, Array]]:
 
 
 STATE_FILE, PREVIOUS_FILE_NAME, _NEXT_FILE = "state.npz", "previous.npz", "next.npz"
-NONFINITE_FILE_NAME = "nonfinite.npz"
 
 #: Format version in the JSON of a state. It changes when the meaning of an entry changes.
 FORMAT = 4

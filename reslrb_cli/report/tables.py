@@ -1,4 +1,4 @@
-"""Measurements as aligned tables: bench, conditioning, gradcheck and convergence, each with its summary."""
+"""Measurements as aligned tables: bench, gradcheck and convergence, each with its summary."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import fields
 
 from reslrb_cli.measure.bench import BenchResult
 from reslrb_cli.measure.judgement import ConvergenceResults
-from reslrb_cli.optimization.sensitivity import QUANTITIES, Conditioning
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
     TARGETS,
@@ -23,7 +22,7 @@ from reslrb_cli.records.measurements import (
     SummaryRecord,
     Verdict,
 )
-from reslrb_cli.report.format import Columns, interval, number, shorten, table
+from reslrb_cli.report.format import Columns, interval, number, shorten
 
 
 def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
@@ -53,23 +52,6 @@ def _milliseconds(time: Spread | None) -> str:
 
 def _ratio(ratio: Spread | None) -> str:
     return "" if ratio is None else interval(ratio.median, ratio.min, ratio.max, ".2f")
-
-
-def conditioning_lines(measured: Conditioning) -> list[str]:
-    """Return one line per parameter, in the parameter's units, and a line with the spread between parameters. Unknown
-    values are `-`.
-    """
-    rows: list[tuple[str, ...]] = [("parameter", "entries", "value", "gradient", "noise", "image / unit", "length")]
-    for row in measured.rows:
-        numbers = (row.value, row.gradient, row.noise, row.change, row.length)
-        rows.append((row.key, str(row.entries), *map(_number, numbers)))
-    gradient, change, length = (_number(measured.spread(quantity)) for quantity in QUANTITIES)
-    rows.append(("largest / smallest", "", "", gradient, "", change, length))
-    return table(rows, "<>")
-
-
-def _number(value: float | None) -> str:
-    return number(value, 3) or "-"
 
 
 HEAD = ("parameter", "integrator", "reference", "seeds", "rel. L2", "z rms", "max |z|", "cosine", "variance",

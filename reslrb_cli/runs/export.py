@@ -28,13 +28,12 @@ from reslrb_cli.lens.solid import (
     within,
 )
 from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-from reslrb_cli.measure.tolerance import OpticalBench
 from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of, what_moves
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.records.run_folder import FABRICATION_FILE, exposures, workshop_file
-from reslrb_cli.runs.workshop import add_sheet, add_tolerances
+from reslrb_cli.runs.workshop import OpticalBench, add_sheet, add_tolerances
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.scene.images import read_photo
@@ -93,16 +92,15 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
         numbers = measured(solid, sheet, plan)
         target = read_target(config, scene.sensors()[sensors[0]], needed=tolerances)
         if target is not None:
-            image, numbers["loss"] = measure_loss(config, scene, sensors[0], integrator, target)
-            pictures = add_sheet(numbers, plan, scene, sensors[0], sheet, luminance(image), luminance(target))
+            tracer, spp = mi.load_dict(dict(integrator)), config.run.final_spp
+            image = luminance(np.array(mi.render(scene, integrator=tracer, sensor=sensors[0], spp=spp)))
+            pictures = add_sheet(numbers, plan, scene, sensors[0], sheet, image, luminance(target))
             if tolerances:
                 try:
-                    bench = OpticalBench(scene, selection.params, plan, mi.load_dict(dict(integrator)), sensors[0])
+                    bench = OpticalBench(scene, selection.params, plan, tracer, sensors[0])
                 except ConfigError as error:
                     raise ConfigError(config.source, error.key, error.message) from None
-                pictures |= add_tolerances(
-                    numbers, bench, sheet, luminance(image), luminance(target), config.run.final_spp, say
-                )
+                pictures |= add_tolerances(numbers, bench, image, luminance(target), spp, say)
         pictures |= pictures_of(solid)
         beside = solid_files(plan, sheet, solid, numbers, pictures)
     exposure = exposure_line(run)
@@ -121,9 +119,6 @@ def write_export(config: Config, run: Path, output: Path, tolerances: bool, say:
             inside, aside, beyond = (100 * light[name] for name in ("inside", "beside", "beyond"))
             say(f"of the light that leaves it, {inside:.4g} % falls in the picture, {aside:.2g} % beside it on the "
                 f"film, {beyond:.2g} % outside")  # fmt: skip
-        if loss := numbers.get("loss"):
-            how = f"{loss['integrator']} ({loss['spp']} samples per pixel, seed {loss['seed']})"
-            say(f"mean squared difference from the target is {loss['l2']:.4g}, also for the solid, by {how}")
         if f"{plan.kind}.3mf" not in beside:
             say(f"{plan.kind}.3mf is not written: lib3mf is missing; pip install 'reslrb[fabrication]'")
 
@@ -225,22 +220,6 @@ def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None
     if needed:
         raise ConfigError("--tolerances", "", reason)
     return None
-
-
-def measure_loss(
-    config: Config, scene: mi.Scene, sensor: int, integrator: dict[str, object], target: Array
-) -> tuple[Array, dict[str, Any]]:
-    """Return the scene's image and the image's mean squared difference from `target`. The exported scene reproduces
-    both.
-
-    The image is rendered by Mitsuba's own `integrator` with independent samples. A run may render its images with
-    low-discrepancy samples. Low-discrepancy samples have less noise, so the run's loss for the same face is lower.
-    """
-    spp, seed = config.run.final_spp, 0
-    image = np.array(mi.render(scene, integrator=mi.load_dict(dict(integrator)), sensor=sensor, spp=spp, seed=seed))
-    difference = image[:, :, :3].astype(np.float64) - target
-    l2 = float(np.mean(difference**2))
-    return image, {"l2": l2, "spp": spp, "seed": seed, "integrator": integrator["type"]}
 
 
 def solid_files(

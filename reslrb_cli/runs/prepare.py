@@ -33,7 +33,7 @@ from reslrb_cli.optimization.results import Images, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.views import view_records
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, entries_below, save_checkpoint
+from reslrb_cli.records.checkpoint import entries_below, save_checkpoint
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest, commit_of
 from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
@@ -254,10 +254,6 @@ class RunProgress:
         """
         save_checkpoint(folder, self.done, *self._entries(self.state))
         return self.done
-
-    def save_begun(self, folder: Path) -> None:
-        """Save the state at the start of the current iteration, for `inspect --nonfinite`. Raises OSError."""
-        save_checkpoint(folder, self.done, *self._entries(self.state), name=NONFINITE_FILE_NAME)
 
     def _entries(self, state: State) -> tuple[Arrays, dict[str, Any]]:
         """Return the arrays and the other values that a checkpoint stores for `state`, in the form of

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import os
-import shlex
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.errors import MachineError, NonFinite, describe, is_machine_fault
+from reslrb_cli.errors import MachineError, describe, is_machine_fault
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.problem import Problem, saved_spp
@@ -24,7 +22,6 @@ from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 from reslrb_cli.records.atomic import remove_parts
 from reslrb_cli.records.checkpoint import (
-    NONFINITE_FILE_NAME,
     STATE_FILE,
     newest_checkpoint,
 )
@@ -62,13 +59,12 @@ class Recording:
     certainty: CertaintyRecord | None = None
     #: How the run ended, or RUNNING.
     status: Status = Status.RUNNING
-    _saved_nonfinite: bool = field(init=False)
+    _told_nonfinite: bool = False
     #: Iterations that the newest checkpoint contains; None before the first one.
     _saved: int | None = None
 
     def __post_init__(self) -> None:
         self._stop: Callable[[], bool] = lambda: False
-        self._saved_nonfinite = (self.folder.checkpoint / NONFINITE_FILE_NAME).exists()
         self.page = LivePage(self._write_live_page)
 
     @property
@@ -145,8 +141,6 @@ class Recording:
         except KeyboardInterrupt:
             self.course.stand()
             status = Status.INTERRUPTED
-        except NonFinite as error:
-            failure = NonFinite(f"{error}; {self._where()}") if self._saved_nonfinite else error
         except BaseException as error:
             failure = error
         self.status = self._end(status, failure)
@@ -210,19 +204,10 @@ class Recording:
             logger.log(level, f"scale {self.problem.config.optimizer.scale}: {scale_line(row)}")
 
     def _on_nonfinite(self, found: Findings) -> None:
-        """Save the state before the first step with a non-finite value, and explain how to inspect the state."""
-        if self._saved_nonfinite:
-            return
-        self.course.save_begun(self.folder.checkpoint)
-        self._saved_nonfinite = True
-        if self.problem.config.run.on_nonfinite != "stop":  # with "stop", the error says so
-            logger.warning(f"{found}; {self._where()}")
-
-    def _where(self) -> str:
-        """Return a hint on how to find the cause of a non-finite value."""
-        if self.problem.config.codes:
-            return "check what your own code returns; `reslrb inspect --nonfinite` does not run it"
-        return f"where: reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
+        """Print the first values that are not finite. With `stop`, the error says so."""
+        if not self._told_nonfinite and self.problem.config.run.on_nonfinite != "stop":
+            logger.warning(f"{found}")
+        self._told_nonfinite = True
 
     def _end(self, status: Status, failure: BaseException | None) -> Status:
         """Complete the folder, starting with the state, and return how the run ended. Raises the first error."""

@@ -8,15 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.loader import OVERRIDDEN, Override, dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import Settled, State
-from reslrb_cli.optimization.state import load as load_state
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, PREVIOUS_FILE_NAME, STATE_FILE
+from reslrb_cli.records.checkpoint import PREVIOUS_FILE_NAME, STATE_FILE
 from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
 from reslrb_cli.records.run_folder import RunFolder, check_writable, opened, write_beginning
@@ -174,22 +171,6 @@ def open_earlier(run: Path, overrides: Sequence[str | Override]) -> Iterator[Ope
         if not earlier.is_done:
             check_writable(folder)
         yield earlier
-
-
-def problem_before_nonfinite(run: Path, say: Say) -> tuple[Problem, int]:
-    """Return the problem at the start of the first iteration with a non-finite value. Also return the iteration's
-    index, counted from 0.
-
-    The function sets the run's variant. The function does not lock the folder, so the run may be in progress. Raises
-    ConfigError and UnsupportedScene.
-    """
-    stored = Stored(RunFolder(run).checkpoint / NONFINITE_FILE_NAME)
-    settled = stored.read(Settled)
-    set_variant(settled.variant)
-    config = loads(settled.config, run / "config.yaml")
-    _check_files(settled.files, config, run)
-    problem = assemble(config, say, settled=stored)
-    return problem, load_state(problem, stored).iteration
 
 
 def _read_state(folder: RunFolder, said: list[str]) -> Stored:

@@ -1,29 +1,25 @@
 """Figures and pictures of the sheet for the workshop that makes a lens or a mirror (`report/page/workshop.py`).
 
-`setup_of` measures the set-up in its scene: distances, direction of the light, orientation of the picture. Lengths are
-in mm. Directions are unit vectors in the axes of the scene.
+`OpticalBench` and `tolerances` render images with errors of light, position or glass. For each error, a stock
+integrator of Mitsuba renders the scene with the changed part. If a rotation shifts the whole picture, the shift is
+reported, and removed before images are compared. `setup_of` measures the set-up in its scene: distances, direction of
+the light, orientation of the picture. Lengths are in mm. Directions are unit vectors in the axes of the scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.ndimage
 
 from reslrb_cli.config.schema import Fabrication
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens.solid import Sheet
-from reslrb_cli.measure.tolerance import (
-    DISTANCE,
-    INDEX,
-    TURN,
-    OpticalBench,
-    figures,
-    picture_within,
-    tolerances,
-    where_light_goes,
-)
 from reslrb_cli.records.images import luminance
 from reslrb_cli.report.page.workshop import shown_ssim
 from reslrb_cli.scene.images import read_image
@@ -36,14 +32,250 @@ ALLOWED_LOSS = 0.05
 #: Errors that a careful workshop keeps: distance in mm, rotations in degrees, index of refraction.
 TOLERANCES = {"distance": 1.0, "light turned": 0.5, "solid turned": 0.5, "index": 0.002}
 
-#: Share of the darkest pixels of a picture, and the brightness up to which they count as black, in means.
-DARKEST, BLACK = 0.05, 0.2
+#: Assumed errors of the distance, of the index, and of rotations in degrees.
+DISTANCE, INDEX, TURN = 0.02, 0.005, 1.0
 
-#: Brightness in means by which black may be brighter than in the picture.
-GREY = 0.05
+#: Rays for the shares of lost light, which are 0.1 % to 5 %, and the maximum number of faces that each ray meets.
+SHARE_RAYS, BOUNCES = 2**19, 8
 
-#: Side of a corner as a fraction of the picture, and the least share of its light. Darker corners count as black.
-CORNER, LIT = 0.1, 0.5
+#: Directions within a light as wide as the sun, in units of its radius: the centre, and six on a circle with the mean
+#: squared distance of an even disc (one half).
+_DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) ** 0.5)
+                             for a in np.arange(6) * np.pi / 3)]  # fmt: skip
+
+
+def figures(image: Array, target: Array) -> dict[str, float]:
+    """Compare luminances (H, W) within the picture: SSIM, L1 and contrast (standard deviation over mean).
+
+    Also returns the target's `contrast`, and the share of the film's light that falls into the picture. The picture is
+    the bounding rectangle of the target's nonzero pixels. Each image is divided by its mean within the picture. SSIM is
+    computed by scikit-image, with the target's maximum as data_range.
+    """
+    from skimage.metrics import structural_similarity
+
+    inside = picture_within(target)
+    seen, wanted = image[inside], target[inside]
+    seen, wanted = seen / max(float(seen.mean()), 1e-30), wanted / wanted.mean()
+    return {
+        "ssim": float(structural_similarity(seen, wanted, data_range=float(wanted.max()))),
+        "l1": float(np.abs(seen - wanted).mean()),
+        "inside": float(image[inside].sum() / max(float(image.sum()), 1e-30)),
+        "contrast": float(seen.std()),
+        "target_contrast": float(wanted.std()),
+    }
+
+
+def picture_within(target: Array) -> tuple[slice, slice]:
+    """Return rows and columns of the picture in a target (H, W): the bounding rectangle of its nonzero pixels."""
+    rows, columns = (np.flatnonzero(np.any(target > 0, axis=axis)) for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, target: Array) -> dict[str, float]:
+    """Return three shares of the light from the front face. The light goes `inside` the picture, `beside` the picture
+    on the film, or `beyond`.
+
+    `beyond` is light that lands elsewhere on the receiver, or misses the receiver. The shares are estimated with
+    `SHARE_RAYS` rays from the lamps. Mitsuba samples the BSDFs, and reflections in the glass are included. The picture
+    consists of the nonzero pixels of the luminance `target` (H, W). Light reflected back to the lamp, and light past
+    the lens, do not count. If no light leaves the lens, all shares are 0.
+    """
+    rows, columns = picture_within(target)
+    shapes = {shape.id(): shape for shape in scene.shapes()}
+    front, receiver = mi.ShapePtr(shapes[plan.face]), mi.ShapePtr(shapes[plan.receiver])
+    solid = [shape for name, shape in shapes.items() if name in (plan.face, "back")]
+    sampler, ray, light = _from_lamps(scene, SHARE_RAYS)
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    left, active = dr.zeros(mi.Bool, SHARE_RAYS), light > 0
+    dr.make_opaque(ray, light, left, active)  # so that each rotation launches one kernel
+    totals = dict.fromkeys(("inside", "beside", "beyond"), 0.0)
+    for _ in range(BOUNCES):
+        si = scene.ray_intersect(ray, active)
+        again = active & si.is_valid() & _is_any(si.shape, solid)
+        ended = active & left & ~again
+        ds, importance = sensor.sample_direction(si, mi.Point2f(0.5), ended)
+        on_film = ended & (si.shape == receiver) & (dr.max(importance) > 0)
+        inside = on_film & (ds.uv.x >= columns.start) & (ds.uv.x < columns.stop)
+        inside &= (ds.uv.y >= rows.start) & (ds.uv.y < rows.stop)
+        parts = {"inside": inside, "beside": on_film & ~inside, "beyond": ended & ~on_film}
+        sums = {name: dr.sum(dr.select(part, light, 0)) for name, part in parts.items()}
+        bs, factor = si.bsdf(ray).sample(context, si, sampler.next_1d(again), sampler.next_2d(again), again)
+        towards = si.to_world(bs.wo)
+        ray = si.spawn_ray(towards)
+        light = dr.select(again, light * mi.Float(mi.luminance(factor) if mi.is_rgb else factor.x), 0)
+        active = again & (light > 0)
+        left = active & (si.shape == front) & (dr.dot(towards, si.n) * dr.sign(si.n.z) > 0)
+        dr.eval(ray, light, active, left, sums)
+        for name, part in sums.items():
+            totals[name] += float(part[0])
+        if not dr.any(active):
+            break
+    whole = sum(totals.values())
+    return {name: total / max(whole, 1e-30) for name, total in totals.items()}
+
+
+def _from_lamps(scene: mi.Scene, count: int) -> tuple[mi.Sampler, mi.Ray3f, mi.Float]:
+    """Return a sampler for `count` rays, rays from the lamps, and the light of each ray."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, count)
+    ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
+    return sampler, ray, mi.Float(mi.luminance(weight) if mi.is_rgb else weight.x)
+
+
+def _is_any(shape: mi.ShapePtr, others: Sequence[mi.Shape]) -> mi.Bool:
+    found = mi.Bool(False)
+    for other in others:
+        found = found | (shape == mi.ShapePtr(other))
+    return found
+
+
+def shift_between(image: Array, reference: Array) -> Array:
+    """Return the shift (rows, columns) of `image` relative to `reference`, to a tenth of a pixel."""
+    from skimage.registration import phase_cross_correlation
+
+    return -np.asarray(phase_cross_correlation(reference, image, upsample_factor=10)[0])
+
+
+class OpticalBench:
+    """Scene of a lens or mirror whose parts can be changed. `plan` describes the lens or mirror. `params` are the
+    scene's parameters.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, params: mi.SceneParameters, plan: Fabrication, integrator: mi.Integrator, sensor: int
+    ) -> None:
+        self.scene, self.params, self.plan, self.sensor = scene, params, plan, sensor
+        self._integrator = integrator
+        self.lamps = [shape.id() for shape in scene.shapes() if shape.is_emitter()]
+        self.camera = scene.sensors()[sensor].id()
+        if f"{plan.receiver}.to_world" not in params.properties:
+            raise ConfigError("", "fabrication.receiver", f"there is no `{plan.receiver}` in the scene with a to_world")
+
+    def render(self, spp: int, seed: int = 0) -> Array:
+        """Render the luminance (H, W)."""
+        image = np.array(mi.render(self.scene, integrator=self._integrator, sensor=self.sensor, spp=spp, seed=seed))
+        return luminance(image.reshape(*image.shape[:2], -1))
+
+    @contextmanager
+    def _changed(self, values: dict[str, Any]) -> Iterator[None]:
+        before = {key: type(self.params[key])(self.params[key]) for key in values}
+        try:
+            for key, value in values.items():
+                self.params[key] = value
+            self.params.update()
+            yield
+        finally:
+            for key, value in before.items():
+                self.params[key] = value
+            self.params.update()
+
+    def moved(self, ids: Sequence[str], by: mi.ScalarTransform4f) -> dict[str, Any]:
+        """Return the parameters of the objects with these ids, moved by `by`."""
+        values: dict[str, Any] = {}
+        for id in ids:
+            if (key := f"{id}.vertex_positions") in self.params.properties and f"{id}.to_world" not in (
+                self.params.properties
+            ):
+                points = np.array(self.params[key]).reshape(-1, 3)
+                matrix = np.array(by.matrix)
+                values[key] = mi.Float((points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32).ravel())
+            elif (key := f"{id}.to_world") in self.params.properties:
+                values[key] = type(self.params[key])(by.matrix) @ self.params[key]
+        return values
+
+    def turned(self, ids: Sequence[str], axis: Sequence[float], degrees: float) -> dict[str, Any]:
+        """Return the parameters of the objects with these ids, rotated about an axis through the face's centre."""
+        return self.moved(ids, mi.ScalarTransform4f().rotate(list(axis), degrees))
+
+    def farther(self, part: float) -> dict[str, Any]:
+        """Return the parameters of receiver and camera after a move away from the origin. The move is the fraction
+        `part` of the receiver's distance.
+        """
+        key = f"{self.plan.receiver}.to_world"
+        middle = np.ravel(self.params[key] @ mi.Point3f(0)).astype(float)
+        way = mi.ScalarTransform4f().translate((part * middle).tolist())
+        return self.moved([self.plan.receiver, self.camera], way)
+
+    def denser(self, by: float) -> dict[str, Any]:
+        """Return the refractive index of the glass, changed by `by`."""
+        found = {}
+        for key in self.params.properties:
+            if key.endswith(".eta"):
+                with suppress(TypeError, ValueError):
+                    value = float(np.ravel(self.params[key])[0])
+                    if abs(value - self.plan.ior) < 1e-4:
+                        found[key] = type(self.params[key])(value + by)
+        return found
+
+    def solid_parts(self) -> list[str]:
+        """Return the ids of the face and of the flat back."""
+        return [self.plan.face, "back"]
+
+    def image(self, values: dict[str, Any], spp: int, seed: int = 0) -> Array:
+        """Render the scene with these parameters."""
+        with self._changed(values):
+            return self.render(spp, seed)
+
+    def sun(self, spp: int) -> Array:
+        """Render light with the angular diameter `plan.sun` as the mean over several directions."""
+        half, images = self.plan.sun / 2, []
+        for i, (x, y) in enumerate(_DIRECTIONS):  # each has its own noise, so that it averages out
+            angle = float(np.hypot(x, y))
+            turned = {} if angle == 0 else self.turned(self.lamps, (x / angle, y / angle, 0), half * angle)
+            images.append(self.image(turned, max(1, spp // len(_DIRECTIONS)), i))
+        return np.asarray(np.mean(images, axis=0))
+
+
+def tolerances(
+    bench: OpticalBench,
+    planned: Array,
+    target: Array,
+    spp: int,
+    say: Callable[[str], None] = lambda _: None,
+    original: Array | None = None,
+    keep: Callable[[str, Array], None] = lambda name, image: None,
+) -> dict[str, dict[str, Any]]:
+    """Return `figures` by name, for the image `planned` and for the image of each error. `target` (H, W) is the
+    luminance for comparison.
+
+    A rotation shifts the whole picture by `shift` (columns, rows) in pixels. The shift is removed before the
+    comparison. `original` (H, W) is the picture before its dark parts were raised. If `original` is given,
+    `ssim_of_picture` is the SSIM of the image and `original`. `keep` receives the name and the luminance (H, W) of each
+    image.
+    """
+    plan, both = bench.plan, bench.solid_parts()
+    found: dict[str, dict[str, Any]] = {}
+
+    def tell(name: str, image: Array, turned: bool = False) -> None:
+        entry: dict[str, Any] = {}
+        keep(name, image)
+        if turned:
+            rows, columns = (float(value) for value in shift_between(image, planned))
+            image = scipy.ndimage.shift(image, (-rows, -columns), order=1)
+            entry["shift"] = [columns + 0.0, rows + 0.0]  # no -0
+        if original is not None:
+            entry["ssim_of_picture"] = figures(image, original)["ssim"]
+        found[name] = figures(image, target) | {"spp": spp} | entry
+        moved = f", shifted by {np.hypot(*entry['shift']):.2g} pixels" if turned else ""
+        say(f"{name}: SSIM {found[name]['ssim']:.3f}, {100 * found[name]['inside']:.3g} % of the light inside{moved}")
+
+    tell("as planned", planned)
+    if plan.sun > 0 and bench.lamps:
+        tell(f"light of {plan.sun:g} degrees", bench.sun(spp))
+    for sign in (1, -1):
+        tell(f"distance {sign * 100 * DISTANCE:+g} %", bench.image(bench.farther(sign * DISTANCE), spp))
+    if plan.kind == "lens":
+        for sign in (1, -1):
+            tell(f"index {sign * INDEX:+g}", bench.image(bench.denser(sign * INDEX), spp))
+    for what, ids in (("light", bench.lamps), (plan.kind, both)):
+        for name, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
+            if ids:
+                turned = bench.image(bench.turned(ids, axis, TURN), spp)
+                tell(f"{what} turned by {TURN:g} degree about {name}", turned, turned=True)
+    return found
+
+
+# --- the sheet --------------------------------------------------------------------------------------------------------
 
 
 def add_sheet(
@@ -55,7 +287,7 @@ def add_sheet(
     thrown: Array,
     wanted: Array,
 ) -> dict[str, Array]:
-    """Add quality, light, set-up and warnings of a solid to `numbers`. Returns the original picture and the caustic.
+    """Add quality, light and set-up of a solid to `numbers`. Returns the original picture and the caustic.
 
     `thrown` (H, W) is the luminance of the image of the sensor with index `sensor`. `wanted` (H, W) is the luminance of
     the sensor's target.
@@ -69,16 +301,12 @@ def add_sheet(
         numbers["setup"] = setup_of(scene, scene.sensors()[sensor], plan, sheet, wanted)
     shown = wanted if original is None else original
     inside = picture_within(wanted)
-    numbers["blacks"] = blacks(thrown[inside], shown[inside])
-    corners = unlit_corners(thrown[inside], shown[inside])
-    numbers["warnings"] = numbers["warnings"] + light_warnings(numbers["blacks"], corners)
     return {"picture": as_picture(shown, shown, inside), "caustic": as_picture(thrown, shown, inside)}
 
 
 def add_tolerances(
     numbers: dict[str, Any],
     bench: OpticalBench,
-    sheet: Sheet,
     planned: Array,
     wanted: Array,
     spp: int,
@@ -92,7 +320,7 @@ def add_tolerances(
     def keep(name: str, image: Array) -> None:
         pictures[name] = as_picture(image, shown, inside)
 
-    found = tolerances(bench, sheet, planned, wanted, spp, say, original, keep)
+    found = tolerances(bench, planned, wanted, spp, say, original, keep)
     setup = numbers.get("setup")
     deviations = {"turn": TURN, "index": INDEX}
     if setup is not None:
@@ -123,7 +351,7 @@ def as_picture(image: Array, original: Array, inside: tuple[slice, slice]) -> Ar
     return np.asarray(scaled, dtype=np.float32)[:, :, None]
 
 
-# --- allowed errors, grey blacks and unlit corners --------------------------------------------------------------------
+# --- allowed errors ---------------------------------------------------------------------------------------------------
 
 
 def allowed_errors(
@@ -169,52 +397,6 @@ def allowed_error(fall: float, deviation: float) -> float:
     measured.
     """
     return deviation * min(1.0, ALLOWED_LOSS / fall) if fall > 0 else deviation
-
-
-def blacks(image: Array, picture: Array) -> dict[str, float]:
-    """Return the mean brightness of the darkest 5 % of a `picture` (H, W). Also return the mean brightness of the same
-    pixels of an `image`.
-
-    Both images are divided by their means.
-    """
-    seen, wanted = (each / max(float(each.mean()), 1e-30) for each in (image, picture))
-    dark = wanted <= np.quantile(wanted, DARKEST)
-    return {"image": float(seen[dark].mean()), "picture": float(wanted[dark].mean())}
-
-
-def unlit_corners(image: Array, picture: Array) -> list[str]:
-    """Return the names of the corners in which an `image` (H, W) has less than half the light of the `picture` (H, W).
-
-    A corner spans a tenth of the width and a tenth of the height. Both images are divided by their means. Black corners
-    of the picture do not count.
-    """
-    seen, wanted = (each / max(float(each.mean()), 1e-30) for each in (image, picture))
-    height, width = (max(1, round(CORNER * size)) for size in picture.shape)
-    rows = {"top": slice(None, height), "bottom": slice(-height, None)}
-    columns = {"left": slice(None, width), "right": slice(-width, None)}
-    return [
-        f"{row} {column}"
-        for row, of_row in rows.items()
-        for column, of_column in columns.items()
-        if (light := float(wanted[of_row, of_column].mean())) > GREY
-        and float(seen[of_row, of_column].mean()) < LIT * light
-    ]
-
-
-def light_warnings(dark: Mapping[str, float], corners: list[str]) -> list[str]:
-    """Return a warning sentence if black comes out grey. Return another sentence if `corners` are unlit. `dark` is a
-    result of `blacks`.
-    """
-    lines = []
-    if dark["picture"] <= BLACK and dark["image"] > dark["picture"] + GREY:
-        lines.append(f"Black parts of the picture come out at {100 * dark['image']:.0f} % of the mean brightness "
-                     f"({100 * dark['picture']:.0f} % in the picture), so they look grey")  # fmt: skip
-    if corners:
-        named = ", ".join(corners[:-1]) + " and " + corners[-1] if len(corners) > 1 else corners[0]
-        lines.append(f"The {named} corner{'s' if len(corners) > 1 else ''} of the picture "
-                     f"get{'' if len(corners) > 1 else 's'} less than half of {'their' if len(corners) > 1 else 'its'} "
-                     "light")  # fmt: skip
-    return lines
 
 
 # --- the set-up -------------------------------------------------------------------------------------------------------
@@ -310,15 +492,9 @@ def _light(scene: mi.Scene, solid: list[mi.Shape]) -> tuple[Array, Array] | None
 
     Returns None if no ray meets them.
     """
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, RAYS)
-    ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
-    active = (mi.luminance(weight) if mi.is_rgb else weight.x) > 0
-    si = scene.ray_intersect(ray, active)
-    met = mi.Bool(False)
-    for shape in solid:
-        met = met | (si.shape == mi.ShapePtr(shape))
-    kept = np.ravel(np.array(active & si.is_valid() & met)).astype(bool)
+    _, ray, light = _from_lamps(scene, RAYS)
+    si = scene.ray_intersect(ray, light > 0)
+    kept = np.ravel(np.array((light > 0) & si.is_valid() & _is_any(si.shape, solid))).astype(bool)
     points, directions = (np.array(each, dtype=float).reshape(3, -1).T[kept] for each in (si.p, ray.d))
     return (points, directions) if len(points) > 8 else None
 

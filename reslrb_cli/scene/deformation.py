@@ -109,12 +109,7 @@ class Movable:
     def heightmap_obstacle(self) -> str | None:
         """Return the reason why no heightmap can displace the object, or None if a heightmap can."""
         if not self.by_vertices:
-            why = f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
-            return (
-                f"{why}; `grid: 257` in `heightmap` converts it to a mesh"
-                if self.node.class_name() == "Rectangle"
-                else why
-            )
+            return f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
         if not self.node.has_vertex_texcoords():
             return f"`{self.id}` has no texture coordinates, which a heightmap needs; give the mesh some"
         return None

@@ -1,15 +1,16 @@
-"""Loading of Mitsuba scene files. Errors name their location."""
+"""Loading of Mitsuba scene files, and scenes of the caller (`SceneInMemory`). Errors name their location."""
 
 from __future__ import annotations
 
 import functools
 import logging
 import os
-import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -20,7 +21,6 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.graph import bounds
-from reslrb_cli.scene.values import Place
 from reslrb_cli.scene.xml.build import Owners, build, resize_films
 from reslrb_cli.scene.xml.dictionary import write_dictionary
 from reslrb_cli.scene.xml.mend import Note, mend, warnings
@@ -120,43 +120,6 @@ def load_for_script(
     return load_scene(path, options, keys=wanted)
 
 
-def make_grid(description: Description, id: str, size: tuple[int, int], place: Place) -> None:
-    """Replace the rectangle `id` of a description by a mesh, before the scene is built. `size` has the vertex counts
-    along the rectangle's edges.
-
-    The shape's position and material do not change. Raises ConfigError at `place` for any other shape.
-    """
-    element = description.root.by_id().get(id)
-    if element is None or element.tag != "shape":
-        return  # the selection of the parameter reports the reason
-    if element.type != "rectangle":
-        how = "remove `grid`, and write the shape as a rectangle, or as a mesh that is as fine as the map"
-        raise place.fail("heightmap.grid", f"`{id}` is not a `rectangle`; {how}")
-    kept = [item for item in element.children if not item.is_value or item.name in _KEPT_OF_GRID]
-    element.attributes["type"] = "ply"
-    element.children[:] = [element.new("string", name="filename", value=str(_grid_file(*size))), *kept]
-
-
-#: Parameters that a rectangle passes to its grid.
-_KEPT_OF_GRID = ("to_world", "flip_normals", "face_normals")
-
-
-@functools.cache
-def _grid_file(width: int, height: int) -> Path:
-    """Return a temporary file with a grid over [-1, 1] x [-1, 1], facing up. It exists until the process ends."""
-    from reslrb_cli.lens.experiment import face_ply  # late, because SciPy takes a while to load
-    from reslrb_cli.lens.surface import Setting
-
-    path = Path(_grid_folder().name) / f"grid_{width}x{height}.ply"
-    path.write_bytes(face_ply(Setting(size=(2.0, 2.0)), width, height))
-    return path
-
-
-@functools.cache
-def _grid_folder() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="reslrb-")
-
-
 def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
     """Mark the 8-bit and 16-bit bitmaps that `keys` name as floats in the description. Returns whether there are any.
 
@@ -215,3 +178,79 @@ def _lost_light(scene: Any) -> str | None:
 def warn_once(line: str, level: int = logging.WARNING) -> None:
     """Log a message once, because one experiment may load its scene several times."""
     logger.log(level, "%s", line)
+
+
+# --- a scene of the caller --------------------------------------------------------------------------------------------
+
+#: What to do where an experiment needs the description of its scene, or another process needs the scene.
+INSTEAD = "give the scene as a file or as a Mitsuba dictionary"
+_MERGED = "Mitsuba merges shapes and materials as it loads a scene, unless `optimize=False`"
+
+#: How often each scene, by its `id`, has got its first values again.
+_restored: Counter[int] = Counter()
+
+
+class SceneInMemory:
+    """A scene of the caller, and the values that its parameters had when the caller passed it.
+
+    Raises ConfigError, located in `source`, for a scene that no run can use.
+    """
+
+    def __init__(self, scene: mi.Scene, source: object) -> None:
+        check_scene(source, scene)
+        self.scene = scene
+        params = mi.traverse(scene)
+        self._values = {key: _copied(params[key]) for key in params.properties}
+
+    @property
+    def uses(self) -> int:
+        """A number that changes if another experiment, or another call, uses the scene."""
+        return _restored[id(self.scene)]
+
+    def restore(self) -> mi.Scene:
+        """Give the scene its first values, without derivatives, and return it."""
+        params = mi.traverse(self.scene)
+        for key, value in self._values.items():
+            now = params[key]
+            if dr.grad_enabled(now) or not _equal(now, value):
+                params[key] = _copied(value)
+        params.update()
+        _restored[id(self.scene)] += 1
+        return self.scene
+
+    def check_merged(self, keys: Iterable[str], objects: Iterable[str], source: object) -> None:
+        """Raise ConfigError if Mitsuba has merged an object of the parameters `keys` (or globs), or one of the moved
+        `objects`, with other objects.
+        """
+        params, shapes, keys = mi.traverse(self.scene), self.scene.shapes(), list(keys)
+        if any(not shape.id() for shape in shapes):
+            ids = {shape.id() for shape in shapes} | {emitter.id() for emitter in self.scene.emitters()}
+            lost = [name for name in objects if name not in ids]
+            lost += [each for each in keys if not any(is_named(key, [each]) for key in params.properties)]
+            if lost:
+                raise ConfigError(source, "scene", f"has no `{lost[0]}`, but shapes without ids; {_MERGED}")
+        users: dict[Any, list[str]] = {}
+        for shape in shapes:
+            if shape.bsdf() is not None:
+                users.setdefault(shape.bsdf(), []).append(shape.id())
+        for key in params.properties:
+            if is_named(key, keys):
+                node = params.properties[key][2]
+                while node is not None and node not in users:
+                    node = params.hierarchy[node][0]
+                names = users.get(node, [])
+                if len(names) > 1 and key.partition(".")[0] in names:
+                    raise ConfigError(source, "scene", f"has one material for {', '.join(names)}; {_MERGED}")
+
+
+def _copied(value: Any) -> Any:
+    """Return a value that later changes of the scene do not affect."""
+    return type(value)(dr.detach(value))
+
+
+def _equal(first: Any, second: Any) -> bool:
+    if dr.is_array_v(first) or dr.is_tensor_v(first):
+        a, b = (np.array(getattr(each, "matrix", each) if "Transform" in type(each).__name__ else each)
+                for each in (first, second))  # fmt: skip
+        return a.shape == b.shape and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    return bool(first == second)

@@ -158,7 +158,7 @@ def test_a_notebook_is_valid_and_has_no_outputs(path: Path) -> None:
 def test_the_wrong_integrator_of_the_docs_is_found(checkout: Path) -> None:
     """The program prints what the page shows. With two lines exchanged, the integrator is correct."""
     page = (DOCS / "your_integrator.md").read_text(encoding="utf-8")
-    code, (said,) = script_of(page), re.findall(r"^    mine.py:Replay: (its image holds.*)$", page, re.MULTILINE)
+    code, (said,) = script_of(page), re.findall(r"^    (\d of 6 comparisons hold, \d fail)$", page, re.MULTILINE)
     first, second = (line for line in code.splitlines() if "behind = " in line or "L = L + Le" in line)
     (checkout / "mine.py").write_text(code, encoding="utf-8")
     (checkout / "right.py").write_text(code.replace(f"{first}\n{second}", f"{second}\n{first}"), encoding="utf-8")
@@ -168,7 +168,4 @@ def test_the_wrong_integrator_of_the_docs_is_found(checkout: Path) -> None:
         done = subprocess.run([sys.executable, "-m", "reslrb_cli", *command], capture_output=True, text=True,
                               timeout=300, cwd=checkout, env=environment(checkout))  # fmt: skip
         assert done.returncode == code_of, done.stderr
-        (sentence,) = [line for line in done.stdout.splitlines() if "its image holds" in line] or [""]
-        assert re.sub(r"[0-9.]+ \+- [0-9.]+", "R", sentence) == (
-            f"mine.py:Replay: {re.sub(r'[0-9.]+ [+]- [0-9.]+', 'R', said)}" if code_of else ""
-        )
+        assert (said if code_of else "6 of 6 comparisons hold, 0 fail") in done.stdout.splitlines()

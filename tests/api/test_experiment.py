@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import pickle
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from cli.tiny import KEY, done
+from cli.tiny import KEY, done, measured
 from measure.pretended_steps import Stage
 from runs.going_on import LAMP, work_alone, write_experiment
 
@@ -248,17 +247,12 @@ def test_arguments_are_named_in_errors(folder: Path, call: Callable[[], Any], li
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
-def lines_of(file: str) -> list[dict[str, Any]]:
-    """Return the lines of a `--json` file without the first line, which describes the origin of the measurement."""
-    return [json.loads(line) for line in Path(file).read_text().splitlines()][1:]
-
-
 def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
     done("gradcheck", "tiny.yaml", "--integrators", "reslrb:stack", "--seeds", "3", "--spp", "4", "--json", "g.jsonl")
     records = rl.gradcheck("tiny.yaml", "reslrb:stack", seeds=3, spp=4)
     found = [json.loads(record.to_json()) for record in records]
     assert [record.parameter for record in records if record.reference.value == "walk_ad"] == [KEY, LAMP]
-    told = lines_of("g.jsonl")
+    told = measured("g.jsonl")
     assert [{**one, **dict.fromkeys(other)} for one, other in zip(told, found, strict=True)] == [
         dict.fromkeys(each) for each in found
     ]
@@ -271,7 +265,7 @@ class Played(Session):
 
     def __init__(self, plan: Plan, folder: Path, stop: Callable[[], bool], say: Callable[[str], None], **given: Any):
         stage = Stage()
-        super().__init__(plan, folder, stop, say, stage.start, stage.clock, earlier=given.get("earlier"))
+        super().__init__(plan, folder, stop, say, stage.start, stage.clock)
 
 
 def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,7 +274,7 @@ def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch
     done("convergence", "tiny.yaml", *given, "--json", "c.jsonl")
     records = rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
     found = [json.loads(record.to_json()) for record in records]
-    assert found == lines_of("c.jsonl")
+    assert found == measured("c.jsonl")
     assert {"point", "method", "reference", "summary"} <= {each["kind"] for each in found}
 
     class Interrupted(Played):
@@ -308,29 +302,19 @@ class Interrupting(logging.Handler):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("call", "words", "later"),
-    [
-        (lambda: rl.gradcheck("tiny.yaml", "reslrb:stack", seeds=3, spp=4), "gradient reslrb:stack", "differences"),
-        (lambda: rl.gradcheck("tiny.yaml", seeds=12, spp=4, integrators="own_replay.py:Replay(fault=kept)",
-                              allow_code=True), "examining", "its image holds"),
-    ],
-)  # fmt: skip
-def test_an_interrupt_ends_long_calls(
-    folder: Path, caplog: pytest.LogCaptureFixture, call: Callable[[], Any], words: str, later: str
-) -> None:
+def test_an_interrupt_ends_long_calls(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     """An interrupt ends a call before all measurements are done."""
-    shutil.copy(Path(__file__).parents[1] / "measure/own_replay.py", folder)
+    words = "gradient reslrb:stack"
     handler = Interrupting(words)
     with caplog.at_level(logging.DEBUG, "reslrb_cli"):
         logging.getLogger("reslrb_cli").addHandler(handler)
         try:
             with pytest.raises(KeyboardInterrupt):
-                call()
+                rl.gradcheck("tiny.yaml", "reslrb:stack", seeds=3, spp=4)
         finally:
             logging.getLogger("reslrb_cli").removeHandler(handler)
     assert [line for line in handler.said if words in line]
-    assert not [line for line in handler.said if later in line]
+    assert not [line for line in handler.said if "differences" in line]
 
 
 @pytest.mark.long

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
-from cli.tiny import KEY, done, outcome, write_experiment
+from cli.tiny import KEY, done, measured, outcome, write_experiment
 
-from reslrb_cli.measure.processes import Process
 from reslrb_cli.records.measurements import TARGETS
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -24,19 +22,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def read(path: Path) -> list[dict]:
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert lines[0]["kind"] == "origin"
-    return lines[1:]
-
-
-def test_a_scene_end_to_end(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_end_to_end(folder: Path) -> None:
     """The bias of each method stays below its limit, and the error of averages falls at the expected rate."""
     names = ["reslrb:reservoir(capacity=2)"]
     args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16"]
     (folder / "out").mkdir()
     printed = done("convergence", "tiny.yaml", *args).stdout.splitlines()
-    lines = read(folder / "out/c.jsonl")
+    lines = measured(folder / "out/c.jsonl")
     methods = [line for line in lines if line["kind"] == "method"]
     assert [(line["label"], line["parameter"]) for line in methods] == [(n, KEY) for n in names]
     assert [line["capacity"] for line in methods] == [2]
@@ -60,12 +52,6 @@ def test_a_scene_end_to_end(folder: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert printed[-1].startswith("Best for this scene: ")
     assert sum("16 rounds " in line for line in printed) == len(names)  # one row for each method
     assert any(line.startswith(f"{names[0]}: first step") for line in printed)  # compilation has its own line
-    # Samples that are already in the file are not taken again.
-    monkeypatch.setattr(Process, "__init__", None)
-    again = done("convergence", "tiny.yaml", *args).stdout.splitlines()
-    assert read(folder / "out/c.jsonl") == lines
-    assert "using the samples in out/c.samples.npz" in again
-    assert again[-1] == printed[-1]
 
 
 @pytest.mark.long
@@ -73,7 +59,7 @@ def test_the_loss_reveals_correlated_samples(folder: Path) -> None:
     args = ["--objective", "loss", "--rounds", "64", "--json", "c.jsonl", "--set", "run.spp=4", "--set", "loss.type=l2"]
     cases = "reslrb:stack(adjoint=correlated),reslrb:stack(adjoint=independent)"
     sentence = done("convergence", "tiny.yaml", *args, "--integrators", cases).stdout.splitlines()[-1]
-    methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method"]
+    methods = [line for line in measured(folder / "c.jsonl") if line["kind"] == "method"]
     assert [(line["adjoint"], line["biased"]) for line in methods] == [("correlated", True), ("independent", False)]
     assert methods[0]["slope"] > -0.4
     assert -0.65 < methods[1]["slope"] < -0.4
@@ -112,29 +98,9 @@ def test_bad_input_is_one_located_line(folder: Path, args: tuple[str, ...], line
     assert line in err
 
 
-def test_steps_that_cannot_be_continued(folder: Path) -> None:
-    (folder / "c.jsonl").write_text("kept\n")
-    (folder / "c.samples.npz").write_bytes(b"PK\x03\x04 cut off")
-    code, _, err = outcome("convergence", "tiny.yaml", "--json", "c.jsonl")
-    assert (code, "c.samples.npz: " in err) == (2, True)
-    assert (folder / "c.jsonl").read_text() == "kept\n"
-
-
 @pytest.mark.long
 def test_the_image(folder: Path) -> None:
     words = ("--objective", "image", "--rounds", "4", "--json", "c.jsonl", "--integrators", "prb")
     done("convergence", "tiny.yaml", *words)
-    methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method"]
+    methods = [line for line in measured(folder / "c.jsonl") if line["kind"] == "method"]
     assert [(line["label"], line["parameter"], line["biased"]) for line in methods] == [("prb", "image", False)]
-
-
-@pytest.mark.long
-def test_continuing(folder: Path) -> None:
-    args = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack", "--json", "c.jsonl", "--rounds"]
-    done(*args, "4")
-    done(*args, "8")
-    assert {line["repeats"] for line in read(folder / "c.jsonl") if line["kind"] == "method"} == {16}
-    code, _, err = outcome(*args, "9", "--set", "run.spp=8")
-    reason = "run.spp is 4 there, 8 here; remove the file, or use another one"
-    assert (code, err) == (2, f"--json: c.jsonl belongs to another measurement: {reason}\n")
-    assert len(read(folder / "c.jsonl")) > 2  # file is unchanged

@@ -14,10 +14,8 @@ import pytest
 from cli import tiny
 from cli.tiny import done, reslrb, settings
 from kit import area, diffuse, scene, sensor, shape
-from turns import real_room
 
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.scene.load import load_scene
 
 # A scene whose objects have no ids, from `inspect` to the report page. The keys are the same everywhere.
 
@@ -135,8 +133,6 @@ TRUE = {
 #: Largest error of a colour channel above `BRIGHT`, that limit, and the largest error of the exposure. Errors are
 #: shares of the true value.
 COLOUR, BRIGHT, FACTOR = 0.1, 0.1, 0.05
-#: Largest error of colours after few iterations. The initial guesses are up to 230 % off.
-SHORT_COLOUR = 0.15
 
 
 def room(left: str, right: str, seat: str, size: int) -> str:
@@ -228,52 +224,3 @@ def test_colours_and_exposure_from_a_photograph(tmp_path: Path, monkeypatch: pyt
     shutil.rmtree("runs/room")
     done("optimize", "room.yaml", *without)
     assert {"exposure", *TRUE} & set(misses(run)) > {"exposure"}
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("llvm")
-def test_the_same_in_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run has fewer pixels, and fewer but larger iterations."""
-    write_room(tmp_path, 20, 1024)
-    monkeypatch.chdir(tmp_path)
-    few = ("run.iterations=60", "run.spp=64", "run.final_spp=8", "run.certainty=false", "integrator.estimator=stack")
-    run = three_commands(*few)
-    check_mask(run, mirror=True)  # with a named estimator, all paths are light paths
-    assert misses(run, SHORT_COLOUR) == []
-
-
-# The three commands on another user's room, with an 8-bit photograph.  Most of the room's light comes through windows,
-# which clip. A mirror and clear glass are in view. The exposure is not given.
-
-#: True values in the photograph. The scene file has 0.1 and 1 for them.
-TRUE_OF_ROOM = {"Walls.brdf_0.reflectance.value": [0.45, 0.35, 0.25], "Sofa.brdf_0.reflectance.value": [0.6, 0.3, 0.2]}
-WIDTH, HEIGHT, SPP, PARTS = 320, 180, 128, 4
-
-
-def photograph_room(scene_file: Path, path: Path) -> None:
-    """Render the room in its true colours with camera paths of any length, and write the image."""
-    loaded = load_scene(scene_file, size=(WIDTH, HEIGHT))
-    params = mi.traverse(loaded)
-    for key, true in TRUE_OF_ROOM.items():
-        params[key] = mi.Color3f(true)
-    params.update()
-    integrator = mi.load_dict({"type": "path", "max_depth": -1})
-    image = sum(np.array(mi.render(loaded, integrator=integrator, spp=SPP, seed=part)) for part in range(PARTS)) / PARTS
-    tiny.write_photo(path, EXPOSURE * image)
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.long
-def test_colours_of_a_real_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene_file = real_room()
-    photograph_room(scene_file, tmp_path / "photo.png")
-    monkeypatch.chdir(tmp_path)
-    done("init", scene_file, "--target", "photo.png", "-o", "room.yaml")
-    keep(Path("room.yaml"), list(TRUE_OF_ROOM))
-    done("optimize", "room.yaml")
-    check_mask(Path("runs/room"), mirror=False)
-    assert misses(Path("runs/room"), COLOUR, TRUE_OF_ROOM) == []
-    without = settings("target.mask=none", "target.exposure=1", "integrator.estimator=stack")
-    shutil.rmtree("runs/room")
-    done("optimize", "room.yaml", *without)
-    assert misses(Path("runs/room"), COLOUR, TRUE_OF_ROOM) == [*TRUE_OF_ROOM, "exposure"]

@@ -310,7 +310,6 @@ def test_the_film_size_is_known_before_the_scene_is_built(
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.usefixtures("llvm")
 def test_a_record_too_large_for_a_thread(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def find(*sets: str) -> None:
         room.check_step(assemble_scene(load(experiment / "tiny.yaml", sets)))

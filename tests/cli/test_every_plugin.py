@@ -125,6 +125,6 @@ def test_unknown_plugins_are_refused_by_every_command_and_integrator(folder: Pat
         assert row.light in said("optimize", "c.yaml", *settings(f"integrator.type={type}"), code=2)
     one_case = ("--integrators", "reslrb:stack", "--max-depth", "2")  # each case has a process of its own
     for command, *words in (("render", "-o", "image.exr"), ("render", "--scene", "-o", "image.exr"), ("gradcheck",),
-                            ("convergence",), ("bench", *one_case)):  # fmt: skip
+                            ("bench", *one_case)):  # fmt: skip
         assert row.light in said(command, "c.yaml", *words, code=2)
     assert not (folder / "image.exr").exists()

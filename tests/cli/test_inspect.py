@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.tiny import done, outcome, settings
+from cli.tiny import done, outcome
 
 pytestmark = pytest.mark.usefixtures("llvm")
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "cornell_floor.yaml"
@@ -166,7 +166,6 @@ def test_an_incomplete_configuration_is_accepted(scene, text, next_step):
             "$nothing: is set in scene.options, but the scene file does",
         ),
         (["scene.xml", "--set", "scene.filee=1"], "--set scene.filee=1: scene.filee: unknown key"),
-        (["scene.xml", "--conditioning"], "scene.xml: target: missing; --conditioning needs a complete experiment"),
         (["empty.yaml"], "empty.yaml: is empty; it needs at least scene"),
         (["run.yaml"], "run.yaml: scene: missing; it has no default"),
     ],
@@ -209,41 +208,3 @@ def test_an_edited_decision_is_one_located_line(scene):
         assert (code, f"run/manifest.json: decisions: {said}" in err) == (2, True), err
     decide(value="camera", why="edited by hand")
     assert "paths: auto, edited by hand" in " ".join(lines_of("run"))
-
-
-STIFF = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
-
-
-def conditioning(*arguments: str) -> str:
-    """Return the output of `inspect --conditioning` for a small stiff lamp."""
-    small = ["scene.options={resx: 12, resy: 12}", "integrator={max_depth: 2}", "run.spp=32", "target.render.spp=64"]
-    return done("inspect", STIFF, "--conditioning", *settings(*small), *arguments).stdout
-
-
-def test_conditioning_as_a_table_and_as_json():
-    lines = conditioning().splitlines()
-    assert " ".join(lines[-4].split()) == "parameter entries value gradient noise image / unit length"
-    assert lines[-5] == "conditioning (8 gradients of 32 spp, seed 0)"
-    measured = json.loads(conditioning("--json"))["conditioning"]
-    floor, lamp = measured["parameters"]
-    for row, line in ((floor, lines[-3]), (lamp, lines[-2])):
-        cells = line.split()
-        assert cells[:2] == [row["key"], "3"]
-        names = ("value", "gradient", "noise", "change", "length")
-        assert [float(cell) for cell in cells[2:]] == pytest.approx([row[name] for name in names], rel=6e-3)
-    # The albedo is 0.5 and the intensity 3e6, so the ratio of these values alone is about 6e6
-    assert 1e6 < measured["spread"]["change"] < 1e8
-    assert measured["spread"]["change"] == pytest.approx(floor["change"] / lamp["change"])
-    assert float(lines[-1].split()[4]) == pytest.approx(measured["spread"]["change"], rel=6e-3)
-
-
-def test_a_spread_needs_two_samples():
-    from reslrb_cli.optimization.sensitivity import Conditioning
-    from reslrb_cli.records.decisions import Sensitivity
-
-    rows = [Sensitivity("a", 1, 1.0, 2.0, 0.1, change=4.0), Sensitivity("b", 1, 1.0, 0.0, 0.1)]
-    assert Conditioning(rows, 2, 1, 0).spread("change") is None
-    assert Conditioning(rows, 2, 1, 0).spread("gradient") is None
-    rows.append(Sensitivity("c", 1, 1.0, 1e-3, 0.1, change=8.0))
-    assert Conditioning(rows, 2, 1, 0).spread("change") == 2.0
-    assert Conditioning(rows, 2, 1, 0).spread("gradient") == pytest.approx(2e3)

@@ -24,7 +24,6 @@ from turns import a_few
 
 from reslrb_cli.cli.options import Keeper
 from reslrb_cli.cli.terminal import SIGNALS
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.records import measurement_files
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.measurements import SummaryRecord
@@ -178,7 +177,7 @@ def test_a_closed_terminal(experiment: Path) -> None:
     assert COMPLETE <= files(run)
 
 
-# Files of measurements in progress. The files are complete and current, and a later measurement can continue from them.
+# Files of measurements in progress, which are complete and current.
 
 
 def lines(*words: str) -> list[SummaryRecord]:
@@ -193,40 +192,27 @@ def read(path: Path) -> list[str]:
 
 
 class Measurement:
-    """Measurement whose lines and samples a test can change while the measurement goes on."""
+    """Measurement whose lines a test can change while the measurement goes on."""
 
     def __init__(self, file: Path) -> None:
-        self.lines, self.rows = lines(), np.zeros(0)
-        self.keeper = Keeper(file, *lines("here"), lambda: self.lines, self.kept)
-
-    def kept(self) -> measurement_files.Kept | None:
-        return ({"rows": len(self.rows)}, {"rows": self.rows}) if len(self.rows) else None
+        self.lines = lines()
+        self.keeper = Keeper(file, *lines("here"), lambda: self.lines)
 
 
-def test_both_files_are_current_and_old_ones_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_is_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurement_files, "PAGE_SECONDS", 0.0)
     monkeypatch.setattr(measurement_files, "PAGE_SHARE", 0.0)
     file = tmp_path / "c.jsonl"
     file.write_text("old\n")
-    samples = measurement_files.samples_file(file)
-    measurement_files.write_samples(samples, {"rows": 9}, {})
     measured = Measurement(file)
-    # The old files stay until there is a new result.
-    assert (file.read_text(), measurement_files.read_samples(samples)[0]) == ("old\n", {"rows": 9})
+    assert file.read_text() == "old\n"  # the old file stays until there is a new result
     measured.lines = lines("a")
     measured.keeper.refresh()
     assert read(file) == ["a"]
-    with pytest.raises(ConfigError, match=r"c\.samples\.npz: no such file"):
-        measurement_files.read_samples(samples)
-    measured.lines, measured.rows = lines("a", "b"), np.ones(3)
-    measured.keeper.refresh()
-    assert read(file) == ["a", "b"]
-    head, arrays = measurement_files.read_samples(samples)
-    assert (head, list(arrays["rows"])) == ({"rows": 3}, [1.0] * 3)
     measured.lines = lines("a", "c")
     measured.keeper.finish()
     assert read(file) == ["a", "c"]
-    assert {path.name for path in tmp_path.iterdir()} == {"c.jsonl", "c.samples.npz"}
+    assert [path.name for path in tmp_path.iterdir()] == ["c.jsonl"]
 
 
 def test_a_failed_intermediate_write_is_reported_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,17 +229,6 @@ def test_a_failed_intermediate_write_is_reported_at_the_end(tmp_path: Path, monk
         measured.keeper.finish()
 
 
-def test_too_large_samples_are_not_saved_and_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(measurement_files, "MOST_SAMPLES_BYTES", 100)
-    measured = Measurement(tmp_path / "c.jsonl")
-    measured.rows = np.ones(13)
-    measured.keeper.finish()
-    assert "the same command will measure everything again" in capsys.readouterr().out
-    assert not measurement_files.samples_file(tmp_path / "c.jsonl").exists()
-
-
 def test_a_pipe_gets_all_lines_at_the_end(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
@@ -264,41 +239,3 @@ def test_a_pipe_gets_all_lines_at_the_end(tmp_path: Path) -> None:
     assert os.read(reader, 1000).splitlines()[1:] == [b'{"kind": "summary", "line": "a"}']
     os.close(reader)
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
-
-
-# Measurements whose process is killed. Their files hold all results so far, and a later measurement continues from
-# them.
-
-WORDS = ["--integrators", "reslrb:stack"]
-
-
-def repeats(file: Path) -> set[int]:
-    return {
-        entry["repeats"] for entry in map(json.loads, file.read_text().splitlines()) if entry.get("status") is not None
-    }
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
-@pytest.mark.long
-def test_a_killed_convergence_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A measurement of 1000000 rounds is killed once its first rounds are on the disk. The same command with 4 rounds
-    continues to exactly 4 rounds, of two steps each.
-    """
-    write_experiment(tmp_path)
-    file, kept = tmp_path / "c.jsonl", tmp_path / "c.samples.npz"
-    process = start(tmp_path, *WORDS, "--rounds", "1000000", "--json", file.name, command="convergence")
-    end = time.monotonic() + 60
-    while not (file.exists() and kept.exists()) and time.monotonic() < end:
-        time.sleep(0.02)
-    process.kill()
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
-    text = file.read_text()
-    assert text.endswith("}\n")
-    assert all(json.loads(line) for line in text.splitlines())
-    # The next write would come seconds later, so the files hold one round.
-    monkeypatch.chdir(tmp_path)
-    tiny.done("convergence", "tiny.yaml", *WORDS, "--rounds", "4", "--json", file.name)
-    assert repeats(file) == {8}
-    assert not list(tmp_path.glob(".c.*"))

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
 from click.testing import CliRunner, Result
 from compilation import search_path
 from kit import POSTER_BSDF, ref, scene, sensor, shape
@@ -195,3 +196,17 @@ def faults(folder: Path, code: int, err: str) -> list[str]:
     if status == "finished" and absent - {"report.html"}:
         found.append(f"absent: {sorted(absent)}")
     return found
+
+
+def ended(*words: str) -> int:
+    """Run a command in this process, and return its exit code."""
+    with pytest.raises(SystemExit) as end:
+        main([*words], prog_name="reslrb")
+    return int(end.value.code or 0)
+
+
+def measured(file: Path | str) -> list[dict[str, Any]]:
+    """Return the lines of a `--json` file without the first line, which describes the origin of the measurement."""
+    origin, *lines = [json.loads(line) for line in Path(file).read_text().splitlines()]
+    assert origin["kind"] == "origin"
+    return lines

@@ -23,7 +23,6 @@ from conformance.drawing import (
     aim_everywhere,
     aimed,
     both,
-    by_harsh_table,
     guided,
     replayed_from,
     sample,
@@ -307,19 +306,12 @@ def test_without_a_way_its_code_is_not_compiled(way: str) -> None:
 # Moving light: the random numbers of the emission are held, so that the weight of guided emission is a constant.
 
 MOTIONS = ("latents", "spot", "mesh", "bounces_4")
-#: The default suite: a moving lamp. test_survival.py has learned roulette where light bounces.
-QUICK = {"guided-spot-stack", "sequence-spot-stack"}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("way", "name", "estimator"),
-    [
-        pytest.param(way, name, estimator, id=f"{way}-{name}-{estimator}",
-                     marks=() if f"{way}-{name}-{estimator}" in QUICK else pytest.mark.long)
-        for way in ("guided", "roulette", "sequence") for name in MOTIONS for estimator in ("stack", "reservoir")
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("estimator", ["stack", "reservoir"])
+@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("way", ["guided", "sequence"])
 def test_means_with_moving_light_are_those_of_plain_samples(way: str, name: str, estimator: str) -> None:
     moving, found = MOVING[name].moving(), []
     own = {"sequence": "low_discrepancy"} if way == "sequence" else {"guiding": "on"}
@@ -327,8 +319,6 @@ def test_means_with_moving_light_are_those_of_plain_samples(way: str, name: str,
         ours = make_integrator("reslrb", max_depth=5, rr_depth=1000, estimator=estimator, **options)
         if "guiding" in options:
             learn_from_four(moving, ours)
-            if way == "roulette":
-                by_harsh_table(ours.preparation.guiding)
         rows = [moving.gradient(ours, seed, 16) for seed in seeds(32, block)]
         found.append(np.stack([np.concatenate(list(row.values())) for row in rows]))
     result = compare(*found, block=None)

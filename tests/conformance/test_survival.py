@@ -37,14 +37,9 @@ BOUNCES = next(case for case in MOVING if case.name == "bounces")
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("estimator", "table", "rr_depth"),
-    [
-        pytest.param(estimator, table, rr_depth, marks=() if (estimator, table, rr_depth) == ("stack", "harsh", 5)
-                     else pytest.mark.long)
-        for estimator in ("stack", "reservoir") for table in ("harsh", "learned") for rr_depth in (2, 5, 1000)
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("rr_depth", [2, 5, 1000])
+@pytest.mark.parametrize("table", ["harsh", "learned"])
+@pytest.mark.parametrize("estimator", ["stack", "reservoir"])
 def test_means_hold_with_moving_light(estimator: str, table: str, rr_depth: int) -> None:
     """Guided and unguided means agree for parameters before and behind the moving object. Roulette on throughput is on
     (`rr_depth` 2) or off (5).

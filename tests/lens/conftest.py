@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from reslrb_cli.measure import tolerance
-from reslrb_cli.runs import export
+from reslrb_cli.runs import export, workshop
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -16,6 +15,6 @@ def _few_samples() -> Iterator[None]:
     seconds in every run.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tolerance, "RAYS", 2**16)
+        patch.setattr(workshop, "SHARE_RAYS", 2**16)  # the error of a share is at most 2e-3
         patch.setattr(export, "PICTURE_SPP", 4)
         yield

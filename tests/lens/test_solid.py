@@ -137,7 +137,7 @@ def test_radius_slope_and_relief_of_a_sphere_are_reported(sign: int, outline: st
     def cap(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return sign * (radius - np.sqrt(radius**2 - x**2 - y**2))
 
-    wanted = plan(outline=outline, thickness=9.0, tool_radius=100.0)
+    wanted = plan(outline=outline, thickness=9.0)
     made = sheet(cap)
     told = measured(make_solid(made, wanted), made, wanted)
     face = told["faces"]["face"]
@@ -148,11 +148,8 @@ def test_radius_slope_and_relief_of_a_sphere_are_reported(sign: int, outline: st
     assert told["least_thickness"] == pytest.approx(9 if sign > 0 else 9 - relief, abs=0.01)
     if sign > 0:
         assert face["smallest_concave_radius"] == pytest.approx(radius, rel=2e-3)
-        assert face["share_narrower_than_tool"] == 1
-        assert told["warnings"][0].startswith("the tool does not reach 1e+02 % of `face`")
     else:
         assert face["smallest_concave_radius"] is None
-        assert face["share_narrower_than_tool"] == 0
     assert solids.hollows(made, wanted).max() == pytest.approx(sign / radius, rel=2e-3)
 
 
@@ -220,7 +217,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
 @pytest.mark.long
 def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    said = done("export", run, "-o", out, "--set", "fabrication.tool_radius=1000").output
+    said = done("export", run, "-o", out).output
     told = json.loads((out / "fabrication.json").read_text())
     face = mi.traverse(mi.load_file(str(out / "scene.xml"), optimize=False))
     points = np.array(face["face.vertex_positions"]).reshape(-1, 3)
@@ -232,8 +229,6 @@ def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: P
     corners = {tuple(point) for point in np.asarray(read.vertices, np.float32).tolist()}
     assert {tuple(point) for point in points.tolist()} <= corners
     assert "lens.stl: 75 x 100 x" in said
-    assert "the tool does not reach" in said
-    assert told["warnings"][0] in said
     # Heights as seen from the receiver's side, with y up.
     map = told["faces"]["face"]["heights"]
     wanted = points[:, 2].reshape(48, 36)[::-1]  # three vertices per pixel
@@ -292,12 +287,6 @@ def test_the_reloaded_solid_casts_the_image_of_the_scene(kind: str, run: Path, t
     target = np.array(mi.Bitmap(str(run.parents[1] / "lens/target.exr")))
     losses = [float(np.mean((image - target) ** 2)) for image in images]
     assert losses[1] == pytest.approx(losses[0], rel=0.02)
-    # The reported loss holds for the reported number of samples.
-    loss = told["loss"]
-    assert loss["integrator"] == "ptracer"
-    assert f"difference from the target is {loss['l2']:.4g}, also for the solid" in said
-    again = np.array(mi.render(solid, spp=loss["spp"], seed=loss["seed"]))
-    assert loss["l2"] == pytest.approx(float(np.mean((again - target) ** 2)), rel=0.02)
     # Every ray enters once and leaves once, so that no surfaces cross.
     x, y = (np.random.default_rng(3).uniform(-0.49, 0.49, (2, 4096)) * [[75], [100]]).astype(np.float32)
     ray, count = mi.Ray3f(mi.Point3f(x, y, 99), mi.Vector3f(0, 0, -1)), 0

@@ -15,9 +15,9 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.lens.solid import SCALLOP, cutter, stepover
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import luminance, write_file
-from reslrb_cli.report.page.workshop import material, setup_facts, sketch
+from reslrb_cli.report.page.workshop import material, setup_facts
 from reslrb_cli.runs.export import read_solid
-from reslrb_cli.runs.workshop import allowed_errors, blacks, light_warnings, setup_of, unlit_corners
+from reslrb_cli.runs.workshop import allowed_errors, setup_of
 
 
 def test_the_step_of_a_ball_leaves_scallops_of_the_given_height() -> None:
@@ -27,12 +27,11 @@ def test_the_step_of_a_ball_leaves_scallops_of_the_given_height() -> None:
 
 def test_the_largest_ball_fits_into_all_hollows_but_the_sharpest_hundredth() -> None:
     curvature = np.concatenate([np.full(995, 0.1), np.full(5, 5.0)])
-    found = cutter(curvature, None)
+    found = cutter(curvature)
     assert found["largest_radius"] == pytest.approx(10)
     assert found["stepover"] == pytest.approx(stepover(10.0))
-    assert cutter(np.concatenate([curvature, np.full(20, 5.0)]), None)["largest_radius"] == pytest.approx(0.2)
-    assert cutter(np.full(9, -0.1), None)["largest_radius"] is None
-    assert cutter(curvature, 2.0)["stepover"] == pytest.approx(stepover(2.0))
+    assert cutter(np.concatenate([curvature, np.full(20, 5.0)]))["largest_radius"] == pytest.approx(0.2)
+    assert cutter(np.full(9, -0.1))["largest_radius"] is None
 
 
 def test_an_error_is_allowed_until_ssim_has_fallen_by_a_twentieth() -> None:
@@ -46,17 +45,6 @@ def test_an_error_is_allowed_until_ssim_has_fallen_by_a_twentieth() -> None:
     assert (allowed["distance"]["value"], allowed["distance"]["passes"]) == (pytest.approx(2.0), True)
     assert (allowed["light turned"]["value"], allowed["light turned"]["at_least"]) == (1.0, True)
     assert (allowed["solid turned"]["value"], allowed["solid turned"]["passes"]) == (pytest.approx(0.125), False)
-
-
-def test_grey_blacks_and_dark_corners_give_warnings() -> None:
-    wanted = np.ones((20, 20))
-    wanted[5:10, 5:10] = 0
-    assert light_warnings(blacks(wanted, wanted), unlit_corners(wanted, wanted)) == []
-    seen = np.maximum(wanted, 0.3)
-    seen[:2, -2:] = 0.1
-    grey, corner = light_warnings(blacks(seen, wanted), unlit_corners(seen, wanted))
-    assert grey.startswith("Black parts of the picture come out at 3")
-    assert corner.startswith("The top right corner of the picture gets less than half of its light")
 
 
 SETUPS = {
@@ -85,9 +73,6 @@ def test_a_set_up_matches_the_options_of_the_command(name: str, tmp_path: Path, 
     assert setup["picture_size"] == pytest.approx([40, 60], rel=2e-3)
     assert words in " ".join(setup_facts(setup).values())
     assert setup["picture_up"][1] > 0.9
-    drawn = sketch(setup, config.fabrication.thickness)
-    assert "300 mm" in drawn
-    assert "NaN" not in drawn.replace("nan", "NaN")
 
 
 def test_a_material_is_named_by_its_index() -> None:

@@ -209,10 +209,10 @@ def plan(cases: str = LIST, **changes: Any) -> Plan:
 
 
 def play(
-    folder: Path, stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False, earlier: Any = None
+    folder: Path, stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Session, ConvergenceResults, list[str]]:
     said: list[str] = []
-    session = Session(what, folder, stop, said.append, stage.start, stage.clock, earlier=earlier)
+    session = Session(what, folder, stop, said.append, stage.start, stage.clock)
     for _ in session.run():
         pass
     assert stage.alive == 0

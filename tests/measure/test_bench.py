@@ -1,8 +1,7 @@
-"""`reslrb bench`: the command line, its processes, and scenes where parameters move light."""
+"""`reslrb bench`: the command line and its processes."""
 
 from __future__ import annotations
 
-import gc
 import io
 import json
 import os
@@ -10,21 +9,18 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import pytest
+from cli.tiny import ended, measured
 from kit import diffuse, ref, scene, sensor, shape
-from measure.faults import room
 
-from reslrb_cli.cli import main
-from reslrb_cli.measure import methods
-from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
-from reslrb_cli.measure.steps import Stepper, scratch_bytes
-from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.measure.steps import scratch_bytes
 from reslrb_cli.records.measurements import BenchStatus
 
 # `reslrb bench` from the command line, on a scene of 16x16 pixels.
@@ -35,22 +31,13 @@ KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "
 SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--rounds", "3"]
 
 
-def call(*args: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["bench", *args], prog_name="reslrb")
-    return int(ended.value.code or 0)
-
-
-def read(path: Path) -> list[dict]:
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert lines[0]["kind"] == "origin"
-    return lines[1:]
+call = partial(ended, "bench")
 
 
 def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     assert call(*SMALL, "--max-depth", "4", "--integrators", "reslrb:stack", "--json", str(file)) == 0
-    rows = read(file)
+    rows = measured(file)
     assert [list(row) for row in rows] == [KEYS] * 2
     assert [(row["integrator"], row["estimator"], row["capacity"], row["max_depth"]) for row in rows] == [
         ("reslrb", "stack", None, depth) for depth in (2, 4)
@@ -74,19 +61,6 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [line.split()[:2] for line in lines[3:5]] == [[str(depth), "reslrb:stack"] for depth in (2, 4)]
 
 
-@pytest.mark.long
-def test_too_little_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "bench.json"
-    monkeypatch.setattr(methods, "memory_bytes", lambda variant: 100 * 2**20)
-    args = ["--max-depth", "4", "--integrators", "ptracer", "--json", str(file)]
-    assert call(*SMALL, *args) == 4
-    rows = read(file)
-    assert [list(row) for row in rows] == [KEYS] * 2
-    assert [row["status"] for row in rows] == ["out_of_memory"] * 2
-    assert rows[0]["step_ms"] is None
-    assert "depth 2, ptracer: " in capsys.readouterr().out
-
-
 def test_a_failing_case_gives_its_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,7 +73,7 @@ def test_a_failing_case_gives_its_reason(
     )
     args = ["--max-depth", "2", "--integrators", "prb,trajectory", "--json", str(file)]
     assert call(str(tmp_path / "x.yaml"), *args, "--set", "run.spp=1", "--rounds", "3") == 0
-    rows = read(file)
+    rows = measured(file)
     assert [(row["integrator"], row["status"]) for row in rows] == [("prb", "ok"), ("trajectory", "failed")]
     assert rows[0]["scratch_bytes"] == 0
     assert not (tmp_path / "kernels").exists()
@@ -170,7 +144,7 @@ def test_ctrl_c_keeps_finished_measurements(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=30)
     assert process.returncode == 130
-    rows = read(file)
+    rows = measured(file)
     assert rows
     origin = json.loads(file.read_text().partition("\n")[0])
     assert origin["command"] == ["reslrb", *command[3:], "--integrators", "reslrb:stack", "--json", str(file)]
@@ -184,34 +158,6 @@ MASKED = scene(
     shape("rectangle", "", ref("veil")),
     '<emitter type="point"><point name="position" x="0" y="1" z="3"/></emitter>',
 )
-
-
-# What `bench` measures if parameters move light: all capable integrators take steps, and memory stays constant.
-
-
-def peak(name: str, depth: int) -> float:
-    """Return the memory peak of a cold step in MiB, without the memory of the scene and of everything loaded before."""
-    [case] = parse_cases(name)
-    stepper = Stepper(case.at(room("wavy_glass.xml", "top.vertex_positions"), depth, known=True))
-    gc.collect()
-    dr.flush_malloc_cache()
-    reset_peak()
-    before = peak_mib(dr.backend_v(mi.Float))
-    cold = stepper.step(0, True)
-    warm = stepper.step(1, False)
-    assert warm["kernel_ms"] > 0
-    return float(cold["peak_mib"]) - before
-
-
-def peaks(name: str) -> list[float]:
-    return [peak(name, depth) for depth in (4, 16)]
-
-
-@pytest.mark.long
-def test_memory_of_stack_does_not_grow_with_depth():
-    shallow, deep = peaks("reslrb:stack")
-    assert 0 < shallow  # otherwise the watermark shows nothing
-    assert deep < 1.1 * shallow  # sizes are so small that allocator rounding shows
 
 
 # How the end of a process is interpreted, and what kernels report about thread-local memory.

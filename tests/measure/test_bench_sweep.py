@@ -291,14 +291,9 @@ def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool
 # Sweeps of sample counts.
 
 
-def run_swept(values: list[int], **changes: Any) -> tuple[list[BenchResult], list[str]]:
-    cases = parse_cases(LIST)
-    settings: dict[str, Any] = {
-        "config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"]), "variant": "llvm_ad_rgb", "cases": cases,
-        "values": values, "memory_limit": None,
-        "budget_s": 0.0, "rounds": 3, "swept": "spp",
-    }  # fmt: skip
-    what = Sweep(**(settings | changes))
+def run_swept(values: list[int], rounds: int | None = 3) -> tuple[list[BenchResult], list[str]]:
+    config = loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"])
+    what = sweep(config=config, values=values, rounds=rounds, swept="spp")
     what.check()
     return play(what)
 

@@ -9,7 +9,6 @@ import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -19,16 +18,10 @@ from cli.tiny import KEY
 
 import reslrb_cli as rl
 from reslrb_cli.config.loader import load
-from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.methods import Plan, parse_cases
-from reslrb_cli.measure.methods import kept_settings as measured_as
-from reslrb_cli.measure.participants import CheckSettings
-from reslrb_cli.measure.sampling import settings as sampled_as
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.autotune.sampling import situation
 from reslrb_cli.records.decisions import DecisionCache, key_of
-from reslrb_cli.records.measurement_files import first_difference
 from reslrb_cli.runs.sweep import make_plan, resumed, started
 from reslrb_cli.scene.files import files_of
 
@@ -136,55 +129,23 @@ def change(path: Path) -> Callable[[], object]:
 CASES = [("photo.yaml", OF_PHOTO), ("cameras.yaml", OF_CAMERAS)]
 
 
-def measurements(config: Config, ours: str = "reslrb:stack", reference: str = "path") -> dict[str, Any]:
-    """Return, for each command, the settings that must be equal for its measurement to continue."""
-    cases = parse_cases(ours)
-    shared: dict[str, Any] = {"config": config, "variant": "llvm_ad_rgb", "cases": cases,
-                              "memory_limit": None, "budget_s": 0.0}  # fmt: skip
-    return {
-        "gradcheck": sampled_as(CheckSettings(config, cases, 0), "llvm_ad_rgb", ""),
-        "gradcheck --missing": measured_as(config, {}, "llvm_ad_rgb", ""),
-        "convergence": Plan(**shared, objective="fixed", reference=parse_cases(reference)[0], spps=(4,)).settings(),
-    }
-
-
 @pytest.mark.parametrize(("name", "files"), CASES)
 def test_each_file_is_another_experiment(folder: Path, name: str, files: dict[str, str]) -> None:
     config = load(name).with_code()
     problem = assemble_scene(config)
     assert {str(path.relative_to(folder)): key for key, path in files_of(config).items()} == {
         **files, "data/ior/Cu.eta.spd": "scene.file (data/ior/Cu.eta.spd)"}  # fmt: skip
-    key, before = key_of(situation(problem)), measurements(config)
-    for file, place in files.items():
+    key = key_of(situation(problem))
+    for file in files:
         restore = change(folder / file)
         assert key_of(situation(problem)) != key, file
-        for command, now in measurements(config).items():
-            assert first_difference(before[command], now) == f"{place} has changed", (file, command)
         restore()
     assert key_of(situation(problem)) == key
-    assert measurements(config) == before
-
-
-def test_code_named_by_a_command_counts(folder: Path) -> None:
-    config = load("photo.yaml", ["loss={type: l2}"])
-    named: list[tuple[tuple[str, ...], set[str]]] = [
-        (("prb,own.py:A(x=1)",), {"gradcheck", "convergence"}), (("prb", "own.py:A(x=1)"), {"convergence"}),
-    ]  # fmt: skip
-    for given, commands in named:
-        before = measurements(config, *given)
-        restore = change(folder / "own.py")
-        found = {name: first_difference(before[name], now) for name, now in measurements(config, *given).items()}
-        assert {name: line for name, line in found.items() if line} == dict.fromkeys(
-            commands, "own.py:A(x=1) has changed"
-        )
-        restore()
 
 
 @pytest.mark.long
 def test_a_run_continues_with_its_original_files(folder: Path) -> None:
-    """A resumed run refuses changed files, except files of initial values, which its state has. A measurement that
-    starts from its values detects the run's progress.
-    """
+    """A resumed run refuses changed files, except files of initial values, which its state has."""
     list(rl.optimize("photo.yaml", folder="first", overrides={"run.measuring": 0}, allow_code=True))
     for file in ("scene.xml", "parts/grid.vol", "own.py", "start.exr", "photo.exr"):
         place, restore = OF_PHOTO[file], change(folder / file)
@@ -193,11 +154,7 @@ def test_a_run_continues_with_its_original_files(folder: Path) -> None:
                 rl.optimize(resume="first", overrides={"run.iterations": 2}, allow_code=True)
             assert f": {place}: has changed since first began; put it back" in str(caught.value)
             restore()
-    beside = load("photo.yaml", ["parameters[0].initial={run: first}"])
-    before = measurements(beside)
     assert len(list(rl.optimize(resume="first", overrides={"run.iterations": 2}, allow_code=True))) == 1
-    for command, now in measurements(beside).items():
-        assert first_difference(before[command], now) == "parameters[0].initial.run has changed", command
 
 
 def test_a_sweep_continues_with_its_original_files(folder: Path) -> None:

@@ -6,13 +6,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
+from measure.pretended_steps import CONFIG, Pretence, Stage, of, plan, play
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.measure.convergence import Role
-from reslrb_cli.records.measurement_files import Earlier, read_samples, write_samples
 from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.tables import closing_sentence, notes
 
@@ -111,65 +109,6 @@ def test_only_unnamed_methods_are_left_out(tmp_path: Path, default: bool) -> Non
     session, _, said = play(tmp_path, stage, plan(default=default, rounds=4))
     assert ("left out: ptracer: it emits wrongly" in said) is default
     assert ("ptracer" in [m.label for m in session.of(Role.CASE)]) is not default
-
-
-def test_continuing(tmp_path: Path) -> None:
-    """The steps of both calls count, dL/dI is computed once, and no seed is used twice."""
-    stage = Stage()
-    session, _, _ = play(tmp_path, stage, plan(rounds=4))
-    kept = session.kept()
-    assert kept is not None
-    write_samples(tmp_path / "c.samples.npz", *kept)
-    stage.asked.clear()
-    earlier = Earlier("convergence", Path("c.jsonl"), *read_samples(tmp_path / "c.samples.npz"))
-    more, results, _ = play(tmp_path, stage, plan(rounds=12), earlier=earlier)
-    assert {question["of"] for question in stage.asked} == {"case " + c for c in LIST.split(",")} | {
-        "reference reslrb:stack"
-    }
-    assert (more.rounds, of(results, "ptracer").repeats) == (12, 24)
-    for before, member in zip(session.members, more.members, strict=True):
-        assert member.turns == [turn for turn in range(12) for _ in range(member.count)]
-        assert len(member.seconds) == 12
-        np.testing.assert_array_equal(member.rows[: len(before.rows)], before.rows)
-        assert len({row.tobytes() for row in member.rows}) == len(member.rows)
-
-
-@pytest.mark.parametrize("after", [186, 210, 230])
-def test_an_interrupted_round_is_restarted(tmp_path: Path, after: int) -> None:
-    """The restarted round uses new seeds and no earlier step of that round, so that figures cover whole rounds only."""
-    answers = iter(range(10**6))
-    session, _, _ = play(tmp_path, Stage(), plan(rounds=8), stop=lambda: next(answers) > after)
-    assert len({len(member.rows) // member.count for member in session.members}) == 2
-    kept = session.kept()
-    assert kept is not None
-    more, results, _ = play(tmp_path, Stage(), plan(rounds=8), earlier=Earlier("convergence", Path("c.jsonl"), *kept))
-    for member in more.members:
-        assert member.turns == [turn for turn in range(8) for _ in range(member.count)]
-        assert len(member.seconds) == 8
-        assert len({row.tobytes() for row in member.rows}) == len(member.rows)
-    assert of(results, "ptracer").efficiency is not None
-
-
-def test_ended_methods_stay_and_the_rest_continues(tmp_path: Path) -> None:
-    first, _, _ = play(tmp_path, Stage(case_reslrb_stack=Pretence(ends=5)), plan(rounds=8))
-    kept = first.kept()
-    assert kept is not None
-    stage = Stage()
-    _, results, _ = play(tmp_path, stage, plan(rounds=12), earlier=Earlier("convergence", Path("c.jsonl"), *kept))
-    ended, sound = of(results, "reslrb:stack"), of(results, "ptracer")
-    assert (ended.status, ended.message, sound.repeats) == (BenchStatus.OUT_OF_MEMORY, "ended by SIGKILL", 24)
-    assert "case reslrb:stack" not in {question["of"] for question in stage.asked}
-
-
-def test_a_second_budget_too_small_for_a_round_is_reported(tmp_path: Path) -> None:
-    first, _, _ = play(tmp_path, Stage(), plan(rounds=None, budget_s=30.0))
-    kept = first.kept()
-    assert kept is not None
-    earlier = Earlier("convergence", Path("c.jsonl"), *kept)
-    again, results, said = play(tmp_path, Stage(), plan(rounds=None, budget_s=5.25), earlier=earlier)
-    assert again.rounds == first.rounds
-    assert of(results, "ptracer").efficiency is not None  # from the earlier samples
-    assert said[-1] == "no round was added: the budget was spent; allow more with --budget"
 
 
 @pytest.mark.parametrize("after", [0, 5, 12, 40, 120])

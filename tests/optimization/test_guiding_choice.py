@@ -125,40 +125,6 @@ def test_the_sequence_follows_a_rule(experiment: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.usefixtures("llvm")
-def test_nothing_remains_of_guiding_that_does_not_pay(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kernels contain no part of guiding. The kept decision gives the same result."""
-    fix_times(monkeypatch, {"guiding": 1000.0})
-    counts = []
-    for settings in ([*AUTO, "integrator.sequence=auto"], [*SMALL, "integrator.sequence=low_discrepancy"]):
-        problem = assemble(load("tiny.yaml", settings), cache=DecisionCache())
-        counts.append(operations(problem))
-        assert is_even(problem)
-        assert problem.integrator.preparation.guiding is None
-        del problem
-        gc.collect()
-    assert counts[0] == counts[1]
-    monkeypatch.setattr(StepTrial, "take", lambda *args: pytest.fail("measured"))
-    again = assemble(load("tiny.yaml", [*AUTO, "integrator.sequence=auto"]), cache=DecisionCache())
-    assert [(each.setting, each.value, each.cached) for each in again.decisions] == [
-        ("sequence", "low_discrepancy", False),
-        ("guiding", "off", True),
-    ]
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.long  # the run reports it as well
-def test_a_dry_run_measures_it_for_the_run(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    fix_times(monkeypatch, {"guiding": 0.1})
-    assert optimize("tiny.yaml", "--dry-run", *(word for text in AUTO for word in ("--set", text))) == 0
-    assert "chosen by measurement: guiding on" in "".join(capsys.readouterr())
-    assert not RUN.exists()
-    monkeypatch.setattr(StepTrial, "take", lambda *args: pytest.fail("measured"))
-    assert assemble(load("tiny.yaml", AUTO), cache=DecisionCache()).decisions[0].cached
-
-
-@pytest.mark.usefixtures("llvm")
 def test_guiding_is_off_if_images_would_lose(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     take = StepTrial.take
 
@@ -476,16 +442,6 @@ def test_few_entries_are_measured_more_often() -> None:
     assert few.race().other
     assert many.race().other
     assert few.rounds > many.rounds
-
-
-def test_images_with_their_own_samples_decide_as_well() -> None:
-    """The time of the image is a part of the step time, and the image must not lose efficiency."""
-    for image, image_time, on in [(0.2, 2.0, True), (2.0, 1.0, False), (0.2, 10.0, False)]:
-        found = World(0.05, 2.0, image=image, image_time=image_time, alone=True).race()
-        assert found.other == on
-        assert found.gain is not None
-        learning = (16 + 1) * SIZES.lessons / 16
-        assert found.gain[0] == pytest.approx((1 + 1) / (0.05 * (2 + image_time + learning)), rel=0.2)
 
 
 @pytest.mark.parametrize("alone", [False, True])

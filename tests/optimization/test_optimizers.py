@@ -39,6 +39,8 @@ CASES = [
     ("sgd", {}, sgd),
     ("sgd", {"momentum": 0.9}, sgd),
 ]
+KINDS = {"texture": lambda: dr.full(mi.TensorXf, 0.5, (2, 3, 3)), "colour": lambda: mi.Color3f(0.5),
+         "number": lambda: mi.Float(0.5)}  # fmt: skip
 
 
 def make(type="sgd", value=START, options=None, rate=None, bounds=None):
@@ -170,13 +172,9 @@ def test_an_overflowing_update_is_undone():
 
 
 @pytest.mark.parametrize("type", OPTIMIZERS)
-@pytest.mark.parametrize("kind", ["texture", "colour", "number"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_changing_rate_compiles_nothing(type, kind):
-    value = {
-        "texture": lambda: dr.full(mi.TensorXf, 0.5, (4, 4, 3)),
-        "colour": lambda: mi.Color3f(0.5, 0.4, 0.3),
-        "number": lambda: mi.Float(0.5),
-    }[kind]()
+    value = KINDS[kind]()
     optimizer, clock = Optimizer(type, RATE, {}, {"p": value}, {"p": None}, {"p": (0.0, 1.0)}), StepClock()
     compiled = []
     for step in range(4):
@@ -317,14 +315,9 @@ def adam_in_u(name, bounds, target, steps, rate):
 
 
 @pytest.mark.parametrize("name", ["sigmoid", "log"])
-@pytest.mark.parametrize("kind", ["texture", "colour", "number"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_optimiser_moves_the_variable(name, kind):
-    value = {
-        "texture": lambda: dr.full(mi.TensorXf, 0.5, (2, 3, 3)),
-        "colour": lambda: mi.Color3f(0.5, 0.5, 0.5),
-        "number": lambda: mi.Float(0.5),
-    }[kind]()
-    bounds = (0.0, 1.0)
+    value, bounds = KINDS[kind](), (0.0, 1.0)
     optimizer, clock = Optimizer("adam", 0.05, {}, {"p": value}, {"p": None}, {"p": bounds},
                                  {"p": make_transform(name, bounds)}), StepClock()  # fmt: skip
     compiled = []

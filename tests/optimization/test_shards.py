@@ -75,12 +75,12 @@ def independent(problem: Problem) -> np.ndarray:
 # --- unbiased ---------------------------------------------------------------------------------------------------------
 
 WAYS = {
-    "2 in rounds": (["run.spp=2", "run.shards=2", ROUNDS], 400),
+    "2 in rounds": (["run.spp=2", "run.shards=2", ROUNDS], 250),
     "4 in rounds": (["run.spp=4", "run.shards=4", ROUNDS], 200),
     "16 in rounds": (["run.spp=16", "run.shards=16", ROUNDS], 100),
     "2 in batches": (["run.spp=4", "run.shards=2", "run.batches=2", "run.adjoint=batched"], 200),
     "4 by themselves": (["run.spp=4", "run.shards=4", "run.adjoint=independent"], 200),
-    "guided": (["run.spp=4", "run.shards=4", ROUNDS, "integrator.guiding=on"], 200),
+    "guided": (["run.spp=4", "run.shards=4", ROUNDS, "integrator.guiding=on"], 120),
     "relative": (["run.spp=4", "run.shards=4", ROUNDS, "loss.type=relative_l2"], 200),
 }
 
@@ -101,14 +101,14 @@ def test_gradients_are_unbiased(folder, way):
 def test_a_single_set_of_samples_would_be_found(folder):
     """The comparison of `test_gradients_are_unbiased` has enough power to detect the bias of a single set."""
     reference = independent(make(folder, "run.adjoint=independent"))
-    found = compare(rows(make(folder, "run.spp=2", "run.shards=2", "run.adjoint=correlated"), 400), reference, None)
+    found = compare(rows(make(folder, "run.spp=2", "run.shards=2", "run.adjoint=correlated"), 250), reference, None)
     assert not found, found
 
 
 def test_views_and_exposures_are_unbiased(folder):
     """Two views with different weights have two shards each. The second view's exposure is recovered."""
     reference = independent(make(folder, TWO_VIEWS, "run.adjoint=independent"))
-    found = compare(rows(make(folder, TWO_VIEWS, "run.spp=2", "run.shards=4", ROUNDS), 300), reference, block=None)
+    found = compare(rows(make(folder, TWO_VIEWS, "run.spp=2", "run.shards=4", ROUNDS), 180), reference, block=None)
     assert found, found
 
 
@@ -131,7 +131,7 @@ def shuffled(problem: Problem, function: Callable[..., Any], work: Any) -> Itera
         pytest.param(["run.spp=8", "run.shards=4", ROUNDS, "target.exposure=1.5"], marks=pytest.mark.long),
         ["run.spp=16", "run.shards=4", "run.adjoint=batched", "integrator.guiding=on"],
         ["run.spp=4", "run.shards=2", "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]", "integrator.guiding=on"],
-        ["run.spp=8", "run.shards=4", ROUNDS, TWO_VIEWS.replace("auto", "2")],
+        pytest.param(["run.spp=8", "run.shards=4", ROUNDS, TWO_VIEWS.replace("auto", "2")], marks=pytest.mark.long),
     ],
 )
 def test_the_order_of_evaluation_does_not_matter(folder, sets):

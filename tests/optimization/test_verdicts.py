@@ -380,7 +380,7 @@ def test_entries_of_a_motion_have_their_own_noise():
 
 # Whether a loss fell beyond its noise: how often the verdict is right, and which verdicts never occur.
 
-ROUNDS = 400
+ROUNDS = 200
 
 
 def shares_of_verdicts(make, iterations, seed=3):

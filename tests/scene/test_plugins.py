@@ -147,7 +147,6 @@ CONFIG_FILE = "../c.yaml"
             [
                 ["inspect", "../scene/scene.xml"],
                 ["inspect", CONFIG_FILE],
-                ["render", CONFIG_FILE, "-o", "image.exr"],
                 ["render", CONFIG_FILE, "-o", "image.exr", "--set", "integrator={type: ptracer, max_depth: 2}"],
                 ["optimize", CONFIG_FILE, "--set", "integrator={type: prb, max_depth: 2}"],
             ],

@@ -7,11 +7,10 @@ except at the film's border (`_seen_by`). Camera paths are also compared with na
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS
 from reslrb_cli.integrators.step import gradient_step
@@ -22,8 +21,6 @@ from reslrb_cli.measure.methods import parse_cases, records_of
 from reslrb_cli.measure.references import Situation, prb_image
 from reslrb_cli.measure.scenes.analytic import KnownScene
 from reslrb_cli.measure.scenes.moving import Move, moving_case
-from reslrb_cli.records.measurement_files import Earlier, Kept, program
-from reslrb_cli.records.measurement_files import kept as kept_content
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
 Scene = Callable[[], dict]
@@ -194,39 +191,6 @@ def without_roulette(case: ExtremeCase) -> dict[str, Any]:
     `rr_depth`.
     """
     return {key: value for key, value in case.options.items() if key != "rr_depth"}
-
-
-#: Kind of measurement in the file of samples.
-KIND = "gradcheck --suite"
-
-
-def settings(estimators: Sequence[str] | None, seeds: int | None, variant: str, device: str) -> dict[str, Any]:
-    """Return the settings that must be the same in all sessions. If a setting is None, each case sets its own value."""
-    return {
-        "--estimators": "all" if estimators is None else list(estimators),
-        "--seeds": "as the cases have it" if seeds is None else seeds,
-        "variant": variant,
-        "device": device,
-        "versions": program(),
-    }
-
-
-def restore(before: Earlier) -> dict[str, list[GradcheckRecord]]:
-    """Return the records of an earlier session by case. Raises ConfigError if they are invalid."""
-    reader = TypeAdapter(dict[str, list[GradcheckRecord]])
-    try:
-        found: dict[str, list[GradcheckRecord]] = reader.validate_python(before.head["cases"])
-    except (KeyError, ValueError):
-        raise before.other("its cases are damaged") from None
-    return found
-
-
-def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckRecord]]) -> Kept | None:
-    """Return the state for a later session, or None if no case is finished."""
-    if not cases:
-        return None
-    rows = {case: [asdict(record) for record in records] for case, records in cases.items()}
-    return kept_content(KIND, settings, None, cases=rows)
 
 
 #: Number of comparisons for the correction of all z scores of the suite; slightly more than it has.

@@ -40,7 +40,7 @@ from reslrb_cli.config.integrators import DECIDABLE
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.pixels import noted_part
 from reslrb_cli.guiding.tables import sensor_bytes
-from reslrb_cli.integrators.plan_report import PlanRow, scene_rows, without_light
+from reslrb_cli.integrators.plans import PlanRow, scene_rows, without_light
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune.race import Finding, StepTrial, measured_step, sizes
