@@ -205,6 +205,9 @@ def _check_moving(problem: Problem) -> None:
     """Raise ConfigError at the faulty setting if the integrator cannot differentiate a moving parameter."""
     if not problem.moves:
         return
+    if problem.config.optimizer.type == "auto":
+        reason = "auto has no steps for what moves geometry or lamps; use adam, with a learning_rate and a schedule"
+        raise ConfigError(problem.config.source, "optimizer.type", reason)
     config, moved = problem.config, where_moved(problem.selection.params, problem.selection.scene_keys)
     kind, tracer = config.integrator.type, problem.integrator
     if moved and kind in ("prb", "trajectory"):

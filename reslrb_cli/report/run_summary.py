@@ -121,15 +121,15 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
         return Remedy("more samples for it", f"--set target.render.spp={MORE_SAMPLES * measured['target_spp']}")
     moved, rate, iterations = about.get("moved"), about.get("rate"), measured.get("iterations")
-    if about.get("verdict") != MOVING or moved is None or not rate or not iterations:
+    if about.get("verdict") != MOVING or moved is None or not iterations:
         return None
     if (results.get("loss_trend") or {}).get("change") == "rose":
-        if incomplete_records(results.get("incomplete") or ()):
+        if rate is None or incomplete_records(results.get("incomplete") or ()):
             return None
         return Remedy("a lower rate", _rate_setting(measured, rate, 1 / LOWER))
     way = moved + max((abs(value) for value in about.get("to_go") or () if value is not None), default=0.0)
     reach = about.get("reach")
-    if reach and way > REACHED * reach:
+    if reach and rate and way > REACHED * reach:
         emits = (results.get("parameters") or {}).get(key, {}).get("quantity")
         if emits in EMITTED and measured.get("scale") == "none":
             return Remedy("scale: auto", "--set optimizer.scale=auto")
