@@ -197,6 +197,10 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     if isinstance(problem.integrator, LightTracer):
         problem.integrator.expect(pass_spp(config))
     problem.apply()
+    if config.optimizer.type == "auto" and (moves or selection.factors):
+        lacks = "what moves geometry or lamps" if moves else "an unknown exposure"
+        reason = f"auto has no steps for {lacks}; use adam, with a learning_rate and a schedule"
+        raise ConfigError(config.source, "optimizer.type", reason)
     _check_moving(problem)
     return problem
 
@@ -205,9 +209,6 @@ def _check_moving(problem: Problem) -> None:
     """Raise ConfigError at the faulty setting if the integrator cannot differentiate a moving parameter."""
     if not problem.moves:
         return
-    if problem.config.optimizer.type == "auto":
-        reason = "auto has no steps for what moves geometry or lamps; use adam, with a learning_rate and a schedule"
-        raise ConfigError(problem.config.source, "optimizer.type", reason)
     config, moved = problem.config, where_moved(problem.selection.params, problem.selection.scene_keys)
     kind, tracer = config.integrator.type, problem.integrator
     if moved and kind in ("prb", "trajectory"):

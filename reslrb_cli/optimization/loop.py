@@ -85,7 +85,9 @@ LEAST_ITERATIONS, CLOSE, LEAST_SHARE = 20, 0.025, 0.2
 def close_enough(problem: Problem, iteration: int) -> str:
     """Return a message if more iterations would not help, otherwise "". `iteration` is the number of iterations."""
     optimizer = problem.optimizer
-    if iteration < LEAST_ITERATIONS or not optimizer.measures_curvature:
+    measured = 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last iteration of `measures_now`
+    is_long = iteration >= max(LEAST_ITERATIONS, 1.5 * measured)
+    if not optimizer.measures_curvature or not is_long:
         return ""
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
         extent = optimizer.extent(key)

@@ -12,7 +12,8 @@ H is the diagonal of the loss's second derivative, measured with random signs z 
 numbers: H_i = z_i (g_i(x + d z) - g_i(x)) / d. A measurement costs one gradient. It takes place in the iterations 0, 2,
 6, 14, 30, and so on, because H changes as the parameters move. A single H_i is mostly noise. The least-squares factor c
 uses all entries, and s gives the differences between entries, as in Adam. Parameters of at most four entries use the
-mean of H instead. Where the loss is not convex, the absolute value of the curvature counts, as a length of steps.
+root mean square of H over the measurements instead, because coupled parameters may change its sign. Where the loss is
+not convex, the absolute value of the curvature counts.
 
 L is a share of the parameter's extent, so one bright path cannot move a texel far. n_i counts the iterations in which
 g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length.
@@ -24,7 +25,9 @@ from noise, and
 
     sum_i g_i (m_i / 2) / h_i  /  sum_i h_i
 
-estimates the mean square of the distance, with the curvature as weight.
+estimates the mean square of the distance, with the curvature as weight. Where parameters are coupled, for example a
+lamp and an albedo, the distance along a valley of the loss is longer than m / h. The distance that the parameter has
+moved since the last measurement of H is therefore another limit.
 """
 
 from __future__ import annotations
@@ -46,31 +49,35 @@ DISPLACEMENT, NEWEST = 0.05, 0.75
 SMALL, OF_SMALL, OF_LARGE = 4, (0.25, 0.25), (0.08, 0.5)
 #: The limit of the distance uses this many iterations, and exceeds the largest of them by this factor.
 RECENT, SURE = 4, 1.5
+#: A mean square distance that is not known. A state on file has only finite numbers.
+UNKNOWN = 3e38
 
 
 class Newton(dropt.Optimizer[Any]):
     """The update of `optimizer: auto` for one parameter. The learning rate is the longest step L.
 
-    Data: m, s, n, H, and the mean square distances of the last iterations, of width 1 each, newest first.
+    Data: m, s, n, H, the variable at the last measurement of H, and the mean square distances of the last iterations,
+    of width 1 each, newest first.
     """
 
     def _step(self, cache: Any, value: Any, grad: Any, lr: Any, extra: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
-        velocity, size, turns, bent, *squares = extra
+        velocity, size, turns, bent, earlier, *squares = extra
         size = dr.lerp(dr.abs(grad), size, MEMORY)
         steepness = _steepness(size, bent)
         known = steepness > 0
         weight = total(dr.select(known, steepness, 0))
-        square = total(dr.select(known, grad * ((1 - MOMENTUM) * velocity / steepness), 0)) / weight
+        offsets = dr.select(known, grad * ((1 - MOMENTUM) * velocity / steepness), 0)
+        square = dr.select(weight > 0, total(offsets) / weight, UNKNOWN)
         turns = turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
         velocity = MOMENTUM * velocity + grad
         longest = dr.opaque(dr.leaf_t(grad), lr)
         step = dr.clip(GAIN * velocity / steepness, -longest, longest) / (1 + _options(value)[1] * turns)
-        return value - dr.select(known, step, 0), (velocity, size, turns, bent, square, *squares[:-1])
+        return value - dr.select(known, step, 0), (velocity, size, turns, bent, earlier, square, *squares[:-1])
 
     def _reset(self, key: str, value: Any, promoted: bool) -> None:
         array = value.array
-        zeros = [dr.opaque(type(array), 0, array.shape) for _ in range(4)]
-        unknown = [dr.opaque(dr.leaf_t(array), np.inf) for _ in range(RECENT)]
+        zeros = [dr.opaque(type(array), 0, array.shape) for _ in range(5)]
+        unknown = [dr.opaque(dr.leaf_t(array), UNKNOWN) for _ in range(RECENT)]
         self.state[key] = value, promoted, None, (*zeros, *unknown)
 
     def limit(self, key: str) -> float:
@@ -79,10 +86,16 @@ class Newton(dropt.Optimizer[Any]):
 
     def bend(self, key: str, curvature: Any) -> None:
         """Take a measurement of H, in the shape of the parameter."""
-        value, promoted, lr, (velocity, size, turns, bent, *squares) = self.state[key]
-        bent = dr.select(dr.all(flat(bent) == 0), curvature, dr.lerp(bent, curvature, NEWEST))
+        value, promoted, lr, (velocity, size, turns, bent, _, *squares) = self.state[key]
+        if dr.width(flat(value)) <= SMALL:  # other displacements change the sign, so squares are averaged
+            curvature = dr.abs(curvature)
+            ratio = dr.select(bent > 0, curvature / bent, 1)  # squares would underflow
+            newest = dr.select(bent > 0, bent * dr.sqrt(dr.lerp(1, ratio * ratio, NEWEST)), curvature)
+        else:
+            newest = dr.lerp(bent, curvature, NEWEST)
+        bent = dr.select(dr.all(flat(bent) == 0), curvature, newest)
         dr.make_opaque(bent)
-        self.state[key] = value, promoted, lr, (velocity, size, turns, bent, *squares)
+        self.state[key] = value, promoted, lr, (velocity, size, turns, bent, dr.detach(value).array, *squares)
 
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
         """Return the gradient of each entry that moves it by 1, summed over the steps, as a flat array. It is infinite
@@ -95,8 +108,14 @@ class Newton(dropt.Optimizer[Any]):
 
     def to_go(self, key: str) -> float:
         """Return a limit of the root mean square distance to the optimum. It is infinite if it is not known."""
-        squares = np.abs([float(np.array(each).ravel()[0]) for each in self.state[key][3][4:]])
-        return SURE * float(np.sqrt(np.max(np.where(np.isfinite(squares), squares, np.inf))))
+        value, _, _, (_, size, _, bent, earlier, *squares) = self.state[key]
+        left = np.abs([float(np.array(each).ravel()[0]) for each in squares])
+        steepness = np.array(_steepness(size, bent), dtype=np.float64).ravel()
+        moved = np.array(dr.detach(value).array - earlier, dtype=np.float64).ravel()
+        if left.max() >= np.float32(UNKNOWN) or not steepness.any():
+            return float("inf")
+        far = np.sum(steepness * np.square(moved)) / np.sum(steepness)
+        return float(np.sqrt(max(SURE**2 * left.max(), far)))
 
 
 def _options(value: Any) -> tuple[float, float]:
@@ -108,7 +127,8 @@ def _steepness(size: Any, bent: Any) -> Any:
     """Return the curvature of each entry, which is 0 if it is not known."""
     entries = flat(bent)
     if dr.width(entries) <= SMALL:
-        return dr.zeros(type(size), dr.shape(size)) + dr.abs(dr.mean(entries))
+        largest = dr.maximum(dr.max(dr.abs(entries)), 1e-37)  # squares would underflow
+        return dr.zeros(type(size), dr.shape(size)) + dr.sqrt(dr.mean(dr.square(entries / largest))) * largest
     largest = dr.max(flat(size))
     unit = dr.select(largest > 0, size / largest, 0)  # squares of gradients would underflow
     factor = total(bent * unit) / total(unit * unit)

@@ -294,7 +294,8 @@ class Optimizer:
         reached = {key: self.gradient(key) != 0 for key in colours}
         if colours:
             old = dr.detach(self[exposure])
-            dr.set_grad(self[exposure], self._along_valley(exposure, colours))
+            products = [dr.sum(flat(dr.detach(self[key]) * self.gradient(key))) for key in colours]
+            dr.set_grad(self[exposure], self.gradient(exposure) - sum(products) / old)
         # Dr.Jit makes the rate opaque, so a changing rate compiles no new kernel.
         moved, before, counts = [key for key in self._own if key not in skip], {}, {}
         for key in moved:
@@ -328,11 +329,6 @@ class Optimizer:
         exposure, colours = self._balanced or ("", [])
         return exposure, [] if exposure in skip else [key for key in colours if key not in skip]
 
-    def _along_valley(self, exposure: str, colours: Sequence[str]) -> Any:
-        """Return the derivative with respect to the exposure E with constant E c."""
-        products = [dr.sum(flat(dr.detach(self[key]) * self.gradient(key))) for key in colours]
-        return self.gradient(exposure) - sum(products) / dr.detach(self[exposure])
-
     def extent(self, key: str) -> float:
         """Return the size of the values that the optimiser's variable may have: the distance of the bounds, or twice
         the root mean square of the current values.
@@ -349,37 +345,31 @@ class Optimizer:
         Accumulate the gradient before, and within the block the gradient at the displaced values, with the same
         samples. Afterwards, values and gradients are as before.
         """
-        exposure, colours = self._moving(())
-        stands_at, kept, before, steps = self.stands_at, {}, {}, {}
-        for key, own in self._own.items():
-            kept[key] = own.state[key], self._scene.get(key)
-            before[key] = self._descent(key, exposure, colours)
-        old = dr.detach(self[exposure]) if colours else 1.0
+        kept = self.stands_at, {key: (own.state[key], self._scene.get(key)) for key, own in self._own.items()}
+        before, steps = self._descents(), {}
         for key, own in self._own.items():
             v, variable = dr.detach(own[key]), self.variable(key)
             signs = random.choice([-1.0, 1.0], size=np.array(v).shape) * DISPLACEMENT * self.extent(key)
-            step = type(v)(signs.astype(np.float32))
-            ahead = v + step
-            ahead = variable.clamp(dr.select(variable.clamp(ahead) == ahead, ahead, v - step))
+            ahead = v + type(v)(signs.astype(np.float32))
+            ahead = variable.clamp(dr.select(variable.clamp(ahead) == ahead, ahead, 2 * v - ahead))
             steps[key] = ahead - v
             dr.eval(ahead, steps[key])
             self.set_value(key, variable.to_scene(ahead))
-        for key in colours:
-            self.set_value(key, clamp(dr.detach(self[key]) * (old / dr.detach(self[exposure])), self._bounds[key]))
         yield
-        after = {key: self._descent(key, exposure, colours) for key in self._own}
+        after = self._descents()
+        self.stands_at = kept[0]
         for key, own in self._own.items():
-            own.state[key] = kept[key][0]
-            if kept[key][1] is not None:
-                self._scene[key] = kept[key][1]
+            own.state[key], value = kept[1][key]
+            if value is not None:
+                self._scene[key] = value
             bent = (after[key] - before[key]) / steps[key]
-            own.bend(key, flat(dr.select(dr.isfinite(bent), bent, 0)))
-        self.stands_at = stands_at
+            own.bend(key, dr.select(dr.isfinite(bent), bent, 0).array)
 
-    def _descent(self, key: str, exposure: str, colours: Sequence[str]) -> Any:
-        """Return the gradient by the optimiser's variable, as the next step would use it."""
-        gradient = self._along_valley(exposure, colours) if colours and key == exposure else self.gradient(key)
-        found = self.variable(key).chain(dr.detach(self._own[key][key]), gradient)
+    def _descents(self) -> dict[str, Any]:
+        """Return the accumulated gradients by the optimiser's variables, evaluated."""
+        found = {
+            key: self.variable(key).chain(dr.detach(own[key]), self.gradient(key)) for key, own in self._own.items()
+        }
         dr.eval(found)
         return found
 
