@@ -134,7 +134,8 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
         if emits in EMITTED and measured.get("scale") == "none":
             return Remedy("scale: auto", "--set optimizer.scale=auto")
         return Remedy("a higher rate", _rate_setting(measured, rate, max(2 * way / reach, 2.0)))
-    if (results.get("loss_trend") or {}).get("late") == "flat":  # more of the same steps would not help
+    # More of the same steps would not help, or the run would end again at once.
+    if (results.get("loss_trend") or {}).get("late") == "flat" or (rate is None and results.get("stopped")):
         return Remedy("a new run from here", "initial: {run: RUN} for each parameter")
     longer = min(max(way / moved if moved else MOST_LONGER, LEAST_LONGER), MOST_LONGER)
     return Remedy("more iterations", f"--set run.iterations={int(float(f'{longer * iterations:.2g}'))}")
