@@ -85,8 +85,9 @@ class Newton(dropt.Optimizer[Any]):
         return _options(dr.detach(self[key]))[0]
 
     def bend(self, key: str, curvature: Any) -> None:
-        """Take a measurement of H, in the shape of the parameter."""
+        """Take a measurement of H, in the shape of the parameter. Entries that are not finite keep their curvature."""
         value, promoted, lr, (velocity, size, turns, bent, _, *squares) = self.state[key]
+        curvature = dr.select(dr.isfinite(curvature), curvature, bent)
         if dr.width(flat(value)) <= SMALL:  # other displacements change the sign, so squares are averaged
             curvature = dr.abs(curvature)
             ratio = dr.select(bent > 0, curvature / bent, 1)  # squares would underflow

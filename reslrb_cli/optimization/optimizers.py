@@ -362,8 +362,7 @@ class Optimizer:
             own.state[key], value = kept[1][key]
             if value is not None:
                 self._scene[key] = value
-            bent = (after[key] - before[key]) / steps[key]
-            own.bend(key, dr.select(dr.isfinite(bent), bent, 0).array)
+            own.bend(key, ((after[key] - before[key]) / steps[key]).array)
 
     def _descents(self) -> dict[str, Any]:
         """Return the accumulated gradients by the optimiser's variables, evaluated."""

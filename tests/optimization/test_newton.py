@@ -176,6 +176,19 @@ def test_a_run_whose_gradients_are_noise_does_not_end_early(tmp_path, steps):
     assert (state.iteration, state.stopped) == (60, "")
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_measurements_that_are_not_finite_change_nothing(tmp_path, steps, bad):
+    """The calls 8 and 9 are the iteration 6 and its measurement."""
+    steps.spoil = lambda call, key: bad if call in (8, 9) else 1.0
+    problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=30"])
+    bent = []
+    for _ in loop.optimize(problem):
+        assert np.isfinite(np.array(problem.optimizer["albedo"])).all()
+        bent.append(np.array(problem.optimizer.moments()["albedo"]["3"]))
+    np.testing.assert_array_equal(bent[5], bent[6])
+    assert np.abs(np.array(problem.optimizer["albedo"]) - 0.8).max() < 0.02
+
+
 def test_a_measurement_has_the_samples_of_its_step(tmp_path, steps):
     problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=7"])
     list(loop.optimize(problem))
