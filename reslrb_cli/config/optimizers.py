@@ -200,4 +200,24 @@ class SGD(OptimizerSettings, json_schema_extra=NEEDS_TYPE):
     momentum: _Decay = Field(default=0.0, description="Decay of the running sum of gradients. 0: no momentum.")
 
 
-AnyOptimizer = Annotated[Adam | SGD, ByType("adam")]
+class Auto(OptimizerSettings, json_schema_extra=NEEDS_TYPE):
+    """Steps from measured curvature ([Optimizers](optimizers.md)). Needs no learning rate and no schedule, and ends the
+    run when every parameter is close to the optimum. `run.iterations` is the limit. Not for motions, heightmaps,
+    unknown exposures and `precondition`."""
+
+    type: Literal["auto"] = Field(default="auto", description="Steps from measured curvature, without a rate.")
+    learning_rate: Positive = Field(default=1.0, description="Not with `auto`.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_alone(cls, values: Any) -> Any:
+        for name in OptimizerSettings.model_fields:
+            if isinstance(values, dict) and name in values and name != "type":
+                raise located(name, "has no effect with type: auto, which measures its steps; remove it, or take adam")
+        return values
+
+    def idle(self) -> set[str]:
+        return set(OptimizerSettings.model_fields) - {"type"}
+
+
+AnyOptimizer = Annotated[Adam | SGD | Auto, ByType("adam")]

@@ -313,6 +313,10 @@ class Config(Section):
                 if places.setdefault((option, name), i) < i:
                     at = option if j is None else f"{option}[{j}]"
                     raise located(f"parameters[{i}].{at}", f"`{name}` is already in parameters[{places[option, name]}]")
+            if self.optimizer.type == "auto":
+                for option in ("learning_rate", "precondition"):
+                    if getattr(spec, option) is not None:
+                        raise located(f"parameters[{i}].{option}", "needs optimizer.type: adam or sgd; remove it")
         self._check_samples()
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(

@@ -3,7 +3,8 @@
 A schedule gives the learning-rate factor for iteration i of n. The factor goes from 1 at the first iteration to
 `final_fraction` at the last.
 
-A run ends early if its time is up (`run.max_seconds`).
+A run ends early if its time is up (`run.max_seconds`), or, with `optimizer: auto`, if all parameters are close enough
+to the optimum (`close_enough`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.integrators.step import Refused, gradient_step
@@ -34,6 +36,7 @@ from reslrb_cli.optimization.state import State, put, standing
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
+from reslrb_cli.statistics import rms
 
 #: Functions of a run's progress (0 to 1) and the final fraction. `cosine` is half a period (Loshchilov and Hutter 2017,
 #: without restarts); `exponential` has the same factor from each iteration to the next.
@@ -72,6 +75,40 @@ def out_of_time(limit_s: float | None, state: State) -> str:
     if limit_s is None or state.elapsed_s + mean_s <= limit_s:
         return ""
     return f"the time is up, after {state.elapsed_s:.3g} s of iterations"
+
+
+#: Fewest iterations, and the distance to the optimum at which a run with `auto` ends: a share of a value's root mean
+#: square, or of this share of its extent if that is larger. It is a quarter of the tolerance of a verdict.
+LEAST_ITERATIONS, CLOSE, LEAST_SHARE = 20, 0.025, 0.2
+
+
+def close_enough(problem: Problem, iteration: int) -> str:
+    """Return a message if more iterations would not help, otherwise "". `iteration` is the number of iterations."""
+    optimizer = problem.optimizer
+    measured = 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last iteration of `measures_now`
+    is_long = iteration >= max(LEAST_ITERATIONS, 1.5 * measured)
+    if not optimizer.measures_curvature or not is_long:
+        return ""
+    for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
+        extent = optimizer.extent(key)
+        value = LEAST_SHARE if optimizer.variable(key).transform else rms(problem.selection.array(key)) / extent
+        if optimizer.to_go(key) > CLOSE * max(value, LEAST_SHARE):
+            return ""
+    return f"every parameter is within {100 * CLOSE:g} % of the optimum"
+
+
+def measures_now(problem: Problem, iteration: int) -> bool:
+    """True if `auto` measures the curvature in `iteration`, which is 0, 2, 6, 14, 30, and so on."""
+    return problem.optimizer.measures_curvature and (iteration + 2) & (iteration + 1) == 0
+
+
+def measure_curvature(problem: Problem, iteration: int) -> None:
+    """Measure the curvature for `auto`, with the samples of `iteration`. Its gradient must be accumulated."""
+    random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
+    with problem.optimizer.displaced(random):
+        problem.apply()
+        gradient(problem, iteration)
+    problem.apply()
 
 
 #: The moments are set to zero each time a large loss has fallen to this fraction. A first loss is large if the loss of
@@ -123,6 +160,9 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
+    if measures_now(problem, iteration):
+        with clock.counted():
+            measure_curvature(problem, iteration)
     factor = learning_rate_factor(
         config.optimizer.schedule,
         iteration,
@@ -158,7 +198,8 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         end=why_end(config.run.on_nonfinite, found, standstill),
         gradients=gradients,
     )
-    state = standing(problem, replace(state, stopped=out_of_time(problem.limit_s, state)))
+    stopped = out_of_time(problem.limit_s, state) or close_enough(problem, state.iteration)
+    state = standing(problem, replace(state, stopped=stopped))
     return state, Record(
         iteration=iteration,
         loss=value,

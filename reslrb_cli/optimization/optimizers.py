@@ -23,6 +23,7 @@ its moments and its number of steps.
 
     adam      m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)    Kingma and Ba 2015
     sgd       v = momentum · v + g; p -= lr · v
+    auto      steps from measured curvature, without a rate (`newton.py`)
 
 Exposure (`balance`): an image hardly changes if an exposure E rises and the colours c of the surfaces fall by the same
 factor. Separate steps in E and c would cross this valley of the loss again and again. Therefore a step of E divides the
@@ -36,7 +37,8 @@ Parameters must be finite and within their bounds (`clamp`, `count_nonfinite`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,6 +47,7 @@ import drjit.opt as dropt
 import numpy as np
 import scipy.fft
 
+from reslrb_cli.optimization.newton import DISPLACEMENT, Newton
 from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
 from reslrb_cli.statistics import Array, rms
 
@@ -189,7 +192,11 @@ def _opaque(like: Any, number: float) -> Any:
 OPTIMIZERS: dict[str, Callable[..., Any]] = {
     "adam": dropt.Adam,
     "sgd": dropt.SGD,
+    "auto": Newton,
 }
+
+#: Extent of a parameter with a transform, in units of u.
+EXTENT_OF_TRANSFORM = 2.0
 
 
 class Optimizer:
@@ -263,9 +270,10 @@ class Optimizer:
         self._balanced = exposure, list(colours)
 
     def forget(self) -> None:
-        """Set the moments of all parameters to zero."""
+        """Set the moments of all parameters to zero. `auto` has no long memory, and keeps its measured curvature."""
         for own in self._own.values():
-            own.reset()
+            if not isinstance(own, Newton):
+                own.reset()
 
     def gradient(self, key: str) -> Any:
         """Return the gradient that has been accumulated into `self[key]`."""
@@ -293,7 +301,8 @@ class Optimizer:
         for key in moved:
             own = self._own[key]
             before[key] = own.state[key], self[key]
-            own.set_learning_rate(self._rates[key] * factor)
+            is_auto = isinstance(own, Newton)
+            own.set_learning_rate(own.limit(key) * self.extent(key) if is_auto else self._rates[key] * factor)
             if key in self._variables:
                 self._step_variable(key)
             else:
@@ -320,6 +329,56 @@ class Optimizer:
         exposure, colours = self._balanced or ("", [])
         return exposure, [] if exposure in skip else [key for key in colours if key not in skip]
 
+    def extent(self, key: str) -> float:
+        """Return the size of the values that the optimiser's variable may have: the distance of the bounds, or twice
+        the root mean square of the current values.
+        """
+        low, high = self._bounds[key] or (-math.inf, math.inf)
+        if self.variable(key).transform is not None:
+            return EXTENT_OF_TRANSFORM
+        return high - low if math.isfinite(high - low) else 2 * rms(np.array(dr.detach(self[key]))) or 1.0
+
+    @contextmanager
+    def displaced(self, random: np.random.Generator) -> Iterator[None]:
+        """Displace all entries by random signs, and measure the curvature for `auto`.
+
+        Accumulate the gradient before, and within the block the gradient at the displaced values, with the same
+        samples. Afterwards, values and gradients are as before.
+        """
+        kept = self.stands_at, {key: (own.state[key], self._scene.get(key)) for key, own in self._own.items()}
+        before, steps = self._descents(), {}
+        for key, own in self._own.items():
+            v, variable = dr.detach(own[key]), self.variable(key)
+            signs = random.choice([-1.0, 1.0], size=np.array(v).shape) * DISPLACEMENT * self.extent(key)
+            ahead = v + type(v)(signs.astype(np.float32))
+            ahead = variable.clamp(dr.select(variable.clamp(ahead) == ahead, ahead, 2 * v - ahead))
+            steps[key] = ahead - v
+            dr.eval(ahead, steps[key])
+            self.set_value(key, variable.to_scene(ahead))
+        yield
+        after = self._descents()
+        self.stands_at = kept[0]
+        for key, own in self._own.items():
+            own.state[key], value = kept[1][key]
+            if value is not None:
+                self._scene[key] = value
+            own.bend(key, ((after[key] - before[key]) / steps[key]).array)
+
+    def _descents(self) -> dict[str, Any]:
+        """Return the accumulated gradients by the optimiser's variables, evaluated."""
+        found = {
+            key: self.variable(key).chain(dr.detach(own[key]), self.gradient(key)) for key, own in self._own.items()
+        }
+        dr.eval(found)
+        return found
+
+    def to_go(self, key: str) -> float:
+        """Return an upper limit of the distance to the optimum as a share of the extent. Only for `auto`; infinity
+        otherwise.
+        """
+        own = self._own[key]
+        return own.to_go(key) / self.extent(key) if isinstance(own, Newton) else math.inf
+
     def _step_variable(self, key: str) -> None:
         own, variable = self._own[key], self._variables[key]
         gradient = variable.chain(dr.detach(own[key]), self.gradient(key))
@@ -341,6 +400,8 @@ class Optimizer:
             steps = int(np.array(extra[0]).ravel()[0])
             mean = np.array(extra[2], dtype=np.float64).ravel() / max(1 - own.beta_2**steps, 1e-300)
             steepness = (np.sqrt(mean) + own.epsilon) if steps else np.full_like(value, np.inf)
+        elif isinstance(own, Newton):
+            steepness = own.steepness(key)
         else:
             steepness = np.full_like(value, 1 - own.momentum)
         if key not in self._variables:
@@ -350,6 +411,11 @@ class Optimizer:
         result = slope**2 / variable.gain / steepness
         return result if variable.smoother is None else result * variable.smoother.gain
 
+    @property
+    def measures_curvature(self) -> bool:
+        """True for `auto`."""
+        return all(isinstance(own, Newton) for own in self._own.values())
+
     def rate(self, key: str) -> float:
         """Return the learning rate of a parameter, before any schedule."""
         return self._rates[key]
@@ -358,7 +424,7 @@ class Optimizer:
         """Return the root mean square change of the scene's current value in one step at the parameter's learning rate.
         Return None if the step length depends on the gradient.
         """
-        if isinstance(self._own[key], dropt.SGD):
+        if isinstance(self._own[key], (dropt.SGD, Newton)):
             return None
         if key not in self._variables:
             return self._rates[key]

@@ -121,20 +121,21 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
         return Remedy("more samples for it", f"--set target.render.spp={MORE_SAMPLES * measured['target_spp']}")
     moved, rate, iterations = about.get("moved"), about.get("rate"), measured.get("iterations")
-    if about.get("verdict") != MOVING or moved is None or not rate or not iterations:
+    if about.get("verdict") != MOVING or moved is None or not iterations:
         return None
     if (results.get("loss_trend") or {}).get("change") == "rose":
-        if incomplete_records(results.get("incomplete") or ()):
+        if rate is None or incomplete_records(results.get("incomplete") or ()):
             return None
         return Remedy("a lower rate", _rate_setting(measured, rate, 1 / LOWER))
     way = moved + max((abs(value) for value in about.get("to_go") or () if value is not None), default=0.0)
     reach = about.get("reach")
-    if reach and way > REACHED * reach:
+    if reach and rate and way > REACHED * reach:
         emits = (results.get("parameters") or {}).get(key, {}).get("quantity")
         if emits in EMITTED and measured.get("scale") == "none":
             return Remedy("scale: auto", "--set optimizer.scale=auto")
         return Remedy("a higher rate", _rate_setting(measured, rate, max(2 * way / reach, 2.0)))
-    if (results.get("loss_trend") or {}).get("late") == "flat":  # more of the same steps would not help
+    # More of the same steps would not help, or the run would end again at once.
+    if (results.get("loss_trend") or {}).get("late") == "flat" or (rate is None and results.get("stopped")):
         return Remedy("a new run from here", "initial: {run: RUN} for each parameter")
     longer = min(max(way / moved if moved else MOST_LONGER, LEAST_LONGER), MOST_LONGER)
     return Remedy("more iterations", f"--set run.iterations={int(float(f'{longer * iterations:.2g}'))}")

@@ -76,6 +76,8 @@ class OpenedRun:
         stopped = iterations > self.iteration and self.stored.read(State).stopped
         more = f"run.{'max_seconds' if stopped else 'iterations'}{equals}NUMBER"
         done = f"{self.iteration} of {iterations} iterations"
+        if stopped and self.config.run.max_seconds is None:
+            return f"{self.folder.path}: is finished, after {done}: {stopped}"
         return f"{self.folder.path}: is finished, after {done}; {option} {more} continues it"
 
     def begin(self, variant: str, say: Say, warn: Say) -> PreparedRun:

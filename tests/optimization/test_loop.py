@@ -107,11 +107,12 @@ def test_each_view_and_iteration_has_its_own_seed(tmp_path, steps):
     assert {call.adjoint for call in steps.calls} == {"independent"}  # 3 samples do not divide into four batches
 
 
-def test_equal_states_have_equal_successors(tmp_path, steps):
+@pytest.mark.parametrize("kind", ["adam", "auto"])
+def test_equal_states_have_equal_successors(tmp_path, steps, kind):
     """A step depends only on its state. An earlier state can be restored, and a step leaves its input state
     unchanged.
     """
-    sets = ["optimizer.type=adam"]
+    sets = [f"optimizer={{type: {kind}}}"]
     problem = steps.problem = make_problem(tmp_path, sets=sets, keys=("albedo", "other"))
     begun = standing(problem)
     second, _ = loop.step(problem, loop.step(problem, begun)[0])

@@ -59,7 +59,7 @@ def descend(optimizer, gradient=lambda p: 2 * (p - TARGET)):
 
 
 def test_every_optimiser_has_a_reference():
-    assert {case[0] for case in CASES} == set(OPTIMIZERS)
+    assert {case[0] for case in CASES} == set(OPTIMIZERS) - {"auto"}  # in test_newton.py
 
 
 @pytest.mark.parametrize(("type", "options", "reference"), CASES)

@@ -208,6 +208,15 @@ def test_scaling_memory_and_run_are_tables(tmp_path):
     assert "None" not in everything
 
 
+def test_a_run_that_ended_early_says_why(tmp_path):
+    folder = make_run(tmp_path / "lamp")
+    assert not [row for row in page_of(folder).cells["Run"] if row and row[0] == "ended early"]
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["results"]["stopped"] = "the time is up, after 3 s of iterations"
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert page_of(folder).row("Run", "ended early")[1] == "the time is up, after 3 s of iterations"
+
+
 def test_paths_and_their_sampling_are_reported(tmp_path):
     """Decisions on `auto` settings appear in the order in which they are made."""
     why = "camera paths have 1.5 times the efficiency here (1.2 to 1.9)"

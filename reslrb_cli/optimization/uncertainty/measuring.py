@@ -149,7 +149,9 @@ class Certainty:
         reach = None if step is None else step * float(sum(self.rates))
         kept = own.touched & (True if own.seen is None else own.seen)
         moved = rms((own.value - own.start)[kept]) if kept.any() else 0.0
-        return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key))
+        return replace(
+            about, moved=moved, reach=reach, rate=None if optimizer.measures_curvature else optimizer.rate(key)
+        )
 
     def scale(self, key: str) -> float:
         """Return a parameter's scale, in the parameter's unit.

@@ -1,0 +1,226 @@
+"""Steps from measured curvature (`optimizer: auto`)."""
+
+from __future__ import annotations
+
+import itertools
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.tiny import manifest
+from optimization.toy import make_problem
+from runs.going_on import begin_alone, optimize
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization import loop
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.newton import OF_LARGE, OF_SMALL
+from reslrb_cli.optimization.optimizers import Optimizer, make_transform
+from reslrb_cli.optimization.state import standing
+
+AUTO = "optimizer={type: auto}"
+#: The loss sum of a_i / 2 (p_i - b_i)^2, for a parameter of many entries and one of few.
+MANY = np.array([3.0, 0.5, 20.0, 1.0, 8.0, 2.0]), np.array([0.9, 0.1, 0.4, 0.7, 0.2, 0.6])
+FEW = np.array([5.0, 5.0]), np.array([0.2, 0.9])
+
+
+def make(values, bounds=(0.0, 1.0), transforms=None) -> Optimizer:
+    tensors = {key: mi.TensorXf(value.astype(np.float32)) for key, value in values.items()}
+    same = dict.fromkeys(tensors)
+    return Optimizer("auto", 1.0, {}, tensors, same, dict.fromkeys(tensors, bounds), transforms)
+
+
+def pull(optimizer, losses):
+    """Accumulate the gradients of `losses` at the current values, and return them."""
+    found = {}
+    for key, (curvature, best) in losses.items():
+        optimizer.clear_gradient(key)
+        gradient = curvature * (np.array(optimizer[key], dtype=np.float64) - best)
+        dr.backward(dr.sum(optimizer[key] * mi.TensorXf(gradient.astype(np.float32)), axis=None))
+        found[key] = gradient
+    return found
+
+
+def measure(optimizer, losses, seed=0):
+    with optimizer.displaced(np.random.default_rng(seed)):
+        pull(optimizer, losses)
+
+
+@pytest.mark.parametrize(("loss", "options"), [(MANY, OF_LARGE), (FEW, OF_SMALL)])
+def test_updates_follow_the_formula(loss, options):
+    curvature, best = loss
+    optimizer = make({"p": np.full(best.shape, 0.5)})
+    x, m, s, n = np.full(best.shape, 0.5), 0.0, 0.0, np.zeros(best.shape)
+    for iteration in range(12):
+        g = pull(optimizer, {"p": loss})["p"]
+        if iteration == 0:
+            measure(optimizer, {"p": loss})
+        optimizer.step(1.0)
+        s = 0.9 * s + 0.1 * np.abs(g)
+        h = curvature.mean() if len(best) < 5 else np.sum(curvature * s) / np.sum(s * s) * s
+        n = n + (g * m < 0)
+        m = 0.5 * m + g
+        x = np.clip(x - np.clip(0.4 * m / h, -options[0], options[0]) / (1 + options[1] * n), 0, 1)
+        np.testing.assert_allclose(np.array(optimizer["p"]), x, atol=1e-4)
+    assert n.max() > 0
+
+
+def test_a_measurement_leaves_values_and_gradients_as_they_were():
+    optimizer = make({"many": np.full(6, 0.5), "few": np.array([0.0, 1.0])})  # at the bounds
+    losses = {"many": MANY, "few": FEW}
+    pull(optimizer, losses)
+    before = {key: (np.array(optimizer[key]), np.array(optimizer.gradient(key))) for key in losses}
+    for seed in (0, 1):
+        measure(optimizer, losses, seed)
+        for key, (value, gradient) in before.items():
+            np.testing.assert_array_equal(np.array(optimizer[key]), value)
+            np.testing.assert_array_equal(np.array(optimizer.gradient(key)), gradient)
+            bent = optimizer.moments()[key]["3"]
+            np.testing.assert_allclose(np.array(bent).ravel(), losses[key][0], rtol=1e-3)
+
+
+def test_a_colour_has_one_curvature():
+    colour = mi.Color3f(0.5, 0.4, 0.3)
+    optimizer = Optimizer("auto", 1.0, {}, {"c": colour}, {"c": None}, {"c": (0.0, 1.0)})
+
+    def pull_colour():
+        optimizer.clear_gradient("c")
+        dr.backward(dr.sum(optimizer["c"] * mi.Color3f(2.0, 4.0, 6.0) * (dr.detach(optimizer["c"]) - 0.2)))
+
+    pull_colour()
+    with optimizer.displaced(np.random.default_rng(0)):
+        pull_colour()
+    assert np.array(optimizer.moments()["c"]["3"]).shape == (3, 1)
+    optimizer.step(1.0)
+    h = np.sqrt((4 + 16 + 36) / 3)
+    moved = 0.4 * np.array([2.0, 4.0, 6.0]) * np.array([0.3, 0.2, 0.1]) / h
+    np.testing.assert_allclose(np.array(optimizer["c"]).ravel(), [0.5, 0.4, 0.3] - moved, rtol=1e-3)
+
+
+def test_curvature_of_a_transformed_value_is_that_of_its_variable():
+    """The loss is a quadratic of x = exp(u), far from the minimum. d2L/du2 = a x (2 x - b)."""
+    curvature, best = np.array([2.0]), np.array([10.0])
+    optimizer = make({"p": np.array([30.0])}, (0.0, np.inf), {"p": make_transform("log", (0.0, np.inf))})
+    pull(optimizer, {"p": (curvature, best)})
+    measure(optimizer, {"p": (curvature, best)})
+    assert float(np.array(optimizer.moments()["p"]["3"])[0]) == pytest.approx(2 * 30 * (60 - 10), rel=0.15)
+
+
+def test_where_the_loss_is_not_convex_a_step_goes_downhill():
+    optimizer, loss = make({"p": np.array([0.5])}), (np.array([-4.0]), np.array([0.45]))
+    pull(optimizer, {"p": loss})
+    measure(optimizer, {"p": loss})
+    optimizer.step(1.0)
+    assert float(np.array(optimizer["p"])[0]) > 0.51
+
+
+def test_a_valley_between_two_parameters_does_not_look_like_the_optimum():
+    """The loss bends 20 times more along p + q than along p - q. The optimum is p = 0, q = 1."""
+    optimizer, ends = make({"p": np.array([0.9]), "q": np.array([0.9])}, (-2.0, 2.0)), []
+
+    def pull_both():
+        p, q = (float(np.array(optimizer[key])[0]) for key in ("p", "q"))
+        both, apart = 20 * (p + q - 1.0), 1.0 * (p - q + 1.0)
+        for key, gradient in (("p", both + apart), ("q", both - apart)):
+            optimizer.clear_gradient(key)
+            dr.backward(dr.sum(optimizer[key] * gradient, axis=None))
+
+    for iteration in range(40):
+        pull_both()
+        if (iteration + 1) & (iteration + 2) == 0:
+            with optimizer.displaced(np.random.default_rng(iteration)):
+                pull_both()
+        optimizer.step(1.0)
+        if max(optimizer.to_go(key) for key in ("p", "q")) < loop.CLOSE * loop.LEAST_SHARE:
+            ends.append(abs(float(np.array(optimizer["p"])[0])))
+    assert ends
+    assert max(ends) < loop.CLOSE * loop.LEAST_SHARE * 4
+
+
+def test_noise_shortens_the_steps_and_a_steady_pull_does_not():
+    """Both entries have the same gradients but for their signs. The steps of the noisy entry fall with their number."""
+    random, lengths = np.random.default_rng(3), []
+    optimizer = make({"p": np.full(6, 0.5)}, (-100.0, 100.0))
+    loss = {"p": (np.full(6, 1.0), np.zeros(6))}
+    pull(optimizer, loss)
+    measure(optimizer, loss)
+    for _ in range(60):
+        before = np.array(optimizer["p"], dtype=np.float64)
+        gradient = np.where(np.arange(6) < 3, random.choice([-1.0, 1.0], size=6), 1.0)
+        optimizer.clear_gradient("p")
+        dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(gradient.astype(np.float32)), axis=None))
+        optimizer.step(1.0)
+        lengths.append(np.abs(np.array(optimizer["p"]) - before))
+    first, last = (np.mean(part, axis=0) for part in (lengths[:10], lengths[-10:]))
+    assert last[:3].max() < 0.25 * first[:3].min()
+    assert last[3:].min() > 0.9 * first[3:].max()
+
+
+def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):
+    problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=500"])
+    *_, (state, record) = loop.iterate(problem, standing(problem))
+    assert loop.LEAST_ITERATIONS <= state.iteration < 40
+    assert state.stopped == "every parameter is within 2.5 % of the optimum"
+    assert np.abs(np.array(problem.optimizer["albedo"]) - 0.8).max() < 0.02
+    assert record.lr == 1
+
+
+def test_a_run_whose_gradients_are_noise_does_not_end_early(tmp_path, steps):
+    """Each gradient has a random factor between -2 and 2, and the value stays far from the optimum."""
+    random = np.random.default_rng(1)
+    steps.spoil = lambda call, key: float(random.choice([-2.0, 2.0]))
+    problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=60"])
+    *_, (state, _) = loop.iterate(problem, standing(problem))
+    assert (state.iteration, state.stopped) == (60, "")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_measurements_that_are_not_finite_change_nothing(tmp_path, steps, bad):
+    """The calls 8 and 9 are the iteration 6 and its measurement."""
+    steps.spoil = lambda call, key: bad if call in (8, 9) else 1.0
+    problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=30"])
+    bent = []
+    for _ in loop.optimize(problem):
+        assert np.isfinite(np.array(problem.optimizer["albedo"])).all()
+        bent.append(np.array(problem.optimizer.moments()["albedo"]["3"]))
+    np.testing.assert_array_equal(bent[5], bent[6])
+    assert np.abs(np.array(problem.optimizer["albedo"]) - 0.8).max() < 0.02
+
+
+def test_a_measurement_has_the_samples_of_its_step(tmp_path, steps):
+    problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=7"])
+    list(loop.optimize(problem))
+    seeds = [call.seed for call in steps.calls]
+    assert len(seeds) == 7 + 3  # iterations 0, 2 and 6 measure
+    assert [a == b for a, b in itertools.pairwise(seeds)].count(True) == 3
+
+
+def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
+    begin_alone(tmp_path, monkeypatch)
+    for sets, where in (
+        (["optimizer={type: auto, learning_rate: 0.1}"], "optimizer.learning_rate"),
+        (["optimizer={type: auto, schedule: cosine}"], "optimizer.schedule"),
+        ([AUTO, "parameters[0].learning_rate=0.1"], "learning_rate"),
+        ([AUTO, "parameters[0].precondition=0.1"], "precondition"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            load(tmp_path / "tiny.yaml", sets)
+        assert where in str(error.value)
+    motion = "parameters=[{motion: {of: wall, free: [x]}}]"
+    with pytest.raises(ConfigError, match="auto has no steps for what moves"):
+        assemble(load(tmp_path / "tiny.yaml", [AUTO, motion]))
+    with pytest.raises(ConfigError, match="auto has no steps for an unknown exposure"):
+        assemble(load(tmp_path / "tiny.yaml", [AUTO, "target.exposure=auto"]))
+
+
+def test_a_finished_run_says_why_it_ended(llvm, tmp_path, monkeypatch, capsys):
+    begin_alone(tmp_path, monkeypatch)
+    monkeypatch.setattr(loop, "CLOSE", 10.0)
+    sets = ("--set", AUTO, "--set", "run.iterations=40", "--set", "run.certainty=false", "--set", "run.measuring=0")
+    assert optimize("tiny.yaml", *sets) == 0
+    assert "stopped after 21 iterations: every parameter is within" in "".join(capsys.readouterr())
+    assert manifest("runs/tiny")["results"]["stopped"].startswith("every parameter is within")
+    assert optimize("--resume", "runs/tiny", "--set", "run.iterations=50") == 0
+    assert "is finished, after 21 of 50 iterations: every parameter is within" in "".join(capsys.readouterr())
