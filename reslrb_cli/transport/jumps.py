@@ -40,7 +40,7 @@ LINES, DIRECTION = 0xC4A1, 0x57E
 
 
 @dataclass
-class Line:
+class ScanLine:
     """Line in a cell of the plane: places `u` + `along` t for t in [0, 1].
 
     `across` is perpendicular to `along`. `place` is a random number, and `chance` the probability of the cell.
@@ -57,7 +57,7 @@ class Line:
         return self.u + self.along * t
 
 
-def random_lines(chains: Chains, weights: mi.Float, number: mi.UInt32, count: mi.UInt32) -> Line:
+def random_lines(chains: Chains, weights: mi.Float, number: mi.UInt32, count: mi.UInt32) -> ScanLine:
     """Return line `number` of `count` lines. Half of the lines run along each axis.
 
     `weights` are the cumulative weights of the cells.
@@ -72,7 +72,7 @@ def random_lines(chains: Chains, weights: mi.Float, number: mi.UInt32, count: mi
     cell, chance = pick(weights, width * height, position)
     along = dr.select(axis < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
     across = mi.Vector2f(along.y, along.x)
-    return Line(mi.Point2f(cell % width, cell // width) + across * y, along, across, place, chance)
+    return ScanLine(mi.Point2f(cell % width, cell // width) + across * y, along, across, place, chance)
 
 
 def pick(weights: mi.Float, count: int, number: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -85,7 +85,7 @@ def pick(weights: mi.Float, count: int, number: mi.Float) -> tuple[mi.UInt32, mi
 
 
 def _search(
-    chains: Chains, line: Line, inner: mi.Float, outer: mi.Float, code: mi.UInt32, active: mi.Bool
+    chains: Chains, line: ScanLine, inner: mi.Float, outer: mi.Float, code: mi.UInt32, active: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
     """Return both ends of a small interval between `inner` and `outer` in which the chain's code changes from `code`.
     If the code at `outer` is `code`, return `outer` twice.
@@ -127,7 +127,7 @@ class Interval:
     differs: mi.Bool
 
 
-def random_interval(chains: Chains, line: Line) -> Interval:
+def random_interval(chains: Chains, line: ScanLine) -> Interval:
     """Return a random interval of the line."""
     begin = (1 + INTERVAL) * line.place - INTERVAL
     forward = mi.sample_tea_32(chains.key, mi.UInt32(DIRECTION))[0] % 2 == 0
@@ -137,7 +137,7 @@ def random_interval(chains: Chains, line: Line) -> Interval:
     return Interval(begin, step, first.code, differs)
 
 
-def _find_jump(chains: Chains, line: Line) -> Jump:
+def _find_jump(chains: Chains, line: ScanLine) -> Jump:
     """Return the first jump from the begin of a random interval of the line."""
     interval = random_interval(chains, line)
     begin, step, before, active = interval.begin, interval.step, interval.before, interval.differs
@@ -285,7 +285,7 @@ def _normal(chains: Chains, edge: EdgePoint, outwards: mi.Vector3f, active: mi.B
     return dr.mulsign(n, dr.dot(n, outwards))
 
 
-def sample_edge(chains: Chains, line: Line) -> ChainEdge:
+def sample_edge(chains: Chains, line: ScanLine) -> ChainEdge:
     """Return the edge of a jump in a random interval of the line."""
     jump = _find_jump(chains, line)
     pair = _compare(chains, line.at(jump.inner), line.at(jump.outer), jump.active)
