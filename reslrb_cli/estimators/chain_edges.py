@@ -42,8 +42,9 @@ from reslrb_cli.transport.walk import Vertex, find_vertex, walk
 
 #: Rays per cell that look for specular surfaces, and for lamps behind them.
 PROBES = 16
-#: Paths of a step per tested interval, and per sampled edge.
-PATHS_PER_INTERVAL, PATHS_PER_EDGE = 1, 16
+#: Tested intervals per sampled edge. A step tests as many intervals as it has paths, but at most about MOST_INTERVALS,
+#: because it stores one number for each.
+INTERVALS_PER_EDGE, MOST_INTERVALS = 16, 1 << 20
 #: Streams of random numbers, mixed into the seed.
 CHAIN_EDGES, CELLS, SIDE = 0xED6E4, 0xED6E5, 0x0E4
 
@@ -53,7 +54,7 @@ def has_edges_behind_chains(plan: Plan) -> bool:
     return bool(plan.needs.has_delta_lobes) and (plan.camera or not plan.moving_emission)
 
 
-def _samples_of(samples: Samples, stream: int, each: int) -> Samples:
+def _samples_of(samples: Samples, stream: int, each: int = 1) -> Samples:
     """Return samples of edges for the paths `samples`, one for `each` paths."""
     edges = edge_samples(samples, stream, each)
     if samples.plan.camera:
@@ -91,11 +92,16 @@ def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Spectrum:
     return showing(dr.select(edge.here.hides, -0.5 * lost, dr.select(over, found, -found))) * p.scale
 
 
-def choose_intervals(own: Samples) -> list[mi.Float]:
-    """Return cumulative sampling weights of the cells of chains that begin at the sensor or at lamps, and of random
-    intervals in which a chain changes.
+def choose_intervals(own: Samples, passes: int) -> list[mi.Float]:
+    """Return cumulative sampling weights of the cells of chains that begin at the sensor or at lamps. Also return
+    cumulative weights of random intervals, which are 1 if the chain changes within the interval. Without mirrors and
+    glass, the result is empty.
+
+    `own` are the samples of one of several `passes`.
     """
-    samples = _samples_of(own, CELLS, 1)
+    if not has_edges_behind_chains(own.plan):
+        return []
+    samples = _samples_of(own, CELLS)
     width, height = _chains(samples, mi.UInt32(0)).cells
     cell = dr.arange(mi.UInt32, width * height)
     samples = replace(samples, width=width * height)
@@ -111,7 +117,7 @@ def choose_intervals(own: Samples) -> list[mi.Float]:
     cells = around + lit * dr.select(total > 0, total / dr.maximum(dr.sum(lit), 1e-30), 0)
     cells = dr.cumsum(cells + dr.select(total > 0, 0, mi.Float(1)))
     dr.make_opaque(cells)
-    samples = _samples_of(own, CHAIN_EDGES, PATHS_PER_INTERVAL)
+    samples = _samples_of(own, CHAIN_EDGES, -(-own.width * passes // MOST_INTERVALS))
     number = dr.arange(mi.UInt32, samples.width)
     chains = _chains(samples, number)
     line = random_lines(chains, cells, number, dr.opaque(mi.UInt32, samples.width))
@@ -185,15 +191,16 @@ def _stack_of(p: Pass, chains: Chains, edge: ChainEdge, ring: Ring) -> StackStat
 
 def differentiate_edges_behind_chains(own: Pass) -> None:
     """Add the derivatives of the edges behind specular chains. dL/dI must be known."""
-    candidates, samples = (_samples_of(own.samples, CHAIN_EDGES, each) for each in (PATHS_PER_INTERVAL, PATHS_PER_EDGE))
-    assert samples.edges is not None
-    cells, found = samples.edges.chains
+    assert own.samples.edges is not None
+    cells, found = own.samples.edges.chains
+    intervals = dr.width(found)
+    samples = _samples_of(own.samples, CHAIN_EDGES, INTERVALS_PER_EDGE * max(own.samples.width // intervals, 1))
     p = Pass(samples, None, own.adjoint)
     lane, ring = dr.arange(mi.UInt32, samples.width), Ring(MOST_VERTICES + 1, False)
     pairs = dr.opaque(mi.Float, (samples.width + 1) // 2)  # two lanes share an edge
     offset = mi.Float(mi.sample_tea_32(samples.seed, mi.UInt32(SIDE))[0] >> 8) * 2.0**-24
-    number, chance = pick(found, candidates.width, (mi.Float(lane // 2) + offset) / pairs)
-    count = dr.opaque(mi.UInt32, candidates.width)
+    number, chance = pick(found, intervals, (mi.Float(lane // 2) + offset) / pairs)
+    count = dr.opaque(mi.UInt32, intervals)
     chains = _chains(samples, number)
     edge = sample_edge(chains, random_lines(chains, cells, number, count))
     edge.weight *= dr.select(chance > 0, dr.rcp(chance * mi.Float(count)), 0)

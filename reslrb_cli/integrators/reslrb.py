@@ -159,10 +159,12 @@ class LightTracer(StepIntegrator):
             return parts
         now = self.preparation.edges(plan).now()
         tables = [weigh_edges(side, now) for side in parts[0].sides()]
-        for side, edges in zip(parts[0].sides(), tables, strict=True):
-            if has_edges_behind_chains(side.plan):
-                edges.chains = choose_intervals(side)
-        return [part.with_edges(*tables) for part in parts]
+
+        def with_edges(part: Samples) -> Samples:
+            chains = [choose_intervals(side, len(parts)) for side in part.sides()]
+            return part.with_edges(*(replace(table, chains=own) for table, own in zip(tables, chains, strict=True)))
+
+        return [with_edges(part) for part in parts]
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
         """Return the share of light paths. Also return the emitters' densities if paths from both sides are

@@ -69,6 +69,8 @@ SIMILAR = (
     "box-moving_spot-2",
     "flat-area-2",  # no planted fault needs these two: those of edges between surfaces show in two-area-3 as well
     "box-indirect-3",
+    "reflected-area-3",  # the slab has edges and shadows of both kinds of chains
+    "mirror-constant-3",
 )
 
 
