@@ -31,6 +31,7 @@ from reslrb_cli.scene.needs import (
     camera_finds_all,
     camera_finds_nothing,
     check_paths,
+    light_finds_all,
     paths_obstacle,
     scaled_emitter,
     scene_needs,
@@ -183,9 +184,12 @@ def paths_of(
     if camera_finds_nothing(scene) or scaled_emitter(scene) is not None:
         return "light"
     looked = [scene.sensors()[sensor] for sensor in sensors]
-    if moves and not camera_finds_all(scene, integrator.max_depth, gloss=True):
-        return "light"
-    for kind in ("camera",) if moves else ("both", "camera"):
+    kinds = ["both", "camera"]
+    if moves:
+        kinds = ["camera"]
+        if not camera_finds_all(scene, integrator.max_depth, gloss=True):
+            kinds = [] if light_finds_all(scene, looked, integrator.hide_emitters) else ["both"]
+    for kind in kinds:
         if all(paths_obstacle(scene, sensor, kind) is None for sensor in looked):
             return kind
     return "light"

@@ -263,6 +263,15 @@ def test_paths_of_runs_that_move_shapes(name: str, settings: list[str], paths: s
     assert (problem.paths, problem.moves, problem.integrator.paths) == (paths, Moves.SHAPES, paths)
 
 
+def test_runs_that_see_moving_glass_use_both_kinds_of_paths(tmp_path: Path):
+    text = (ROOT / "scenes" / "moved_box" / "scene.xml").read_text()
+    box = text.index('id="box"')
+    begin, end = text.index("<bsdf", box), text.index("</bsdf>", box) + len("</bsdf>")
+    (tmp_path / "scene.xml").write_text(f'{text[:begin]}<bsdf type="dielectric"/>{text[end:]}')
+    words = [f"scene.file={tmp_path / 'scene.xml'}", "integrator.max_depth=6", "target={render: {}}"]
+    assert assemble_scene(load(ROOT / "configs" / "moved_box.yaml", words)).paths == "both"
+
+
 def test_moving_lamps_use_light_paths():
     words = ["parameters=[{motion: {of: lamp}}]", "integrator.paths=both"]
     problem = assemble_scene(load(ROOT / "configs" / "moved_box.yaml", [*words, "target={render: {}}"]))
