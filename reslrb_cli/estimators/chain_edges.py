@@ -67,7 +67,7 @@ def _chains(samples: Samples, number: mi.UInt32) -> Chains:
     return SensorChains(samples, key) if samples.plan.camera else LampChains(samples, key)
 
 
-def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Spectrum:
+def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Float:
     """Return <delta, g L_p> or W_p in the lanes `over`. In other lanes, return minus the value for x.
 
     At the edge of a shadow, return minus half of the value for x in all lanes.
