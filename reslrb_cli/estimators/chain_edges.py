@@ -28,16 +28,18 @@ import mitsuba as mi
 from reslrb_cli.estimators.attached import Adjoint
 from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.camera import Radiance
-from reslrb_cli.estimators.edges import AROUND, MAY_LACK, Contribution, edge_samples, for_camera, moved_by
+from reslrb_cli.estimators.edges import AROUND, MAY_LACK, Contribution, edge_samples, for_camera, moved_by, ray_offset
 from reslrb_cli.estimators.stack import Ring, StackState, pop
 from reslrb_cli.transport.bsdf import EventNumbers, evaluate, scatter
 from reslrb_cli.transport.camera import FilmRay, camera_walk
 from reslrb_cli.transport.chains import MOST_VERTICES, Chain, Chains, LampChains, SensorChains
+from reslrb_cli.transport.edges import pick
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.factors import Product, showing
-from reslrb_cli.transport.jumps import ChainEdge, pick, random_interval, random_lines, sample_edge
+from reslrb_cli.transport.jumps import ChainEdge, random_interval, random_lines, sample_edge
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.sobol import unit
 from reslrb_cli.transport.walk import Vertex, find_vertex, walk
 
 #: Rays per cell that look for specular surfaces, and for lamps behind them.
@@ -73,7 +75,7 @@ def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Float:
     At the edge of a shadow, return minus half of the value for x in all lanes.
     """
     samples, camera = p.samples, p.plan.camera
-    continues, shadow = edge.active & ~edge.here.hides, edge.active & edge.here.hides
+    continues, shadow = edge.active & ~edge.shadow, edge.active & edge.shadow
     ray, depth = dr.select(over, edge.over.ray, edge.past.ray), edge.over.count + 1
     x = edge.past.vertex(shadow)
     target = edge.here.target
@@ -89,15 +91,12 @@ def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Float:
         emission = Emission(ray, edge.weight, dr.zeros(mi.EmitterPtr))
         found = walk(samples, Contribution(p), continues, emission, depth)[0]
         lost = dr.dot(p.delta(target.u, shadow), lost)
-    return showing(dr.select(edge.here.hides, -0.5 * lost, dr.select(over, found, -found))) * p.scale
+    return showing(dr.select(edge.shadow, -0.5 * lost, dr.select(over, found, -found))) * p.scale
 
 
-def choose_intervals(own: Samples, passes: int) -> list[mi.Float]:
-    """Return cumulative sampling weights of the cells of chains that begin at the sensor or at lamps. Also return
-    cumulative weights of random intervals, which are 1 if the chain changes within the interval. Without mirrors and
-    glass, the result is empty.
-
-    `own` are the samples of one of several `passes`.
+def weigh_cells(own: Samples) -> list[mi.Float]:
+    """Return cumulative sampling weights of the cells of chains that begin at the sensor or at lamps. Without mirrors
+    and glass, the result is empty.
     """
     if not has_edges_behind_chains(own.plan):
         return []
@@ -117,13 +116,22 @@ def choose_intervals(own: Samples, passes: int) -> list[mi.Float]:
     cells = around + lit * dr.select(total > 0, total / dr.maximum(dr.sum(lit), 1e-30), 0)
     cells = dr.cumsum(cells + dr.select(total > 0, 0, mi.Float(1)))
     dr.make_opaque(cells)
+    return [cells]
+
+
+def with_intervals(own: Samples, cells: list[mi.Float], passes: int) -> list[mi.Float]:
+    """Return the weights of `weigh_cells`, and cumulative weights of random intervals. A weight is 1 if the chain
+    changes within the interval. `own` are the samples of one of several `passes`.
+    """
+    if not cells:
+        return []
     samples = _samples_of(own, CHAIN_EDGES, -(-own.width * passes // MOST_INTERVALS))
     number = dr.arange(mi.UInt32, samples.width)
     chains = _chains(samples, number)
-    line = random_lines(chains, cells, number, dr.opaque(mi.UInt32, samples.width))
+    line = random_lines(chains, cells[0], number, dr.opaque(mi.UInt32, samples.width))
     found = dr.cumsum(dr.select(random_interval(chains, line).differs, mi.Float(1), 0))
     dr.make_opaque(found)
-    return [cells, found]
+    return [*cells, found]
 
 
 def _behind_chains(samples: Samples, cell: mi.UInt32) -> tuple[mi.Float, mi.Float]:
@@ -152,6 +160,11 @@ class SpecularFrame:
 
     point: SurfacePoint
     sample: mi.Float
+
+    @staticmethod
+    def blank(plan: Plan) -> SpecularFrame:
+        """Return a frame of zeros."""
+        return SpecularFrame(SurfacePoint.blank(plan), mi.Float(0))
 
     def differentiate(self, p: Pass, adjoint: Adjoint) -> Adjoint:
         """Add the derivatives of the vertex. Takes the adjoint of the outgoing ray, and returns that of the ray that
@@ -184,8 +197,8 @@ def _stack_of(p: Pass, chains: Chains, edge: ChainEdge, ring: Ring) -> StackStat
         chain = chains.onward(chain, hit, scattering, passes, product)
         return passes & (chain.count < edge.over.count), chain, stack
 
-    form = SpecularFrame(SurfacePoint.blank(p.plan), mi.Float(0))
-    state = edge.active, chains.start(edge.u, edge.active), StackState.begin(form, ring, mi.Float(1))
+    stack = StackState.begin(SpecularFrame.blank(p.plan), ring, mi.Float(1))
+    state = edge.active, chains.start(edge.u, edge.active), stack
     return dr.while_loop(state, lambda active, *_: active, body, label="chain to an edge")[2]
 
 
@@ -198,21 +211,20 @@ def differentiate_edges_behind_chains(own: Pass) -> None:
     p = Pass(samples, None, own.adjoint)
     lane, ring = dr.arange(mi.UInt32, samples.width), Ring(MOST_VERTICES + 1, False)
     pairs = dr.opaque(mi.Float, (samples.width + 1) // 2)  # two lanes share an edge
-    offset = mi.Float(mi.sample_tea_32(samples.seed, mi.UInt32(SIDE))[0] >> 8) * 2.0**-24
-    number, chance = pick(found, intervals, (mi.Float(lane // 2) + offset) / pairs)
+    offset = unit(mi.sample_tea_32(samples.seed, mi.UInt32(SIDE))[0])
+    number, chance = pick(found, (mi.Float(lane // 2) + offset) / pairs)
     count = dr.opaque(mi.UInt32, intervals)
     chains = _chains(samples, number)
     edge = sample_edge(chains, random_lines(chains, cells, number, count))
     edge.weight *= dr.select(chance > 0, dr.rcp(chance * mi.Float(count)), 0)
-    shadow = edge.here.hides
+    shadow = edge.shadow
     # If the edge touches the surface in its shadow, the chain itself meets it.
-    touches = shadow & (edge.here.pi.t < 2 * AROUND * mi.math.RayEpsilon * (1 + dr.max(dr.abs(edge.here.p))))
+    touches = shadow & (edge.here.pi.t < 2 * AROUND * ray_offset(edge.here.p))
     size = dr.select(edge.active & ~touches, 2 * _light(p, edge, lane % 2 == 0), 0)
     active = size != 0
     at_p = size * edge.n
     with dr.resume_grad(), dr.isolate_grad():
         dr.backward_from(moved_by(edge.here.pi, edge.here.ray, at_p, active), flags=MAY_LACK)
-    behind = Pass(replace(own.samples, width=samples.width), None, own.adjoint)
     end, ray = active & shadow, mi.Ray3f(edge.over.ray)
     with dr.resume_grad():
         ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
@@ -225,6 +237,5 @@ def differentiate_edges_behind_chains(own: Pass) -> None:
         dr.select(active, dr.select(shadow, direction, -at_p * edge.over.pi.t), 0),
         mi.Spectrum(0),
     )
-    form = SpecularFrame(SurfacePoint.blank(own.plan), mi.Float(0))
-    stack = _stack_of(own, chains, edge, ring)
-    pop(behind, form, ring, stack, dr.select(active, edge.over.count, 0), mi.UInt32(0), adjoint)
+    vertices = dr.select(active, edge.over.count, 0)
+    pop(own, SpecularFrame.blank(own.plan), ring, _stack_of(own, chains, edge, ring), vertices, mi.UInt32(0), adjoint)

@@ -132,9 +132,9 @@ class Beside:
     active: mi.Bool
 
 
-def ray_offset(outline: Outline) -> mi.Float:
-    """Return Mitsuba's ray offset at the outline."""
-    return mi.math.RayEpsilon * (1 + dr.max(dr.abs(outline.p)))
+def ray_offset(p: mi.Point3f) -> mi.Float:
+    """Return Mitsuba's ray offset at `p`."""
+    return mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
 
 
 def both_sides(
@@ -146,7 +146,7 @@ def both_sides(
     all active lanes.
     """
     scene, view, d = samples.scene, outline.view, -outline.view.to_y
-    offset = ray_offset(outline)
+    offset = ray_offset(outline.p)
     back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset)
     active = outline.active & (back > 0)
 
@@ -171,7 +171,7 @@ def both_sides(
 
 def touches_behind(outline: Outline, beside: Beside) -> mi.Bool:
     """True if the shape touches the surface behind it."""
-    return beside.x.is_valid() & (beside.x.t < 2 * AROUND * ray_offset(outline))
+    return beside.x.is_valid() & (beside.x.t < 2 * AROUND * ray_offset(outline.p))
 
 
 def _shares_edges(samples: Samples) -> bool:
@@ -183,7 +183,7 @@ def share_of(samples: Samples, outline: Outline, beside: Beside) -> mi.Float:
     """Return 1/2 where the shape touches another shape that also ends there, otherwise 1."""
     if not _shares_edges(samples):
         return mi.Float(1)
-    x, offset = beside.x, ray_offset(outline)
+    x, offset = beside.x, ray_offset(outline.p)
     touches = beside.active & touches_behind(outline, beside) & (x.shape != outline.shape)
     n, n_x = (
         mi.Vector3f(hit.compute_surface_interaction(ray, mi.RayFlags.All, touches).n)
@@ -362,7 +362,7 @@ def _carried_to(
     light's ray. It also slides along the ray, so that it stays in the surface.
     """
     towards = light.towards
-    offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
+    offset = ray_offset(p)
     cos = dr.dot(n, towards)
     adjoint = adjoint - n * dr.select(cos != 0, dr.dot(adjoint, towards) / cos, 0)
     return _carried(samples, light.emitter, mi.Ray3f(p + dr.mulsign(n, cos) * offset, towards), adjoint, active)
@@ -497,7 +497,7 @@ def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
     """Return a random outline for each lane, seen from a random direction."""
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
-    offset = ray_offset(outline)
+    offset = ray_offset(outline.p)
     back = mi.Ray3f(outline.p + outline.normal * offset, outline.view.to_y)
     y = samples.scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
     outline.active = outline.active & y.is_valid()

@@ -22,9 +22,10 @@ from reslrb_cli.estimators.base import Estimator, Pass
 from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths
 from reslrb_cli.estimators.camera_edges import differentiate_edges_of_camera_paths
 from reslrb_cli.estimators.chain_edges import (
-    choose_intervals,
     differentiate_edges_behind_chains,
     has_edges_behind_chains,
+    weigh_cells,
+    with_intervals,
 )
 from reslrb_cli.estimators.edges import differentiate_edges
 from reslrb_cli.guiding.collect import hear
@@ -158,11 +159,12 @@ class LightTracer(StepIntegrator):
         if not plan.has_edges or purpose is Purpose.IMAGE:
             return parts
         now = self.preparation.edges(plan).now()
-        tables = [weigh_edges(side, now) for side in parts[0].sides()]
+        tables = [replace(weigh_edges(side, now), chains=weigh_cells(side)) for side in parts[0].sides()]
 
         def with_edges(part: Samples) -> Samples:
-            chains = [choose_intervals(side, len(parts)) for side in part.sides()]
-            return part.with_edges(*(replace(table, chains=own) for table, own in zip(tables, chains, strict=True)))
+            sides = zip(part.sides(), tables, strict=True)
+            own = (replace(table, chains=with_intervals(side, table.chains, len(parts))) for side, table in sides)
+            return part.with_edges(*own)
 
         return [with_edges(part) for part in parts]
 

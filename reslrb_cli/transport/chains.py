@@ -21,6 +21,7 @@ from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect
 from reslrb_cli.transport.emission import emission_of
 from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.sobol import unit
 
 #: Probability of reflection at a vertex that also refracts or scatters.
 REFLECTS = 0.3
@@ -32,11 +33,6 @@ LAMP_CELLS = 64
 EVENTS, APERTURE, TARGET, PLACE = 0x5E1, 0xA9E, 0x1A4, 0x9C3
 
 _WITH_NORMALS = mi.RayFlags.All | mi.RayFlags.dNSdUV
-
-
-def unit(word: mi.UInt32) -> mi.Float:
-    """Return a random number in [0, 1)."""
-    return mi.Float(word >> 8) * 2.0**-24
 
 
 def vertex_at(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> Hit:

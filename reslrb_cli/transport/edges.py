@@ -18,6 +18,7 @@ from reslrb_cli.scene.edges import SEGMENT, SPHERE, TUBE, EdgeTable, edge_kinds,
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect
 from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.sobol import evenly
 
 #: Sampling weight of an edge that no probe sees as an outline, relative to an outline of the same length.
 UNLIKELY = 0.02
@@ -116,14 +117,20 @@ class Chances:
     def spread(numbers: mi.PCG32, seed: mi.UInt32, index: mi.UInt32, count: mi.UInt32) -> Chances:
         """Return the numbers of points with an `index` below `count`. `count` is opaque.
 
-        They are Hammersley points and a Kronecker sequence (Roberts 2018), with a random offset for each seed.
+        The numbers of the edge are in ascending order, and the others those of `evenly`.
         """
         edge = (mi.Float(index) + numbers.next_float32()) / mi.Float(count)
-        first, second = mi.sample_tea_32(seed, mi.UInt32(SPREAD_STREAM))
-        third, _ = mi.sample_tea_32(seed, mi.UInt32(SPREAD_STREAM + 1))
-        words = dr.brev(index) + first, index * 3242174889 + second, index * 2447445414 + third
-        place, x, y = (mi.Float(word >> 8) * 2.0**-24 for word in words)
-        return Chances(dr.minimum(edge, dr.one_minus_epsilon(mi.Float)), place, mi.Point2f(x, y))
+        place, x, y = evenly(seed, SPREAD_STREAM, index)
+        return Chances(edge, place, mi.Point2f(x, y))
+
+
+def pick(weights: mi.Float, number: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """Return the entry of cumulative `weights` that a random `number` selects, and its probability."""
+    last = dr.width(weights) - 1
+    number, total = dr.minimum(number, dr.one_minus_epsilon(mi.Float)), dr.gather(mi.Float, weights, last)
+    entry = mi.UInt32(dr.binary_search(0, last, lambda i: dr.gather(mi.Float, weights, i) <= number * total))
+    below = dr.select(entry > 0, dr.gather(mi.Float, weights, dr.maximum(entry, 1) - 1), 0)
+    return entry, (dr.gather(mi.Float, weights, entry) - below) / total
 
 
 def sample_outline(
@@ -138,12 +145,7 @@ def sample_outline(
     table, only_hide = samples.edges, _occluders_only_hide(samples)
     kinds = edge_kinds(samples.plan.edged + (() if creases and only_hide else samples.plan.occluders))
     assert table is not None
-    row_number, place = chances.edge, chances.place
-    rows = dr.width(weights)
-    total = dr.gather(mi.Float, weights, rows - 1)
-    row = dr.binary_search(0, rows - 1, lambda i: dr.gather(mi.Float, weights, i) <= row_number * total)
-    below = dr.select(row > 0, dr.gather(mi.Float, weights, dr.maximum(row, 1) - 1), 0)
-    probability = (dr.gather(mi.Float, weights, row) - below) / total
+    (row, probability), place = pick(weights, chances.edge), chances.place
     kind = dr.gather(mi.UInt32, table.kind, row)
     a, b = dr.gather(mi.Point3f, table.a, row), dr.gather(mi.Point3f, table.b, row)
     along = b - a

@@ -23,7 +23,9 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.bsdf import Hit
-from reslrb_cli.transport.chains import Chain, Chains, Target, surface_code, unit, vertex_at
+from reslrb_cli.transport.chains import Chain, Chains, Target, surface_code, vertex_at
+from reslrb_cli.transport.edges import pick
+from reslrb_cli.transport.sobol import evenly, unit
 
 #: Length of an interval that is tested for a jump, in cells of the plane.
 INTERVAL = 0.5
@@ -62,26 +64,13 @@ def random_lines(chains: Chains, weights: mi.Float, number: mi.UInt32, count: mi
 
     `weights` are the cumulative weights of the cells.
     """
-    seed, (width, height) = chains.samples.seed, chains.cells
-    first, second = mi.sample_tea_32(seed, mi.UInt32(LINES))
-    third, fourth = mi.sample_tea_32(seed, mi.UInt32(LINES + 1))
-    y, place, axis = (
-        unit(word) for word in (number * 3242174889 + first, number * 2447445414 + second, dr.brev(number) + third)
-    )
-    position = (mi.Float(number) + unit(mi.sample_tea_32(number, fourth)[0])) / mi.Float(count)
-    cell, chance = pick(weights, width * height, position)
+    seed, width = chains.samples.seed, chains.cells[0]
+    axis, y, place = evenly(seed, LINES, number)
+    jitter = unit(mi.sample_tea_32(number, mi.sample_tea_32(seed, mi.UInt32(LINES + 1))[1])[0])
+    cell, chance = pick(weights, (mi.Float(number) + jitter) / mi.Float(count))
     along = dr.select(axis < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
     across = mi.Vector2f(along.y, along.x)
     return ScanLine(mi.Point2f(cell % width, cell // width) + across * y, along, across, place, chance)
-
-
-def pick(weights: mi.Float, count: int, number: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """Return the entry of `count` cumulative `weights` that a random `number` selects, and its probability."""
-    total = dr.gather(mi.Float, weights, count - 1)
-    number = dr.minimum(number, dr.one_minus_epsilon(mi.Float)) * total
-    entry = mi.UInt32(dr.binary_search(0, count - 1, lambda i: dr.gather(mi.Float, weights, i) <= number))
-    below = dr.select(entry > 0, dr.gather(mi.Float, weights, dr.maximum(entry, 1) - 1), 0)
-    return entry, (dr.gather(mi.Float, weights, entry) - below) / total
 
 
 def _search(
@@ -168,14 +157,13 @@ def _find_jump(chains: Chains, line: ScanLine) -> Jump:
 class EdgePoint:
     """Point p of an edge: intersection `pi` of `ray`.
 
-    `end` is the vertex that the chain reaches. In the lanes `hides`, the edge hides the point y of `target`.
+    `end` is the vertex that the chain reaches, and `target` its point y.
     """
 
     ray: mi.Ray3f
     pi: mi.PreliminaryIntersection3f
     end: Hit
     target: Target
-    hides: mi.Bool
 
     @property
     def p(self) -> mi.Point3f:
@@ -187,8 +175,9 @@ class EdgePoint:
 class ChainEdge:
     """Random point of an edge behind a specular chain.
 
-    `over` is the chain that reaches the edge, and `past` the chain that misses it. `here` is p, `n` its normal, and `s`
-    its place between y and x. `weight` (C,) is the throughput divided by |<dq/du, n>| and by the density of the line.
+    `over` is the chain that reaches the edge, and `past` the chain that misses it. `here` is p, and `n` its normal.
+    `weight` (C,) is the throughput divided by |<dq/du, n>| and by the density of the line. In the lanes `shadow`, the
+    edge hides y from x, and p divides the segment from y to x in the ratio `s`.
     """
 
     over: Chain
@@ -197,6 +186,7 @@ class ChainEdge:
     here: EdgePoint
     n: mi.Vector3f
     s: mi.Float
+    shadow: mi.Bool
     weight: mi.Spectrum
     active: mi.Bool
 
@@ -252,7 +242,7 @@ def _edge_point(chains: Chains, chain: Chain, shadow: mi.Bool, active: mi.Bool) 
     to_target = end.si.spawn_ray_to(target.y)
     pi = chains.samples.scene.ray_intersect_preliminary(to_target, coherent=False, active=active & shadow)
     ray = dr.select(shadow, mi.Ray3f(to_target), mi.Ray3f(chain.ray))
-    return EdgePoint(dr.detach(ray), dr.select(shadow, pi, chain.pi), end, target, shadow)
+    return EdgePoint(dr.detach(ray), dr.select(shadow, pi, chain.pi), end, target)
 
 
 def _normal(chains: Chains, edge: EdgePoint, outwards: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
@@ -327,4 +317,4 @@ def sample_edge(chains: Chains, line: ScanLine) -> ChainEdge:
     active &= (slope > 0) & (slope >= dr.abs(dr.dot(n, across)))
     density = jump.places * line.chance * (chains.cells[0] * chains.cells[1] / (2 * (1 + INTERVAL)))
     weight = over.product * dr.select(active, dr.rcp(slope * density), 0)
-    return ChainEdge(over, past, line.at(0.5 * (jump.inner + jump.outer)), here, n, s, weight, active)
+    return ChainEdge(over, past, line.at(0.5 * (jump.inner + jump.outer)), here, n, s, shadow, weight, active)

@@ -125,7 +125,7 @@ class Net:
     def stratified(self, lane: mi.UInt32, jitter: mi.Float) -> mi.Float:
         """Return the first coordinate. `jitter`, in [0, 1), is the position of the coordinate within its interval."""
         within = mi.UInt64(mi.UInt32(jitter * 2.0**24)) * (self.step >> 24)
-        return _float(mi.UInt32((mi.UInt64(lane) * self.step + within) >> 32))
+        return unit(mi.UInt32((mi.UInt64(lane) * self.step + within) >> 32))
 
 
 class Points:
@@ -152,7 +152,7 @@ class Points:
         shift, key = mi.sample_tea_32(self.seed, mi.UInt32(self.used))
         digits = point(self.lane, self.used, self.digits)
         self.used += 1
-        return _float(dr.brev(scrambled(digits, shift, key)))
+        return unit(dr.brev(scrambled(digits, shift, key)))
 
     def next_2d(self, independent: mi.Point2f | None = None, used: tuple[bool, bool] = (True, True)) -> mi.Point2f:
         """Return the next two coordinates. The coordinates replace the random numbers for which `used` is true."""
@@ -160,6 +160,16 @@ class Points:
         return mi.Point2f(*(self.next_1d(u) if used[k] else u for k, u in enumerate((own.x, own.y))))
 
 
-def _float(digits: mi.UInt32) -> mi.Float:
+def unit(digits: mi.UInt32) -> mi.Float:
     """Return a number in [0, 1) from digits. The highest bit is the first digit."""
     return mi.Float(digits >> 8) * 2.0**-24
+
+
+def evenly(seed: mi.UInt32, stream: int, index: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Return three numbers in [0, 1) for each `index`, which are spread evenly over indices.
+
+    They are van der Corput's sequence and a Kronecker sequence (Roberts 2018), with a random offset for each seed.
+    """
+    first, second = mi.sample_tea_32(seed, mi.UInt32(stream))
+    third, _ = mi.sample_tea_32(seed, mi.UInt32(stream + 1))
+    return unit(dr.brev(index) + first), unit(index * 3242174889 + second), unit(index * 2447445414 + third)
