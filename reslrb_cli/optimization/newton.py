@@ -40,7 +40,7 @@ import numpy as np
 
 from reslrb_cli.optimization.nonfinite import flat
 
-#: Step as a share of Newton's, decay of the momentum, and decay of the gradients' size. docs/notes/method.md has
+#: Step as a share of Newton's, decay of the momentum, and decay of the gradients' size. docs/optimizers.md has
 #: measurements.
 GAIN, MOMENTUM, MEMORY = 0.4, 0.5, 0.9
 #: Displacement d of a measurement as a share of the extent, and the weight of the newest measurement.
