@@ -25,7 +25,7 @@ from reslrb_cli.transport.sobol import unit
 
 #: Probability of reflection at a vertex that also refracts or scatters.
 REFLECTS = 0.3
-#: Most specular vertices of a chain.
+#: Largest number of specular vertices of a chain.
 MOST_VERTICES = 8
 #: Cells of the square of a lamp's random numbers, along each axis.
 LAMP_CELLS = 64
@@ -113,7 +113,7 @@ class Chains(ABC):
     @property
     @abstractmethod
     def most(self) -> int:
-        """Most specular vertices of a chain."""
+        """Largest number of specular vertices of a chain."""
 
     def random(self, number: mi.UInt32, stream: int) -> mi.Point2f:
         """Return two random numbers of the chain."""
@@ -181,7 +181,7 @@ class Chains(ABC):
 
 
 class SensorChains(Chains):
-    """Chains that begin at the sensor. The plane is the film, and its cells are pixels."""
+    """Chains from the sensor. The plane is the film, and its cells are pixels."""
 
     @property
     def cells(self) -> tuple[int, int]:

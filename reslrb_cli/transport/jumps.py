@@ -29,7 +29,7 @@ from reslrb_cli.transport.sobol import evenly, unit
 
 #: Length of an interval that is tested for a jump, in cells of the plane.
 INTERVAL = 0.5
-#: Least length of the places from which a jump is found, in cells. Rarer jumps have the weight of this length.
+#: Smallest `Jump.places`, in cells. It limits the weight of jumps that are rarely found.
 NARROWEST = 0.02
 #: Bisections of an interval.
 BISECTIONS = 15
