@@ -54,7 +54,7 @@ def _renumbered(
         shift, key = mi.sample_tea_32(self.seed, mi.UInt32(scramble(self.used)))
         digits = sobol.point(self.lane, coordinate(self.used), self.digits)
         self.used += 1
-        return sobol._float(dr.brev(sobol.scrambled(digits, shift, key)))
+        return sobol.unit(dr.brev(sobol.scrambled(digits, shift, key)))
 
     patch.setattr(sobol.Points, "next_1d", next_1d)
 
@@ -73,8 +73,8 @@ def without_jitter(patch: pytest.MonkeyPatch) -> None:
 
 def squeezed(patch: pytest.MonkeyPatch) -> None:
     """The range of the numbers ends below 1."""
-    right = sobol._float
-    patch.setattr(sobol, "_float", lambda digits: right(digits) * 0.96)
+    right = sobol.unit
+    patch.setattr(sobol, "unit", lambda digits: right(digits) * 0.96)
 
 
 def of_emission_again(patch: pytest.MonkeyPatch) -> None:
