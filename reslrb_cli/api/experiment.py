@@ -426,13 +426,12 @@ def convergence(
             return result_lines(Judgement(session).results())
 
 
-def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], tolerances: bool = False) -> Path:
+def export(run: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Path:
     """Write the scene of a run with the recovered values for plain Mitsuba, and return the path of `scene.xml`.
 
     `run` is the run folder. `folder` must not exist or must be empty. `mi.load_file` loads the returned file.
 
-    For a lens or a mirror, the folder also holds the solid in millimetres. `tolerances` adds how deviations from the
-    plan change the image, as `reslrb export` does.
+    For a lens or a mirror, the folder also holds the solid in millimetres.
 
     Sets the experiment's Mitsuba variant if none is set. Raises ConfigError and UnsupportedScene.
     """
@@ -442,7 +441,7 @@ def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], toleranc
         config = recovered(path, ())
         from reslrb_cli.runs.export import check_export, write_export
 
-        check_export(config, out, tolerances)
+        check_export(out)
         keep_variant(config.variant, config.source)
-        write_export(config, path, out, tolerances, logger.info)
+        write_export(config, path, out, logger.info)
         return out / "scene.xml"
