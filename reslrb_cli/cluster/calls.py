@@ -29,7 +29,6 @@ from distributed import CancelledError, Client, KilledWorker, Worker, WorkerPlug
 from distributed.comm import CommClosedError
 from distributed.scheduler import NoWorkerError
 
-from reslrb_cli.cluster.bundle import unpack
 from reslrb_cli.cluster.connection import NOBODY_S
 from reslrb_cli.errors import ConfigError, MachineError, ReslrbError, describe, is_machine_fault, is_out_of_memory
 from reslrb_cli.records.manifest import versions
@@ -122,8 +121,11 @@ class Workload(WorkerPlugin):
         logging.getLogger("reslrb_cli").addHandler(logging.NullHandler())  # the run has reported it already
         try:
             with _guarded(worker, COLD_S):
-                unpack(self.files, self._folder(worker))
-                state, longest = self.function(self._folder(worker), self.threads, *self.arguments)
+                folder = self._folder(worker)
+                folder.mkdir(exist_ok=True)
+                for file, data in self.files.items():
+                    (folder / file).write_bytes(data)
+                state, longest = self.function(folder, self.threads, *self.arguments)
         except Exception as error:
             raise MachineError(f"{_name(worker)} cannot load the experiment: {describe(error)}") from None
         self._loaded = _Loaded(state, time.perf_counter() - begin, longest)

@@ -1,8 +1,11 @@
 """The shards of a run's steps on workers (`calls.Workers`), and the data that workers need to compute the shards.
 
-A call depends only on the experiment (files by digest), on parameter values and tables (`Standing`), on the shard, and
-on the shard's dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions, or on the
-number of workers. Optimiser, checkpoints and page stay in the process of `optimize`.
+Workers read the files of the experiment at the same paths as the run, and compare their digests. The run sends its
+state before the first iteration, and its targets.
+
+A call depends only on the experiment, on parameter values and tables (`Standing`), on the shard, and on the shard's
+dL/dI. It returns NumPy arrays. The result does not depend on the worker, on repetitions, or on the number of workers.
+Optimiser, checkpoints and page stay in the process of `optimize`.
 
 The module imports dask, so it is imported only for `--cluster`.
 """
@@ -20,10 +23,10 @@ import drjit as dr
 import numpy as np
 
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.cluster.bundle import bundle_of, read_bundle
 from reslrb_cli.cluster.calls import Workers, Workload
 from reslrb_cli.cluster.connection import Place, connected
-from reslrb_cli.errors import ConfigError, MachineError
+from reslrb_cli.config.loader import loads
+from reslrb_cli.errors import MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.memory import check_step
 from reslrb_cli.optimization.problem import Problem
@@ -32,11 +35,11 @@ from reslrb_cli.optimization.state import Settled, begin_as, decide_as, guiding_
 from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.records.checkpoint import STATE_FILE, write_archive
 from reslrb_cli.records.tree import Stored, like, to_array
-from reslrb_cli.runs.prepare import RunProgress, digests
+from reslrb_cli.runs.prepare import RunProgress, check_files
 
 Array = np.ndarray[Any, Any]
 
-#: Beside the files of an experiment: settled decisions of the run (`STATE_FILE`), and the targets of its views.
+#: File of the targets of the views.
 TARGETS_FILE = "targets.npz"
 
 
@@ -73,15 +76,18 @@ class Standing:
 
 
 def assembled(folder: Path, threads: int | None, allows_code: bool) -> tuple[Problem, dict[str, float]]:
-    """Load the run's problem with targets and decisions from the experiment's files, and compile the problem's kernels.
+    """Load the run's problem from the experiment's files and the run's state and targets in `folder`, and compile the
+    problem's kernels.
 
     Also returns the time of each shard function after compilation, in seconds.
     """
     stored = Stored(folder / STATE_FILE)
+    settled = stored.read(Settled)
+    config = loads(settled.config, stored.path)
+    check_files(settled.files, config)
     with np.load(folder / TARGETS_FILE) as targets:
-        set_variant(stored.read(Settled).variant)
-        config, initial = read_bundle(folder)
-        problem = assemble_scene(config.with_code(allows_code), values=initial)
+        set_variant(settled.variant)
+        problem = assemble_scene(config.with_code(allows_code))
         begin_as(problem, stored)
         check_step(problem)
         problem = decide_as(problem, stored)
@@ -119,15 +125,11 @@ def workload_of(course: RunProgress, folder: Path, threads: int | None, own: boo
 
     Raises OSError. Raises ConfigError if a file has changed since the run began.
     """
-    config, selection = course.problem.config, course.problem.selection
-    files = bundle_of(config, {key: selection.array(key) for key in selection.keys}).files
-    here = digests(config)
-    for key, digest in course.files.items():
-        if here.get(key) != digest:
-            raise ConfigError(config.source, key, "has changed since the run began; restore it, or start a new run")
+    config = course.problem.config
+    check_files(course.files, config)
     course.save(folder)
     write_archive(folder / TARGETS_FILE, target_arrays(course.problem.views))
-    files |= {name: (folder / name).read_bytes() for name in (STATE_FILE, TARGETS_FILE)}
+    files = {name: (folder / name).read_bytes() for name in (STATE_FILE, TARGETS_FILE)}
     allows_code = config.allows_code
     return Workload(files, assembled, (allows_code,), threads, asks_for_code=allows_code and not own)
 

@@ -177,6 +177,15 @@ def digests(config: Config) -> dict[str, str]:
     return file_digests({key: path for key, path in files_of(config).items() if ".initial." not in key})
 
 
+def check_files(before: Mapping[str, str], config: Config, run: str = "the run") -> None:
+    """Raise ConfigError if a file of the experiment is not the one with which the run began. `before` are digests."""
+    here = digests(config)
+    for key, digest in before.items():
+        if here.get(key) != digest:
+            what = "has changed" if key in here else "is missing"
+            raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or start a new run")
+
+
 Array = np.ndarray[Any, Any]
 
 

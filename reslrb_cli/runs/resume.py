@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from reslrb_cli.runs.prepare import (
     RunProgress,
     changes,
     check_changes,
-    digests,
+    check_files,
     manifest_of,
 )
 
@@ -167,7 +167,7 @@ def open_earlier(run: Path, overrides: Sequence[str | Override]) -> Iterator[Ope
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
             raise ConfigError(config.source, "run.iterations", reason)
-        _check_files(settled.files, config, run)
+        check_files(settled.files, config, str(run))
         records, size = read_records(folder.path, iteration)
         earlier = OpenedRun(folder, manifest, stored, settled, config, differing, records, size, said)
         if not earlier.is_done:
@@ -194,11 +194,3 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
     if failures:
         raise failures[0]
     raise ConfigError(folder.path, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
-
-
-def _check_files(before: Mapping[str, str], config: Config, run: Path) -> None:
-    here = digests(config)
-    for key, digest in before.items():
-        if here.get(key) != digest:
-            what = "has changed" if key in here else "is missing"
-            raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or start a new run")

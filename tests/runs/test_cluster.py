@@ -24,7 +24,6 @@ from cli import tiny
 from runs.going_on import MOTION, one_thread, optimize
 from runs.hosts import hosts, make_certificates, missing
 
-from reslrb_cli.cluster import bundle
 from reslrb_cli.cluster.connection import Place, connected
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError, MachineError
@@ -127,71 +126,7 @@ def compare(folder: Path, sets: list[str], workers: int) -> None:
     }
 
 
-# --- what a worker is sent --------------------------------------------------------------------------------------------
-
-
-SCENE = """\
-<scene version="3.0.0">
-    <default name="size" value="8"/>
-    <path value="parts"/>
-    <include filename="lamps.xml"/>
-    <sensor type="perspective">
-        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm"><integer name="width" value="$size"/><integer name="height" value="$size"/></film>
-    </sensor>
-    <shape type="obj">
-        <string name="filename" value="quad.obj"/>
-        <bsdf type="diffuse" id="wall">
-            <texture type="bitmap" name="reflectance"><string name="filename" value="../textures/print.exr"/></texture>
-        </bsdf>
-    </shape>
-    <shape type="sphere"><bsdf type="conductor"><string name="material" value="Cu"/></bsdf></shape>
-</scene>
-"""
-QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
-
-
-def test_a_bundle_contains_all_files_of_an_experiment(
-    llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The bundle contains includes, files from <path> folders, variables, meshes, textures, tables of metals, initial
-    values and cameras, wherever they are. After unpacking, nothing is read from the experiment's own folder.
-    """
-    rng, where = np.random.default_rng(1), made(tmp_path / "here")
-    for name in ("parts", "textures", "shots", "data", "data/ior"):
-        made(where / name)
-    (where / "data/ior/Cu.k.spd").write_text("400 2\n700 2\n")
-    (where / "parts" / "lamps.xml").write_text(
-        f'<scene version="3.0.0"><emitter type="envmap" id="sky"><string name="filename" value="{where}/sky.exr"/>'
-        "</emitter></scene>"
-    )
-    (where / "parts" / "quad.obj").write_text(QUAD)
-    # The bounds below exclude the scene's own values, which must not be checked.
-    for name, size, low in (("sky.exr", 4, 0.2), ("textures/print.exr", 6, 0.2), ("start.exr", 6, 0.85)):
-        mi.Bitmap(rng.uniform(low, low + 0.1, (size, size, 3)).astype(np.float32)).write(str(where / name))
-    (where / "scene.xml").write_text(SCENE)
-    (where / "shots" / "cameras.txt").write_text("1 PINHOLE 12 10 12 12 6 5\n")
-    (where / "shots" / "images.txt").write_text("1 1 0 0 0 0 0 4 1 one.png\n\n")
-    text = (
-        "scene: {file: scene.xml, options: {size: 16}, cameras: shots/images.txt}\n"
-        "target: {render: {}}\nintegrator: {paths: camera}\n"
-        "parameters: [{key: Obj_1.bsdf.reflectance.data, initial: {file: start.exr}, bounds: [0.8, 1]}]\n"
-    )
-    (where / "x.yaml").write_text(text)
-    config = load(where / "x.yaml")
-    before = assemble_scene(config)
-    files = bundle.bundle_of(config, before.values()).files
-    where.rename(tmp_path / "elsewhere")
-    bundle.unpack(files, tmp_path / "there")
-    there, values = bundle.read_bundle(tmp_path / "there")
-    after = assemble_scene(there, values=values)
-    assert [int(n) for n in after.scene.sensors()[0].film().size()] == [12, 10]
-    both = [mi.traverse(problem.scene) for problem in (before, after)]
-    assert list(both[0].properties) == list(both[1].properties)
-    for key in both[0].properties:
-        assert np.array_equal(np.array(both[0][key]), np.array(both[1][key])), key
-    runs = [problem.config.run.model_dump(exclude={"output"}) for problem in (before, after)]
-    assert runs[0] == runs[1]
+# --- the side of a worker ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
