@@ -210,15 +210,16 @@ def command(
     described: list[Description] = []
     scene = load_scene(scene_file, options, look=described.append)
     [description] = described
+    hides = description.hides_emitters and target is None  # a photograph shows its lamps and its background
     sensors = [str(sensor.id()) for sensor in scene.sensors()]
     _tell_sensor(index, sensors)
     sensor = scene.sensors()[index]
     film = sensor.film()
     own, whole = ((int(size[0]), int(size[1])) for size in (film.crop_size(), film.size()))
     size = choose_size(own, photo, fixed=own != whole)
-    reason = _why_camera(scene, sensor, description.hides_emitters, scene_file)
+    reason = _why_camera(scene, sensor, hides, scene_file)
     is_integer = photo is not None and photo.is_integer
-    proposals = propose(scene, index, lamps=not is_integer and not description.hides_emitters)
+    proposals = propose(scene, index, lamps=not is_integer and not hides)
     if not proposals:
         raise ConfigError(scene_file, "", "has no recoverable parameter; reslrb inspect --all says why")
     image, copied = target, photo is not None and photo.size != size
@@ -229,7 +230,7 @@ def command(
     text = _first_config(
         path, options, description.variables, sensors, index, proposals, scene=scene_file, target=image,
         is_integer=is_integer, size=size, film=own, reason=reason,
-        hides_emitters=description.hides_emitters, depth=depth, missing=missing,
+        hides_emitters=hides, depth=depth, missing=missing,
     )  # fmt: skip
     specs = loads(text, path).parameters
     scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])

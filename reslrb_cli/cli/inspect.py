@@ -326,5 +326,6 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
         return str(error)
     if not decisions:
         open_ = open_settings(config, paths)
+        open_ += ["edges"] if edges_of(scene, selection) and config.integrator.options().get("edges") == "auto" else []
         decisions = [Decision(setting=setting, value="auto", why="which a run decides") for setting in open_]
     return plan_rows(plan, decisions)

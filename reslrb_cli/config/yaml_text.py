@@ -109,6 +109,17 @@ def format_location(location: Location) -> str:
     return text
 
 
+def flattened(data: Any, key: str = "") -> dict[str, Any]:
+    """Return the values of nested mappings, and of lists with mappings, by their keys as in `--set`."""
+    if isinstance(data, dict):
+        inner = {f"{key}.{name}" if key else str(name): each for name, each in data.items()}
+    elif isinstance(data, (list, tuple)) and any(isinstance(each, dict) for each in data):
+        inner = {f"{key}[{place}]": each for place, each in enumerate(data)}
+    else:
+        return {key: data}
+    return {name: value for below, each in inner.items() for name, value in flattened(each, below).items()}
+
+
 def parse(text: str, source: str, example: Callable[[str], str] | None = None) -> Any:
     """Return the plain data in YAML `text`. `source` names the text in error messages, with the line number.
 

@@ -20,7 +20,9 @@ path with three vertices and without roulette contributes E c_1 + E s_1 c_2 + E 
 
 This is like Mitsuba's `prb`, except that `prb` traces each path a second time. `prb` then knows the sum of all
 contributions, subtracts those of the vertices that it passes, and divides by s_j. Here, the stack has what a vertex
-needs, and B_j comes from multiplications. Nothing is divided, so zero factors need no special treatment.
+needs, and B_j comes from multiplications. Nothing is divided, so zero factors need no special treatment here. Only the
+walk must not end a path at a zero factor that has a derivative: `Plan.track_zeros` says that there may be one, and
+`Product.alive` then ends a path at its second zero.
 
 Paths are traced while gradients are suspended. Only `Frame.differentiate` resumes them. It evaluates both factors f of
 one vertex again, and `dr.backward_from` adds their derivatives to the parameters' gradients, inside the symbolic loop.
@@ -63,7 +65,7 @@ from reslrb_cli.estimators.base import (
     event,
     vertices,
 )
-from reslrb_cli.estimators.base import lobe as kept_lobe
+from reslrb_cli.estimators.base import lobe as lobe_of
 from reslrb_cli.estimators.gather import Gathering, Visibility
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, KnownVisibility
@@ -280,12 +282,12 @@ class Frame:
     def blank(plan: Plan) -> Frame:
         """Return a frame of zeros with the members that the plan needs."""
         wo, zero = mi.Vector3f(0), mi.Spectrum(0)
-        return Frame(SurfacePoint.blank(plan), wo, wo, zero, zero, zero, zero, kept_lobe(plan, None))
+        return Frame(SurfacePoint.blank(plan), wo, wo, zero, zero, zero, zero, lobe_of(plan, None))
 
     @staticmethod
     def empty_stack(plan: Plan, ring: Ring) -> StackState:
         """Return the state before the first vertex."""
-        throughput = mi.Float(1) if is_gapless(plan) else mi.Spectrum(1)
+        throughput = mi.Float(1) if pushes_all(plan) else mi.Spectrum(1)
         return StackState.begin(Frame.blank(plan) if plan.differentiate_bsdfs else None, ring, throughput)
 
     def differentiate(self, p: Pass, B: mi.Spectrum) -> mi.Spectrum:
@@ -322,14 +324,14 @@ def push(
         adjoint_s_per_b=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
         own=state.gap() + T * own,
         onward=dr.select(on, T * scattering.s, 0),
-        lobe=kept_lobe(plan, scattering),
+        lobe=lobe_of(plan, scattering),
     )
-    if not is_gapless(plan):
+    if not pushes_all(plan):
         state = state.plus(own, visible & ~here).scaled(scattering.s)
     return state.pushed(frame, ring, here, visible)
 
 
-def is_gapless(plan: Plan) -> bool:
+def pushes_all(plan: Plan) -> bool:
     """True if every vertex has something to differentiate, so the stack leaves out no vertex."""
     return plan.differentiate_bsdfs and not plan.only_bsdfs
 

@@ -23,6 +23,7 @@ from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
+from reslrb_cli.config.yaml_text import flattened
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
@@ -99,20 +100,7 @@ def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], r
 
 def flat(config: Config) -> dict[str, Any]:
     """Return all settings that are not None, by their keys as in `--set`."""
-    found: dict[str, Any] = {}
-
-    def add(key: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for name, each in value.items():
-                add(f"{key}.{name}" if key else str(name), each)
-        elif isinstance(value, (list, tuple)) and any(isinstance(each, dict) for each in value):
-            for place, each in enumerate(value):
-                add(f"{key}[{place}]", each)
-        elif value is not None:
-            found[key] = value
-
-    add("", config.model_dump(mode="json", exclude_none=True))
-    return found
+    return flattened(config.model_dump(mode="json", exclude_none=True))
 
 
 def _shown(value: Any) -> str:

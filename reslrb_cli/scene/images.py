@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.files import open_file
+from reslrb_cli.config.files import open_file, read_file
 from reslrb_cli.errors import ConfigError, is_out_of_memory
 
 if TYPE_CHECKING:
@@ -54,6 +54,9 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
         try:
             if photograph is not None and photograph.format != "PNG":
                 photograph.load()  # Mitsuba's reader would fill missing data of a JPEG with grey
+                data = read_file(path)  # zeros in place of missing data have no end of image (FF D9) after a scan
+                if data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+                    raise ConfigError(path, "", _NO_IMAGE)
             bitmap = mi.Bitmap(str(path))
         except Exception as error:
             if is_out_of_memory(error):

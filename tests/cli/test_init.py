@@ -360,6 +360,10 @@ def test_a_scene_that_hides_its_lights_keeps_hiding_them(choices: Path) -> None:
         (choices / "hall.yaml").unlink()
         tiny.done("init", "hall.xml")
         assert load(choices / "hall.yaml").integrator.hide_emitters == (value == "true")
+    scene.write_text(scene.read_text().replace('"false"', '"true"'))
+    write_noise(choices / "photo.png", 16, 16)
+    tiny.done("init", "hall.xml", "-o", "photo.yaml", "--target", "photo.png")
+    assert not load(choices / "photo.yaml").integrator.hide_emitters  # the photograph shows what is behind the scene
 
 
 def test_open_variables_of_a_scene_are_named_and_can_be_set(choices: Path) -> None:

@@ -73,6 +73,7 @@ def test_files_are_found_beside_the_scene(tmp_path, monkeypatch):
             "",
             "$height: is set in scene.options, but the scene file does not use",
         ),
+        (LIT_SPHERE, {"radius": "nan"}, ":4", "radius: value `nan` is not a number"),
         (LIT_SPHERE, {"radius": "wide"}, ":4", 'could not parse floating point value "wide"'),
         (LIT_SPHERE.replace("constant", "envmap"), {"radius": 1}, ":3", "filename"),
         (LIT_SPHERE.replace('<emitter type="constant"/>', ""), {"radius": 1}, "", "has no emitters"),

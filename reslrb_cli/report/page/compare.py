@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from markupsafe import Markup
 
-from reslrb_cli.config.yaml_text import parse
+from reslrb_cli.config.yaml_text import flattened, parse
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.sweeps import in_words
@@ -44,23 +43,12 @@ def differences(runs: Sequence[ShownRun]) -> list[tuple[str, list[str]]]:
     flat = []
     for run in runs:
         try:
-            flat.append(dict(_flattened(parse(read_text(run.path / "config.yaml"), "config.yaml"))))
+            flat.append(flattened(parse(read_text(run.path / "config.yaml"), "config.yaml")))
         except ConfigError:
             flat.append({})
     keys = dict.fromkeys(key for settings in flat for key in settings)
     rows = [(key, [in_words(settings[key]) if key in settings else "" for settings in flat]) for key in keys]
     return [(key, values) for key, values in rows if len(set(values)) > 1 and key not in ("run.name", "run.output")]
-
-
-def _flattened(value: Any, place: str = "") -> list[tuple[str, Any]]:
-    """Return the settings below `place` with their keys, such as `parameters[0].key`."""
-    if isinstance(value, dict):
-        inner = [(f"{place}.{key}".lstrip("."), each) for key, each in value.items()]
-    elif isinstance(value, list) and any(isinstance(each, dict) for each in value):
-        inner = [(f"{place}[{number}]", each) for number, each in enumerate(value)]
-    else:
-        return [(place, value)]
-    return [found for key, each in inner for found in _flattened(each, key)]
 
 
 def _pictures(run: ShownRun, exposures: Mapping[str, float]) -> Markup:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import bisect
 import difflib
+import math
 import os
 import re
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import mitsuba as mi
 from reslrb_cli.backend.installation import is_known, likely_parameters, looking_in, nearest_plugin, plugin_type
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.xml.mend import Note
-from reslrb_cli.scene.xml.read import Description, Element, quoted, tag_lines
+from reslrb_cli.scene.xml.read import Description, Element, floats, quoted, tag_lines
 
 #: Mitsuba's class for each tag.
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Texture"}
@@ -99,12 +100,15 @@ REFUSED_PLUGINS = {
 
 
 def _check(description: Description) -> None:
-    """Raise ConfigError with file and line for a plugin that is not Mitsuba's own, and for a file that is missing or
-    never ends.
+    """Raise ConfigError with file and line for a plugin that is not Mitsuba's own, for a number that is NaN, and for a
+    file that is missing or never ends.
     """
     for element in description.root.walk():
         if element.is_object:
             _check_plugin(element)
+        for name, text in element.attributes.items() if element.tag != "string" else ():
+            if name not in ("id", "name", "type", "as") and any(map(math.isnan, floats(text))):
+                raise element.fail(element.name, f"{name} {quoted(text)} is not a number")
     for element, name in description.named_files():
         path = description.find_file(name)
         if path is None:
