@@ -40,7 +40,6 @@ from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.parameters import select_parameters
 
-Array = np.ndarray[Any, Any]
 
 #: Parameters of emission; parameters of the same quantity have the same unit.
 _EMITTED = {
@@ -161,22 +160,20 @@ def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
     return problem.afresh({**problem.values(), **found})
 
 
-def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:
+def assemble_scene(config: Config, scene: Any = None) -> Problem:
     """Load and check the experiment of `config` without its targets.
 
-    `scene` replaces `scene.file`, and `values` replace the initial values of the parameters.
+    `scene` replaces `scene.file`.
     """
     scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
     views = make_views(config, scene)
     check_films(config, scene, [view.sensor for view in views])
     sensors = [view.sensor for view in views]
-    selection = select_parameters(scene, config.parameters, config.source, values)
+    selection = select_parameters(scene, config.parameters, config.source)
     moves = what_moves(config, selection)
     check_integrator(config, config.integrator, scene, sensors, moves)
     paths = paths_of(config.integrator, scene, sensors, moves)
     expose(views, scene, selection)
-    if values is not None:
-        selection.set_arrays(values)
     motions = selection.deformation.quantities
     problem = Problem(
         config=config,

@@ -144,14 +144,8 @@ class Selection:
         return self.deformation.values if key in self.deformation.values else self.params
 
 
-def select_parameters(
-    scene: mi.Scene,
-    specs: Sequence[ParameterSpec],
-    source: object,
-    values: Mapping[str, np.ndarray[Any, Any]] | None = None,
-) -> Selection:
-    """Select the parameters of `scene` that `specs` describes. Set them in the scene to their initial values, or to
-    `values`.
+def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: object) -> Selection:
+    """Select the parameters of `scene` that `specs` describes. Set them in the scene to their initial values.
 
     A glob selects the matching parameters that can be recovered. `source` names the configuration in errors. Raises
     ConfigError for:
@@ -166,9 +160,7 @@ def select_parameters(
         at = functools.partial(specs[origin[key]].at, word=settings.word)
         place = Place(source, f"parameters[{origin[key]}]", at)
         slot = selection.slot(key)
-        value = initial_array(slot, settings.initial if values is None else "scene", settings.resolution, place)
-        if values is not None and key in values and values[key].shape == value.shape:
-            value = values[key]
+        value = initial_array(slot, settings.initial, settings.resolution, place)
         if settings.bounds is not None:
             plate = any(isinstance(each, Thickness) for each in settings.regularizers)
             held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
@@ -180,7 +172,7 @@ def select_parameters(
             instead = "; recover a `heightmap` of the mesh instead" if key.endswith(".vertex_positions") else ""
             raise place.fail("precondition", f"smooths textures and heightmaps, but not `{key}`{instead}")
         selection.check_regularizers(key, place)
-        if values is not None or settings.initial != "scene" or settings.resolution is not None:
+        if settings.initial != "scene" or settings.resolution is not None:
             slot.set(value)
     selection.update()
     return selection
