@@ -40,7 +40,6 @@ from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.parameters import select_parameters
 
-
 #: Parameters of emission; parameters of the same quantity have the same unit.
 _EMITTED = {
     "AreaLight": "radiance",
