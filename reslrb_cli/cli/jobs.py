@@ -26,6 +26,7 @@ import click
 from reslrb_cli.backend.doctor import ask_gpu, free_bytes, of_system
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.cli.terminal import Interrupts
+from reslrb_cli.config.files import tail
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.processes import last_words
 from reslrb_cli.report.format import shorten
@@ -220,10 +221,8 @@ def _memory(process: int, kind: str) -> int:
 
 
 def _last_lines(output: IO[bytes]) -> list[str]:
-    """Return the last lines of a run's `output`. `pread` leaves the file offset alone, which the run writes at."""
-    start = max(os.fstat(output.fileno()).st_size - MOST_BYTES, 0)
-    text = os.pread(output.fileno(), MOST_BYTES, start).decode(errors="replace")
-    return [line for line in text.splitlines() if line.strip()]
+    """Return the last lines of a run's `output`."""
+    return [line for line in tail(output, MOST_BYTES).decode(errors="replace").splitlines() if line.strip()]
 
 
 def follow() -> None:

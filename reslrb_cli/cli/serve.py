@@ -22,6 +22,7 @@ import click
 
 from reslrb_cli.cli.options import FOLDER
 from reslrb_cli.cli.terminal import echo
+from reslrb_cli.config.files import tail
 from reslrb_cli.errors import ConfigError, ReslrbError, one_line
 
 #: Names of this machine in the header `Host`.
@@ -131,8 +132,7 @@ def _last_record(folder: Path) -> dict[str, Any]:
 
     try:
         with (folder / METRICS_FILE).open("rb") as file:
-            file.seek(max(os.fstat(file.fileno()).st_size - LAST_BYTES, 0))
-            found = json.loads(file.read().rpartition(b"\n")[0].rpartition(b"\n")[2])
+            found = json.loads(tail(file, LAST_BYTES).rpartition(b"\n")[0].rpartition(b"\n")[2])
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

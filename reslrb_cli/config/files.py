@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import stat
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 from reslrb_cli.errors import ConfigError, one_line
 
@@ -72,6 +72,11 @@ def read_file(path: Path) -> bytes:
             return file.read()
         except OSError as error:
             raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
+
+
+def tail(file: IO[bytes], most: int) -> bytes:
+    """Return the last `most` bytes of an open file. `pread` leaves its offset alone, where a process may write."""
+    return os.pread(file.fileno(), most, max(os.fstat(file.fileno()).st_size - most, 0))
 
 
 def in_words(count: float) -> str:

@@ -23,7 +23,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_scene_end_to_end(folder: Path) -> None:
     """The bias of each method stays below its limit, and the error of averages falls at the expected rate."""
     names = ["reslrb:reservoir(capacity=2)"]
-    args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16"]
+    args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16",
+            "--reference", "reslrb:stack"]  # fmt: skip
     (folder / "out").mkdir()
     printed = done("convergence", "tiny.yaml", *args).stdout.splitlines()
     lines = measured(folder / "out/c.jsonl")

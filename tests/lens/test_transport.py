@@ -89,7 +89,7 @@ def test_a_resized_black_and_white_picture_stays_within_black_and_white(side: in
     disc = np.hypot(*np.meshgrid(at - side / 2, at - side / 2)) < 0.4 * side
     for picture in (disc, (at[:, None] + at) % 2, np.outer(at == 5, at == 9)):
         light = picture.astype(np.float64)
-        for size in (7, 32, 45, 64, 127, 128, 256, 511):
+        for size in (7, 45, 128, 256):
             for between in (False, True):
                 made = resized(light, (size, max(2, size - 7)), between)
                 assert made.min() >= 0  # -1e-16 would count as negative

@@ -31,18 +31,17 @@ ORIGIN = Origin("a machine, 3 threads", "llvm_ad_rgb", ["reslrb", "bench", "my <
                 "Plan 9", "2026-01-02T03:04:05+00:00")  # fmt: skip
 
 
-def write_bench(path, depths=(2, 4, 8), spps=(4,)):
+def write_bench(path, depths=(2, 4, 8)):
     """Write a bench of two integrators. `ptracer` runs out of memory at the last depth."""
     records = []
-    for spp in spps:
-        for depth in depths:
-            for integrator, estimator, factor in (("ptracer", None, 3.0), ("reslrb", "reservoir", 1.0)):
-                ended = estimator is None and depth == depths[-1]
-                times = None if ended else Spread(factor * depth, 0.9 * factor * depth, 1.2 * factor * depth)
-                status = BenchStatus.OUT_OF_MEMORY if ended else BenchStatus.OK
-                cold = None if ended else 900.0
-                records.append(BenchRecord(integrator, estimator, None, depth, 99, spp, 64, 48, status, times, times,
-                                           times, times, cold, cold, cold, 0, 5))  # fmt: skip
+    for depth in depths:
+        for integrator, estimator, factor in (("ptracer", None, 3.0), ("reslrb", "reservoir", 1.0)):
+            ended = estimator is None and depth == depths[-1]
+            times = None if ended else Spread(factor * depth, 0.9 * factor * depth, 1.2 * factor * depth)
+            status = BenchStatus.OUT_OF_MEMORY if ended else BenchStatus.OK
+            cold = None if ended else 900.0
+            records.append(BenchRecord(integrator, estimator, None, depth, 99, 4, 64, 48, status, times, times, times,
+                                       times, cold, cold, cold, 0, 5))  # fmt: skip
     write_records(path, records)
 
 

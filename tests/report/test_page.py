@@ -354,7 +354,7 @@ def pages(llvm, tmp_path_factory):
     for made in folders.values():
         (made / "config.yaml").write_text(f"scene:\n  file: {'/a/long/path' * 30}\n  name: {'x' * 300}\n")
     written = {name: write_report(made) for name, made in folders.items()}
-    write_bench(folder / "bench.jsonl", spps=(4, 16))
+    write_bench(folder / "bench.jsonl")
     write_gradcheck(folder / "check <script>.jsonl", LONG)
     write_convergence(folder / "convergence.jsonl")
     files = ("bench.jsonl", "check <script>.jsonl", "convergence.jsonl")

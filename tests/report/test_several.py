@@ -103,15 +103,6 @@ def test_a_bench(tmp_path):
     assert "samples per pixel 4" in page.sections[title]
 
 
-def test_a_bench_of_two_sweeps_has_a_diagram_for_each(tmp_path):
-    write_bench(tmp_path / "x.jsonl", spps=(4, 16, 64))
-    labels = re.findall(r'aria-label="([^"]*)"', render(read_sources([tmp_path / "x.jsonl"])))
-    assert labels == [
-        "time of a step (ms) against path depth", "peak memory (MiB) against path depth",
-        "time of a step (ms) against samples per pixel", "peak memory (MiB) against samples per pixel",
-    ]  # fmt: skip
-
-
 def test_a_gradcheck(tmp_path):
     write_gradcheck(tmp_path / "check.jsonl")
     page = page_of(tmp_path / "check.jsonl")

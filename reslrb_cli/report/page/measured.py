@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, SummaryRecord, Verdict, record_of
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
+from reslrb_cli.report.page.layout import diagram, key, lay_out
 from reslrb_cli.report.page.run import guarded, outcome, run_parts
 from reslrb_cli.report.page.sweep import sweep_parts
 from reslrb_cli.report.plots import Curve
@@ -20,35 +20,24 @@ from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 Entry = Mapping[str, Any]
 Naming = Callable[[Entry], str]
 
-#: Quantities that can be varied, by field name, in words.
-SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixels of the film", "texels": "texels"}
+#: Quantities that `bench` varies, by field name, in words.
+SWEPT = {"max_depth": "path depth", "spp": "samples per pixel"}
 
 
 def bench(objects: Sequence[Entry]) -> Markup:
     """Return diagrams and a table of a bench."""
-    entries = [
-        {"pixels": entry["width"] * entry["height"] if entry.get("width") else None, **entry}
-        for entry in objects
-        if "integrator" in entry and "status" in entry
-    ]
+    entries = [entry for entry in objects if "integrator" in entry and "status" in entry]
     labels = list(dict.fromkeys(map(label, entries)))
-    values = {name: [entry[name] for entry in entries if entry.get(name)] for name in SWEPT}
-    usual = {name: max(dict.fromkeys(found), key=found.count) for name, found in values.items() if found}
-    varied = [name for name in SWEPT if len(set(values[name])) > 1] or ["max_depth"]
-    parts = lay_out("legend", labels)
-    for name in varied:
-        others = [other for other in varied if other != name]
-        chosen = [entry for entry in entries if all(entry.get(other) == usual[other] for other in others)]
-        drawn = [
-            ("", diagram(curves_of(chosen, labels, label, name, what), SWEPT[name], words, log_x=2))
-            for what, words in (("step_ms", "time of a step (ms)"), ("peak_mib", "peak memory (MiB)"))
-        ]
-        at = ", ".join(f"{SWEPT[other]} {number(usual[other])}" for other in others)
-        parts += lay_out("diagrams", drawn) + soft(f"At {at}." if at else "")
-    fixed = [f"{SWEPT[name]} {number(value)}" for name, value in usual.items() if name not in varied]
-    entries.sort(key=lambda entry: [entry.get(name) or 0 for name in varied])
+    name = next((name for name in SWEPT if len({entry.get(name) for entry in entries}) > 1), "max_depth")
+    drawn = [
+        ("", diagram(curves_of(entries, labels, label, name, what), SWEPT[name], words, log_x=2))
+        for what, words in (("step_ms", "time of a step (ms)"), ("peak_mib", "peak memory (MiB)"))
+    ]
+    entries.sort(key=lambda entry: entry.get(name) or 0)
+    fixed = [f"{SWEPT[other]} {number(entries[0].get(other))}" for other in SWEPT if other != name and entries]
     rows = [{"label": label(entry), "entry": entry} for entry in entries]
-    return parts + lay_out("measured.bench", rows, {name: SWEPT[name] for name in varied}, fixed)
+    parts = lay_out("legend", labels) + lay_out("diagrams", drawn)
+    return parts + lay_out("measured.bench", rows, name, SWEPT[name], fixed)
 
 
 def label(entry: Entry) -> str:
