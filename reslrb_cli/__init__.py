@@ -5,7 +5,7 @@ chooses the libLLVM that Dr.Jit loads.
 
 - `load` reads an experiment.
 - `optimize` recovers parameters in your own loop.
-- `render`, `gradient`, `gradcheck` and `export` run the commands of the same name on an experiment.
+- `render`, `gradient`, `gradcheck`, `convergence` and `export` run the commands of the same name on an experiment.
 - `Callback` receives the progress of a run; `TensorBoard`, `MLflow` and `WandB` log it.
 - `register` registers the plugins with Mitsuba.
 - `register_estimator` adds an estimator of your own to the integrator `reslrb`, and `check_estimator` checks it.
@@ -35,7 +35,7 @@ from reslrb_cli.version import __version__  # noqa: E402
 
 if TYPE_CHECKING:
     from reslrb_cli.api import torch
-    from reslrb_cli.api.experiment import check_estimator, export, gradcheck, gradient, load, render
+    from reslrb_cli.api.experiment import check_estimator, convergence, export, gradcheck, gradient, load, render
     from reslrb_cli.api.run import Run, optimize
     from reslrb_cli.config.schema import Config
     from reslrb_cli.errors import ConfigError, ReslrbError
@@ -60,6 +60,7 @@ __all__ = [
     "WandB",
     "__version__",
     "check_estimator",
+    "convergence",
     "export",
     "gradcheck",
     "gradient",
@@ -78,7 +79,7 @@ _llvm.prepare()
 
 _LAZY = {
     **{name: ("reslrb_cli.api.experiment", name)
-       for name in ("check_estimator", "export", "gradcheck", "gradient", "load", "render")},
+       for name in ("check_estimator", "convergence", "export", "gradcheck", "gradient", "load", "render")},
     **{name: ("reslrb_cli.runs.loggers", name) for name in ("MLflow", "TensorBoard", "WandB")},
     **{name: ("reslrb_cli.runs.callbacks", name) for name in ("Callback", "RunInfo")},
     "Config": ("reslrb_cli.config.schema", "Config"),

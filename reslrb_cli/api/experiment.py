@@ -1,7 +1,7 @@
 """Functions of the Python interface that take an experiment and return a result in one call.
 
 - `load`: read a configuration from a file, a mapping or a run folder.
-- `render`, `gradient`, `gradcheck`, `export`: the commands, or parts of them, as functions.
+- `render`, `gradient`, `gradcheck`, `convergence`, `export`: the commands, or parts of them, as functions.
 - `held`: delay an interrupt until it is safe to stop.
 """
 
@@ -12,13 +12,14 @@ import gc
 import logging
 import os
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from reslrb_cli.config.files import NAMELESS, as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override
 from reslrb_cli.config.schema import IN_MEMORY, Config
 from reslrb_cli.errors import ConfigError, one_line
+from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
 from reslrb_cli.records.run_folder import recovered
 
@@ -370,6 +372,58 @@ def check_estimator(
             if name == "checked":
                 del ESTIMATORS[name]
         return found
+
+
+def convergence(
+    experiment: Experiment,
+    integrators: str | None = None,
+    objective: Literal["fixed", "loss", "image"] = "fixed",
+    budget: float = 240.0,
+    rounds: int | None = None,
+    spps: Sequence[int] = (),
+    reference: str | None = None,
+    allow_code: bool = False,
+) -> list[Line]:
+    """Measure how fast the error of each method falls, as `reslrb convergence` does (docs/convergence.md).
+
+    Returns the records that `--json` writes: points, methods, references and a summary sentence. The arguments are the
+    options of the command.
+
+    - `integrators`, `reference`: as for `--integrators` and `--reference`.
+    - `budget`: total time in seconds.
+    - `rounds`: number of rounds, regardless of `budget`.
+    - `spps`: sample counts per pixel to compare.
+    - `allow_code`: permit running the files of your own integrators.
+
+    Each method runs in its own process with the experiment's variant. The calling process sets no variant. An interrupt
+    stops the measurement soon and raises KeyboardInterrupt. Raises ConfigError.
+    """
+    began = time.monotonic()
+    with called() as stop:
+        config = load(experiment)
+        config = config.with_code(allow_code or config.allows_code)
+        if config.own_scene is not None:
+            reason = "is an mi.Scene, which the processes of this measurement do not have; give a file or a dictionary"
+            raise ConfigError(config.source, "scene", reason)
+        from reslrb_cli.measure.convergence import Session
+        from reslrb_cli.measure.judgement import Judgement
+        from reslrb_cli.measure.methods import Plan
+        from reslrb_cli.report.tables import result_lines
+
+        for option, count in [("rounds", rounds), *(("spps", each) for each in spps)]:
+            if count is not None and count < 1:
+                raise ConfigError(option, "", f"is {count}; at least 1 is needed")
+        plan = Plan.of(
+            config, objective, integrators, reference, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps))
+        )
+        with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
+            spent_s = time.monotonic() - began
+            session = Session(plan, Path(name), stop, logger.info, spent_s=spent_s)
+            for _ in session.run():
+                pass
+            if stop():
+                raise KeyboardInterrupt
+            return result_lines(Judgement(session).results())
 
 
 def export(run: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Path:

@@ -10,7 +10,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,14 @@ import numpy as np
 import pytest
 from cli import tiny
 from cli.tiny import KEY, done, measured
+from measure.pretended_steps import Stage
 from runs.going_on import LAMP, work_alone, write_experiment
 
 import reslrb_cli as rl
 from reslrb_cli.config.loader import changed, dump, load, with_integrator
+from reslrb_cli.measure import convergence as session
+from reslrb_cli.measure.convergence import Session
+from reslrb_cli.measure.methods import Plan
 
 #: Settings that make a run cheap and exactly repeatable.
 FAST = {"run.certainty": False, "run.iterations": 3}
@@ -131,7 +135,7 @@ def test_every_copy_keeps_the_own_loss_and_the_permission(folder: Path) -> None:
     assert rl.load(given, {"run.spp": 8}).source == given.source
 
 
-def test_calls_keep_the_own_loss_and_the_permission(folder: Path) -> None:
+def test_calls_keep_the_own_loss_and_the_permission(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def own(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
         return 2 * dr.mean(dr.square(image - target), axis=None)
 
@@ -151,6 +155,13 @@ def test_calls_keep_the_own_loss_and_the_permission(folder: Path) -> None:
     assert rl.optimize(named.with_code(), overrides={"run.spp": 8}).config.allows_code
     with pytest.raises(rl.ConfigError, match=r"none\.py: no such file"):
         rl.gradcheck(config.with_code(), integrators="none.py:A")
+
+    def seen(session: Session) -> None:
+        raise LookupError(f"allowed: {session.plan.config.allows_code}")
+
+    monkeypatch.setattr(Session, "run", seen)
+    with pytest.raises(LookupError, match="allowed: True"):
+        rl.convergence(config.with_code(), integrators="own.py:A")
 
 
 # --- looking ----------------------------------------------------------------------------------------------------------
@@ -221,6 +232,10 @@ def test_the_gradient_belongs_to_the_loss(folder: Path) -> None:
         (lambda: rl.render("tiny.yaml", values={KEY: 1}, initial=False), "values: are those of parameters; leave out"),
         (lambda: rl.gradient("tiny.yaml", spp=0), "overrides: run.spp: must be at least 1"),
         (lambda: rl.gradcheck("tiny.yaml", "reslrb:stick"), "integrators reslrb:stick: integrator.estimator: must be"),
+        (lambda: rl.convergence("tiny.yaml", "prb,nothing"), "integrators nothing: integrator.type: must be one of"),
+        (lambda: rl.convergence("tiny.yaml", reference="prb,ptracer"), "reference: errors are relative to one method"),
+        (lambda: rl.convergence("tiny.yaml", objective="mean"), "objective: is 'mean'; there are fixed, loss, image"),
+        (lambda: rl.convergence("tiny.yaml", rounds=0), "rounds: is 0; at least 1 is needed"),
     ],
 )  # fmt: skip
 def test_arguments_are_named_in_errors(folder: Path, call: Callable[[], Any], line: str) -> None:
@@ -243,6 +258,34 @@ def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
     ]
     names = ("parameter", "reference", "kind", "seeds", "verdict", "holds")
     assert [[each[name] for name in names] for each in found] == [[each[name] for name in names] for each in told]
+
+
+class Played(Session):
+    """Session with simulated processes, and a clock that only these processes advance."""
+
+    def __init__(self, plan: Plan, folder: Path, stop: Callable[[], bool], say: Callable[[str], None], **given: Any):
+        stage = Stage()
+        super().__init__(plan, folder, stop, say, stage.start, stage.clock)
+
+
+def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "Session", Played)
+    given = ["--integrators", "reslrb:stack,ptracer", "--reference", "reslrb:stack", "--rounds", "8", "--spp", "4,8"]
+    done("convergence", "tiny.yaml", *given, "--json", "c.jsonl")
+    records = rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
+    found = [json.loads(record.to_json()) for record in records]
+    assert found == measured("c.jsonl")
+    assert {"point", "method", "reference", "summary"} <= {each["kind"] for each in found}
+
+    class Interrupted(Played):
+        def run(self) -> Iterator[int]:
+            os.kill(os.getpid(), signal.SIGINT)
+            yield from super().run()
+            assert self.rounds < 8
+
+    monkeypatch.setattr(session, "Session", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
 
 
 class Interrupting(logging.Handler):
@@ -272,6 +315,12 @@ def test_an_interrupt_ends_long_calls(folder: Path, caplog: pytest.LogCaptureFix
             logging.getLogger("reslrb_cli").removeHandler(handler)
     assert [line for line in handler.said if words in line]
     assert not [line for line in handler.said if "differences" in line]
+
+
+@pytest.mark.long
+def test_convergence_measures(folder: Path) -> None:
+    records = rl.convergence("tiny.yaml", "reslrb:stack", reference="reslrb:stack", rounds=4)
+    assert [record.to_json() for record in records][-1].startswith('{"kind": "summary"')
 
 
 def test_an_export_equals_that_of_the_command(folder: Path) -> None:
@@ -315,6 +364,7 @@ rl.register()
 reveal_type((run.parameters, run.gradients, run.images, run.targets, run.truth))
 reveal_type((rl.gradient(config), rl.render(config, values={"a": 3}), rl.export("x", "y")))
 reveal_type([(check.holds, check.verdict, check.to_json()) for check in rl.gradcheck(config)])
+reveal_type([line.to_json() for line in rl.convergence(config, objective="image")])
 reveal_type(rl.__version__)
 
 

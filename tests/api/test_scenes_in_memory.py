@@ -261,6 +261,7 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: rl.load(experiment(), scene=mi.load_dict(dark())), "scene: the scene has no emitters"),
     (lambda: rl.render(rl.load(experiment(), {"scene.size": [8, 8]}, scene=loaded())), "scene.size: cannot change an "
      "mi.Scene; give the scene as a file or as a Mitsuba dictionary"),
+    (lambda: rl.convergence(rl.load(experiment(), scene=loaded())), "scene: is an mi.Scene, which the processes"),
     (lambda: rl.optimize(resume="x", scene=loaded()), "scene: cannot be given with resume"),
     (lambda: rl.optimize(experiment(), scene=loaded(twin={"type": "sphere", "bsdf": room()["ball"]["bsdf"]},
                                                     optimize=True)),

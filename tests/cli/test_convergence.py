@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from cli.tiny import KEY, done, measured, outcome, write_experiment
 
+
 pytestmark = pytest.mark.usefixtures("llvm")
 
 

@@ -61,7 +61,8 @@ def write_records(path, records):
 
 
 def convergence_lines(parameter="all"):
-    """Return lines of two methods and their reference. The errors fall as the square root of time."""
+    """Return lines of two methods and their reference. The errors fall as the square root of time.
+    """
     lines = []
     for integrator, estimator, factor in (("ptracer", None, 0.5), ("reslrb", "stack", 0.2)):
         label = integrator if estimator is None else f"{integrator}:{estimator}"
