@@ -28,6 +28,7 @@ from reslrb_cli.measure.comparison import ROUNDING, TAIL, Family, compare_expect
 from reslrb_cli.measure.convergence import FEWEST, Member, Role, Session
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
+    TARGETS,
     BenchStatus,
     Method,
     MethodRecord,
@@ -194,6 +195,21 @@ class MethodSamples:
         left = np.log(reference.signal) - np.log(own) - np.log(seconds)
         right = np.log(signals) - np.log(other) - np.log(self.step_s)
         return _joined(float(value), left, right)
+
+    def seconds_to(self, error: float, biased: bool) -> tuple[float | None, bool]:
+        """Return the seconds until the relative error is `error`. Also return a boolean that is true if the seconds are
+        extrapolated.
+
+        The seconds are None if a bias keeps the error above `error`. At least one step is needed. The boolean is true
+        if more steps are needed than were measured. The boolean is also true if the reference's own error (`floor`) is
+        unknown or larger than `error`. If the seconds are None, the boolean is false.
+        """
+        room = error**2 - (self.squared_bias if biased else 0.0)
+        if room <= 0:
+            return None, False
+        steps = max(self.variance / room, 1.0)
+        floor = self.reference.floor
+        return steps * self.step_s, bool(steps > self.count or floor is None or error < floor)
 
 
 def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, noise: float, biased: bool) -> np.ndarray:
@@ -377,6 +393,7 @@ class Judgement:
         message = bias.message
         if not message and tail_weight(samples.deviations) > TAIL:
             message = HEAVY
+        times = {f"{target:g}": magnitude.seconds_to(target, biased) for target in TARGETS}
         efficiency = magnitude.efficiency(biased)
         return MethodRecord(
             method=member.method,
@@ -390,6 +407,8 @@ class Judgement:
             slope=samples.slope(),
             efficiency=None if efficiency is None else efficiency.exponential(),
             bias=float(np.sqrt(magnitude.squared_bias)) if biased else None,
+            seconds_to={name: seconds for name, (seconds, _) in times.items()},
+            extrapolated=[name for name, (_, beyond) in times.items() if beyond],
             **vars(replace(bias, message=message)),
         )
 

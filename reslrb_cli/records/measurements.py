@@ -81,6 +81,10 @@ class BenchRecord(Line):
     light_share: float | None = None
 
 
+#: Relative errors for which the required time is reported.
+TARGETS = (0.1, 0.03, 0.01)
+
+
 def _column(title: str, width: int) -> dict[str, Any]:
     """Return the metadata of a field that the table of `convergence` shows."""
     return {"title": title, "width": width}
@@ -138,7 +142,7 @@ class PointRecord(Line):
 @dataclass(frozen=True)
 class MethodRecord(Line):
     """Summary of the points of one method and parameter. The table of `convergence` shows the fields with a column, in
-    this order.
+    this order, and `seconds_to`.
 
     - `repeats` is the number of steps.
     - `relative_rmse` is the error of one step, computed from the variance of the steps. `step_s` is the number of
@@ -151,6 +155,9 @@ class MethodRecord(Line):
         `bias_z`. By chance, any value in the table exceeds its limit with probability 1e-4.
     - `bias` is the relative bias, if there is one. `biased` is None if the bias is undecided. `message` then gives the
         reason.
+    - `seconds_to` has the time until averages reach each error (`0.1`, `0.03`, `0.01`). The time is None if a bias
+        keeps averages above the error.
+    - `extrapolated` lists the errors that need more steps than were measured, or that are below the reference's error.
 
     Values that were not measured are None.
     """
@@ -172,6 +179,8 @@ class MethodRecord(Line):
     bias: float | None = None
     bias_reference: str | None = None
     biased: bool | None = None
+    seconds_to: dict[str, float | None] = field(default_factory=lambda: {f"{target:g}": None for target in TARGETS})
+    extrapolated: list[str] = field(default_factory=list)
     message: str = ""
 
 

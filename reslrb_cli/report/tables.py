@@ -10,6 +10,7 @@ from reslrb_cli.measure.bench import BenchResult
 from reslrb_cli.measure.judgement import ConvergenceResults
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
+    TARGETS,
     BenchStatus,
     GradcheckRecord,
     Kind,
@@ -159,10 +160,10 @@ FIGURES = [figure for figure in fields(MethodRecord) if "title" in figure.metada
 
 def method_columns(labels: Sequence[str], parameters: Sequence[str]) -> Columns:
     """Return the columns of the table. The first two columns fit `labels` and `parameters`."""
-    titles = ("", "parameter", *(figure.metadata["title"] for figure in FIGURES))
+    titles = ("", "parameter", *(figure.metadata["title"] for figure in FIGURES), *(f"s to {t:.0%}" for t in TARGETS))
     names = max(len(shorten(key, KEY_WIDTH)) for key in ("parameter", *parameters))
     figures = (figure.metadata["width"] for figure in FIGURES)
-    return Columns(titles, (max(map(len, labels), default=0), names, *figures), "<<>")
+    return Columns(titles, (max(map(len, labels), default=0), names, *figures, *(9 for _ in TARGETS)), "<<>")
 
 
 def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[str, ...]:
@@ -170,7 +171,8 @@ def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[st
     named = (record.method.label, shorten(parameter or record.parameter, KEY_WIDTH))
     if record.relative_rmse is None:
         return *named, record.message if record.status is BenchStatus.OK else record.status.value
-    return *named, *(_figure(record, figure.name) for figure in FIGURES)
+    figures = (_figure(record, figure.name) for figure in FIGURES)
+    return *named, *figures, *(_seconds(record, f"{target:g}") for target in TARGETS)
 
 
 def _figure(record: MethodRecord, name: str) -> str:
@@ -187,6 +189,14 @@ def _deviation(record: MethodRecord) -> str:
         return ""
     word = {True: " biased", False: "", None: " open"}[record.biased]
     return f"{abs(record.bias_z):.1f} ({record.bias_z_limit or 0:.1f}){word}"
+
+
+def _seconds(record: MethodRecord, target: str) -> str:
+    """Return a time, with `~` if the time is extrapolated. Return a dash if a bias keeps the error above the target."""
+    seconds = record.seconds_to[target]
+    if seconds is None:
+        return "-"
+    return ("~" if target in record.extrapolated else "") + number(seconds, 3)
 
 
 def notes(records: Sequence[MethodRecord]) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from cli.tiny import KEY, done, measured, outcome, write_experiment
 
+from reslrb_cli.records.measurements import TARGETS
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -38,6 +39,7 @@ def test_a_scene_end_to_end(folder: Path) -> None:
         assert line["efficiency"]["low"] < line["efficiency"]["value"] < line["efficiency"]["high"]
         assert line["efficiency"]["value"] == pytest.approx(1 / (line["relative_rmse"] ** 2 * line["step_s"]))
         assert abs(line["slope"] + 0.5) < 0.2
+        assert list(line["seconds_to"]) == [f"{target:g}" for target in TARGETS]
         assert line["cold_s"] > line["step_s"] > 0
     points = [line for line in lines if line["kind"] == "point" and line["label"] == names[0]]
     assert {(line["parameter"], line["reference_rmse"] > 0) for line in points} == {(KEY, True)}

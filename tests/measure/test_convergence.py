@@ -39,6 +39,10 @@ def test_cost_error_slope_and_efficiency_match_the_methods(tmp_path: Path) -> No
         assert record.efficiency.low < 1 / (noise**2 * step_s) < record.efficiency.high
         assert abs(record.slope + 0.5) < 0.1
         assert abs(record.bias_z) < record.bias_z_limit
+        seconds = record.seconds_to["0.1"]
+        assert seconds == pytest.approx(step_s * noise**2 / 0.01, rel=0.25)
+        assert record.extrapolated == [name for name in ("0.1", "0.03", "0.01") if
+                                       record.seconds_to[name] > record.repeats * step_s or float(name) < record.reference_rmse]  # fmt: skip # noqa: E501
     assert closing_sentence(results.methods).startswith("Best for this scene: reslrb:stack; ")
 
 
@@ -51,10 +55,11 @@ def test_a_planted_bias_of_three_percent_is_reported(tmp_path: Path) -> None:
     assert biased.bias == pytest.approx(0.03, rel=0.2)
     assert biased.bias_z > biased.bias_z_limit
     assert biased.bias_reference == "ptracer"
-    # Squared bias counts like variance. Without bias, this method would be the most
+    # Squared bias counts like variance, and keeps the error above 1 %. Without bias, this method would be the most
     # efficient.
     assert biased.efficiency.low < 1 / (0.05 * (0.1**2 + 0.03**2)) < biased.efficiency.high
     assert biased.efficiency.value > 2 * sound.efficiency.value
+    assert (biased.seconds_to["0.01"], sound.seconds_to["0.01"] is not None) == (None, True)
     sentence = closing_sentence(results.methods)
     assert sentence.startswith(("Best for this scene: ptracer", "Best for this scene: reslrb:stack"))
     assert "The biased reslrb:event has" in sentence
@@ -293,14 +298,41 @@ def test_repeated_seeds_flatten_the_slope() -> None:
     assert slope > -0.45
 
 
+def test_times() -> None:
+    """Times follow sqrt(variance / steps), and are at least one step. Times beyond the measured steps or below the
+    floor are extrapolated.
+    """
+    samples = make(5, steps=64, rows=200)
+    relative = samples.variance
+    for target in (0.5, 0.2, 0.01):
+        seconds, beyond = samples.seconds_to(target, biased=False)
+        steps = max(relative / target**2, 1.0)
+        assert seconds == pytest.approx(steps * samples.step_s)
+        assert beyond is (steps > 64 or target < samples.reference.floor)
+    assert [samples.seconds_to(target, False)[1] for target in (0.5, 0.01)] == [False, True]
+    assert samples.seconds_to(100.0, False) == (samples.step_s, False)
+    rough = make(5, steps=64, rows=3, per_row=1)
+    assert rough.reference.floor > 0.3
+    assert rough.seconds_to(0.3, False)[1]  # within the steps, but below the noise floor
+
+
+def test_times_prevented_by_a_bias() -> None:
+    samples = make(6, steps=256, rows=100, bias=0.2)
+    size = float(np.sqrt(samples.squared_bias))
+    assert samples.seconds_to(0.9 * size, biased=True) == (None, False)
+    assert samples.seconds_to(0.9 * size, biased=False)[0] is not None
+    seconds, _ = samples.seconds_to(2 * size, biased=True)
+    assert seconds == pytest.approx(samples.variance / (3 * size**2) * samples.step_s)
+
+
 def test_figures_of_the_table_are_fields_of_the_record() -> None:
-    figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)")
+    figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)", "s to 10%", "s to 3%", "s to 1%")
     assert method_columns([], []).titles == ("", "parameter", *figures)
     record = MethodRecord(
         METHOD, "a", BenchStatus.OK, step_s=0.5, repeats=12000, relative_rmse=0.1, slope=-0.5,
         efficiency=Range(2, 1, 3), bias_z=1.5, bias_z_limit=4.5,
     )  # fmt: skip
-    assert method_cells(record)[2:] == ("0.5", "12000", "0.1", "-0.5", "2 [1, 3]", "1.5 (4.5) open")
+    assert method_cells(record)[2:8] == ("0.5", "12000", "0.1", "-0.5", "2 [1, 3]", "1.5 (4.5) open")
 
 
 def test_too_few_steps_have_no_intervals() -> None:

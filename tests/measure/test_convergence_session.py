@@ -72,7 +72,7 @@ def test_an_ended_method_is_recorded_and_the_rest_continues(tmp_path: Path) -> N
     stage = Stage(case_reslrb_stack=Pretence(ends=5), case_reslrb_event=Pretence(nan_at=20))
     _, results, said = play(tmp_path, stage, plan())
     ended, broken, sound = (of(results, label) for label in ("reslrb:stack", "reslrb:event", "ptracer"))
-    assert (ended.status, ended.efficiency) == (BenchStatus.OUT_OF_MEMORY, None)
+    assert (ended.status, ended.efficiency, ended.seconds_to["0.1"]) == (BenchStatus.OUT_OF_MEMORY, None, None)
     assert "not finite" in broken.message
     assert broken.relative_rmse is None
     assert sound.biased is False

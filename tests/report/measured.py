@@ -61,7 +61,8 @@ def write_records(path, records):
 
 
 def convergence_lines(parameter="all"):
-    """Return lines of two methods and their reference. The errors fall as the square root of time.
+    """Return lines of two methods and their reference. The errors fall as the square root of time. One time is
+    extrapolated, and one error is never reached.
     """
     lines = []
     for integrator, estimator, factor in (("ptracer", None, 0.5), ("reslrb", "stack", 0.2)):
@@ -74,7 +75,7 @@ def convergence_lines(parameter="all"):
         lines.append({
             "kind": "method", **method, "status": "ok", "slope": {"value": -0.5, "low": -0.55, "high": -0.45},
             "efficiency": {"value": 4.0, "low": 3.0, "high": 5.0}, "bias_z": 0.7, "bias_z_limit": 4.5, "biased": False,
-            "message": "",
+            "seconds_to": {"0.1": 3.5, "0.03": 120.0, "0.01": None}, "extrapolated": ["0.03"], "message": "",
         })  # fmt: skip
     return [*lines, {"kind": "reference", **method, "reference_rmse": 0.01, "repeats": 8}]
 

@@ -125,7 +125,7 @@ def test_a_convergence(tmp_path):
     page = Page(markup)
     title = "Error against run time: c.jsonl"
     assert page.row(title, "ptracer, independent")[1:] == [
-        "-0.5 [-0.55, -0.45]", "4 [3, 5]", "0.7 < 4.5"]  # fmt: skip
+        "-0.5 [-0.55, -0.45]", "4 [3, 5]", "0.7 < 4.5", "3.5 s", "2 min 0 s extrapolated", "—"]  # fmt: skip
     assert page.row(title, "reslrb:stack")[:2] == ["reslrb:stack, independent biased", "-0.5"]
     assert page.row(title, "prb")[1:3] == ["out of memory", ""]
     assert "reslrb:stack, independent: too few <steps>" in page.sections[title]
