@@ -132,8 +132,8 @@ class AboutParameters:
 
     @property
     def only_shapes_move(self) -> bool:
-        """True if the parameters move shapes and no lamps."""
-        return bool(self.which.shapes) and not self.which.emitters
+        """True if the parameters move shapes, but no lamps and no refracted light."""
+        return bool(self.which.shapes) and not (self.which.emitters or self.which.bends)
 
 
 @dataclass
@@ -199,7 +199,7 @@ class Preparation:
         if self.guiding is not None and spp is not None:
             self._meet(spp, params is not None and not image)
         about = None if params is None else self._look_through(params)
-        moves = about is not None and bool(about.which.shapes or about.which.emitters or self._motion.attached is True)
+        moves = about is not None and (about.which.moves_light or self._motion.attached is True)
         paths, whole = self.sampling.paths, self.sampling.whole
         if about is not None and moves and (self._motion.sampling == "follow" or not about.only_shapes_move):
             paths, whole = "light", whole and paths == "light"

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.scene.dispersion import GLASS_CLASS
 from reslrb_cli.scene.graph import (
     Lamp,
     SceneGraph,
@@ -35,7 +36,7 @@ _PLAIN_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 
 _SIMPLE_BSDFS = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
-    *("TwoSidedBRDF", "Null"),
+    *("TwoSidedBRDF", "Null", GLASS_CLASS),
 )
 #: BSDFs that read only texture coordinates and local directions of a surface.
 _PLAIN_BSDFS = (
