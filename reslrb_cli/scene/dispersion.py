@@ -183,12 +183,14 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
                 for number in range(1, len(indices)):
                     wavelength = dr.select(drawn == number, si.wavelengths[number], wavelength)
                 goes = [si.wavelengths[number] == wavelength for number in range(len(indices))]
-            shares = [dr.select(reflects, R, dr.select(same, 1 - R, 0)) for (R, *_), same in zip(found, goes)]
+            shares = [
+                dr.select(reflects, R, dr.select(same, 1 - R, 0)) for (R, *_), same in zip(found, goes, strict=True)
+            ]
             pdf = dr.detach(sum(shares) / len(indices))
             values = [share / pdf for share in shares]
             if ctx.mode == mi.TransportMode.Radiance:
                 values = [dr.select(reflects, each, each * dr.square(eta_ti))
-                          for each, (*_, eta_ti) in zip(values, found)]  # fmt: skip
+                          for each, (*_, eta_ti) in zip(values, found, strict=True)]  # fmt: skip
             return pdf, values
 
         def _normals(self) -> mi.MicrofacetDistribution:
@@ -237,6 +239,9 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
         ) -> mi.Float:  # fmt: skip
             return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def class_name(self) -> str:
+            return GLASS_CLASS
 
         def to_string(self) -> str:
             rough = "" if self.alpha is None else f", alpha = {self.alpha[0]:g}"

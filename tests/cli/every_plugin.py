@@ -1,4 +1,4 @@
-"""Every plugin that Mitsuba 3.9.1 ships and the plugins of `reslrb` for scenes, in a separate scene, and how the program
+"""Every plugin that Mitsuba 3.9.1 ships, and those of `reslrb` for scenes, in a separate scene, and how the program
 treats this scene. This module is docs/plugins.md as data.
 
 `python tests/cli/every_plugin.py` writes the page again. Each plugin has at least one row. Each place or form of the

@@ -50,9 +50,9 @@ def picture(nd: float | None = None, Vd: float | None = None) -> np.ndarray:
     o = o + d * (((SCREEN[:, None] - o) * normal).sum(0) / (d * normal).sum(0))
     place = ((o - SCREEN[:, None]) * right).sum(0)
 
-    # Film: the eye looks along -normal at a distance of 1. Columns run against `right`, or along it.
+    # Film: the eye looks along -normal, and columns run along `right`.
     half = np.tan(np.radians(FOV) / 2) * float(np.linalg.norm(SCREEN - EYE))
-    u = (1 - place / half) / 2 * FILM[0]
+    u = (1 + place / half) / 2 * FILM[0]
     pixel = (2 * half / FILM[0]) ** 2
     area = 2 * HALF_WIDTH * HEIGHT / PLACES
     spectra = colour_of(nm) * (flux * illuminant(nm) * STEP * area * ALBEDO / np.pi / pixel)[:, None]
