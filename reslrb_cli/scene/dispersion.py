@@ -183,9 +183,8 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
                 for number in range(1, len(indices)):
                     wavelength = dr.select(drawn == number, si.wavelengths[number], wavelength)
                 goes = [si.wavelengths[number] == wavelength for number in range(len(indices))]
-            shares = [
-                dr.select(reflects, R, dr.select(same, 1 - R, 0)) for (R, *_), same in zip(found, goes, strict=True)
-            ]
+            refracted = [dr.select(same, 1 - R, 0) for (R, *_), same in zip(found, goes, strict=True)]
+            shares = [dr.select(reflects, R, T) for (R, *_), T in zip(found, refracted, strict=True)]
             pdf = dr.detach(sum(shares) / len(indices))
             values = [share / pdf for share in shares]
             if ctx.mode == mi.TransportMode.Radiance:

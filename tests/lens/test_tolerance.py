@@ -158,7 +158,7 @@ def test_a_displaced_part_matches_a_scene_of_its_own(name: str, folder: Path) ->
 
 
 def test_colours_spread_as_snells_law_says(folder: Path) -> None:
-    """Light meets the flat back of a wedge at a right angle, and leaves the face at an angle that depends on the index."""
+    """Light meets the flat back of a wedge at a right angle. Its direction behind the face depends on the index."""
     tilt, glass = np.arctan(0.2), find_glass("PMMA")
     made = with_face(folder, lambda x: 0.2 * x)
     to = [200 * np.tan(np.arcsin(n * np.sin(tilt)) - tilt) for n in (glass.index(486.1327), glass.index(656.2725))]
