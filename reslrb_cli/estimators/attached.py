@@ -133,7 +133,7 @@ def reach(
     # direction is. (A variable that is made in one selective scope counts as suspended in another.)
     with dr.suspend_grad(when=parameters), dr.resume_grad(reaching.d, when=parameters):
         f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
-    changed = dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1) * factor
+    changed = mi.Spectrum(dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1)) * factor
     if plan.near > 0:
         near = plan.near**2
         shares = [near / (dr.squared_norm(place - ray.o) + near) for place in (stayed.p, slid.p)]

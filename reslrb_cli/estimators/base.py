@@ -151,7 +151,7 @@ def adjoint_of_factor(
     """
     f, value, zeros = dr.detach(f), adjoint.value, adjoint.product.zero
     if not zeros:
-        return dr.select(f != 0, showing(value / f), 0)
+        return mi.Spectrum(dr.select(f != 0, showing(value / f), 0))
     result, rest = mi.Spectrum(0), mi.Spectrum(rest)
     for c, zero in enumerate(zeros):
         at_zero = dr.select(zero == mi.Int32(index), value[c] * rest[c], 0)

@@ -208,7 +208,7 @@ def sensor_rays(
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = ray.wavelengths
         total = response.eval(si)
-        weight = dr.select(total > 0, weight / total, 0)
+        weight = mi.Spectrum(dr.select(total > 0, weight / total, 0))
     return mi.Ray3f(ray), weight
 
 

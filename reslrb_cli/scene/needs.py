@@ -267,7 +267,7 @@ def _unsampled(scene: Any) -> str | None:
 
 
 def _film_obstacle(sensor: Any) -> str | None:
-    if sensor.film().class_name() != "HDRFilm":
+    if sensor.film().class_name() not in ("HDRFilm", "SpecFilm"):
         return f"sensor {sensor.id()} has a {sensor.film().class_name()}; paths are splatted on an `hdrfilm`"
     return None
 

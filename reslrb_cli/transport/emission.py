@@ -115,7 +115,7 @@ def _at_fixed_wavelengths(plan: Plan, ray: mi.Ray3f, emitter: mi.EmitterPtr, wei
     for own, spectrum in plan.sampled_spectra:
         value, mean = spectrum.eval(si), spectrum.mean()
         ratio = value / dr.detach(value) * (dr.detach(mean) / mean)
-        weight = dr.select((emitter == mi.EmitterPtr(own)) & (value != 0), weight * ratio, weight)
+        weight = mi.Spectrum(dr.select((emitter == mi.EmitterPtr(own)) & (value != 0), weight * ratio, weight))
     return weight
 
 
@@ -216,7 +216,7 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, ray: mi.Ray3f, a
         weight = dr.select(state.active, adjoint * state.transmittance, 0)
         objective = weight * Le if plan.differentiate_emission else mi.Spectrum(0)
         if masks:
-            behind = dr.select(transmission != 0, (total - radiance) / dr.detach(transmission), 0)
+            behind = mi.Spectrum(dr.select(transmission != 0, (total - radiance) / dr.detach(transmission), 0))
             objective += dr.select(state.active, adjoint * behind, 0) * transmission
         # The scene may have masks without differentiated parameters.
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)

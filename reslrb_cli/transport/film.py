@@ -96,7 +96,8 @@ class Film:
         self, block: mi.ImageBlock, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool, colours: Colours,
         normalization: bool = False,
     ) -> None:  # fmt: skip
-        """Add `value` (C,) of paths with these `colours` at film position `u` (pixels, relative to the crop window) through the filter.
+        """Add `value` (C,) of paths with these `colours` at film position `u` (pixels, relative to the crop window)
+        through the filter.
 
         Under naive AD, the pixels' weights have derivatives with respect to `u`. Mitsuba divides the filter weights by
         their sum, and detaches this sum. With `normalization`, the sum is differentiated as well. If the film is

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare, renders
-from conformance.scenes import lamp, rgb, stage
+from conformance.scenes import camera, lamp, rgb, stage
 
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import Case, integrator, seeds
@@ -31,14 +31,15 @@ def spectrum(values: np.ndarray, kind: str) -> dict[str, Any]:
     return {"type": kind, "wavelengths": ", ".join(map(str, NODES)), "values": text}
 
 
-def furnace(film: dict[str, Any] | None = None, kind: str = "regular") -> dict[str, Any]:
+def furnace(kind: str = "regular") -> dict[str, Any]:
     """Return a sensor in a sphere with one reflectance and one emission."""
     return {
         "type": "scene",
-        "wall": {"type": "sphere", "flip_normals": True, "bsdf": {"type": "diffuse", "reflectance": spectrum(RHO, kind)},
+        "wall": {"type": "sphere", "flip_normals": True,
+                 "bsdf": {"type": "diffuse", "reflectance": spectrum(RHO, kind)},
                  "emitter": {"type": "area", "radiance": spectrum(EMITTED, kind)}},
         "sensor": {"type": "perspective", "fov": 60, "film": {
-            "type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb", "rfilter": {"type": "box"}} | (film or {})},
+            "type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb", "rfilter": {"type": "box"}}},
     }  # fmt: skip
 
 
@@ -60,7 +61,7 @@ def closed_form() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("kind", ["regular", "irregular"])
 @pytest.mark.parametrize("paths", PATHS)
 def test_the_furnace_has_its_colour(paths: str, kind: str) -> None:
-    scene = Case(furnace(kind=kind), []).scene
+    scene = Case(furnace(kind), []).scene
     tracer = integrator("reslrb", DEPTH, paths=paths)
     found = renders(lambda seed: render_image(tracer, scene, 0, seed, 256), range(16)).mean((1, 2))
     expected, *_ = closed_form()
@@ -77,7 +78,7 @@ def test_the_furnace_has_its_derivatives(paths: str, estimator: str, kind: str) 
     if paths == "camera" and estimator != "stack":
         pytest.skip("camera paths have one estimator")
     keys = ["wall.bsdf.reflectance.values", "wall.emitter.radiance.values"]
-    case = Case(furnace(kind=kind), keys)
+    case = Case(furnace(kind), keys)
     tracer = integrator("reslrb", DEPTH, paths=paths, estimator=estimator)
     found = case.gradients(tracer, seeds(16), 256)
     _, by_rho, by_Le = closed_form()
@@ -133,12 +134,10 @@ SPECFILM = {
 @pytest.mark.parametrize("paths", PATHS)
 def test_a_film_with_its_own_responses(paths: str) -> None:
     """The image equals that of `path`, in each channel."""
-    scene = stage({"lamp": lamp(radiance=rgb(8, 7, 6))})
-    sensor = mi.load_dict({"type": "perspective", "fov": 50, "to_world": mi.traverse(scene.sensors()[0])["to_world"],
-                           "film": SPECFILM})  # fmt: skip
-    tracers = integrator("reslrb", 4, paths=paths)
-    ours = renders(lambda seed: mi.TensorXf(render_image(tracers, scene, sensor, seed, 256)), range(8))
-    theirs = renders(lambda seed: render_image(integrator("path", 4), scene, sensor, seed, 256), range(100, 108))
+    scene = stage({"lamp": lamp(radiance=rgb(8, 7, 6))}, camera() | {"film": SPECFILM})
+    tracer, reference = integrator("reslrb", 4, paths=paths), integrator("path", 4)
+    ours = renders(lambda seed: render_image(tracer, scene, 0, seed, 256), range(8))
+    theirs = renders(lambda seed: render_image(reference, scene, 0, seed, 256), range(100, 108))
     inner = (slice(None), slice(1, -1), slice(1, -1))
     result = compare(ours[inner], theirs[inner], block=2)
     assert ours.shape[-1] == 4

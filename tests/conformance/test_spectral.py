@@ -28,7 +28,6 @@ def run(*arguments: str) -> None:
 
 
 def test_the_spectral_variant() -> None:
-    chosen = "stack or coefficients or (colour and regular and not irregular)"
     run(str(HERE / "spectral.py"), *(str(HERE / one) for one in QUICK))
 
 

@@ -48,8 +48,8 @@ def build(options: dict[str, Any]) -> Any:
     scene = mi.cornell_box()
     texels = np.random.default_rng(0).uniform(0.2, 0.9, (texture, texture, 3))
     scene["white"] = {"type": "diffuse", "reflectance": {
-        "type": "bitmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "raw": not mi.is_spectral, "filter_type": "bilinear",
-        "format": "variant"}}  # fmt: skip
+        "type": "bitmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "raw": not mi.is_spectral,
+        "filter_type": "bilinear", "format": "variant"}}  # fmt: skip
     scene["sensor"]["film"] |= {"width": size, "height": size, "rfilter": {"type": "box"}}
     return mi.load_dict(scene, optimize=False)
 

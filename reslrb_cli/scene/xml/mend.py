@@ -5,10 +5,10 @@ without an id a new id. The new id consists of the object's kind and its number 
 Conversions keep the meaning, and are silent. `mend` returns notes on the parts that are left out, and on spectra that
 become colours.
 
-The plugins `regular`, `irregular` and `blackbody` need wavelengths, which only spectral variants have. `convert_spectra` replaces
-these plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba converts a `<spectrum>` element to a
-colour with the CIE matching functions. For emitters, the result is the colour of light. Otherwise, the result is the
-colour of a surface under D65.
+The plugins `regular`, `irregular` and `blackbody` need wavelengths, which only spectral variants have. In other
+variants, `convert_spectra` replaces these plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba
+converts a `<spectrum>` element to a colour with the CIE matching functions. For emitters, the result is the colour of
+light. Otherwise, the result is the colour of a surface under D65.
 """
 
 from __future__ import annotations
