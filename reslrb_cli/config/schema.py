@@ -123,8 +123,11 @@ class Fabrication(Section):
 class Config(Section):
     """One checked experiment. Its paths are absolute."""
 
-    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
-    """Mitsuba variant. `auto`: cuda_ad_rgb if Mitsuba can trace rays with it, otherwise llvm_ad_rgb."""
+    variant: Literal[
+        "auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono", "llvm_ad_spectral", "cuda_ad_spectral"
+    ] = "auto"
+    """Mitsuba variant. `auto`: cuda_ad_rgb if Mitsuba can trace rays with it, otherwise llvm_ad_rgb. The spectral
+    variants trace four wavelengths per path."""
     scene: SceneConfig = Field(description="The scene and its sensors.")
     target: TargetConfig = Field(description="The image to match.")
     views: Annotated[list[ViewSpec], Field(min_length=1)] | None = None

@@ -40,6 +40,10 @@ NEARLY_ZERO = 1e-2
 FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
 
 
+#: Spectra whose wavelengths Mitsuba samples in proportion to their values.
+SAMPLED_SPECTRA = ("RegularSpectrum", "IrregularSpectrum")
+
+
 @dataclass(frozen=True)
 class Differentiated:
     """Parameters that track derivatives.
@@ -51,6 +55,7 @@ class Differentiated:
         directions of refraction.
     - `least` has a value for each parameter that is a factor of a path. A parameter up to this value counts as zero.
     - `entries` is the number of differentiated entries for each node.
+    - `sampled_spectra` are as in `Plan`.
     """
 
     bsdf_nodes: tuple[mi.Object, ...]
@@ -59,6 +64,7 @@ class Differentiated:
     emitters: tuple[mi.Emitter, ...]
     least: dict[str, float]
     entries: dict[mi.Object, int]
+    sampled_spectra: tuple[tuple[mi.Emitter, mi.Texture], ...] = ()
     bends: bool = False
 
     @property
@@ -103,7 +109,18 @@ class Differentiated:
                 obstacle = "light tracing has derivatives of surfaces and emitters, not of the sensor"
             if obstacle is not None:
                 raise UnsupportedScene(f"{key}: {obstacle}")
-        return Differentiated(tuple(nodes), tuple(emitting), tuple(shapes), tuple(emitters), least, entries, bends)
+        owners = {node: params.hierarchy[node][0] for node in emitting if node.class_name() in SAMPLED_SPECTRA}
+        spectra = tuple((owner, node) for node, owner in owners.items() if isinstance(owner, mi.Emitter))
+        return Differentiated(
+            tuple(nodes),
+            tuple(emitting),
+            tuple(shapes),
+            tuple(emitters),
+            least,
+            entries,
+            spectra if mi.is_spectral else (),
+            bends,
+        )
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,8 @@ def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarr
     shapes, emitters = at.graph.shapes(), at.scene.emitters()
     if len(shapes) != 1 or len(emitters) != 1 or shapes[0].class_name() != "Sphere" or weights.shape[2] != 3:
         return None
+    if mi.is_spectral:
+        return None
     bsdf, emitter = mi.traverse(shapes[0].bsdf()), mi.traverse(emitters[0])
     uniform = "reflectance.value" in bsdf and shapes[0].bsdf().class_name() == "SmoothDiffuse" and (
         "radiance.value" in emitter and emitters[0].class_name() == "AreaLight"

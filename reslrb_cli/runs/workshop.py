@@ -23,6 +23,7 @@ from reslrb_cli.glasses import C_LINE, F_LINE, Glass
 from reslrb_cli.lens.solid import Sheet
 from reslrb_cli.records.images import luminance
 from reslrb_cli.report.page.workshop import shown_ssim
+from reslrb_cli.scene.graph import brightness
 from reslrb_cli.scene.images import read_image
 
 Array = np.ndarray[Any, Any]
@@ -103,7 +104,7 @@ def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, targ
         bs, factor = si.bsdf(ray).sample(context, si, sampler.next_1d(again), sampler.next_2d(again), again)
         towards = si.to_world(bs.wo)
         ray = si.spawn_ray(towards)
-        light = dr.select(again, light * mi.Float(mi.luminance(factor) if mi.is_rgb else factor.x), 0)
+        light = dr.select(again, light * (mi.luminance(factor) if mi.is_rgb else dr.mean(factor)), 0)
         active = again & (light > 0)
         left = active & (si.shape == front) & (dr.dot(towards, si.n) * dr.sign(si.n.z) > 0)
         dr.eval(ray, light, active, left, sums)
@@ -120,7 +121,7 @@ def _from_lamps(scene: mi.Scene, count: int) -> tuple[mi.Sampler, mi.Ray3f, mi.F
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, count)
     ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
-    return sampler, ray, mi.Float(mi.luminance(weight) if mi.is_rgb else weight.x)
+    return sampler, ray, brightness(weight, ray.wavelengths)
 
 
 def _is_any(shape: mi.ShapePtr, others: Sequence[mi.Shape]) -> mi.Bool:

@@ -268,7 +268,7 @@ def _unsampled(scene: Any) -> str | None:
 
 
 def _film_obstacle(sensor: Any) -> str | None:
-    if sensor.film().class_name() != "HDRFilm":
+    if sensor.film().class_name() not in ("HDRFilm", "SpecFilm"):
         return f"sensor {sensor.id()} has a {sensor.film().class_name()}; paths are splatted on an `hdrfilm`"
     return None
 
@@ -368,6 +368,8 @@ def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
 def _somewhere() -> Any:
     """Return one surface point, seen from straight above."""
     si = dr.zeros(mi.SurfaceInteraction3f)
+    if mi.is_spectral:
+        si.wavelengths = mi.Spectrum(460, 520, 580, 640)
     si.wi, si.n, si.sh_frame = mi.Vector3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
     return si
 
