@@ -77,7 +77,8 @@ class SceneNeeds:
 
     `emitters` holds class names in the order of `scene.emitters()`. `environment` is the index of the surrounding
     emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
-    tells whether a thin lens may see objects outside of its clip planes, or nothing because of its focus.
+    tells whether a thin lens may see objects outside of its clip planes, or nothing because of its focus. `disperses`
+    tells whether a smooth boundary refracts each wavelength into another direction.
     """
 
     emitters: tuple[str, ...]
@@ -90,6 +91,7 @@ class SceneNeeds:
     has_shading_normals: bool
     has_perturbed_normals: bool
     bsdfs_read_geometry: bool
+    disperses: bool
     moving_shutter: bool
     thin_lens: bool
     principal_point: bool
@@ -143,6 +145,9 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         ),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
+        disperses=mi.is_spectral and any(
+            bsdf.class_name() == GLASS_CLASS and int(bsdf.flags()) & delta for bsdf in graph.of_type(mi.BSDF)
+        ),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=any(

@@ -18,7 +18,7 @@ from reslrb_cli.transport.bsdf import EventNumbers, Scattering, begins_caustic, 
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import density_of_rays
 from reslrb_cli.transport.factors import Product, play
-from reslrb_cli.transport.film import Colours
+from reslrb_cli.transport.film import Colours, keep_one
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex, intersect
@@ -65,6 +65,8 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0.5)
     ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture, wavelength)
+    if samples.plan.needs.disperses:
+        weight = keep_one(ray, weight)
     weight = weight * (samples.fraction * dr.rcp(per_pixel))
     return FilmRay(dr.detach(ray), u, dr.detach(weight))
 

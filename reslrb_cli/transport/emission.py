@@ -19,7 +19,7 @@ import numpy as np
 
 from reslrb_cli.scene.graph import sensor_rays
 from reslrb_cli.transport.connection import forward_derivatives
-from reslrb_cli.transport.film import AdjointImage, Colours
+from reslrb_cli.transport.film import AdjointImage, Colours, keep_one
 from reslrb_cli.transport.lamp_light import moving_splats, small_splat
 from reslrb_cli.transport.lamps import environment_ray, lamp_ray
 from reslrb_cli.transport.plan import Plan
@@ -116,7 +116,7 @@ def _at_fixed_wavelengths(plan: Plan, ray: mi.Ray3f, emitter: mi.EmitterPtr, wei
         value, mean = spectrum.eval(si), spectrum.mean()
         ratio = value / dr.detach(value) * (dr.detach(mean) / mean)
         weight = mi.Spectrum(dr.select((emitter == mi.EmitterPtr(own)) & (value != 0), weight * ratio, weight))
-    return weight
+    return keep_one(ray, weight) if plan.needs.disperses else weight
 
 
 def _emitter_ray(

@@ -245,6 +245,16 @@ def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
 # ---- Response to wavelengths ----
 
 
+def keep_one(ray: mi.Ray3f, weight: mi.Spectrum) -> mi.Spectrum:
+    """Give a ray its first wavelength in place of all, and return the weight (C,) of the ray.
+
+    Behind a smooth boundary of glass with dispersion, only one wavelength goes on (`scene/dispersion.py`). Rays that
+    carry one wavelength from the start lose no light there.
+    """
+    ray.wavelengths = mi.Spectrum(ray.wavelengths[0])
+    return mi.Spectrum(weight[0])
+
+
 def responses_of(sensor: mi.Sensor) -> Callable[[mi.Wavelength], list[mi.Spectrum]]:
     """Return a function from wavelengths to the responses of the film's channels, divided by the number of wavelengths.
 
