@@ -145,9 +145,8 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         ),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
-        disperses=mi.is_spectral and any(
-            bsdf.class_name() == GLASS_CLASS and int(bsdf.flags()) & delta for bsdf in graph.of_type(mi.BSDF)
-        ),
+        disperses=mi.is_spectral
+        and any(bsdf.class_name() == GLASS_CLASS and int(bsdf.flags()) & delta for bsdf in graph.of_type(mi.BSDF)),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=any(

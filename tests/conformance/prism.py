@@ -4,6 +4,8 @@ wavelength and each place in the slit. It shares no code with the package or Mit
 
 from __future__ import annotations
 
+import functools
+
 import colour
 import numpy as np
 
@@ -16,7 +18,7 @@ SLIT, BEAM, HALF_WIDTH, HEIGHT = np.array([-0.85584, -0.25322]), 24.0, 0.005, 0.
 INRADIUS, SCREEN, SCREEN_TURN, EYE = 0.14433757, np.array([1.9332, -0.7825]), -64.7, np.array([1.0291, -0.3552])
 ALBEDO, LIGHT = 0.8, 40.0
 #: Wavelengths in nm, and places in the slit.
-STEP, PLACES = 0.5, 101
+STEP, PLACES = 1.0, 41
 WAVELENGTHS = np.arange(380.0, 780.0, STEP)
 
 
@@ -33,6 +35,7 @@ def index(nm: np.ndarray, nd: float | None = None, Vd: float | None = None) -> n
     return nd + (nd - 1) / Vd * (sellmeier(nm) - d) / (F - C_)
 
 
+@functools.cache
 def picture(nd: float | None = None, Vd: float | None = None) -> np.ndarray:
     """Return the sum of the picture over its rows, (width, 3), in linear sRGB."""
     along, across = axes(90 - BEAM)[0], axes(90 - BEAM)[1]
@@ -56,7 +59,15 @@ def picture(nd: float | None = None, Vd: float | None = None) -> np.ndarray:
     pixel = (2 * half / FILM[0]) ** 2
     area = 2 * HALF_WIDTH * HEIGHT / PLACES
     spectra = colour_of(nm) * (flux * illuminant(nm) * STEP * area * ALBEDO / np.pi / pixel)[:, None]
-    return splat(u, spectra)
+    return splat(u, spectra, FILM[0])
+
+
+def image(nd: float | None = None, Vd: float | None = None) -> np.ndarray:
+    """Return the picture (height, width, 3) in linear sRGB. All rows show the same colours."""
+    half = np.tan(np.radians(FOV) / 2) * float(np.linalg.norm(SCREEN - EYE))
+    v = FILM[1] / 2 + np.linspace(-0.5, 0.5, 1001) * HEIGHT / (2 * half) * FILM[0]
+    rows = splat(v, np.ones((len(v), 1)), FILM[1])[:, 0]
+    return (rows / rows.sum())[:, None, None] * picture(nd, Vd)
 
 
 def axes(turn: float) -> tuple[np.ndarray, np.ndarray]:
@@ -93,13 +104,13 @@ def illuminant(nm: np.ndarray) -> np.ndarray:
     return LIGHT * np.interp(nm, d65.wavelengths, d65.values) / whole
 
 
-def splat(u: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the values (N, 3) at film columns u (N,) through Mitsuba's Gaussian filter, summed per column."""
-    image, first = np.zeros((FILM[0], 3)), np.floor(u).astype(int)
+def splat(u: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:
+    """Return the values (N, C) at places u (N,) on a film through Mitsuba's Gaussian filter, summed per pixel."""
+    result, first = np.zeros((size, values.shape[1])), np.floor(u).astype(int)
     columns = [first + i for i in range(-3, 4)]
     weights = [np.maximum(np.exp(-2 * (c + 0.5 - u) ** 2) - np.exp(-8.0), 0) * (abs(c + 0.5 - u) <= 2) for c in columns]
     whole = sum(weights)
     for column, weight in zip(columns, weights, strict=True):
-        inside = (column >= 0) & (column < FILM[0])
-        np.add.at(image, column[inside], values[inside] * (weight / whole)[inside, None])
-    return image
+        inside = (column >= 0) & (column < size)
+        np.add.at(result, column[inside], values[inside] * (weight / whole)[inside, None])
+    return result

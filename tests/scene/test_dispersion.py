@@ -115,7 +115,7 @@ def test_each_wavelength_scatters_as_in_mitsubas_dielectric(rough: float | None,
     """With one wavelength, samples, values and densities are equal to those of Mitsuba's plugins. With four, the mean
     of each weighted by a function of the direction is that of the wavelength alone.
     """
-    context, count = mi.BSDFContext(getattr(mi.TransportMode, mode)), 200_000
+    context, count = mi.BSDFContext(getattr(mi.TransportMode, mode)), 50_000
     more = {} if rough is None else {"alpha": rough}
     glass = mi.load_dict(GLASS | more)
     si, sample1, sample2 = rays(count)
