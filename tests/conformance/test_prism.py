@@ -1,4 +1,6 @@
-"""The rainbow of a prism: picture and derivatives against a tracer of its own (`prism.py`), and recovery of the glass."""
+"""The rainbow of a prism: picture and derivatives against an independent tracer (`prism.py`), and recovery of the
+glass.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +17,7 @@ from conformance.prism import FILM, image, index, picture
 from reslrb_cli.integrators.plugin import register
 from reslrb_cli.records.images import write_file
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.run_folder import read_value
 from reslrb_cli.scene.load import load_scene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -82,12 +85,12 @@ def test_derivatives_by_the_glass_match_differences_of_the_tracer(estimator: str
 
 
 @pytest.mark.long
-def test_the_glass_is_recovered_from_the_picture_of_the_tracer(tmp_path: Path) -> None:
+def test_the_glass_is_recovered_from_the_picture_of_the_tracer(prism: mi.Scene, tmp_path: Path) -> None:
     """The picture is a file that neither the package nor Mitsuba rendered."""
     write_file(tmp_path / "rainbow.exr", image().astype(np.float32), linear=True)
     done("optimize", ROOT / "configs/prism.yaml", "--set", f"run.output={tmp_path}", "--set", "run.name=it",
          "--set", f"target={{file: {tmp_path}/rainbow.exr, mask: none}}")  # fmt: skip
     assert read_manifest(tmp_path / "it")["status"] == "finished"
-    values = {key: float(np.load(tmp_path / f"it/parameters/{key}.npy")) for key in TRUE}
+    values = {key: float(read_value(tmp_path / "it", key)) for key in TRUE}
     assert values["glass.nd"] == pytest.approx(TRUE["glass.nd"], abs=1e-4)
     assert values["glass.Vd"] == pytest.approx(TRUE["glass.Vd"], rel=0.01)
