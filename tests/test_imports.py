@@ -21,6 +21,7 @@ ROWS = [
     "errors",
     "seeds",
     "statistics",
+    "glasses",
     "config",
     "backend",
     "records",
@@ -45,6 +46,7 @@ FOREIGN = {
     "config": {"mitsuba", "drjit"},
     "seeds": {"mitsuba", "drjit"},
     "statistics": {"mitsuba", "drjit"},
+    "glasses": {"mitsuba", "drjit"},
     "records": {"matplotlib"},
     "lens": {"mitsuba", "drjit", "matplotlib"},
 }

@@ -94,10 +94,8 @@ def choose(name: str = "auto") -> tuple[str, str]:
 
 
 def works_under(variant: str) -> bool:
-    """True if the integrators support `variant`. A supported variant has derivatives, and three colour channels
-    or one.
-    """
-    return variant.endswith(("_ad_rgb", "_ad_mono"))
+    """True if the integrators support `variant`. A supported variant has derivatives, and no polarization."""
+    return variant.endswith(("_ad_rgb", "_ad_mono", "_ad_spectral"))
 
 
 @functools.cache

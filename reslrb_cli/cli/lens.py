@@ -10,6 +10,7 @@ import click
 
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.glasses import find_glass
 from reslrb_cli.records.atomic import write_atomically, writing
 
 if TYPE_CHECKING:
@@ -46,6 +47,23 @@ def read_luminance(path: Path) -> np.ndarray:
     return image
 
 
+class Index(click.ParamType):
+    """An index of refraction, or the name of a material of the catalogue."""
+
+    name = "index"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
+        try:
+            return float(value)
+        except ValueError:
+            pass
+        try:
+            find_glass(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+        return str(value)
+
+
 @dataclass(frozen=True)
 class LensOptions:
     """The options of the command, by the names of its parameters."""
@@ -55,7 +73,7 @@ class LensOptions:
     size: float
     distance: float
     picture_size: float | None
-    ior: float
+    ior: float | str
     thickness: float | None
     mirror: float | None
     outline: Literal["rectangle", "round"]
@@ -87,7 +105,8 @@ class LensOptions:
     "--distance", type=float, default=200.0, show_default=True, help="Distance from the face to the receiver, in mm."
 )
 @click.option("--picture-size", type=float, help="Longer side of the picture on the receiver, in mm. Default: --size.")
-@click.option("--ior", type=float, default=1.49, show_default=True, help="Index of refraction.")
+@click.option("--ior", type=Index(), default=1.49, show_default=True,
+              help="Index of refraction, or the name of a material, such as PMMA.")  # fmt: skip
 @click.option(
     "--thickness", type=float, help="Thickness of the lens at its flat face, in mm. Default: a quarter of --size."
 )
@@ -146,6 +165,7 @@ def command(**given: Any) -> None:
                           f"{longer} pixels")  # fmt: skip
     rows, columns = image.shape
     at, is_mirror = options.light_distance, options.mirror is not None
+    glass = options.ior if isinstance(options.ior, str) else None
     if options.outline == "round" and at is not None and (is_mirror or rows != columns):
         raise ConfigError("--outline", "", "round needs parallel light, or a point light, a lens and a square picture: "
                           "the cone of a point light fits no other face")  # fmt: skip
@@ -155,7 +175,7 @@ def command(**given: Any) -> None:
         size=tuple(size * share),
         distance=options.distance,
         picture_size=tuple((size if options.picture_size is None else options.picture_size) * share),
-        ior=options.ior,
+        ior=options.ior if glass is None else find_glass(glass).nd,
         thickness=size / 4 if options.thickness is None else options.thickness,
         outline=options.outline,
         light_distance=np.inf if at is None else at,
@@ -182,7 +202,7 @@ def command(**given: Any) -> None:
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
             "scene.xml": experiment.scene_xml(surface, film, columns, power, sun).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun, glass).encode(),
         }
         for name, content in texts.items():
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]

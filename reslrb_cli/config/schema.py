@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
     PrivateAttr,
@@ -42,6 +43,7 @@ from reslrb_cli.config.optimizers import (
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.run import AUTO_SHARDS, RunConfig
 from reslrb_cli.config.views import TargetConfig, ViewSpec, check_views
+from reslrb_cli.glasses import Glass, find_glass
 
 
 def _scalar(value: Any) -> Any:
@@ -72,6 +74,17 @@ class SceneConfig(Section):
 # --- solids -----------------------------------------------------------------------------------------------------------
 
 
+def _index(value: float | str) -> float | str:
+    if isinstance(value, str):
+        try:
+            find_glass(value)
+        except ValueError as error:
+            raise wrong(str(error)) from None
+    elif not 1 < value <= 5:
+        raise wrong("must be above 1 and at most 5, or the name of a material")
+    return value
+
+
 class Fabrication(Section):
     """Solid of a lens or a mirror with a heightmap on its face, in millimetres. `reslrb export` writes and
     checks it.
@@ -87,7 +100,8 @@ class Fabrication(Section):
     outline: Literal["rectangle", "round"] = "rectangle"
     """Outline of the solid. `round`: the ellipse inside the face; the face outside of it is cut off."""
     rim: Annotated[float, Field(ge=0)] = Field(default=0.0, description="Width of a flat rim around the face, in mm.")
-    ior: Annotated[float, Field(gt=1, le=5)] = Field(default=1.49, description="Index of refraction of a lens.")
+    ior: Annotated[float | str, AfterValidator(_index)] = 1.49
+    """Index of refraction of a lens, or the name of its material, such as `PMMA`."""
     sun: Annotated[float, Field(ge=0, lt=90)] = Field(
         default=0.53, description="Angular diameter of the light source, in degrees."
     )
@@ -95,12 +109,25 @@ class Fabrication(Section):
     """The picture before its dark parts were lifted, as the film sees it. The result is compared with it as well as
     with the target. null: only with the target."""
 
+    @property
+    def glass(self) -> Glass | None:
+        """The material, if `ior` is a name."""
+        return find_glass(self.ior) if isinstance(self.ior, str) else None
+
+    @property
+    def index(self) -> float:
+        """Index of refraction, n_d of a material."""
+        return find_glass(self.ior).nd if isinstance(self.ior, str) else self.ior
+
 
 class Config(Section):
     """One checked experiment. Its paths are absolute."""
 
-    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
-    """Mitsuba variant. `auto`: cuda_ad_rgb if Mitsuba can trace rays with it, otherwise llvm_ad_rgb."""
+    variant: Literal[
+        "auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono", "llvm_ad_spectral", "cuda_ad_spectral"
+    ] = "auto"
+    """Mitsuba variant. `auto`: cuda_ad_rgb if Mitsuba can trace rays with it, otherwise llvm_ad_rgb. The spectral
+    variants trace four wavelengths per path."""
     scene: SceneConfig = Field(description="The scene and its sensors.")
     target: TargetConfig = Field(description="The image to match.")
     views: Annotated[list[ViewSpec], Field(min_length=1)] | None = None

@@ -128,12 +128,12 @@ def reach(
     slid = find_vertex(ray, pi, active if plan.near > 0 else active & ~stays).si
     stayed, reaching, factor = find_following_vertex(ray, pi, stays)
     with dr.suspend_grad():
-        other, other_bsdf = before[0].point.interaction(plan, stays)
+        other, other_bsdf = before[0].point.interaction(plan, ray.wavelengths, stays)
     # Derivatives of f by its own parameters belong to the previous vertex, so if parameters are resumed here, only the
     # direction is. (A variable that is made in one selective scope counts as suspended in another.)
     with dr.suspend_grad(when=parameters), dr.resume_grad(reaching.d, when=parameters):
         f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
-    changed = dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1) * factor
+    changed = mi.Spectrum(dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1)) * factor
     if plan.near > 0:
         near = plan.near**2
         shares = [near / (dr.squared_norm(place - ray.o) + near) for place in (stayed.p, slid.p)]
@@ -217,19 +217,19 @@ class AttachedFrame:
 
         Takes the adjoint of the segment's outgoing ray, and returns the adjoint of the ray that reaches the vertex.
         """
-        assert p.adjoint is not None
+        assert p.adjoint is not None and p.colours is not None
         plan, P, B = p.plan, self.prefix, adjoint.B
         connected = self.connected != 0
         scattered = dr.any(B != 0) | dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)
         numbers = Numbers(self.sample_2, self.sample_1, self.aperture[0] if self.aperture else mi.Point2f(0.5))
-        pi, ray = self.point.hit()
+        pi, ray = self.point.hit(p.wavelengths)
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
             this, reached = segment_again(p.samples, self.before, ray, pi, numbers, connected, scattered)
             there, following = this.connection, this.next_ray(attached=True)
             seen = connected & there.active
-            delta = p.adjoint.lookup(there.u, seen, plan.attached_normalization) * p.scale
+            delta = p.adjoint.lookup(there.u, seen, p.colours, plan.attached_normalization) * p.scale
             own = dr.select(seen, delta * there.f * there.rest, 0)
             later = dr.select(scattered, this.scattering.s * B, 0)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
@@ -279,7 +279,7 @@ class AttachedSweep(VertexHooks):
         p, plan, seen = self.p, self.p.plan, connection.active
         if p.block is not None:
             C = vertex.product.times(connection.c, vertex.depth).scaled(p.scale)
-            p.splat(connection.u, C.value(), seen)
+            p.splat(connection.u, C.value(), seen, self.colours)
         here = vertex.active & self._useful(state, vertex)
         if self.end is not None:
             here = here & (state.stack.count < self.end)
@@ -323,12 +323,13 @@ class AttachedStack(Stack):
     def _differentiate(self, p: Pass) -> Adjoint:
         """Trace the paths, splat them if there is an image, and walk back. Returns the adjoint at the emitter."""
         ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
-        state: AttachedState = p.walk(AttachedSweep(p, ring))
+        sweep = AttachedSweep(p, ring)
+        state: AttachedState = p.walk(sweep)
 
         def before(end: mi.UInt32) -> StackState:
             return again.walk(AttachedSweep(again, ring, end), end > 0).stack
 
-        return walk_back(p, AttachedFrame.blank(p.plan), ring, state.stack, Adjoint.none(), before)
+        return walk_back(p.along(sweep), AttachedFrame.blank(p.plan), ring, state.stack, Adjoint.none(), before)
 
 
 def begins(plan: Plan, vertex: Vertex) -> mi.Bool:

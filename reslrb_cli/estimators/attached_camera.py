@@ -70,7 +70,7 @@ class AttachedCameraFrame:
         scattered = dr.any(B != 0) | dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)
         connected = self.scale[0] != 0 if self.scale else mi.Bool(False)
         lit = self.met[0] != 0 if self.met else mi.Bool(False)
-        pi, ray = self.point.hit()
+        pi, ray = self.point.hit(p.wavelengths)
         pi.valid &= ~leaves
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
@@ -123,7 +123,7 @@ class AttachedCameraSweep(CameraHooks):
 
     def start(self, first: FilmRay) -> AttachedCameraState:
         plan = self.p.plan
-        self.delta = self.p.delta(first.u, mi.Bool(True)) * first.weight
+        self.delta = self.p.delta(first.u, mi.Bool(True), self.colours) * first.weight
         stack = StackState.begin(AttachedCameraFrame.blank(plan), self.ring, mi.Float(1))
         return AttachedCameraState(stack, Before.start(plan), [] if self.p.block is None else [mi.Spectrum(0)])
 

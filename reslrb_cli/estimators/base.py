@@ -14,11 +14,13 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.scene.graph import no_wavelengths
 from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.camera import CameraHooks
 from reslrb_cli.transport.connection import Connection, stand_in, transmittance
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import NO_ZERO, Product, showing
-from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.film import AdjointImage, Colours
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
@@ -36,6 +38,23 @@ class Pass:
     samples: Samples
     block: mi.ImageBlock | None
     adjoint: AdjointImage | None
+    #: Wavelengths of the paths; None before the first walk.
+    colours: Colours | None = None
+
+    def along(self, hooks: Hooks | CameraHooks) -> Pass:
+        """Return this pass with the wavelengths of the paths that `hooks` have followed."""
+        return replace(self, colours=hooks.colours)
+
+    def with_colours(self) -> Pass:
+        """Return this pass with the wavelengths of its light paths, which are sampled again."""
+        wavelengths = self.emission().ray.wavelengths if mi.is_spectral else no_wavelengths()
+        return replace(self, colours=self.samples.film.colours(wavelengths))
+
+    @property
+    def wavelengths(self) -> mi.Wavelength:
+        """Wavelengths of the paths."""
+        assert self.colours is not None
+        return self.colours.wavelengths
 
     @property
     def plan(self) -> Plan:
@@ -55,15 +74,15 @@ class Pass:
         """Return the rays that leave the emitters, and E (C,) of each path, with derivatives."""
         return sample_emission(self.samples, self.samples.sampler())
 
-    def delta(self, u: mi.Point2f, active: mi.Bool) -> mi.Spectrum:
+    def delta(self, u: mi.Point2f, active: mi.Bool, colours: Colours) -> mi.Spectrum:
         """Return the adjoint (C,) at film position `u`. dL/dI must be known."""
         assert self.adjoint is not None
-        return self.adjoint.lookup(u, active)
+        return self.adjoint.lookup(u, active, colours)
 
-    def splat(self, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool) -> None:
+    def splat(self, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool, colours: Colours) -> None:
         """Add `value` (C,) to the image if there is one."""
         if self.block is not None:
-            self.samples.film.put(self.block, u, value, active)
+            self.samples.film.put(self.block, u, value, active, colours)
 
 
 class Estimator(ABC):
@@ -132,7 +151,7 @@ def adjoint_of_factor(
     """
     f, value, zeros = dr.detach(f), adjoint.value, adjoint.product.zero
     if not zeros:
-        return dr.select(f != 0, showing(value / f), 0)
+        return mi.Spectrum(dr.select(f != 0, showing(value / f), 0))
     result, rest = mi.Spectrum(0), mi.Spectrum(rest)
     for c, zero in enumerate(zeros):
         at_zero = dr.select(zero == mi.Int32(index), value[c] * rest[c], 0)
@@ -233,23 +252,28 @@ class SurfacePoint:
         """Return the ray that reached the vertex. The ray is stored only in scenes whose BSDFs read geometry."""
         return mi.Ray3f(*self.numbers[-2:])
 
-    def hit(self) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
+    def hit(self, wavelengths: mi.Wavelength) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
         """Return the intersection and its ray. Both are stored only in scenes whose BSDFs read geometry."""
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to local memory crashes the process
         pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
         pi.shape = dr.reinterpret_array(mi.ShapePtr, shape)
         pi.instance = dr.reinterpret_array(mi.ShapePtr, instance)
-        return pi, mi.Ray3f(o, d)
+        ray = mi.Ray3f(o, d)
+        ray.wavelengths = wavelengths
+        return pi, ray
 
-    def interaction(self, plan: Plan, active: mi.Bool | bool = True) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
+    def interaction(
+        self, plan: Plan, wavelengths: mi.Wavelength, active: mi.Bool | bool = True
+    ) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
         """Return the surface interaction with all data that BSDFs read, and the BSDF."""
         if not plan.keep_geometry:
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.uv, si.wi, *pointer = self.numbers
             si.t = mi.Float(0)  # valid
+            si.wavelengths = wavelengths
             return si, dr.reinterpret_array(mi.BSDFPtr, pointer[0]) if pointer else plan.sole_bsdf
-        pi, ray = self.hit()
+        pi, ray = self.hit(wavelengths)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         return si, si.bsdf()
 

@@ -51,8 +51,9 @@ class Radiance(CameraHooks):
 
 def splat_camera_paths(samples: Samples, block: mi.ImageBlock, tracked: bool = False) -> None:
     """Add the image of camera paths to the block."""
-    first, L = camera_walk(samples, Radiance(tracked))
-    samples.film.put(block, first.u, L * first.weight, mi.Bool(True))
+    hooks = Radiance(tracked)
+    first, L = camera_walk(samples, hooks)
+    samples.film.put(block, first.u, L * first.weight, mi.Bool(True), hooks.colours)
 
 
 @dataclass
@@ -74,7 +75,7 @@ class CameraSweep(CameraHooks):
         self.delta = mi.Spectrum(0)  # assigned at the start
 
     def start(self, first: FilmRay) -> CameraState:
-        self.delta = self.p.delta(first.u, mi.Bool(True)) * first.weight
+        self.delta = self.p.delta(first.u, mi.Bool(True), self.colours) * first.weight
         stack = Frame.empty_stack(self.p.plan, self.ring)
         return CameraState(stack, [] if self.p.block is None else [mi.Spectrum(0)])
 
@@ -130,11 +131,12 @@ def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
     form = (AttachedCameraFrame if attached else Frame).blank(p.plan)
     sweep = AttachedCameraSweep if attached else CameraSweep
     ring, again = Ring.of(p.plan, stack_size, last=int(attached)), Pass(p.samples, None, p.adjoint)
-    first, state = camera_walk(p.samples, sweep(p, ring))
+    hooks = sweep(p, ring)
+    first, state = camera_walk(p.samples, hooks)
     if p.block is not None:
-        p.samples.film.put(p.block, first.u, state.L[0] * first.weight, mi.Bool(True))
+        p.splat(first.u, state.L[0] * first.weight, mi.Bool(True), hooks.colours)
 
     def before(end: mi.UInt32) -> StackState:
         return camera_walk(p.samples, sweep(again, ring, end), end > 0)[1].stack
 
-    walk_back(p, form, ring, state.stack, Adjoint.none() if attached else state.stack.since, before)
+    walk_back(p.along(hooks), form, ring, state.stack, Adjoint.none() if attached else state.stack.since, before)

@@ -109,8 +109,9 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     beside = both_sides(samples, outline, creases=True, everywhere=True)
     ray = dr.select(over, beside.over, beside.past)
     first = FilmRay(ray, outline.view.u, mi.Spectrum(1))
-    _, L = camera_walk(samples, Radiance(tracked=False), beside.active, first)
-    weight = p.delta(outline.view.u, beside.active) * outline.weight * (2 * p.scale)
+    hooks = Radiance(tracked=False)
+    _, L = camera_walk(samples, hooks, beside.active, first)
+    weight = p.delta(outline.view.u, beside.active, hooks.colours) * outline.weight * (2 * p.scale)
     change = showing(dr.dot(weight, L)) * dr.select(over, 1, -1) * share_of(samples, outline, beside)
     active = beside.active & (change != 0)
     # At a crease, x lies on the shape itself.
@@ -159,7 +160,7 @@ class ImportanceHooks(Hooks):
         numbers: list[mi.Float],
     ) -> Importance:  # fmt: skip
         C = vertex.product.times(connection.c, vertex.depth).value()
-        own = dr.dot(C, self.p.delta(connection.u, connection.active)) * state.counts
+        own = dr.dot(C, self.p.delta(connection.u, connection.active, self.colours)) * state.counts
         own = dr.select(connection.active, own, 0)
         first, si = vertex.depth == self.first, vertex.si
         # Behind a caustic's first surface, the light belongs to light paths.
@@ -182,7 +183,8 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     samples = p.samples
     assert samples.edges is not None
     chances = chances_of(samples, numbers)
-    outline = sample_outline(samples, samples.edges.lamp, view_from_lamps(samples, chances.viewpoint), chances)
+    from_lamps = view_from_lamps(samples, chances.viewpoint, chances.wavelengths)
+    outline = sample_outline(samples, samples.edges.lamp, from_lamps, chances)
     n, view = outline.normal, outline.view
     beside = both_sides(samples, outline)
     x, active = beside.x, beside.active & beside.x.is_valid() & ~touches_behind(outline, beside)

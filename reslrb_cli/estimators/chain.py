@@ -184,7 +184,7 @@ class ChainSelection(VertexHooks):
     ) -> ChainState:  # fmt: skip
         p, plan = self.p, self.p.plan
         C = contribution(p, vertex, connection)
-        p.splat(connection.u, C.value(), connection.active)
+        p.splat(connection.u, C.value(), connection.active, self.colours)
         here = begins(plan, vertex)
         on = self.concerned(state) | here
         latest = dr.select(here & vertex.active, vertex.depth, state.latest[0])
@@ -193,7 +193,7 @@ class ChainSelection(VertexHooks):
             p.samples, vertex, state.before, numbers_of(connection, scattering), candidate, scattering.active & on,
             self.damping,
         )  # fmt: skip
-        w = at_least_share(selection_weight(p, self.weight, connection, C), state.W)
+        w = at_least_share(selection_weight(p, self.weight, connection, C, self.colours), state.W)
         w = dr.select(candidate, w, 0)
         W = state.W + w
         [J], G = state.J, state.G
@@ -244,12 +244,12 @@ class KeptConnection:
     @staticmethod
     def of(p: Pass, slot: ChainSlot, share: mi.Float) -> KeptConnection:
         """Return the connection of a slot. dL/dI must be known."""
-        assert p.adjoint is not None
+        assert p.adjoint is not None and p.colours is not None
         C = slot.C.value() * share
         with dr.resume_grad():
             u = mi.Point2f(slot.u)
             dr.enable_grad(u)
-            delta = p.adjoint.lookup(u, slot.w != 0, p.plan.attached_normalization)
+            delta = p.adjoint.lookup(u, slot.w != 0, p.colours, p.plan.attached_normalization)
             dr.backward_from(dr.dot(delta, C))
             by_u = dr.grad(u)
         delta = dr.detach(delta)
@@ -331,7 +331,7 @@ class ChainReplay(SlotReplay):
         with dr.resume_grad():
             this, reached = segment_again(p.samples, before, vertex.ray, vertex.pi, numbers, connected, scattered)
             there, following = this.connection, this.next_ray(attached=True)
-            delta = p.adjoint.lookup(there.u, connected, plan.attached_normalization)
+            delta = p.adjoint.lookup(there.u, connected, self.colours, plan.attached_normalization)
             own_part = dr.select(connected, dr.dot(by_c, reached * delta * there.f * there.rest), 0)
             moved = dr.dot(origin, following.o) + dr.dot(direction, following.d)
             later = dr.select(scattered, moved + dr.dot(by_s, reached * this.scattering.s), 0)
@@ -353,6 +353,7 @@ class AttachedReservoir(Selecting):
         return p.walk(ChainSelection(p, self.capacity, self.weight, self.damping)).stored()
 
     def backward(self, p: Pass, state: ChainState) -> None:
+        p = p.with_colours()
         shares = [inverse_probability(state.W, slot, self.capacity) for slot in state.slots]
         kept = [KeptConnection.of(p, slot, share) for slot, share in zip(state.slots, shares, strict=True)]
         differentiate(p, kept, self.damping)

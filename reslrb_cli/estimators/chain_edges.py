@@ -81,16 +81,17 @@ def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Float:
     target = edge.here.target
     f = evaluate(p.plan, x.si, x.bsdf, target.wo, shadow)
     lost = edge.weight * f * target.weight
+    colours = samples.film.colours(edge.over.ray.wavelengths)
     if camera:
         _, L = camera_walk(
             samples, Radiance(tracked=False), continues, FilmRay(ray, edge.u, mi.Spectrum(1), depth=depth)
         )
-        delta = p.delta(edge.u, edge.active)
+        delta = p.delta(edge.u, edge.active, colours)
         found, lost = dr.dot(delta * edge.weight, L), dr.dot(delta, lost)
     else:
         emission = Emission(ray, edge.weight, dr.zeros(mi.EmitterPtr))
         found = walk(samples, Contribution(p), continues, emission, depth)[0]
-        lost = dr.dot(p.delta(target.u, shadow), lost)
+        lost = dr.dot(p.delta(target.u, shadow, colours), lost)
     return showing(dr.select(edge.shadow, -0.5 * lost, dr.select(over, found, -found))) * p.scale
 
 
@@ -171,7 +172,7 @@ class SpecularFrame:
         reaches the vertex.
         """
         active = dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)
-        pi, ray = self.point.hit()
+        pi, ray = self.point.hit(p.wavelengths)
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
@@ -238,4 +239,5 @@ def differentiate_edges_behind_chains(own: Pass) -> None:
         mi.Spectrum(0),
     )
     vertices = dr.select(active, edge.over.count, 0)
+    own = replace(own, colours=own.samples.film.colours(edge.over.ray.wavelengths))
     pop(own, SpecularFrame.blank(own.plan), ring, _stack_of(own, chains, edge, ring), vertices, mi.UInt32(0), adjoint)

@@ -92,6 +92,7 @@ def edge_samples(samples: Samples, stream: int, each: int = PATHS_PER_OUTLINE) -
         samples.plan, attached=False, stays=False, glossy_follows=False, moving_shapes=(), grid=None,
         aims=False, sequence=None, differentiate_bsdfs=False, differentiate_emission=False, track_zeros=False,
         only_bsdfs=(), differentiate_delta=False, differentiate_null=False, evened_lamps=(),
+        sampled_spectra=(),
     )  # fmt: skip
     width = max(samples.width // each, 1)
     seed = mi.sample_tea_32(samples.seed, mi.UInt32(stream))[0]
@@ -151,7 +152,7 @@ def both_sides(
     active = outline.active & (back > 0)
 
     def ray(side: float | mi.Float) -> mi.Ray3f:
-        return mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d)
+        return with_wavelengths(mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d), outline)
 
     over, past = ray(dr.select(outline.is_round, -ROUND, -1)), ray(1)
     pi = scene.ray_intersect_preliminary(over, coherent=False, active=active)
@@ -167,6 +168,12 @@ def both_sides(
         # Behind a crease lies the other face. It may be narrower than the offset if it is seen at a grazing angle.
         active = active & (~outline.crease | (x.is_valid() & (x.shape == outline.shape)))
     return Beside(over, past, pi, x, active)
+
+
+def with_wavelengths(ray: mi.Ray3f, outline: Outline) -> mi.Ray3f:
+    """Return the ray, with the wavelengths of the outline's light."""
+    ray.wavelengths = outline.wavelengths
+    return ray
 
 
 def touches_behind(outline: Outline, beside: Beside) -> mi.Bool:
@@ -260,7 +267,7 @@ class Contribution(Hooks):
         numbers: list[mi.Float],
     ) -> list[mi.Float]:  # fmt: skip
         C = vertex.product.times(connection.c, vertex.depth).value()
-        own = dr.select(connection.active, dr.dot(C, self.p.delta(connection.u, connection.active)), 0)
+        own = dr.select(connection.active, dr.dot(C, self.p.delta(connection.u, connection.active, self.colours)), 0)
         if self.smooth is None:
             return [state[0] + own]
         here = self.smooth & (vertex.depth == 1)
@@ -281,7 +288,7 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     samples = p.samples
     assert samples.edges is not None
     over, chances = halves(samples, numbers)
-    view = view_from_lamps(samples, chances.viewpoint)
+    view = view_from_lamps(samples, chances.viewpoint, chances.wavelengths)
     outline = sample_outline(samples, samples.edges.lamp, view, chances, creases=True)
     beside = both_sides(samples, outline, creases=True)
     ray = dr.select(over, beside.over, beside.past)
@@ -439,7 +446,7 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     beside.active = beside.active & ~touches
     behind = Behind(n, numbers if samples.plan.moving_emission else None)
     _, L = camera_walk(samples, behind, beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
-    weight = p.delta(outline.view.u, beside.active) * outline.weight * p.scale
+    weight = p.delta(outline.view.u, beside.active, behind.colours) * outline.weight * p.scale
     still, slid, rest = (showing(dr.dot(weight, part)) for part in (L.all, L.slid, L.rest))
     active = beside.active & (still != 0)
     s = outline.view.distance / dr.norm(beside.past.o + beside.past.d * x.t - outline.view.y)
@@ -498,7 +505,7 @@ def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
     offset = ray_offset(outline.p)
-    back = mi.Ray3f(outline.p + outline.normal * offset, outline.view.to_y)
+    back = with_wavelengths(mi.Ray3f(outline.p + outline.normal * offset, outline.view.to_y), outline)
     y = samples.scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
     outline.active = outline.active & y.is_valid()
     outline.view.distance = y.t

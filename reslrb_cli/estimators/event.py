@@ -92,8 +92,8 @@ class EventSelection(VertexHooks):
     ) -> EventState:  # fmt: skip
         p, plan = self.p, self.p.plan
         C = contribution(p, vertex, connection)
-        p.splat(connection.u, C.value(), connection.active)
-        w = dr.select(connection.active, selection_weight(p, self.weight, connection, C), 0)
+        p.splat(connection.u, C.value(), connection.active, self.colours)
+        w = dr.select(connection.active, selection_weight(p, self.weight, connection, C, self.colours), 0)
         q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
         if plan.differentiate_null:
             q = mi.Float(1)  # masks between vertex and sensor may have differentiated parameters
@@ -129,6 +129,7 @@ class EventEstimator(Selecting):
         return EventState([], mi.Float(0), [], [EventSlot.empty(plan) for _ in range(self.capacity)])
 
     def backward(self, p: Pass, state: EventState) -> None:
+        p = p.with_colours()
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
         def emission_weight(E: mi.Spectrum) -> mi.Spectrum:

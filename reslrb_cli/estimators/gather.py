@@ -111,7 +111,7 @@ class AdjointSum:
         The factor must come before all connections in the sum.
         """
         f, total = dr.detach(f), self.value + self.rest
-        result = dr.select(f != 0, total / f, 0)
+        result = mi.Spectrum(dr.select(f != 0, total / f, 0))
         if self.behind_zero:
             behind = (self.behind_zero[0] + self.behind_zero[1]) * rest
             for c, zero in enumerate(prefix.zero):
@@ -162,13 +162,16 @@ class Gathering(VertexHooks):
     ) -> GatherState:  # fmt: skip
         p, depth, last = self.p, vertex.depth, vertex.depth
         C = contribution(p, vertex, connection)
-        p.splat(connection.u, C.value(), connection.active)
+        p.splat(connection.u, C.value(), connection.active, self.colours)
         # The latest differentiable vertex up to this one; 0 if none.
         latest = [dr.select(p.plan.concerns(vertex.bsdf), depth, before) for before in state.latest]
         if latest:
             last = needed(latest[0], depth)
         visibility = state.visibility.with_vertex(depth, connection.active, last)
-        S = [total.plus(p.delta(connection.u, connection.active), C, depth, connection.active) for total in state.S]
+        S = [
+            total.plus(p.delta(connection.u, connection.active, self.colours), C, depth, connection.active)
+            for total in state.S
+        ]
         return GatherState(visibility, S, latest)
 
 
@@ -211,7 +214,7 @@ class Taking(Revisiting):
         p, plan, connected = self.p, self.p.plan, connection.active
         useful = plan.differentiates(vertex.bsdf)
         C = contribution(p, vertex, connection)
-        delta = p.delta(connection.u, connected)
+        delta = p.delta(connection.u, connected, self.colours)
         S = state.minus(delta, C, vertex.depth, connected)
         own = PathAdjoint(delta * C.nonzero, C)
         adjoint_c = adjoint_of_connection(p, vertex, connection, connected, own)

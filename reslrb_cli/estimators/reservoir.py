@@ -99,11 +99,12 @@ class ReservoirSelection(VertexHooks):
         numbers: list[mi.Float],
     ) -> ReservoirState:  # fmt: skip
         C = contribution(self.p, vertex, connection)
-        self.p.splat(connection.u, C.value(), connection.active)
+        self.p.splat(connection.u, C.value(), connection.active, self.colours)
         plan, candidate = self.p.plan, connection.active
         if not plan.differentiate_emission:  # otherwise every connection counts
             candidate = candidate & (self.concerned(state) | plan.concerns(vertex.bsdf))
-        w = at_least_share(dr.select(candidate, selection_weight(self.p, self.weight, connection, C), 0), state.W)
+        w = selection_weight(self.p, self.weight, connection, C, self.colours)
+        w = at_least_share(dr.select(candidate, w, 0), state.W)
         W = state.W + w
         event = [Event.of_connection(plan, vertex, connection)] if plan.differentiate_bsdfs else []
         this = Slot(w, state.latest[0], C.stored(), connection.u, event)
@@ -141,6 +142,7 @@ class Reservoir(Selecting):
         return replace(p.walk(ReservoirSelection(p, self.capacity, self.weight)), latest=[])
 
     def backward(self, p: Pass, state: ReservoirState) -> None:
+        p = p.with_colours()
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
         def emission_weight(E: mi.Spectrum) -> mi.Spectrum:

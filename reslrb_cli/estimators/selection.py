@@ -30,6 +30,7 @@ from reslrb_cli.estimators.base import (
 from reslrb_cli.transport.bsdf import Scattering, tracked_factor
 from reslrb_cli.transport.connection import Connection, connect, stand_in
 from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.film import Colours
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -56,17 +57,19 @@ class Chosen(Protocol):
     u: mi.Point2f
 
 
-def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> mi.Float:
+def selection_weight(p: Pass, weight: str, connection: Connection, C: Product, colours: Colours) -> mi.Float:
     """Return w of a connection: the luminance of C for `luminance`, or sum_c |delta_c C_c| for `adjoint`.
 
     Raises ValueError for `adjoint` if delta is not known.
     """
     value = C.magnitude()
     if weight == "luminance":
+        if mi.is_spectral:
+            return dr.sum(colours.seen(value))
         return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
     if p.adjoint is None:
         raise ValueError('weight "adjoint" needs dL/dI before the paths are traced, which correlated samples lack')
-    return dr.sum(dr.abs(p.delta(connection.u, connection.active) * value))
+    return dr.sum(dr.abs(p.delta(connection.u, connection.active, colours) * value))
 
 
 def is_taken(number: mi.Float, w: mi.Float, W: mi.Float) -> mi.Bool:
@@ -102,7 +105,8 @@ def slot_adjoint(p: Pass, W: mi.Float, slot: Chosen, capacity: int) -> PathAdjoi
     """Return the objective's sensitivity to a slot's connection. The sensitivity is multiplied by the slot's inverse
     selection probability.
     """
-    delta = p.delta(slot.u, slot.w != 0)
+    assert p.colours is not None
+    delta = p.delta(slot.u, slot.w != 0, p.colours)
     return PathAdjoint(delta * slot.C.nonzero * inverse_probability(W, slot, capacity), slot.C)
 
 
@@ -184,7 +188,7 @@ def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.B
     connection.
     """
     plan, active = p.plan, active & (kept.index > 0)
-    si, bsdf = kept.point.interaction(plan, active)
+    si, bsdf = kept.point.interaction(plan, p.wavelengths, active)
     rest = mi.Spectrum(kept.rest[0] if kept.rest else 0)
     if plan.passage_in_gradient:
         own, sample = kept.own

@@ -292,7 +292,7 @@ class Frame:
 
     def differentiate(self, p: Pass, B: mi.Spectrum) -> mi.Spectrum:
         """Add the derivatives of both factors, given B_k (C,). Returns B of the vertex that was pushed before."""
-        si, bsdf = self.point.interaction(p.plan)
+        si, bsdf = self.point.interaction(p.plan, p.wavelengths)
         adjoint_c, adjoint_s = self.adjoint_c, showing(self.adjoint_s_per_b * B)
         connected, scattered = dr.any(adjoint_c != 0), dr.any(adjoint_s != 0)
         with dr.resume_grad():
@@ -371,8 +371,8 @@ class LightSweep(VertexHooks):
     ) -> StackState:  # fmt: skip
         p, plan, visible = self.p, self.p.plan, connection.active
         C = contribution(p, vertex, connection)
-        p.splat(connection.u, C.value(), visible)
-        delta = p.delta(connection.u, visible)
+        p.splat(connection.u, C.value(), visible, self.colours)
+        delta = p.delta(connection.u, visible, self.colours)
         here = vertex.active & plan.differentiates(vertex.bsdf)
         if self.end is not None:
             here = here & (state.count < self.end)
@@ -416,9 +416,10 @@ class Stack(Estimator):
         """Trace the paths and walk back, which adds the derivatives of BSDFs. Returns B_0 (C,)."""
         ring, again = Ring.of(p.plan, self.stack_size), Pass(p.samples, None, p.adjoint)
         active = True if visibility is None else visibility.last > 0
-        state: StackState = p.walk(LightSweep(p, ring, visibility), active)
+        sweep = LightSweep(p, ring, visibility)
+        state: StackState = p.walk(sweep, active)
 
         def before(end: mi.UInt32) -> StackState:
             return again.walk(LightSweep(again, ring, end=end), end > 0)
 
-        return walk_back(p, Frame.blank(p.plan), ring, state, state.since, before)
+        return walk_back(p.along(sweep), Frame.blank(p.plan), ring, state, state.since, before)

@@ -298,14 +298,15 @@ class Hearing(Hooks):
     def start(self, product: Product) -> Heard:
         number, factor = voices(self.samples.plan) - 1, [mi.Float(1)] if self.film else []
         counts, sums = [mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)]
-        return Heard(counts, sums, mi.Float(0), dr.max(dr.abs(product.magnitude())), Trail.begin(number), factor)
+        light = dr.max(dr.abs(self.colours.seen(product.magnitude())))
+        return Heard(counts, sums, mi.Float(0), light, Trail.begin(number), factor)
 
     def vertex(
         self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
     ) -> Heard:  # fmt: skip
         plan, active = self.samples.plan, connection.active
         C = vertex.product.times(connection.c, vertex.depth)
-        said = self.adjoint.lookup(connection.u, active) * self.loudness * C.magnitude()
+        said = self.adjoint.lookup(connection.u, active, self.colours) * self.loudness * C.magnitude()
         said = dr.select(active, said, 0)
         met = [meets(group, vertex) for group in self.groups]
         parts = [said * mi.Float(count + here) for count, here in zip(state.counts, met, strict=True)]
@@ -313,7 +314,7 @@ class Hearing(Hooks):
             parts.append(said)
         if plan.attached:
             parts.append(dr.abs(said))
-        image = dr.squared_norm(dr.select(active, C.value(), 0))
+        image = dr.squared_norm(dr.select(active, self.colours.seen(C.value()), 0))
         for r in state.factor:
             assert self.film is not None
             block = self.film.block(connection.u)
@@ -325,7 +326,8 @@ class Hearing(Hooks):
         trail = state.trail.with_vertex([*parts, image])
         scattered = scattering.active
         counts = [count + dr.select(scattered, here, 0) for count, here in zip(state.counts, met, strict=True)]
-        throughput = dr.max(dr.abs(vertex.product.times(scattering.s, vertex.depth).magnitude()))
+        behind = vertex.product.times(scattering.s, vertex.depth).magnitude()
+        throughput = dr.max(dr.abs(self.colours.seen(behind)))
         inverse = dr.select(scattered & (throughput > 0), dr.rcp(throughput), 0)
         trail.leaves(self.survival.cell(vertex.si.p, scattering.d), inverse)
         return replace(state, counts=counts, sums=sums, image=state.image + image, trail=trail)

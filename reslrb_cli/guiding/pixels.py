@@ -84,10 +84,11 @@ def note(samples: Samples) -> NDArray[np.float64]:
 
     Values that are not finite count as 0.
     """
-    first, noted = camera_walk(samples, Noting(samples))
+    hooks = Noting(samples)
+    first, noted = camera_walk(samples, hooks)
     width, height = (int(n) for n in samples.film.size)
     pixel = mi.UInt32(first.u.y) * width + mi.UInt32(first.u.x)
-    rows = [dr.norm(total * first.weight) for total in noted.sums]
+    rows = [dr.norm(hooks.colours.seen(total * first.weight)) for total in noted.sums]
     rows.append(dr.square(rows[-1]))
     sums = dr.zeros(mi.Float, len(rows) * width * height)
     for number, value in enumerate(rows):

@@ -133,9 +133,9 @@ def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
     """Splat the contributions to the block with tracked derivatives, for naive AD. Memory is proportional to depth."""
     with dr.resume_grad():
         splat_visible_emission(samples, block, "evaluated")
-        for u, C, active in moving_splats(samples):  # twice, so that the image stays the same
-            samples.film.put(block, u, C, active, samples.plan.attached_normalization)
-            samples.film.put(block, dr.detach(u), -dr.detach(C), active)
+        for u, C, active, colours in moving_splats(samples):  # twice, so that the image stays the same
+            samples.film.put(block, u, C, active, colours, samples.plan.attached_normalization)
+            samples.film.put(block, dr.detach(u), -dr.detach(C), active, colours)
         for side in samples.sides():
             if side.plan.camera:
                 splat_camera_paths(side, block, tracked=True)
@@ -206,7 +206,7 @@ class RecordedObjective(Hooks):
         self, state: mi.Float, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
     ) -> mi.Float:  # fmt: skip
         C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
-        delta = self.adjoint.lookup(connection.u, connection.active)
+        delta = self.adjoint.lookup(connection.u, connection.active, self.colours)
         return state + dr.select(connection.active, dr.dot(delta, C), 0)
 
 

@@ -34,6 +34,7 @@ from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.edges import EdgeSet, has_edges
 from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
+from reslrb_cli.scene.upsampling import is_upsampled, spectra_of
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
@@ -132,8 +133,8 @@ class AboutParameters:
 
     @property
     def only_shapes_move(self) -> bool:
-        """True if the parameters move shapes and no lamps."""
-        return bool(self.which.shapes) and not self.which.emitters
+        """True if the parameters move shapes, but no lamps and no refracted light."""
+        return bool(self.which.shapes) and not (self.which.emitters or self.which.bends)
 
 
 @dataclass
@@ -199,7 +200,7 @@ class Preparation:
         if self.guiding is not None and spp is not None:
             self._meet(spp, params is not None and not image)
         about = None if params is None else self._look_through(params)
-        moves = about is not None and bool(about.which.shapes or about.which.emitters or self._motion.attached is True)
+        moves = about is not None and (about.which.moves_light or self._motion.attached is True)
         paths, whole = self.sampling.paths, self.sampling.whole
         if about is not None and moves and (self._motion.sampling == "follow" or not about.only_shapes_move):
             paths, whole = "light", whole and paths == "light"
@@ -214,7 +215,7 @@ class Preparation:
         only = self._bsdfs(scene, which.bsdf_nodes)
         plan = plan.differentiating(bool(which.bsdf_nodes), bool(which.emission_nodes), about.track_zeros, only)
         drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
-        plan = replace(plan, evened_lamps=drawn)
+        plan = replace(plan, evened_lamps=drawn, sampled_spectra=about.which.sampled_spectra)
         if moves:
             edged, motion = self._edges(which, scene) if "edges" in self.sampling.on else None, self._motion
             if edged is not None:
@@ -312,7 +313,8 @@ class Preparation:
         about = known[these]
         # Kept once needed: otherwise kernels would be recompiled whenever a texel becomes or stops being zero.
         least = about.which.least.items()
-        about.track_zeros |= any(_has_singular(key, enabled[key], value) for key, value in least)
+        values = {key: spectra_of(value) if is_upsampled(params, key) else value for key, value in enabled.items()}
+        about.track_zeros |= any(_has_singular(key, values[key], value) for key, value in least)
         return about
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:

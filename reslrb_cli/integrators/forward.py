@@ -76,7 +76,7 @@ class TangentSplat(Hooks):
             f_c = dr.detach(f_c)
         c = f_c * through * connection.rest
         dc = (df_c * through + f_c * d_through) * connection.rest
-        s.film.put(self.block, connection.u, (dP * c + P * dc) * s.scale, seen)
+        s.film.put(self.block, connection.u, (dP * c + P * dc) * s.scale, seen, self.colours)
         return replace(state, d_product=dP * scattering.s + P * tangent_of_scattering(scattering, df_s))
 
     def _attached(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
@@ -109,7 +109,7 @@ class TangentSplat(Hooks):
         c, weight = dr.detach(c), dr.detach(weight)
         C, dC = P * c * s.scale, (dP * c + P * dc) * s.scale
         for (pixel, k), dk in zip(taps, d_weights, strict=True):
-            s.film.add(self.block, pixel, dr.detach(k) * dC + dk * C, seen)
+            s.film.add(self.block, pixel, dr.detach(k) * dC + dk * C, seen, self.colours)
         d_product = dr.select(scattered, dP * weight + P * ds, 0)
         return Tangent(d_product, [mi.Vector3f(d_origin), d_direction], Before.of(plan, vertex, sampled))
 
@@ -205,16 +205,17 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             E = sample_emission(samples, samples.sampler()).E
             [dE] = forward_derivatives(E)
         if plan.visible_emission and plan.paths == "light" and (plan.differentiate_emission or plan.differentiate_null):
-            ray, u, weight = primary_ray(samples)
+            ray, u, weight, colours = primary_ray(samples)
             tangent = visible_tangent(plan, samples.scene, ray)
-            samples.film.put(block, u, tangent * weight * samples.fraction, mi.Bool(True))
+            samples.film.put(block, u, tangent * weight * samples.fraction, mi.Bool(True), colours)
         if plan.small_lamps and plan.differentiate_emission:
-            u, C, active = small_splat(samples)
+            u, C, active, colours = small_splat(samples)
             [tangent] = forward_derivatives(C)
-            samples.film.put(block, u, tangent, active)
+            samples.film.put(block, u, tangent, active, colours)
     for side in samples.sides():
         if side.plan.camera:
-            first, state = camera_walk(side, CameraTangents(side))
-            side.film.put(block, first.u, state.d_radiance * first.weight, mi.Bool(True))
+            hooks = CameraTangents(side)
+            first, state = camera_walk(side, hooks)
+            side.film.put(block, first.u, state.d_radiance * first.weight, mi.Bool(True), hooks.colours)
         else:
             walk(side, TangentSplat(side, block, dE))

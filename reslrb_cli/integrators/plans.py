@@ -23,6 +23,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.scene.catalog import entry_value, parameter_kind
 from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
+from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
@@ -39,6 +40,10 @@ NEARLY_ZERO = 1e-2
 FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
 
 
+#: Spectra whose wavelengths Mitsuba samples in proportion to their values.
+SAMPLED_SPECTRA = ("RegularSpectrum", "IrregularSpectrum")
+
+
 @dataclass(frozen=True)
 class Differentiated:
     """Parameters that track derivatives.
@@ -46,9 +51,11 @@ class Differentiated:
     - `bsdf_nodes` are the nodes of BSDFs that have differentiated parameters: textures, nested BSDFs, and meshes whose
         attributes are textures.
     - `emission_nodes` are the nodes of emission: emitters and their textures.
-    - `shapes` are moving shapes, and `emitters` are emitters with moving rays.
+    - `shapes` are moving shapes, and `emitters` are emitters with moving rays. `bends` is true if a parameter changes
+        directions of refraction.
     - `least` has a value for each parameter that is a factor of a path. A parameter up to this value counts as zero.
     - `entries` is the number of differentiated entries for each node.
+    - `sampled_spectra` are as in `Plan`.
     """
 
     bsdf_nodes: tuple[mi.Object, ...]
@@ -57,6 +64,13 @@ class Differentiated:
     emitters: tuple[mi.Emitter, ...]
     least: dict[str, float]
     entries: dict[mi.Object, int]
+    sampled_spectra: tuple[tuple[mi.Emitter, mi.Texture], ...] = ()
+    bends: bool = False
+
+    @property
+    def moves_light(self) -> bool:
+        """Whether a parameter moves light, so that its derivatives are attached."""
+        return bool(self.shapes or self.emitters or self.bends)
 
     @staticmethod
     def of(params: mi.SceneParameters, keys: Iterable[str]) -> Differentiated:
@@ -71,11 +85,13 @@ class Differentiated:
         emitters: dict[mi.Emitter, None] = {}
         least: dict[str, float] = {}
         entries: dict[mi.Object, int] = {}
+        bends = False
         for key in keys:
             kind, node, obstacle = parameter_kind(params, key), params.properties[key][2], None
             entries[node] = entries.get(node, 0) + math.prod(dr.shape(entry_value(params, key)))
             if kind in ("bsdf", "attribute"):
                 nodes[node] = None
+                bends |= bends_light(params, key)
                 dims = kind == "attribute" or any(name in key for name in FACTORS)
                 least[key] = NEARLY_ZERO if dims else 0
             elif kind == "shape":
@@ -93,7 +109,18 @@ class Differentiated:
                 obstacle = "light tracing has derivatives of surfaces and emitters, not of the sensor"
             if obstacle is not None:
                 raise UnsupportedScene(f"{key}: {obstacle}")
-        return Differentiated(tuple(nodes), tuple(emitting), tuple(shapes), tuple(emitters), least, entries)
+        owners = {node: params.hierarchy[node][0] for node in emitting if node.class_name() in SAMPLED_SPECTRA}
+        spectra = tuple((owner, node) for node, owner in owners.items() if isinstance(owner, mi.Emitter))
+        return Differentiated(
+            tuple(nodes),
+            tuple(emitting),
+            tuple(shapes),
+            tuple(emitters),
+            least,
+            entries,
+            spectra if mi.is_spectral else (),
+            bends,
+        )
 
 
 @dataclass(frozen=True)
@@ -183,7 +210,7 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, s
     """Return the plan with attached derivatives if requested. Raises UnsupportedScene if attached derivatives are
     requested but do not exist.
     """
-    moves = bool(which.shapes or which.emitters)
+    moves = which.moves_light
     if motion.attached is False and moves:
         raise UnsupportedScene(
             "attached: false leaves out the derivatives of parameters that move light; use auto", "attached"
@@ -314,7 +341,7 @@ def scene_rows(plan: Plan) -> list[PlanRow]:
          "no BSDF with parameters has any"),
         ("derivatives of null surfaces", plan.differentiate_null, "a BSDF with parameters is transparent",
          "no BSDF with parameters is transparent"),
-        ("attached derivatives", plan.attached, "a parameter moves surfaces or emitters",
+        ("attached derivatives", plan.attached, "a parameter moves surfaces, emitters or refracted light",
          "nothing moves: directions and film positions are constants"),
         ("vertices that stay", plan.attached and plan.stays,
          "after diffuse bounces light goes on to the same point, so edges at rest count",

@@ -24,6 +24,7 @@ from reslrb_cli.integrators.plans import Motion, SamplingOptions
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.integrators.step import interface_of
+from reslrb_cli.scene import dispersion
 
 #: Our integrators by the names of their plugins.
 TRACERS = ("reslrb", "walk_ad", "trajectory")
@@ -42,7 +43,8 @@ OPTIONS: dict[str, Any] = {
 
 
 def register() -> None:
-    """Register the integrators with Mitsuba, for the current variant and for variants that are set later.
+    """Register the plugins with Mitsuba, for the current variant and for variants that are set later: integrators,
+    `dispersivedielectric` and `illuminant`.
 
     Dr.Jit replaces each error in `mi.render` by a `RuntimeError` without its reason. `register` therefore also replaces
     `mi.render` by a function that raises the errors of these integrators themselves, such as UnsupportedScene.
@@ -132,6 +134,8 @@ def _on_variant(old: str | None, new: str) -> None:
         mi.render = _with_reasons(mi.render)
     for name in TRACERS:
         mi.register_integrator(name, lambda props, name=name: plugin(name, props))
+    if usable:
+        dispersion.register()
 
 
 def _with_reasons(render: Callable[..., Any]) -> Callable[..., Any]:

@@ -33,7 +33,9 @@ from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import Deformation
+from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import Selection
+from reslrb_cli.scene.upsampling import Upsampling, is_upsampled
 
 #: Size of a direction that moves an object, relative to the object's size.
 REACH = 0.1
@@ -41,21 +43,26 @@ REACH = 0.1
 #: Size of a direction of a heightmap, relative to the scene's size.
 RELIEF = 0.02
 
-#: Size of a direction of a motion's component; rotations are in degrees. None: `REACH` times the scene's size.
-UNITS = {"translation": None, "rotation": 10.0, "scale": REACH}
+#: Size of a direction of a motion's component (rotations are in degrees), and of a glass's n_d and V_d. None: `REACH`
+#: times the scene's size.
+UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.02, "Vd": 5.0}
 
 #: Maximum number of wavelengths across a displaced object.
 WAVES = 1.5
 
 
 def moves_light(params: mi.SceneParameters, key: str) -> bool:
-    """True if a parameter moves shapes or lights. Motions and heightmaps always move shapes or lights. `params` does
-    not contain motions or heightmaps.
+    """True if a parameter moves shapes, lights or refracted light. Motions and heightmaps always move shapes or lights.
+    `params` does not contain motions or heightmaps.
     """
     if key not in params.properties:
         return True
     kind = parameter_kind(params, key)
-    return kind == "shape" or (kind == "emitter" and key.rpartition(".")[2] in ("position", "to_world"))
+    return (
+        bends_light(params, key)
+        or kind == "shape"
+        or (kind == "emitter" and key.rpartition(".")[2] in ("position", "to_world"))
+    )
 
 
 def smooth_weights(height: int, width: int, channels: int = 3) -> np.ndarray:
@@ -230,7 +237,10 @@ class Case:
         self.sensor = sensor
         if values is None:
             params = mi.traverse(self.scene)
-            values = Selection(params, {}, {}, Deformation(params))
+            values = Selection(params, {}, {}, Deformation(params), Upsampling(params))
+            for key in keys:
+                if is_upsampled(params, key):
+                    values.colours.add(key)
         self.values, self.params = values, values.params
         self.keys = list(keys)
         self.initial = {key: np.array(values.value(key), dtype=np.float64).ravel() for key in self.keys}

@@ -23,6 +23,7 @@ from reslrb_cli.measure.scenes.analytic import furnace
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import PrimaryHits, SceneNeeds, look, scene_needs, stock_clip
 
@@ -45,6 +46,8 @@ def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarr
     """
     shapes, emitters = at.graph.shapes(), at.scene.emitters()
     if len(shapes) != 1 or len(emitters) != 1 or shapes[0].class_name() != "Sphere" or weights.shape[2] != 3:
+        return None
+    if mi.is_spectral:
         return None
     bsdf, emitter = mi.traverse(shapes[0].bsdf()), mi.traverse(emitters[0])
     uniform = "reflectance.value" in bsdf and shapes[0].bsdf().class_name() == "SmoothDiffuse" and (
@@ -236,6 +239,8 @@ def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
     parameters that move light, or None.
     """
     for key in keys:
+        if bends_light(at.params, key):
+            return "it draws wavelengths by itself, and keeps one in four behind each refraction"
         node = at.params.properties[key][2]
         if not isinstance(node, mi.Shape) or node.is_emitter():
             return "it does not differentiate the sampling of a moving emitter"

@@ -26,6 +26,7 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.scene.deformation import Moves, where_moved
+from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.load import INSTEAD, load_scene, warn_once
 from reslrb_cli.scene.needs import (
     camera_finds_all,
@@ -154,8 +155,11 @@ def are_upright(config: Config) -> bool:
 
 
 def what_moves(config: Config, selection: Selection) -> Moves:
-    """Return what the selected parameters move. With the integrator option `attached: true`, lamps count as moving."""
-    if config.integrator.options().get("attached", "auto") is True:
+    """Return what the selected parameters move. With the integrator option `attached: true`, and if a parameter moves
+    refracted light, lamps count as moving.
+    """
+    bends = any(bends_light(selection.params, key) for key in selection.scene_keys)
+    if bends or config.integrator.options().get("attached", "auto") is True:
         return Moves.LAMPS
     return Moves.of(where_moved(selection.params, selection.scene_keys))
 

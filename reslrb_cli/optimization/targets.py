@@ -104,7 +104,9 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
             continue
         size = (int(film.crop_size()[0]), int(film.crop_size()[1]))
         try:
-            photo = read_photo(view.file, config.target.color_space, size, upright, nonfinite=True)
+            # Pure spectral colours are outside of sRGB, and have negative channels.
+            signed = mi.is_spectral
+            photo = read_photo(view.file, config.target.color_space, size, upright, nonfinite=True, signed=signed)
         except ConfigError as error:
             raise ConfigError(config.source, view.file_key, error.message) from None
         line = turned_line(view.file, upright)

@@ -19,9 +19,11 @@ import scipy.ndimage
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.glasses import C_LINE, F_LINE, Glass
 from reslrb_cli.lens.solid import Sheet
 from reslrb_cli.records.images import luminance
 from reslrb_cli.report.page.workshop import shown_ssim
+from reslrb_cli.scene.graph import brightness
 from reslrb_cli.scene.images import read_image
 
 Array = np.ndarray[Any, Any]
@@ -102,7 +104,7 @@ def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, targ
         bs, factor = si.bsdf(ray).sample(context, si, sampler.next_1d(again), sampler.next_2d(again), again)
         towards = si.to_world(bs.wo)
         ray = si.spawn_ray(towards)
-        light = dr.select(again, light * mi.Float(mi.luminance(factor) if mi.is_rgb else factor.x), 0)
+        light = dr.select(again, light * (mi.luminance(factor) if mi.is_rgb else dr.mean(factor)), 0)
         active = again & (light > 0)
         left = active & (si.shape == front) & (dr.dot(towards, si.n) * dr.sign(si.n.z) > 0)
         dr.eval(ray, light, active, left, sums)
@@ -119,7 +121,7 @@ def _from_lamps(scene: mi.Scene, count: int) -> tuple[mi.Sampler, mi.Ray3f, mi.F
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, count)
     ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
-    return sampler, ray, mi.Float(mi.luminance(weight) if mi.is_rgb else weight.x)
+    return sampler, ray, brightness(weight, ray.wavelengths)
 
 
 def _is_any(shape: mi.ShapePtr, others: Sequence[mi.Shape]) -> mi.Bool:
@@ -203,9 +205,39 @@ class OpticalBench:
             if key.endswith(".eta"):
                 with suppress(TypeError, ValueError):
                     value = float(np.ravel(self.params[key])[0])
-                    if abs(value - self.plan.ior) < 1e-4:
+                    if abs(value - self.plan.index) < 1e-4:
                         found[key] = type(self.params[key])(value + by)
         return found
+
+    def landings(self, values: dict[str, Any]) -> tuple[Array, Array]:
+        """Return where refracted light meets the receiver, (n, 3), with these parameters, and which rays do, (n,).
+
+        The rays come from the lamps, and are the same for all parameters.
+        """
+        receiver = next(shape for shape in self.scene.shapes() if shape.id() == self.plan.receiver)
+        with self._changed(values):
+            _, ray, light = _from_lamps(self.scene, RAYS)
+            active, met, place = light > 0, dr.zeros(mi.Bool, RAYS), dr.zeros(mi.Point3f, RAYS)
+            for _ in range(BOUNCES):
+                si = self.scene.ray_intersect(ray, active)
+                here = active & si.is_valid() & (si.shape == mi.ShapePtr(receiver))
+                met, place = met | here, dr.select(here, si.p, place)
+                # The largest number below 1 chooses refraction.
+                bs, factor = si.bsdf(ray).sample(mi.BSDFContext(), si, 1 - 2**-24, mi.Point2f(0.5), active)
+                active = active & si.is_valid() & ~here & dr.any(factor != 0)
+                ray = si.spawn_ray(si.to_world(bs.wo))
+                dr.eval(ray, active, met, place)
+        return np.array(place, dtype=float).reshape(3, -1).T, np.array(met)
+
+    def spread(self, glass: Glass) -> float:
+        """Return the mean distance in mm between the places where blue and red light (lines F and C) of the same rays
+        meet the receiver.
+        """
+        (blue, some), (red, others) = (
+            self.landings(self.denser(glass.index(line) - glass.nd)) for line in (F_LINE, C_LINE)
+        )
+        both = some & others
+        return float(np.linalg.norm(blue[both] - red[both], axis=1).mean()) if both.any() else 0.0
 
     def solid_parts(self) -> list[str]:
         """Return the ids of the face and of the flat back."""
@@ -267,6 +299,10 @@ def tolerances(
     if plan.kind == "lens":
         for sign in (1, -1):
             tell(f"index {sign * INDEX:+g}", bench.image(bench.denser(sign * INDEX), spp))
+    if plan.kind == "lens" and plan.glass is not None:
+        for name, line in (("blue", F_LINE), ("red", C_LINE)):
+            by = plan.glass.index(line) - plan.glass.nd
+            tell(f"{name} light ({line:.0f} nm)", bench.image(bench.denser(by), spp))
     for what, ids in (("light", bench.lamps), (plan.kind, both)):
         for name, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
             if ids:
@@ -326,6 +362,9 @@ def add_tolerances(
     if setup is not None:
         deviations["distance"] = DISTANCE * setup["receiver_distance"]
     numbers["tolerances"] = found
+    if bench.plan.kind == "lens" and bench.plan.glass is not None:
+        numbers["colour_spread"] = bench.spread(bench.plan.glass)
+        say(f"colour: blue and red light land {numbers['colour_spread']:.2g} mm apart on average")
     numbers["allowed_errors"] = allowed_errors(found, bench.plan.kind, deviations)
     return pictures
 

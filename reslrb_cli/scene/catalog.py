@@ -23,8 +23,9 @@ from reslrb_cli.scene.needs import (
     paths_obstacle,
     unsupported_part,
 )
+from reslrb_cli.scene.upsampling import colour_in_scene, is_upsampled
 
-#: Spectra by wavelength, which RGB variants cannot evaluate: their numbers only describe the scene file.
+#: Spectra by wavelength, which RGB variants cannot evaluate: there, their numbers only describe the scene file.
 _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
 #: Parameters of a mesh besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
@@ -128,7 +129,7 @@ def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
 def _current_value(params: Any, key: str) -> Value | None:
     """Return the value of one `mi.traverse` entry, or None if the value is no number."""
     value = entry_value(params, key)
-    array = as_numbers(value)
+    array = colour_in_scene(params, key) if is_upsampled(params, key) else as_numbers(value)
     if array is None or array.size == 0:
         return None
     if array.dtype == np.uint8 and coarse_bits(params, key) is not None:
@@ -184,7 +185,9 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None
     if kind in ("sensor", "film"):
         return f"belongs to the {kind}; {only}"
-    if node.class_name() in _SPECTRA:
+    if mi.is_spectral and (reason := _spectral_obstacle(node, name)) is not None:
+        return reason
+    if not mi.is_spectral and node.class_name() in _SPECTRA:
         return "is a constant of a spectrum; give the colour as <rgb>"
     if value is None:
         return "is not in the scene file"
@@ -200,6 +203,22 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
     if not differentiable:
         return f"is not differentiable ({node.class_name()})"
     return f"is not a number with derivatives ({type(value).__name__})" if bits is None else None
+
+
+def _spectral_obstacle(node: Any, name: str) -> str | None:
+    """Return the reason why a parameter cannot be recovered in a spectral variant, or None."""
+    kind = node.class_name()
+    if kind == "IrregularSpectrum" and name == "wavelengths":
+        return "has the wavelengths of a spectrum; its `values` have derivatives"
+    if kind == "BlackBodySpectrum":
+        return (
+            "is the temperature of a black body; give the light as a `regular` spectrum, whose values have derivatives"
+        )
+    if kind == "EnvironmentMapEmitter" and name == "data":
+        return "has the spectra of an environment map; recover it in an RGB variant"
+    if isinstance(node, mi.Mesh) and name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY:
+        return "has the colours of a mesh, whose spectra have no derivatives; use a bitmap, or an RGB variant"
+    return None
 
 
 def _storage_bits(value: Any) -> int | None:

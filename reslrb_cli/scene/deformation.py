@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import difflib
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -250,9 +250,51 @@ class Motion:
 
 
 @dataclass
-class _Moved:
-    """Scene parameter that depends on recovered values: its initial value, its motion, and its current value with and
-    without graph.
+class Leaf:
+    """Scene parameter that depends on recovered values: its value with graph (`tracked`), and without (`leaf`)."""
+
+    tracked: Any = None
+    leaf: Any = None
+
+    def place(self, tracked: Any) -> Any:
+        """Take a new value. Returns the value without graph, which the scene gets."""
+        self.tracked = tracked
+        self.leaf = _opaque(type(tracked)(dr.detach(tracked)))
+        if dr.grad_enabled(tracked):
+            dr.enable_grad(self.leaf)
+        return self.leaf
+
+    @property
+    def is_tracked(self) -> bool:
+        """Whether the values on which the parameter depends have derivatives."""
+        return self.leaf is not None and bool(dr.grad_enabled(self.leaf))
+
+
+def collect(leaves: Iterable[Leaf]) -> None:
+    """Add the gradient at the scene's parameters to the gradient of the values. Clear the gradient in the scene."""
+    tracked = [each for each in leaves if each.is_tracked]
+    for each in tracked:
+        dr.set_grad(each.tracked, dr.grad(each.leaf))
+        dr.clear_grad(each.leaf)
+        dr.enqueue(dr.ADMode.Backward, each.tracked)
+    if tracked:
+        # Keep edges for the next step from the same values.
+        dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)
+
+
+def push(leaves: Iterable[Leaf]) -> None:
+    """Propagate tangents of the values to the scene's parameters."""
+    tracked = [each for each in leaves if each.is_tracked]
+    for each in tracked:
+        dr.set_grad(each.leaf, dr.grad(each.tracked))
+        dr.enqueue(dr.ADMode.Forward, each.leaf)
+    if tracked:
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+
+
+@dataclass(kw_only=True)
+class _Moved(Leaf):
+    """Scene parameter that depends on recovered values: its initial value, and its motion.
 
     `heightmap` is the name of the texture (height, width, 1) that displaces a mesh along its own `normals`.
     """
@@ -263,8 +305,6 @@ class _Moved:
     heightmap: str | None = None
     normals: Any = None
     texcoords: Any = None
-    tracked: Any = None
-    leaf: Any = None
 
 
 def _corners(uv: mi.Point2f, width: int, height: int) -> tuple[list[mi.UInt32], list[mi.Float]]:
@@ -339,41 +379,22 @@ class Deformation:
         evaluate.
         """
         for key, moved in self._moved.items():
-            moved.tracked = self._function(moved)
-            moved.leaf = _opaque(type(moved.tracked)(dr.detach(moved.tracked)))
-            if dr.grad_enabled(moved.tracked):
-                dr.enable_grad(moved.leaf)
-            self.params[key] = moved.leaf
+            self.params[key] = moved.place(self._function(moved))
         return [moved.leaf for moved in self._moved.values()]
 
     def collect(self) -> None:
         """Add the gradient at the scene's parameters to the gradient of the values. Clear the gradient in the scene."""
-        tracked = self._tracked()
-        for moved in tracked:
-            dr.set_grad(moved.tracked, dr.grad(moved.leaf))
-            dr.clear_grad(moved.leaf)
-            dr.enqueue(dr.ADMode.Backward, moved.tracked)
-        if tracked:
-            # Keep edges for the next step from the same values.
-            dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)
+        collect(self._moved.values())
 
     def push(self) -> None:
         """Propagate tangents of the values to the scene's parameters."""
-        tracked = self._tracked()
-        for moved in tracked:
-            dr.set_grad(moved.leaf, dr.grad(moved.tracked))
-            dr.enqueue(dr.ADMode.Forward, moved.leaf)
-        if tracked:
-            dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
-
-    def _tracked(self) -> list[_Moved]:
-        return [moved for moved in self._moved.values() if moved.leaf is not None and dr.grad_enabled(moved.leaf)]
+        push(self._moved.values())
 
     def _place(self, item: Movable) -> _Moved:
         if item.key not in self._moved:
             value = dr.detach(self.params[item.key])
             value = dr.unravel(mi.Point3f, value) if item.by_vertices else type(value)(value)
-            self._moved[item.key] = _Moved(item, _opaque(value))
+            self._moved[item.key] = _Moved(item=item, base=_opaque(value))
         return self._moved[item.key]
 
     def _function(self, moved: _Moved) -> Any:

@@ -21,6 +21,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.images import file_stem, write_file
 from reslrb_cli.scene.catalog import as_numbers, parameter_kind
+from reslrb_cli.scene.upsampling import colour_in_scene, is_upsampled
 from reslrb_cli.scene.values import ParameterValue
 from reslrb_cli.scene.xml.build import Owners
 from reslrb_cli.scene.xml.read import Description, Element, tag_lines
@@ -169,6 +170,8 @@ class Replacing:
             replace(owner, owner.new("string", name="format", value="variant"), "color_space", "gamma")
 
     def _array(self, key: str) -> Array:
+        if is_upsampled(self.params, key):
+            return colour_in_scene(self.params, key)
         return ParameterValue(self.params, key).get()
 
     def _fail(self, key: str, why: str) -> ConfigError:

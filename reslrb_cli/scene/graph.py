@@ -181,14 +181,34 @@ def emitted_rays(
     return ray, weight
 
 
+def no_wavelengths() -> mi.Wavelength:
+    """Return the wavelengths of light that has none yet: zeros in a spectral variant, otherwise an empty array."""
+    return mi.Spectrum(0) if mi.is_spectral else mi.Color0f()
+
+
+def brightness(value: mi.Spectrum, wavelengths: mi.Wavelength) -> mi.Float:
+    """Return the luminance of light with the values (C,)."""
+    if mi.is_spectral:
+        return mi.luminance(value, wavelengths)
+    return mi.luminance(value) if mi.is_rgb else mi.Float(value.x)
+
+
 def sensor_rays(
-    sensor: mi.Sensor, time: float | mi.Float, place: mi.Point2f, aperture: mi.Point2f
-) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """Return rays from a sensor, and their weights. `place` on the film and `aperture` are in [0, 1)^2.
+    sensor: mi.Sensor, time: float | mi.Float, place: mi.Point2f, aperture: mi.Point2f,
+    wavelength: float | mi.Float = 0.5,
+) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
+    """Return rays from a sensor, and their weights. `place` on the film and `aperture` are in [0, 1)^2, and the random
+    number `wavelength` is in [0, 1).
 
     The function uses the call that every sensor has, because an irradiance meter has no `sample_ray`.
     """
-    ray, weight = sensor.sample_ray_differential(time, 0.5, place, aperture, True)
+    ray, weight = sensor.sample_ray_differential(time, wavelength, place, aperture, True)
+    if mi.is_spectral and (response := sensor.film().sensor_response_function()) is not None:
+        # The film's response belongs to `Colours`, as in light paths.
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wavelengths = ray.wavelengths
+        total = response.eval(si)
+        weight = mi.Spectrum(dr.select(total > 0, weight / total, 0))
     return mi.Ray3f(ray), weight
 
 
@@ -241,7 +261,7 @@ def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
 def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
     """True if a grid point on the shape is in front of the lens, without occlusion."""
     with dr.suspend_grad():
-        si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), grid(POINTS)), mi.Color0f())
+        si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), grid(POINTS)), no_wavelengths())
         ds, _ = sensor.sample_direction(si, mi.Point2f(0.5), True)
         seen = ds.pdf > 0
         return bool(dr.any(seen & ~scene.ray_test(si.spawn_ray_to(ds.p), seen)))

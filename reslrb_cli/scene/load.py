@@ -18,6 +18,7 @@ from reslrb_cli.backend.variant import check_variant
 from reslrb_cli.config.files import NAMELESS, as_path
 from reslrb_cli.config.parameters import is_named
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene import dispersion
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.graph import bounds
@@ -59,6 +60,7 @@ def load_scene(
     without shapes or light. Warns of a scene that is too far from the origin or too small.
     """
     file = Path(file)
+    dispersion.register()
     description = read_description(file, options or {})
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.scene.dispersion import GLASS_CLASS
 from reslrb_cli.scene.graph import (
     Lamp,
     SceneGraph,
@@ -35,7 +36,7 @@ _PLAIN_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 
 _SIMPLE_BSDFS = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
-    *("TwoSidedBRDF", "Null"),
+    *("TwoSidedBRDF", "Null", GLASS_CLASS),
 )
 #: BSDFs that read only texture coordinates and local directions of a surface.
 _PLAIN_BSDFS = (
@@ -76,7 +77,8 @@ class SceneNeeds:
 
     `emitters` holds class names in the order of `scene.emitters()`. `environment` is the index of the surrounding
     emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
-    tells whether a thin lens may see objects outside of its clip planes, or nothing because of its focus.
+    tells whether a thin lens may see objects outside of its clip planes, or nothing because of its focus. `disperses`
+    tells whether a smooth boundary refracts each wavelength into another direction.
     """
 
     emitters: tuple[str, ...]
@@ -89,6 +91,7 @@ class SceneNeeds:
     has_shading_normals: bool
     has_perturbed_normals: bool
     bsdfs_read_geometry: bool
+    disperses: bool
     moving_shutter: bool
     thin_lens: bool
     principal_point: bool
@@ -142,6 +145,8 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         ),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
+        disperses=mi.is_spectral
+        and any(bsdf.class_name() == GLASS_CLASS and int(bsdf.flags()) & delta for bsdf in graph.of_type(mi.BSDF)),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=any(
@@ -267,7 +272,7 @@ def _unsampled(scene: Any) -> str | None:
 
 
 def _film_obstacle(sensor: Any) -> str | None:
-    if sensor.film().class_name() != "HDRFilm":
+    if sensor.film().class_name() not in ("HDRFilm", "SpecFilm"):
         return f"sensor {sensor.id()} has a {sensor.film().class_name()}; paths are splatted on an `hdrfilm`"
     return None
 
@@ -367,6 +372,8 @@ def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
 def _somewhere() -> Any:
     """Return one surface point, seen from straight above."""
     si = dr.zeros(mi.SurfaceInteraction3f)
+    if mi.is_spectral:
+        si.wavelengths = mi.Spectrum(460, 520, 580, 640)
     si.wi, si.n, si.sh_frame = mi.Vector3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
     return si
 

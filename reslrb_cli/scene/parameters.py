@@ -20,6 +20,7 @@ import numpy as np
 from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings, Thickness
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
+from reslrb_cli.scene.upsampling import Upsampling, is_upsampled
 from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
 
 
@@ -29,7 +30,8 @@ class Selection:
 
     `params` is the complete result of `mi.traverse` for the scene. `specs` maps each key to its settings. Keys follow
     the order of the configuration. Keys that match one glob follow the order of the scene. A key is an entry of
-    `params` or a value of `deformation`, for example a motion's `ID.translation` or a heightmap. `tied` maps a key of
+    `params` or a value of `deformation`, for example a motion's `ID.translation` or a heightmap. In a spectral variant,
+    `colours` has the colours whose spectra are in the scene. `tied` maps a key of
     `params` to the other keys of `params` that share its value. `factors` are values outside of the scene that multiply
     its images (`add_factor`).
     """
@@ -38,6 +40,7 @@ class Selection:
     specs: dict[str, Settings]
     tied: dict[str, list[str]]
     deformation: Deformation
+    colours: Upsampling
     factors: dict[str, Any] = field(default_factory=dict)
 
     def add_factor(self, key: str, value: Any, settings: Settings) -> None:
@@ -53,7 +56,8 @@ class Selection:
     def scene_keys(self) -> list[str]:
         """Entries of `params` that the recovered values determine."""
         own = [key for key in self.keys if self._holder(key) is self.params]
-        return [*own, *(other for key in own for other in self.tied.get(key, ())), *self.deformation.keys]
+        own += [other for key in own for other in self.tied.get(key, ())]
+        return [*own, *self.colours.keys, *self.deformation.keys]
 
     def kind(self, key: str) -> str:
         """Return the kind of `key` for regularizers: `heightmap`, `bitmap`, `mesh`, or "" for other parameters."""
@@ -102,18 +106,20 @@ class Selection:
             for each in keys:
                 holder[each] = value
             own += keys if holder is self.params else []
-        moved = self.deformation.place()
+        moved = self.deformation.place() + self.colours.place()
         self.params.update()
-        settled = settle(self.params, (*own, *self.deformation.keys))
+        settled = settle(self.params, (*own, *self.colours.keys, *self.deformation.keys))
         dr.eval([self.params[key] for key in own], moved, settled, self.factors)
 
     def collect(self) -> None:
-        """Propagate the gradients at moved objects back to the values that move the objects."""
+        """Propagate the gradients at moved objects and at spectra back to the recovered values."""
         self.deformation.collect()
+        self.colours.collect()
 
     def push(self) -> None:
-        """Propagate tangents to the scene from the values that move objects."""
+        """Propagate tangents to the scene from the values that move objects, and from colours."""
         self.deformation.push()
+        self.colours.push()
 
     def shown(self, key: str, value: Any) -> np.ndarray[Any, Any]:
         """Convert `value`, a Dr.Jit value of the parameter `key`, to the form that `array` returns."""
@@ -128,9 +134,10 @@ class Selection:
     def update(self) -> None:
         """Update tied keys and moved objects of the scene after values were set."""
         for key, others in self.tied.items():
-            for other in others:
+            for other in others if key not in self.colours else ():
                 self.params[other] = type(self.params[other])(self.params[key])
         self.deformation.place()
+        self.colours.place()
         self.params.update()
 
     def slot(self, key: str) -> ParameterValue:
@@ -141,6 +148,8 @@ class Selection:
         """Return the object that stores the value of `key`."""
         if key in self.factors:
             return self.factors
+        if key in self.colours:
+            return self.colours
         return self.deformation.values if key in self.deformation.values else self.params
 
 
@@ -197,6 +206,9 @@ def set_values(
             if key in selection.deformation.keys:
                 raise place.fail("", f"`{key}` depends on {' and '.join(f'`{name}`' for name in names)} here")
             given[key] = pattern
+            if key not in selection.colours and key in selection.params.properties:
+                if is_upsampled(selection.params, key):
+                    selection.colours.add(key)
             slot = selection.slot(key)
             slot.set(initial_array(slot, value, None, place, any_size=key in names))
     # Tied parameters get the value of the first one, unless they have their own.
@@ -237,7 +249,11 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
         if is_tied:
             tied[keys[0]], keys = keys[1:], keys[:1]
         chosen |= dict.fromkeys(keys, spec.settings())
-    return Selection(params, chosen, tied, deformation), origin
+    colours = Upsampling(params)
+    for key in chosen:
+        if key in params.properties and is_upsampled(params, key):
+            colours.add(key, tied.get(key, ()))
+    return Selection(params, chosen, tied, deformation, colours), origin
 
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.graph import SceneGraph, sensor_rays
+from reslrb_cli.scene.graph import SceneGraph, brightness, sensor_rays
 from reslrb_cli.scene.needs import LOOK, surfaces_met, what_is_seen
 
 #: Primary rays of a pixel are spread over this many rows and columns of cells.
@@ -249,5 +249,5 @@ def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:
     ray, weight = sensor_rays(sensor, sensor.shutter_open(), position, sampler.next_2d())
     integrator = mi.load_dict({"type": "path", "max_depth": segments, "rr_depth": DEPTHS[-1] + 1})
     light, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(ray))
-    rows = np.array(mi.luminance(mi.Color3f(weight * light)), dtype=np.float64).reshape(_RAYS**2, _PATHS)
+    rows = np.array(brightness(weight * light, ray.wavelengths), dtype=np.float64).reshape(_RAYS**2, _PATHS)
     return np.asarray(rows.mean(axis=1))

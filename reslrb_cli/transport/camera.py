@@ -18,6 +18,7 @@ from reslrb_cli.transport.bsdf import EventNumbers, Scattering, begins_caustic, 
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import density_of_rays
 from reslrb_cli.transport.factors import Product, play
+from reslrb_cli.transport.film import Colours, keep_one
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex, intersect
@@ -62,7 +63,10 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
         per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + _within_pixel(samples, number, pixel, per_pixel)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture)
+    wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0.5)
+    ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture, wavelength)
+    if samples.plan.needs.disperses:
+        weight = keep_one(ray, weight)
     weight = weight * (samples.fraction * dr.rcp(per_pixel))
     return FilmRay(dr.detach(ray), u, dr.detach(weight))
 
@@ -135,6 +139,7 @@ class CameraHooks:
     """
 
     tracked: bool = False
+    colours: Colours  # of the paths; assigned by the walk before `start`
 
     def start(self, first: FilmRay) -> Any:
         """Return the state before the first vertex. The state can be any PyTree."""
@@ -213,6 +218,7 @@ def camera_walk(
     sampler = samples.sampler()
     surrounded = plan.needs.environment is not None
     first = film_ray(samples, sampler) if first is None else first
+    hooks.colours = samples.film.colours(first.ray.wavelengths)
     state = hooks.start(first)
     active = mi.Bool(active) & (plan.max_depth > 0)
 
@@ -337,7 +343,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
     with dr.suspend_grad():
         Le = emitter.eval(si, active)
         reference = dr.zeros(mi.Interaction3f)
-        reference.p, reference.time = path.before, path.ray.time
+        reference.p, reference.time, reference.wavelengths = path.before, path.ray.time, path.ray.wavelengths
         ds = mi.DirectionSample3f(scene, si, reference)
         indirect = active & ~direct
         p_D = scene.pdf_emitter_direction(reference, ds, indirect)

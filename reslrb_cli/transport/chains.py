@@ -30,7 +30,7 @@ MOST_VERTICES = 8
 #: Cells of the square of a lamp's random numbers, along each axis.
 LAMP_CELLS = 64
 #: Streams of random numbers, mixed into the key of a chain.
-EVENTS, APERTURE, TARGET, PLACE = 0x5E1, 0xA9E, 0x1A4, 0x9C3
+EVENTS, APERTURE, TARGET, PLACE, WAVELENGTH = 0x5E1, 0xA9E, 0x1A4, 0x9C3, 0x7B5
 
 _WITH_NORMALS = mi.RayFlags.All | mi.RayFlags.dNSdUV
 
@@ -191,7 +191,8 @@ class SensorChains(Chains):
         samples = self.samples
         aperture = self.random(mi.UInt32(0), APERTURE) if samples.plan.needs.thin_lens else mi.Point2f(0.5)
         time = samples.time(lambda: mi.Float(0.5))
-        return dr.detach(sensor_rays(samples.sensor, time, u / mi.Vector2f(self.cells), aperture))
+        wavelength = self.random(mi.UInt32(0), WAVELENGTH).x if mi.is_spectral else 0.5
+        return dr.detach(sensor_rays(samples.sensor, time, u / mi.Vector2f(self.cells), aperture, wavelength))
 
     def target(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> Target:
         ds, weight = sample_lamp(self.samples, hit.si, self.random(count, TARGET), active)

@@ -17,8 +17,9 @@ import mitsuba as mi
 from reslrb_cli.scene.edges import SEGMENT, SPHERE, TUBE, EdgeTable, edge_kinds, outline_direction
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect
+from reslrb_cli.transport.lamps import wavelengths_of
 from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.sobol import evenly
+from reslrb_cli.transport.sobol import evenly, unit
 
 #: Sampling weight of an edge that no probe sees as an outline, relative to an outline of the same length.
 UNLIKELY = 0.02
@@ -69,17 +70,22 @@ class Outline:
     active: mi.Bool
     crease: mi.Bool
     is_round: mi.Bool
+    wavelengths: mi.Wavelength
 
 
 Viewer = Callable[[Any, Any], EdgeView]  # (point, active lanes) -> view
 
 
-def view_from_lamps(samples: Samples, numbers: mi.Point2f) -> Viewer:
-    """Return the view from lamps. The random `numbers` select the lamp and the place on the lamp."""
+def view_from_lamps(samples: Samples, numbers: mi.Point2f, wavelengths: mi.Wavelength | None = None) -> Viewer:
+    """Return the view from lamps. The random `numbers` select the lamp and the place on the lamp. If no `wavelengths`
+    are given, they are spread over visible light.
+    """
+    if wavelengths is None:
+        wavelengths, _ = wavelengths_of(mi.Float(0.5))
 
     def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
         here = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
-        here.p = p
+        here.p, here.wavelengths = p, wavelengths
         ds, weight = sample_lamp(samples, here, numbers, active)
         parallel = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         surface = dr.select(ds.delta | parallel, mi.Normal3f(0), ds.n)
@@ -112,6 +118,9 @@ class Chances:
     edge: mi.Float
     place: mi.Float
     viewpoint: mi.Point2f
+    #: Wavelengths of the light, and the inverse of their density (C,).
+    wavelengths: mi.Wavelength
+    inverse: mi.Spectrum
 
     @staticmethod
     def spread(numbers: mi.PCG32, seed: mi.UInt32, index: mi.UInt32, count: mi.UInt32) -> Chances:
@@ -121,7 +130,8 @@ class Chances:
         """
         edge = (mi.Float(index) + numbers.next_float32()) / mi.Float(count)
         place, x, y = evenly(seed, SPREAD_STREAM, index)
-        return Chances(edge, place, mi.Point2f(x, y))
+        offset = mi.sample_tea_32(seed, mi.UInt32(SPREAD_STREAM + 1))[1]
+        return Chances(edge, place, mi.Point2f(x, y), *wavelengths_of(unit(index * 2654435769 + offset)))
 
 
 def pick(weights: mi.Float, number: mi.Float) -> tuple[mi.UInt32, mi.Float]:
@@ -206,8 +216,10 @@ def sample_outline(
         sine = dr.select(kind == SPHERE, 1, sine)
     active &= seen.active & (sine > 1e-6)
     weight = seen.weight * dr.select(active, sine / (density * probability), 0)
+    if mi.is_spectral:
+        weight *= chances.inverse
     shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, table.shape, row, active))
-    return Outline(p, normal, seen, weight, shape, active, is_crease, is_round)
+    return Outline(p, normal, seen, weight, shape, active, is_crease, is_round, chances.wavelengths)
 
 
 def _from(first: EdgeView, p: mi.Point3f, again: EdgeView, moved: mi.Bool) -> EdgeView:

@@ -17,8 +17,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.scene.graph import sensor_rays
 from reslrb_cli.transport.connection import forward_derivatives
-from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.film import AdjointImage, Colours, keep_one
 from reslrb_cli.transport.lamp_light import moving_splats, small_splat
 from reslrb_cli.transport.lamps import environment_ray, lamp_ray
 from reslrb_cli.transport.plan import Plan
@@ -83,20 +84,39 @@ def emission_of(
     plan, scene = samples.plan, samples.scene
     if not (plan.environment_map or plan.placed_lamps):
         ray, weight, emitter = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
+        weight = _at_fixed_wavelengths(plan, ray, emitter, weight)
         return Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter, position=sample_2)
 
     index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
     if plan.environment_map:
         is_environment = index == plan.needs.environment
-        ray, weight = environment_ray(plan, scene.environment(), time, sample_2, sample_3)
+        ray, weight = environment_ray(plan, scene.environment(), time, reused, sample_2, sample_3)
         if len(plan.needs.emitters) > 1:
             other = _emitter_ray(samples, emitter, time, reused, sample_2, sample_3, ~is_environment)
             ray, weight = (dr.select(is_environment, a, b) for a, b in zip((ray, weight), other, strict=True))
     else:
         ray, weight = _emitter_ray(samples, emitter, time, reused, sample_2, sample_3, mi.Bool(True))
+    weight = _at_fixed_wavelengths(plan, ray, emitter, weight)
     ray = ray if plan.moving_emission else dr.detach(ray)
     return Emission(ray, weight * dr.detach(index_weight), emitter, position=sample_2)
+
+
+def _at_fixed_wavelengths(plan: Plan, ray: mi.Ray3f, emitter: mi.EmitterPtr, weight: mi.Spectrum) -> mi.Spectrum:
+    """Detach the wavelengths of `ray`, and return radiance / density (C,) with its derivative at these wavelengths.
+
+    Mitsuba samples the wavelengths of some spectra in proportion to their values, and returns their integral.
+    """
+    if not mi.is_spectral:
+        return weight
+    ray.wavelengths = dr.detach(ray.wavelengths)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wavelengths = ray.wavelengths
+    for own, spectrum in plan.sampled_spectra:
+        value, mean = spectrum.eval(si), spectrum.mean()
+        ratio = value / dr.detach(value) * (dr.detach(mean) / mean)
+        weight = mi.Spectrum(dr.select((emitter == mi.EmitterPtr(own)) & (value != 0), weight * ratio, weight))
+    return keep_one(ray, weight) if plan.needs.disperses else weight
 
 
 def _emitter_ray(
@@ -131,9 +151,9 @@ def _emitter_ray(
 # ---- Directly visible light ----
 
 
-def primary_ray(samples: Samples) -> tuple[mi.Ray3f, mi.Point2f, mi.Spectrum]:
-    """Return a primary ray for each path, its film position u (pixels, relative to the crop window), and its weight
-    (C,). The rays are distributed evenly over the pixels of the crop window.
+def primary_ray(samples: Samples) -> tuple[mi.Ray3f, mi.Point2f, mi.Spectrum, Colours]:
+    """Return a primary ray for each path, its film position u (pixels, relative to the crop window), its weight (C,),
+    and its wavelengths with the film's response. The rays are distributed evenly over the pixels of the crop window.
 
     The weight is the sensor's importance, normalised so that a sum over lanes gives the mean over each pixel's samples.
     """
@@ -148,8 +168,9 @@ def primary_ray(samples: Samples) -> tuple[mi.Ray3f, mi.Point2f, mi.Spectrum]:
     time = samples.time(next_1d)
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + mi.Point2f(next_1d(), next_1d())
     aperture = mi.Point2f(next_1d(), next_1d()) if plan.needs.thin_lens else mi.Point2f(0.5)
-    ray, weight = sensor.sample_ray_differential(time, 0.5, u / mi.Vector2f(size), aperture, True)
-    return mi.Ray3f(ray), u, weight * dr.rcp(per_pixel)
+    wavelength = next_1d() if mi.is_spectral else mi.Float(0.5)
+    ray, weight = sensor_rays(sensor, time, u / mi.Vector2f(size), aperture, wavelength)
+    return ray, u, weight * dr.rcp(per_pixel), samples.film.colours(ray.wavelengths)
 
 
 @dataclass
@@ -195,7 +216,7 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, ray: mi.Ray3f, a
         weight = dr.select(state.active, adjoint * state.transmittance, 0)
         objective = weight * Le if plan.differentiate_emission else mi.Spectrum(0)
         if masks:
-            behind = dr.select(transmission != 0, (total - radiance) / dr.detach(transmission), 0)
+            behind = mi.Spectrum(dr.select(transmission != 0, (total - radiance) / dr.detach(transmission), 0))
             objective += dr.select(state.active, adjoint * behind, 0) * transmission
         # The scene may have masks without differentiated parameters.
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
@@ -250,9 +271,9 @@ def _look(
 def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: str = "symbolic") -> None:
     """Add C_0 to the block."""
     if samples.plan.visible_emission and samples.plan.paths == "light":
-        ray, u, weight = primary_ray(samples)
+        ray, u, weight, colours = primary_ray(samples)
         radiance = visible_radiance(samples.plan, samples.scene, ray, loop_mode)
-        samples.film.put(block, u, radiance * weight * samples.fraction, mi.Bool(True))
+        samples.film.put(block, u, radiance * weight * samples.fraction, mi.Bool(True), colours)
     if samples.plan.small_lamps:
         samples.film.put(block, *small_splat(samples))
 
@@ -261,15 +282,15 @@ def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> N
     """Add the derivatives of C_0."""
     plan = samples.plan
     if plan.visible_emission and plan.paths == "light" and (plan.differentiate_emission or plan.differentiate_null):
-        ray, u, weight = primary_ray(samples)
-        delta = adjoint.lookup(u, mi.Bool(True)) * weight * samples.fraction
+        ray, u, weight, colours = primary_ray(samples)
+        delta = adjoint.lookup(u, mi.Bool(True), colours) * weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, ray, delta)
     if plan.small_lamps and plan.differentiate_emission:
         with dr.resume_grad():
-            u, C, active = small_splat(samples)
-            objective = dr.dot(adjoint.lookup(u, active), C)
+            u, C, active, colours = small_splat(samples)
+            objective = dr.dot(adjoint.lookup(u, active, colours), C)
             dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     if plan.visible_moving_lamps:
         with dr.resume_grad():
-            for u, C, active in moving_splats(samples):
-                dr.backward_from(dr.dot(adjoint.lookup(u, active, plan.attached_normalization), C))
+            for u, C, active, colours in moving_splats(samples):
+                dr.backward_from(dr.dot(adjoint.lookup(u, active, colours, plan.attached_normalization), C))

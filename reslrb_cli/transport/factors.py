@@ -52,7 +52,7 @@ def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
     In Dr.Jit 1.5, `x != 0` is false for NaN. On a CPU, atomic sums ignore a NaN unless it shares its address with other
     numbers of the same packet.
     """
-    return dr.select(dr.isnan(value), dr.inf, value)
+    return type(value)(dr.select(dr.isnan(value), dr.inf, value))
 
 
 @dataclass
@@ -92,7 +92,7 @@ class Product:
         factor = dr.detach(factor)
         if not self.zero:
             return Product(self.nonzero * factor, [], tracked)
-        nonzero = self.nonzero * dr.select(factor == 0, stand_in, factor)
+        nonzero = self.nonzero * mi.Spectrum(dr.select(factor == 0, stand_in, factor))
         first = [dr.select(z == NO_ZERO, mi.Int32(index), MANY_ZEROS) for z in self.zero]
         zero = [dr.select(factor[c] == 0, first[c], z) for c, z in enumerate(self.zero)]
         raised = [r * dr.maximum(dr.abs(factor), mi.Spectrum(DIM * stand_in)) for r in self.raised]

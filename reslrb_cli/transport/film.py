@@ -6,13 +6,18 @@ The weights sum to 1 over the pixels.
     splat:   I_p += filter_p(u) C
     lookup:  delta = sum_p filter_p(u) dL/dI_p
 
+In a spectral variant, C has a value for each wavelength of the path, and a pixel has channels. `Colours` converts from
+wavelengths to channels, and adjoints from channels to wavelengths.
+
 `PixelShares` distributes camera paths over a film's pixels.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +30,38 @@ from reslrb_cli.transport.factors import showing
 N_COLOR = 3  # a film's block holds R, G, B, optional alpha, and a weight that light tracing leaves at 0
 
 
+@dataclass
+class Colours:
+    """Wavelengths of each lane's path, and the film's response to them.
+
+    A value C_k at wavelength k adds weights[c]_k C_k to channel c. In other than spectral variants there are no
+    wavelengths, `weights` is empty, and the values of a path are the channels of the film.
+    """
+
+    wavelengths: mi.Wavelength
+    weights: list[mi.Spectrum]
+
+    def channels(self, value: mi.Spectrum, count: int) -> list[mi.Float]:
+        """Return the `count` channels of a value (C,) of a path."""
+        if self.weights:
+            return [dr.dot(weights, value) for weights in self.weights]
+        return [value[c % len(value)] for c in range(count)]  # a mono variant fills all three
+
+    def adjoint(self, delta: Channels) -> mi.Spectrum:
+        """Return the adjoint (C,) of a path's value. `delta` is the adjoint of the film's channels."""
+        if not self.weights:
+            return delta
+        return sum((weights * own for weights, own in zip(self.weights, delta, strict=True)), mi.Spectrum(0))
+
+    def seen(self, value: mi.Spectrum) -> mi.Spectrum:
+        """Return the magnitude (C,) of a path's value, as the film sees it."""
+        return value * sum(dr.abs(weights) for weights in self.weights) if self.weights else value
+
+
+#: Values of a film's channels: a Spectrum, or an array with an entry for each channel in a spectral variant.
+Channels = Any
+
+
 class Film:
     """Film of one sensor in light tracing: image blocks for splatting, adjoint images for lookups."""
 
@@ -35,10 +72,18 @@ class Film:
         integrators do. Otherwise, pixels at the border lack the light that falls off the film, as with `ptracer`.
         """
         self.film, self.whole = sensor.film(), whole
+        self.responses = responses_of(sensor)
+        #: Number of colour channels in a block.
+        self.colors = int(self.film.base_channels_count()) if _is_spectral(self.film) else N_COLOR
         self.integrals = _integrals(self.film.rfilter()) if whole else []
         self.film.prepare([])
         self.size = self.film.crop_size()
         self.offset = self.film.crop_offset()
+
+    def colours(self, wavelengths: mi.Wavelength) -> Colours:
+        """Return the response of the film to paths with these wavelengths."""
+        wavelengths = dr.detach(wavelengths)
+        return Colours(wavelengths, self.responses(wavelengths))
 
     def block(self) -> mi.ImageBlock:
         """Return an empty image block that covers the crop window. Filter weights are normalised per splat."""
@@ -48,9 +93,11 @@ class Film:
         return block
 
     def put(
-        self, block: mi.ImageBlock, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool, normalization: bool = False
-    ) -> None:
-        """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
+        self, block: mi.ImageBlock, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool, colours: Colours,
+        normalization: bool = False,
+    ) -> None:  # fmt: skip
+        """Add `value` (C,) of paths with these `colours` at film position `u` (pixels, relative to the crop window)
+        through the filter.
 
         Under naive AD, the pixels' weights have derivatives with respect to `u`. Mitsuba divides the filter weights by
         their sum, and detaches this sum. With `normalization`, the sum is differentiated as well. If the film is
@@ -59,10 +106,10 @@ class Film:
         if normalization and not self.whole:
             _, total = self.taps(u, normalization)
             value = value * dr.select(total != 0, dr.detach(total) / total, 1)
-        color = [value[c % len(value)] for c in range(N_COLOR)]  # a mono variant fills all three
+        color = colours.channels(value, self.colors)
         if block.channel_count() != len("RGBW"):
             color = [showing(c) for c in color]  # they are added one by one, not as a packet
-        block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
+        block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - len(color)), active)
 
     def taps(self, u: mi.Point2f, normalization: bool) -> tuple[list[tuple[mi.Point2u, mi.Float]], mi.Float]:
         """Return the pixels that a splat at film position `u` touches, with the filter weights of `ImageBlock.put`, and
@@ -83,12 +130,14 @@ class Film:
             (mi.Point2u(mi.Point2i(first.x + x, first.y + y)), columns[x] * rows[y]) for y in range(n) for x in range(n)
         ], total
 
-    def add(self, block: mi.ImageBlock, pixel: mi.Point2u, value: mi.Spectrum, active: mi.Bool) -> None:
+    def add(
+        self, block: mi.ImageBlock, pixel: mi.Point2u, value: mi.Spectrum, active: mi.Bool, colours: Colours
+    ) -> None:
         """Add `value` (C,) to one pixel if it is on the film."""
         inside = active & (pixel.x < self.size.x) & (pixel.y < self.size.y)
         index, channels = dr.fma(pixel.y, mi.UInt32(self.size.x), pixel.x), block.channel_count()
-        for c in range(N_COLOR):
-            at, one = index * channels + c, showing(value[c % len(value)])
+        for c, own in enumerate(colours.channels(value, self.colors)):
+            at, one = index * channels + c, showing(own)
             dr.scatter_reduce(dr.ReduceOp.Add, block.tensor().array, one, at, inside)
 
     def develop(self, block: mi.ImageBlock, tangent: bool = False) -> mi.TensorXf:
@@ -97,7 +146,7 @@ class Film:
         With `tangent`, the block is a derivative. The opaque alpha channel has no derivative.
         """
         self.film.prepare([])
-        if block.channel_count() == len("RGBAW") and not tangent:
+        if block.channel_count() == self.colors + len("AW") and not tangent:
             # Light tracing computes no coverage: every pixel is opaque.
             alpha = dr.arange(mi.UInt32, dr.prod(self.size)) * block.channel_count() + N_COLOR
             dr.scatter(block.tensor().array, mi.Float(1), alpha)
@@ -117,7 +166,7 @@ class Film:
                 there = mi.Int32(place) + offset
                 inside += dr.select((there >= 0) & (there < n), integral, 0)
             part *= inside
-        if channels in (2, 4):
+        if channels in (2, 4) and not _is_spectral(self.film):
             part = dr.select(lane % channels == channels - 1, 1, part)  # alpha is unchanged
         return mi.TensorXf(part, shape)
 
@@ -144,31 +193,39 @@ class AdjointImage:
     def __init__(self, film: Film, image: mi.Float, channels: int) -> None:
         self.image, self.channels, self.film = image, channels, film
 
-    def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> mi.Spectrum:
-        """Return delta (C,) at film position `u` (pixels, relative to the crop window). If gradients are enabled, delta
-        has a derivative with respect to `u`.
+    def lookup(
+        self, u: mi.Point2f, active: mi.Bool, colours: Colours, normalization: bool = True
+    ) -> mi.Spectrum:  # fmt: skip
+        """Return delta (C,) at film position `u` (pixels, relative to the crop window), for paths with these
+        `colours`. If gradients are enabled, delta has a derivative with respect to `u`.
 
         Without `normalization`, the sum that divides the filter's weights has no derivative, as in Mitsuba.
         """
         if self.film.film.rfilter().is_box_filter():  # 1 within a pixel, with or without normalisation
             pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
             inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
-            return self._pixel(pixel, inside)
-        delta = mi.Spectrum(0)
+            return colours.adjoint(self._pixel(pixel, inside))
+        delta = self._channels([mi.Float(0)] * self.film.colors)
         taps, total = self.film.taps(u, normalization)
         for pixel, weight in taps:
             inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
             delta += self._pixel(pixel, inside) * weight
-        return delta * dr.select(total != 0, dr.rcp(total), 0)
+        return colours.adjoint(delta * dr.select(total != 0, dr.rcp(total), 0))
 
-    def _pixel(self, pixel: mi.Point2u, active: mi.Bool) -> mi.Spectrum:
+    def _pixel(self, pixel: mi.Point2u, active: mi.Bool) -> Channels:
         index = dr.fma(pixel.y, mi.UInt32(self.film.size.x), pixel.x)
         if self.channels == len("RGBW"):
             color = dr.gather(mi.Vector4f, self.image, index, active)  # one packet
         else:
-            color = [dr.gather(mi.Float, self.image, index * self.channels + c, active) for c in range(N_COLOR)]
-        color = [color[c] for c in range(N_COLOR)]
-        return mi.Spectrum(*color) if len(mi.Spectrum(0)) == N_COLOR else mi.Spectrum(sum(color))
+            colors = range(self.film.colors)
+            color = [dr.gather(mi.Float, self.image, index * self.channels + c, active) for c in colors]
+        return self._channels([color[c] for c in range(self.film.colors)])
+
+    @staticmethod
+    def _channels(color: list[mi.Float]) -> Channels:
+        if mi.is_spectral:
+            return mi.Color3f(*color) if len(color) == N_COLOR else mi.ArrayXf(color)
+        return mi.Spectrum(*color) if mi.is_rgb else mi.Spectrum(sum(color))
 
 
 STEPS = 256  # for a filter's integral, in each pixel
@@ -183,6 +240,50 @@ def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
     x = (np.arange((2 * taps + 1) * STEPS) + 0.5) / STEPS - taps - 0.5
     values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
     return list(zip(range(-taps, taps + 1), values.reshape(-1, STEPS).mean(1).tolist(), strict=True))
+
+
+# ---- Response to wavelengths ----
+
+
+def keep_one(ray: mi.Ray3f, weight: mi.Spectrum) -> mi.Spectrum:
+    """Give a ray its first wavelength in place of all, and return the weight (C,) of the ray.
+
+    Behind a smooth boundary of glass with dispersion, only one wavelength goes on (`scene/dispersion.py`). Rays that
+    carry one wavelength from the start lose no light there.
+    """
+    ray.wavelengths = mi.Spectrum(ray.wavelengths[0])
+    return mi.Spectrum(weight[0])
+
+
+def responses_of(sensor: mi.Sensor) -> Callable[[mi.Wavelength], list[mi.Spectrum]]:
+    """Return a function from wavelengths to the responses of the film's channels, divided by the number of wavelengths.
+
+    Without wavelengths, the responses are empty.
+    """
+    if not mi.is_spectral:
+        return lambda wavelengths: []
+    count, normalization, film = len(mi.Spectrum(0)), float(mi.MI_CIE_Y_NORMALIZATION), sensor.film()
+    units = [mi.Spectrum(*(float(k == each) for k in range(count))) for each in range(count)]
+
+    def own(wavelengths: mi.Wavelength) -> list[mi.Spectrum]:
+        # The film divides each value by the sum of all responses, by which its sensor multiplies radiance.
+        channels = int(film.base_channels_count())
+        parts = [film.prepare_sample(unit, wavelengths, channels + 1) for unit in units]
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wavelengths = wavelengths
+        total = film.sensor_response_function().eval(si)
+        return [mi.Spectrum(*(part[c] for part in parts)) * total for c in range(channels)]
+
+    def rgb(wavelengths: mi.Wavelength) -> list[mi.Spectrum]:
+        colors = [mi.linear_rgb_rec(wavelength) for wavelength in wavelengths]
+        return [mi.Spectrum(*(color[c] for color in colors)) * (normalization / count) for c in range(N_COLOR)]
+
+    return own if _is_spectral(film) else rgb
+
+
+def _is_spectral(film: mi.Film) -> bool:
+    """True if the film has its own response functions."""
+    return bool(mi.has_flag(film.flags(), mi.FilmFlags.Spectral))
 
 
 EVEN = 0.25  # minimum share of camera paths that are spread evenly over the pixels

@@ -257,7 +257,9 @@ def _normal(chains: Chains, edge: EdgePoint, outwards: mi.Vector3f, active: mi.B
 
     def leaves(angle: mi.Float) -> mi.Bool:
         sin, cos = dr.sincos(angle)
-        there = mi.Ray3f(ray.o, dr.normalize(edge.p + (cos * first + sin * second) * radius - ray.o), ray.time, [])
+        there = mi.Ray3f(
+            ray.o, dr.normalize(edge.p + (cos * first + sin * second) * radius - ray.o), ray.time, ray.wavelengths
+        )
         pi = chains.samples.scene.ray_intersect_preliminary(there, coherent=False, active=active)
         return surface_code(vertex_at(there, pi, active), pi.is_valid()) != code
 

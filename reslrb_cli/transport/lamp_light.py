@@ -21,12 +21,13 @@ import mitsuba as mi
 
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.connection import connect, passage
-from reslrb_cli.transport.lamps import lamp_point
+from reslrb_cli.transport.film import Colours
+from reslrb_cli.transport.lamps import lamp_point, wavelengths_of
 from reslrb_cli.transport.samples import LAMP_STREAM, SMALL_LAMP_STREAM, Samples
 
 
-def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, mi.Bool]]:
-    """Yield film position u, C_0 (C,) and the active lanes for each visible lamp that moves.
+def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, mi.Bool, Colours]]:
+    """Yield film position u, C_0 (C,), the active lanes and the wavelengths for each visible lamp that moves.
 
     If gradients are enabled, u and C_0 have derivatives. Primary rays have already added the light of these lamps to
     the image.
@@ -34,16 +35,18 @@ def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, m
     for lamp in samples.plan.visible_moving_lamps:
         point = _points(samples, (lamp,), mi.UInt32(lamp.index), LAMP_STREAM + lamp.index, True)
         # Points stay at their place on the lamp, so moving parts do not affect their radiance.
-        yield point.u, dr.select(point.active, dr.detach(point.radiance()) * point.weight, 0), point.active
+        C = dr.select(point.active, dr.detach(point.radiance()) * point.weight, 0)
+        yield point.u, C, point.active, samples.film.colours(point.si.wavelengths)
 
 
-def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
-    """Return film position u, C_0 (C,) and the active lanes for lamps smaller than a pixel.
+def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool, Colours]:
+    """Return film position u, C_0 (C,), the active lanes and the wavelengths for lamps smaller than a pixel.
 
     If gradients are enabled, C_0 has its derivative with respect to radiance.
     """
     point = small_points(samples)
-    return point.u, dr.select(point.active, point.radiance() * point.weight, 0), point.active
+    C = dr.select(point.active, point.radiance() * point.weight, 0)
+    return point.u, C, point.active, samples.film.colours(point.si.wavelengths)
 
 
 def small_points(samples: Samples) -> LampPoints:
@@ -94,6 +97,8 @@ def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, stream: i
 
     si, weight = dr.dispatch(emitter, point, time, position, mi.Bool(True))  # as in `sample_emission`
     si.time = time
+    if mi.is_spectral:
+        si.wavelengths, inverse = wavelengths_of(next_1d())
     connection = connect(plan, sensor, si, None, aperture, mi.Bool(True), attached=attached)
     cos = dr.dot(si.n, si.to_world(connection.wo))
     connection.active = connection.active & (cos > 0)
@@ -101,4 +106,6 @@ def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, stream: i
     with dr.suspend_grad():
         active, through = passage(plan, samples.scene, si, mi.UInt32(0), connection)
     weight = through * (cos * weight) * connection.rest * samples.scale
+    if mi.is_spectral:
+        weight *= inverse
     return LampPoints(emitter, si, connection.u, weight, active)

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.scene.graph import Lamp, no_wavelengths
 from reslrb_cli.transport.plan import Plan
 
 DEFENSIVE = 0.1  # share of uniform samples, instead of samples proportional to differentiated radiance
@@ -37,7 +37,7 @@ def lamp_ray(
     """
     si, weight = lamp_point(lamp, areas, time, position, active, evened)
     # For all lanes, because `environment_ray`'s remark on masked lookups holds here, too.
-    _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, True)
+    si.wavelengths, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, True)
     if lamp.parallel:
         d = mi.Vector3f(si.sh_frame.n)  # for a mesh the interpolated normal, as in Mitsuba
     else:
@@ -67,10 +67,10 @@ def lamp_point(
         face = drawn_face(areas, sample.y)
         area = face_area(lamp.shape, face)
         weight = weight * (area / dr.detach(area))
-        si = mi.SurfaceInteraction3f(ps, mi.Color0f())
+        si = mi.SurfaceInteraction3f(ps, no_wavelengths())
         si.n = lamp.shape.face_normal(face)  # rays start off the face; directions are about `ps.n`, interpolated
         return si, weight
-    return mi.SurfaceInteraction3f(ps, mi.Color0f()), weight
+    return mi.SurfaceInteraction3f(ps, no_wavelengths()), weight
 
 
 def _textured_point(
@@ -82,7 +82,7 @@ def _textured_point(
     uv, density = _any_uv(texture, sample, active) if evened else texture.sample_position(sample, active)
     active = active & (density != 0)
     there = mesh.eval_parameterization(uv, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-    si = mi.SurfaceInteraction3f(mi.PositionSample3f(there), mi.Color0f())
+    si = mi.SurfaceInteraction3f(mi.PositionSample3f(there), no_wavelengths())
     si.n = there.n
     return si, _weight(there, density, active)
 
@@ -130,12 +130,23 @@ def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
     return 0.5 * dr.norm(dr.cross(b - a, c - a))
 
 
+def wavelengths_of(number: mi.Float) -> tuple[mi.Wavelength, mi.Spectrum]:
+    """Return wavelengths in proportion to the visible light of a white lamp, and the inverse of their density. The
+    random `number` selects them. Without wavelengths, the density is 1.
+    """
+    if not mi.is_spectral:
+        return no_wavelengths(), mi.Spectrum(1)
+    wavelengths, inverse = mi.sample_rgb_spectrum(mi.sample_shifted(number))
+    return dr.detach(wavelengths), dr.detach(inverse)
+
+
 # ---- Environment maps ----
 
 
 def environment_ray(
-    plan: Plan, environment: mi.Emitter, time: mi.Float, disk: mi.Point2f, direction: mi.Point2f
-) -> tuple[mi.Ray3f, mi.Spectrum]:
+    plan: Plan, environment: mi.Emitter, time: mi.Float, wavelength_sample: mi.Float, disk: mi.Point2f,
+    direction: mi.Point2f,
+) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
     """Return a ray from an environment map. The ray passes through a disk that is perpendicular to the ray and covers
     the scene's bounding sphere.
 
@@ -147,6 +158,7 @@ def environment_ray(
     center, radius = mi.Point3f(*plan.horizon.center), plan.horizon.radius * (1 + 1e-4)
     reference = dr.zeros(mi.Interaction3f)
     reference.p, reference.time = center, time
+    reference.wavelengths, each = wavelengths_of(wavelength_sample)
     if plan.differentiate_emission:
         ds, weight = _any_direction(environment, reference, direction)
     else:
@@ -157,8 +169,9 @@ def environment_ray(
     d = -dr.detach(ds.d)
     offset = mi.warp.square_to_uniform_disk_concentric(disk)
     perpendicular = mi.Frame3f(d).to_world(mi.Vector3f(offset.x, offset.y, 0))
-    ray = mi.Ray3f(center + (perpendicular - d) * radius, d, time, [])
-    return ray, weight * (dr.pi * radius**2)
+    ray = mi.Ray3f(center + (perpendicular - d) * radius, d, time, reference.wavelengths)
+    weight = weight * (dr.pi * radius**2)
+    return ray, weight * each if mi.is_spectral else weight
 
 
 def _any_direction(
@@ -178,5 +191,6 @@ def _any_direction(
         own = environment.pdf_direction(reference, ds, True)
         pdf = dr.select(black, dr.inv_four_pi, (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi)
         seen = dr.zeros(mi.SurfaceInteraction3f)
+        seen.wavelengths = reference.wavelengths
         seen.wi = -ds.d  # `eval_direction` uses texture coordinates, which sampled directions lack
     return ds, environment.eval(seen, True) / pdf

@@ -118,6 +118,8 @@ class Plan:
     # Lamps with a differentiated texture: black texels are sampled, too, because their derivatives can be as large as
     # any.
     evened_lamps: tuple[Lamp, ...] = ()
+    # Emitters with a differentiated spectrum in proportion to which their wavelengths are sampled, and the spectrum.
+    sampled_spectra: tuple[tuple[mi.Emitter, mi.Texture], ...] = ()
     # The BSDFs of differentiated surfaces, if not all are.
     only_bsdfs: tuple[mi.BSDF, ...] = ()
     # Whether any differentiated BSDF has delta lobes, or lets light pass straight through.

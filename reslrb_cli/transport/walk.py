@@ -25,6 +25,7 @@ from reslrb_cli.transport.bsdf import Aimed, EventNumbers, Hit, Scattering, begi
 from reslrb_cli.transport.connection import Connection, KnownVisibility, connect, passage
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import Product, first_eta, play
+from reslrb_cli.transport.film import Colours
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import SELECTION_STREAM, Numbers, Samples
 from reslrb_cli.transport.weights import Rivals, cosine, leave_emitter, weight_of_connection
@@ -59,6 +60,7 @@ class Hooks:
     tracked: bool = False
     attached: bool = False
     max_iterations: int | None = None
+    colours: Colours  # of the paths; assigned by the walk before `start`
 
     def start(self, product: Product) -> Any:
         """Return the state before the first vertex. The state can be any PyTree. `product` is E."""
@@ -116,7 +118,7 @@ class Splat(Hooks):
         s = self.samples
         C = vertex.product.times(connection.c, vertex.depth).scaled(s.scale)
         normalization = self.attached and s.plan.attached_normalization
-        s.film.put(self.block, connection.u, C.value(), connection.active, normalization)
+        s.film.put(self.block, connection.u, C.value(), connection.active, self.colours, normalization)
         return state
 
 
@@ -194,12 +196,13 @@ def walk(
     for lamp in plan.needs.lamps if plan.by_class else ():
         if lamp.parallel:  # no camera path finds its light
             begins |= emission.emitter == mi.EmitterPtr(lamp.emitter)
+    hooks.colours = samples.film.colours(emission.ray.wavelengths)
     product, active, eta = Product.one(plan.track_zeros, hooks.tracked), mi.Bool(active), mi.Float(1)
     if hooks.needs_product:
         product = product.times(emission.E, mi.Int32(0))
         active &= product.alive()
         if plan.roulette:
-            eta = first_eta(dr.max(product.magnitude()), emission.guided)
+            eta = first_eta(dr.max(hooks.colours.seen(product.magnitude())), emission.guided)
     state = hooks.start(product)
     depth = mi.UInt32(depth)
     active &= depth < plan.max_depth
@@ -282,7 +285,7 @@ def walk(
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
         if plan.plays_roulette:
-            throughput = dr.max(dr.abs(product.magnitude()))
+            throughput = dr.max(dr.abs(hooks.colours.seen(product.magnitude())))
             survives, factor = play(plan, survival, path.depth, throughput, eta, si.p, scattering.d, number)
             active &= survives
             product, state = product.scaled(factor), hooks.survived(state, factor)

@@ -1,5 +1,5 @@
-"""Every plugin that Mitsuba 3.9.1 ships, in a separate scene, and how the program treats this scene. This module is
-docs/plugins.md as data.
+"""Every plugin that Mitsuba 3.9.1 ships, and those of `reslrb` for scenes, in a separate scene, and how the program
+treats this scene. This module is docs/plugins.md as data.
 
 `python tests/cli/every_plugin.py` writes the page again. Each plugin has at least one row. Each place or form of the
 plugin that is treated differently has another row.
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from reslrb_cli.scene.dispersion import GLASS, ILLUMINANT
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
 #: Kinds of plugins, and the headings of the page for them.
@@ -188,12 +190,17 @@ PHASES = {
 }  # fmt: skip
 INTEGRATORS = ("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "prb",
                "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic", "direct_projective")  # fmt: skip
+OWN = "a plugin of `reslrb`"
+OWN_INDEX = f"{OWN}; without wavelengths, its index is that at 587.6 nm"
+OWN_GLASS = f'<bsdf type="{GLASS}"><string name="material" value="N-BK7"/>{{}}</bsdf>'
 MENDED = "RGB variants have no spectrum `{}`: read as its colour"
 SPECTRAL = "needs wavelengths, which RGB variants lack"
 
 ROWS: tuple[Row, ...] = (
     *(Row("bsdf", name, scene=thing(xml), note=SAID_OF.get(name, ""), without=SMOOTH.get(name, ""))
       for name, xml in MATERIALS.items()),
+    Row("bsdf", GLASS, scene=thing(OWN_GLASS.format("")), note=OWN_INDEX, without=SMOOTH["dielectric"]),
+    Row("bsdf", GLASS, "with `alpha`", thing(OWN_GLASS.format('<float name="alpha" value="0.3"/>')), note=OWN_INDEX),
     Row("bsdf", "twosided", "with a blend of rough BSDFs",
         thing(f'<bsdf type="twosided">{MATERIALS["blendbsdf"]}</bsdf>')),
     Row("bsdf", "roughconductor", "with spectra", thing(
@@ -266,6 +273,8 @@ ROWS: tuple[Row, ...] = (
     Row("texture", "d65", "on a lamp", lit('<spectrum type="d65" name="{}"/>')),
     Row("texture", "d65", "in a material",
         painted('<spectrum type="d65" name="{}"><float name="scale" value="0.5"/></spectrum>')),
+    Row("texture", ILLUMINANT, "on a lamp",
+        lit('<spectrum type="illuminant" name="{}"><string name="name" value="A"/></spectrum>'), note=OWN),
     Row("texture", "uniform", scene=painted('<spectrum type="uniform" name="{}"><float name="value" '
         'value="0.4"/></spectrum>')),
     Row("texture", "srgb", scene=painted('<spectrum type="srgb" name="{}"><rgb name="color" '
@@ -413,7 +422,8 @@ REASONS = {
 
 HEAD = """# Mitsuba's plugins
 
-This page lists every plugin of Mitsuba 3.9.1, and whether `reslrb` supports it. Each row is a scene that a test runs
+This page lists every plugin of Mitsuba 3.9.1, and whether `reslrb` supports it. It also lists the two plugins that
+`reslrb` adds ([Wavelengths](spectral.md)). Each row is a scene that a test runs
 through `inspect`, `init`, three iterations of `optimize`, and `export`.
 
 - **light paths**: the integrators `reslrb`, `ptracer`, `walk_ad` and `trajectory`. **`prb`**: paths from the sensor.

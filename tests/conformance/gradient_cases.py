@@ -71,7 +71,7 @@ def _perturbed(kind: str) -> dict:
         height = bitmap(random.uniform(0, 0.3, (4, 4, 1)), "bilinear")
         return {"type": kind, "arbitrary": height, "scale": 1.0, "bsdf": diffuse(0.7, 0.5, 0.6)}
     normals = np.concatenate([random.uniform(0.35, 0.65, (4, 4, 2)), np.ones((4, 4, 1))], -1)
-    return {"type": kind, "normalmap": bitmap(normals, "bilinear"), "bsdf": diffuse(0.7, 0.5, 0.6)}
+    return {"type": kind, "normalmap": bitmap(normals, "bilinear") | {"raw": True}, "bsdf": diffuse(0.7, 0.5, 0.6)}
 
 
 def _emitter(**emitter: Any) -> dict:

@@ -39,7 +39,7 @@ def rgb(*value: float) -> dict[str, Any]:
 def bitmap(width: int, height: int, seed: int = 1, low: float = 0.1, high: float = 1.0, channels: int = 3) -> Any:
     """Return a random texture."""
     data = np.random.default_rng(seed).uniform(low, high, (height, width, channels)).astype(np.float32)
-    return {"type": "bitmap", "raw": True, "data": mi.TensorXf(data)}
+    return {"type": "bitmap", "raw": not (mi.is_spectral and channels == 3), "data": mi.TensorXf(data)}
 
 
 def camera(width: int = 32, height: int = 24, rfilter: str = "box", film: dict[str, Any] | None = None,

@@ -66,7 +66,7 @@ try:
 except reslrb_cli.errors.BackendError as error:
     print(error)
 import mitsuba as mi
-for variant in ("scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"):
+for variant in ("scalar_rgb", "llvm_ad_spectral_polarized", "llvm_ad_mono_polarized"):
     mi.set_variant(variant)
     for call in (reslrb_cli.register, lambda: reslrb_cli.load_scene("none.xml"),
                  lambda: mi.load_dict({"type": "reslrb"})):
@@ -74,7 +74,7 @@ for variant in ("scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"):
             call()
         except Exception as error:
             assert f"variant {variant} is set" in str(error), error
-            assert "one of llvm_ad_rgb, cuda_ad_rgb, llvm_ad_mono, cuda_ad_mono" in str(error), error
+            assert "one of llvm_ad_rgb, cuda_ad_rgb, " in str(error), error
             print(type(error).__name__)
 mi.set_variant("llvm_ad_mono")
 print(mi.load_dict({"type": "reslrb", "max_depth": 3}).max_depth)

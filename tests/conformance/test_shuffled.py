@@ -22,6 +22,7 @@ from turns import a_few
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, load, rgb, room
+from reslrb_cli.scene.graph import no_wavelengths
 from reslrb_cli.transport.film import AdjointImage, Film
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -182,12 +183,12 @@ def test_the_derivative_of_film_positions_is_the_same_in_both_modes(whole: bool)
     not divide filter weights by their sum.
     """
     film = Film(load(room(camera=camera("gaussian"))).sensors()[0], whole)
-    shape = film.block().tensor().shape
+    shape, colours = film.block().tensor().shape, film.colours(no_wavelengths())
     weights = mi.Float(np.random.default_rng(1).random(int(np.prod(shape)), np.float32))
 
     def splat(u: mi.Point2f) -> Any:
         block = film.block()
-        film.put(block, u, mi.Spectrum(1), mi.Bool(True), normalization=True)
+        film.put(block, u, mi.Spectrum(1), mi.Bool(True), colours, normalization=True)
         return dr.sum(block.tensor().array * weights)
 
     image = AdjointImage(film, weights, shape[2])
@@ -198,7 +199,7 @@ def test_the_derivative_of_film_positions_is_the_same_in_both_modes(whole: bool)
                    for pixel, k in weighed)  # fmt: skip
 
     found = []
-    for objective in (splat, taps, lambda u: dr.sum(image.lookup(u, mi.Bool(True)))):
+    for objective in (splat, taps, lambda u: dr.sum(image.lookup(u, mi.Bool(True), colours))):
         u = mi.Point2f([2.3, 7.8, 0.2], [5.1, 3.4, 9.9])
         dr.enable_grad(u)
         dr.backward(objective(u))

@@ -15,13 +15,14 @@ from lens.test_experiment import picture
 from skimage.metrics import structural_similarity
 
 from reslrb_cli.config.schema import Fabrication
+from reslrb_cli.glasses import find_glass
 from reslrb_cli.records.images import luminance, write_file
 from reslrb_cli.report.format import number
 from reslrb_cli.runs import export, workshop
 from reslrb_cli.runs.workshop import OpticalBench, figures, shift_between, where_light_goes
 
 PTRACER = {"type": "ptracer", "max_depth": 4}
-FLAT = Fabrication(thickness=25.0)
+FLAT = Fabrication(thickness=25.0, ior="PMMA")
 
 
 def test_shift_and_figures_match_a_known_change_of_a_picture() -> None:
@@ -43,7 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     """Folder with a lens at its start, a run of one iteration, and an export of this run with tolerances."""
     folder = tmp_path_factory.mktemp("tolerance")
     write_file(folder / "p.exr", np.repeat(picture(32, 32)[:, :, None], 3, 2).astype(np.float32), linear=True)
-    done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "32")
+    done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "32", "--ior", "PMMA")
     done("optimize", folder / "lens/lens.yaml", "--set", f"run.output={folder}/runs", "--set", "run.iterations=1",
          "--set", "run.spp=4", "--set", "run.final_spp=24", "--set", "run.certainty=false")  # fmt: skip
     said = done("export", folder / "runs/lens", "-o", folder / "out", "--tolerances").output
@@ -145,14 +146,25 @@ def test_a_displaced_part_matches_a_scene_of_its_own(name: str, folder: Path) ->
     else:
         values = made.denser(0.005)
         text = (folder / "out/scene.xml").read_text()
-        assert 'value="1.49"' in text
-        (folder / "out/moved.xml").write_text(text.replace('value="1.49"', 'value="1.495"'))
+        index = find_glass("PMMA").nd
+        assert f'value="{index:.9g}"' in text
+        (folder / "out/moved.xml").write_text(text.replace(f"{index:.9g}", f"{index + 0.005:.9g}"))
         other = mi.load_file(str(folder / "out/moved.xml"), optimize=False)
     seen = made.image(values, 16)
     wanted = OpticalBench(other, mi.traverse(other), FLAT, mi.load_dict(PTRACER), 0).render(16)
     assert np.abs(seen - wanted).mean() < 3e-4 * wanted.mean()  # the same light paths
     assert np.abs(seen - planned).mean() > 4e-3 * wanted.mean()
     assert np.array_equal(made.render(16), planned)  # the original state is restored
+
+
+def test_colours_spread_as_snells_law_says(folder: Path) -> None:
+    """Light meets the flat back of a wedge at a right angle. Its direction behind the face depends on the index."""
+    tilt, glass = np.arctan(0.2), find_glass("PMMA")
+    made = with_face(folder, lambda x: 0.2 * x)
+    to = [200 * np.tan(np.arcsin(n * np.sin(tilt)) - tilt) for n in (glass.index(486.1327), glass.index(656.2725))]
+    assert 0.2 < to[0] - to[1] < 0.5
+    assert made.spread(glass) == pytest.approx(to[0] - to[1], rel=0.01)
+    assert float(np.ravel(made.params["glass.eta"])[0]) == pytest.approx(glass.nd)  # restored
 
 
 def test_a_lens_rotates_with_both_faces_about_the_middle_of_its_front(folder: Path) -> None:
@@ -190,10 +202,13 @@ def test_the_command_reports_all_figures(folder: Path) -> None:
     told = json.loads((folder / "out/fabrication.json").read_text())["tolerances"]
     assert list(told) == [
         "as planned", "light of 0.53 degrees", "distance +2 %", "distance -2 %", "index +0.005", "index -0.005",
+        "blue light (486 nm)", "red light (656 nm)",
         "light turned by 1 degree about x", "light turned by 1 degree about y", "lens turned by 1 degree about x",
         "lens turned by 1 degree about y",
     ]  # fmt: skip
     said = (folder / "said.txt").read_text()
+    spread = json.loads((folder / "out/fabrication.json").read_text())["colour_spread"]
+    assert f"colour: blue and red light land {spread:.2g} mm apart on average" in said
     light = json.loads((folder / "out/fabrication.json").read_text())["light"]
     assert f"of the light that leaves it, {100 * light['inside']:.4g} % falls in the picture" in said
     assert all(f"{name}: SSIM {entry['ssim']:.3f}, " in said for name, entry in told.items())

@@ -76,6 +76,6 @@ def test_a_set_up_matches_the_options_of_the_command(name: str, tmp_path: Path, 
 
 
 def test_a_material_is_named_by_its_index() -> None:
-    assert "acrylic" in material("lens", 1.49)["material"]
+    assert "PMMA" in material("lens", 1.49)["material"]
     assert "such as" not in material("lens", 2.4)["material"]
     assert "reflect" in material("mirror", None)["finish"]

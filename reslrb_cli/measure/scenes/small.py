@@ -48,8 +48,8 @@ def build(options: dict[str, Any]) -> Any:
     scene = mi.cornell_box()
     texels = np.random.default_rng(0).uniform(0.2, 0.9, (texture, texture, 3))
     scene["white"] = {"type": "diffuse", "reflectance": {
-        "type": "bitmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "raw": True, "filter_type": "bilinear",
-        "format": "variant"}}  # fmt: skip
+        "type": "bitmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "raw": not mi.is_spectral,
+        "filter_type": "bilinear", "format": "variant"}}  # fmt: skip
     scene["sensor"]["film"] |= {"width": size, "height": size, "rfilter": {"type": "box"}}
     return mi.load_dict(scene, optimize=False)
 
@@ -64,8 +64,9 @@ def texture(height: int, width: int, low: float = 0.2, high: float = 0.8, seed: 
 
 
 def bitmap(data: np.ndarray, filter_type: str = "nearest") -> dict:
-    """A bitmap texture with unchanged `data` (H, W, C)."""
-    return {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(data, np.float32)), "raw": True,
+    """A bitmap texture with unchanged `data` (H, W, C). In a spectral variant, three channels are a colour."""
+    is_raw = not (mi.is_spectral and data.shape[2] == 3)
+    return {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(data, np.float32)), "raw": is_raw,
             "filter_type": filter_type, "wrap_mode": "clamp"}  # fmt: skip
 
 

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from reslrb_cli.glasses import GLASSES
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import document, lay_out
 
 Array = np.ndarray[Any, Any]
-
-#: Clear materials and their indices of refraction at 589 nm.
-MATERIALS = {"acrylic (PMMA)": 1.491, "crown glass (N-BK7)": 1.517, "polycarbonate": 1.585, "fused silica": 1.458}
 
 #: Largest difference of an index from that of a material that the sheet names.
 NEAR = 0.01
@@ -68,7 +66,7 @@ def parts(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> dict[str
         "Allowed errors of the set-up": lay_out("workshop.allowed", numbers.get("allowed_errors") or {}),
         "Solid": (
             lay_out("gallery", [each for each in views if each])
-            + lay_out("workshop.solid", numbers, material(kind, numbers.get("ior")))
+            + lay_out("workshop.solid", numbers, material(kind, numbers.get("ior"), numbers.get("glass")))
         ),
         "Deviations": lay_out("gallery", [each for each in off if each]) + lay_out("workshop.deviations", found),
     }  # fmt: skip
@@ -119,17 +117,18 @@ def _angle(cosine: float) -> float:
     return float(np.degrees(np.arccos(min(1.0, float(cosine)))))
 
 
-def material(kind: str, ior: float | None) -> dict[str, str]:
-    """Return material and finish for the `kind` of solid, by name."""
+def material(kind: str, ior: float | None, glass: str | None = None) -> dict[str, str]:
+    """Return material and finish for the `kind` of solid, by name. `glass` is the name of the material, if known."""
     if kind == "mirror":
         return {
             "material": "any that can be polished",
             "finish": "Make the relief reflect like a mirror: polish it, or polish and coat it. A polish must not "
                       "round the relief.",
         }  # fmt: skip
-    near = [] if ior is None else [name for name, index in MATERIALS.items() if abs(index - ior) <= NEAR]
-    example = f", such as {near[0]}" if near else ""
+    near = [] if ior is None else [name for name, known in GLASSES.items() if abs(known.nd - ior) <= NEAR]
+    example = f", such as {near[0]}" if near and glass is None else ""
+    clear = "clear" if ior is None else f"clear, with an index of refraction of {number(ior, 4)}{example}"
     return {
-        "material": "clear" if ior is None else f"clear, with an index of refraction of {number(ior, 4)}{example}",
+        "material": clear if glass is None else f"{glass}, {clear}",
         "finish": "Polish the relief and the back until they are clear. A polish must not round the relief.",
     }

@@ -125,7 +125,9 @@ def _check_plugin(element: Element) -> None:
     tag, type = element.tag, element.type
     if not type:
         raise element.fail("", f"<{tag}> has no type")
-    if (refused := REFUSED_PLUGINS.get((tag, type))) is not None:
+    if tag == "sensor" and element.find("srf") is not None:
+        raise element.fail("srf", "only films have response functions here; use a `specfilm`")
+    if (refused := REFUSED_PLUGINS.get((tag, type))) is not None and not (type == "specfilm" and mi.is_spectral):
         raise element.fail("", f"{tag} `{type}` {refused}")
     others = {"bsdf": "BSDF", "phase": "PhaseFunction", "rfilter": "ReconstructionFilter", "spectrum": "Texture"}
     wanted = getattr(mi.ObjectType, others.get(tag, tag.capitalize()))

@@ -5,10 +5,10 @@ without an id a new id. The new id consists of the object's kind and its number 
 Conversions keep the meaning, and are silent. `mend` returns notes on the parts that are left out, and on spectra that
 become colours.
 
-The plugins `regular`, `irregular` and `blackbody` need wavelengths, which RGB variants lack. `convert_spectra` replaces
-these plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba converts a `<spectrum>` element to a
-colour with the CIE matching functions. For emitters, the result is the colour of light. Otherwise, the result is the
-colour of a surface under D65.
+The plugins `regular`, `irregular` and `blackbody` need wavelengths, which only spectral variants have. In other
+variants, `convert_spectra` replaces these plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba
+converts a `<spectrum>` element to a colour with the CIE matching functions. For emitters, the result is the colour of
+light. Otherwise, the result is the colour of a surface under D65.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.installation import is_known
@@ -195,7 +196,7 @@ def mend(description: Description) -> list[Note]:
     if root.is_object:
         mender.mend_element(root)
     mender.mend_below(root)
-    for spectrum in convert_spectra(root):
+    for spectrum in convert_spectra(root) if not mi.is_spectral else ():
         wrong = f"RGB variants have no spectrum `{spectrum.type}`"
         mender.notes.append(Note(spectrum, wrong, done="read as its colour"))
     root.attributes["version"] = "3.0.0"

@@ -1,0 +1,268 @@
+"""Plugins of `reslrb`: glass with dispersion, and spectra of standard illuminants.
+
+`dispersivedielectric` is a boundary to a glass whose index depends on the wavelength (`glasses.py`). Mitsuba's own
+dielectrics have one index.
+
+A ray carries several wavelengths. A sample draws one of them, and scatters like `dielectric` or `roughdielectric` with
+the index at this wavelength. The density is the mean over the wavelengths that the ray carries (balance heuristic).
+
+- Behind a smooth boundary, refracted light keeps only wavelengths that equal the drawn one. If a ray carries one
+    wavelength four times, its weight is that of a dielectric. If a ray carries four, three weights are 0, and that of
+    the drawn one is 4. Both are unbiased with every integrator; k refractions of four wavelengths leave 4^-k of them.
+- Behind a rough boundary, all wavelengths go on. If the lobe is wide compared with the dispersion, weights are near 1.
+
+In variants without wavelengths, the index is n_d.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.glasses import Glass, cauchy_shape, find_glass, index_of
+
+#: Names of our plugins in scene files.
+GLASS, ILLUMINANT = "dispersivedielectric", "illuminant"
+#: Name of the class of `GLASS`.
+GLASS_CLASS = "DispersiveDielectric"
+#: Shortest wavelength in nm at which an index is evaluated: idle lanes have none, and Sellmeier's formula has poles
+#: in the ultraviolet.
+_SHORTEST = 300.0
+#: Range in nm and step of an illuminant's spectrum.
+_RANGE, _STEP = (360.0, 830.0), 5.0
+
+
+def register() -> None:
+    """Register the plugins for the current variant. A second call has no effect."""
+    mi.register_bsdf(GLASS, lambda props: _glass_class(mi.variant())(props))
+    mi.register_texture(ILLUMINANT, make_illuminant)
+
+
+def bends_light(params: mi.SceneParameters, key: str) -> bool:
+    """True if a parameter changes directions of refraction: n_d or V_d of a glass with dispersion."""
+    node = params.properties[key][2] if key in params.properties else None
+    return node is not None and node.class_name() == GLASS_CLASS and key.endswith((".nd", ".Vd"))
+
+
+def make_illuminant(props: mi.Properties) -> mi.Texture:
+    """Return the spectrum of the illuminant `name` (such as D65, A, FL2, LED-B1), times `scale`.
+
+    The luminance at a scale of 1 equals that of a uniform spectrum of 1. Variants without wavelengths have the colour
+    of the illuminant. Raises ValueError for an unknown name.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour  # late, because it takes a second
+    name, scale = props["name"], float(props.get("scale", 1.0))
+    known = {each.lower(): spectrum for each, spectrum in colour.SDS_ILLUMINANTS.items()}
+    if name.lower() not in known:
+        names = ", ".join(each for each in colour.SDS_ILLUMINANTS if not each.startswith("ISO"))
+        raise ValueError(f"there is no illuminant {name!r}; known are {names}")
+    wavelengths = np.arange(_RANGE[0], _RANGE[1] + _STEP, _STEP)
+    spectrum, observer = known[name.lower()], colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    values = np.interp(wavelengths, spectrum.wavelengths, spectrum.values, left=0, right=0)
+    matching = np.stack([np.interp(wavelengths, observer.wavelengths, observer.values[:, i]) for i in range(3)])
+    values *= scale * matching[1].sum() / (matching[1] @ values)
+    if mi.is_spectral:
+        made = mi.Properties("regular")
+        made["wavelength_min"], made["wavelength_max"] = _RANGE
+        made["values"] = ", ".join(f"{value:.9g}" for value in values)
+    else:
+        xyz = matching @ values / matching[1].sum()
+        made = mi.Properties("srgb")
+        made["color"] = mi.ScalarColor3f(*(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB @ xyz))
+        made["unbounded"] = True
+    made.set_id(props.id())
+    return mi.PluginManager.instance().create_object(made)
+
+
+@functools.cache
+def _glass_class(variant: str) -> type[mi.BSDF]:
+    """Return the class of `dispersivedielectric` for a variant, which must be set."""
+
+    class DispersiveDielectric(mi.BSDF):
+        """Boundary to a glass with dispersion, on the side against the normal. `ext_ior` is the index outside.
+
+        The glass is `material` of the catalogue, or has `nd` and `Vd`, or `sellmeier` coefficients B1 ... C1 ... (C in
+        square micrometres). `nd` and `Vd` may also change a material, which keeps the shape of its dispersion. With
+        `alpha`, the boundary is rough; `distribution` is that of its normals.
+        """
+
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            if mi.is_polarized:
+                raise ValueError(f"{GLASS} does not support polarization")
+            glass = _glass_of(props)
+            self.shape = cauchy_shape if glass is None else glass.shape
+            values = {"nd": None, "Vd": None} if glass is None else {"nd": glass.nd, "Vd": glass.Vd}
+            for name in values:
+                if name in props:
+                    values[name] = float(props[name])
+                if values[name] is None:
+                    raise ValueError(f"{GLASS} needs `material`, `sellmeier`, or both `nd` and `Vd`")
+            self.ext_ior = float(props.get("ext_ior", 1.0))
+            self.alpha = mi.Float(props["alpha"]) if "alpha" in props else None
+            self.distribution = props.get("distribution", "beckmann")
+            nd, Vd = float(values["nd"]), float(values["Vd"])
+            if not (nd > 1 and Vd > 0 and self.ext_ior >= 1):
+                raise ValueError(f"{GLASS} needs nd above 1, Vd above 0, and ext_ior of at least 1")
+            if self.distribution not in ("ggx", "beckmann"):
+                raise ValueError(f"distribution must be ggx or beckmann, not {self.distribution!r}")
+            self.nd, self.Vd = mi.Float(nd), mi.Float(Vd)
+            sides, flags = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide, mi.BSDFFlags
+            smooth = self.alpha is None
+            reflection = flags.DeltaReflection if smooth else flags.GlossyReflection
+            transmission = flags.DeltaTransmission if smooth else flags.GlossyTransmission
+            self.m_components = [int(reflection | sides), int(transmission | sides | flags.NonSymmetric)]
+            self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def traverse(self, callback: mi.TraversalCallback) -> None:
+            flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
+            callback.put("nd", self.nd, flags)
+            callback.put("Vd", self.Vd, flags)
+            if self.alpha is not None:
+                callback.put("alpha", self.alpha, flags)
+
+        def indices(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
+            """Return the index inside, divided by that outside, for each wavelength of the ray."""
+            if not mi.is_spectral:
+                return [self.nd / self.ext_ior]
+            n = index_of(self.nd, self.Vd, self.shape, dr.maximum(si.wavelengths, _SHORTEST))
+            return [each / self.ext_ior for each in n]
+
+        def sample(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f,
+            active: mi.Bool | bool = True,
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:  # fmt: skip
+            cos_i, indices = mi.Frame3f.cos_theta(si.wi), self.indices(si)
+            active = active & (cos_i != 0)
+            m = mi.Normal3f(0, 0, 1)
+            if self.alpha is not None:
+                m, _ = self._normals().sample(dr.mulsign(si.wi, cos_i), sample2)
+            # Draw a wavelength, and then reflection or refraction.
+            count = len(indices)
+            drawn = dr.minimum(mi.UInt32(sample1 * count), count - 1)
+            rest, eta = sample1 * count - drawn, indices[0]
+            for number in range(1, count):
+                eta = dr.select(drawn == number, indices[number], eta)
+            R, cos_t, eta_it, eta_ti = mi.fresnel(dr.dot(si.wi, m), eta)
+            reflects = rest <= R
+            refracted = mi.refract(si.wi, m, cos_t, eta_ti)
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = dr.select(reflects, mi.reflect(si.wi, m), refracted)
+            bs.eta = dr.select(reflects, 1, eta_it)
+            types = [mi.UInt32(flags & int(mi.BSDFFlags.All)) for flags in self.m_components]
+            bs.sampled_type = dr.select(reflects, *types)
+            bs.sampled_component = dr.select(reflects, mi.UInt32(0), mi.UInt32(1))
+            if self.alpha is None:
+                bs.pdf, factors = self._smooth(ctx, si, indices, drawn, reflects)
+            else:
+                bs.pdf, values = self._rough(ctx, si, bs.wo, indices)
+                # The choice between reflection and refraction has no derivative of its own.
+                chosen = dr.select(reflects, R, 1 - R)
+                kept = dr.select(chosen > 0, chosen / dr.detach(chosen), 1) / bs.pdf
+                factors = [value * kept for value in values]
+            active &= bs.pdf > 0
+            bs.pdf = dr.select(active, bs.pdf, 0)
+            return bs, dr.select(active, _spectrum(factors), 0)
+
+        def _smooth(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, indices: list[mi.Float], drawn: mi.UInt32,
+            reflects: mi.Bool,
+        ) -> tuple[mi.Float, list[mi.Float]]:  # fmt: skip
+            """Return the probability of a sampled direction, without derivatives, and the weight by wavelength."""
+            found = [mi.fresnel(mi.Frame3f.cos_theta(si.wi), eta) for eta in indices]
+            goes = [mi.Bool(True)]  # whether a wavelength has the refracted direction
+            if len(indices) > 1:
+                wavelength = si.wavelengths[0]
+                for number in range(1, len(indices)):
+                    wavelength = dr.select(drawn == number, si.wavelengths[number], wavelength)
+                goes = [si.wavelengths[number] == wavelength for number in range(len(indices))]
+            refracted = [dr.select(same, 1 - R, 0) for (R, *_), same in zip(found, goes, strict=True)]
+            shares = [dr.select(reflects, R, T) for (R, *_), T in zip(found, refracted, strict=True)]
+            pdf = dr.detach(sum(shares) / len(indices))
+            values = [share / pdf for share in shares]
+            if ctx.mode == mi.TransportMode.Radiance:
+                values = [dr.select(reflects, each, each * dr.square(eta_ti))
+                          for each, (*_, eta_ti) in zip(values, found, strict=True)]  # fmt: skip
+            return pdf, values
+
+        def _normals(self) -> mi.MicrofacetDistribution:
+            kind = mi.MicrofacetType.GGX if self.distribution == "ggx" else mi.MicrofacetType.Beckmann
+            return mi.MicrofacetDistribution(kind, self.alpha, True)
+
+        def _rough(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, indices: list[mi.Float]
+        ) -> tuple[mi.Float, list[mi.Float]]:  # fmt: skip
+            """Return the density of the direction `wo`, and the value of the BSDF times cosine by wavelength."""
+            wi, normals = si.wi, self._normals()
+            cos_i, cos_o = mi.Frame3f.cos_theta(wi), mi.Frame3f.cos_theta(wo)
+            reflects, density, values = cos_i * cos_o > 0, mi.Float(0), []
+            for index in indices:
+                eta = dr.select(cos_i > 0, index, 1 / index)
+                m = dr.normalize(wi + wo * dr.select(reflects, 1, eta))
+                m = mi.Normal3f(dr.mulsign(m, m.z))
+                i, o = dr.dot(wi, m), dr.dot(wo, m)
+                valid = (cos_i != 0) & (i * cos_i > 0) & (o * cos_o > 0)
+                R, D, G = mi.fresnel(i, index)[0], normals.eval(m), normals.G(wi, wo, m)
+                share = dr.select(reflects, R, 1 - R)
+                # Derivative of the microfacet normal by wo, without |o|.
+                stretch = dr.select(reflects, 0.25, dr.square(eta) * dr.abs(i * o) / dr.square(i + eta * o))
+                value = share * D * G * stretch / dr.abs(cos_i)
+                if ctx.mode == mi.TransportMode.Radiance:
+                    value = dr.select(reflects, value, value / dr.square(eta))
+                pdf = share * normals.pdf(dr.mulsign(wi, cos_i), m) * stretch / dr.abs(i)
+                values.append(dr.select(valid, value, 0))
+                density += dr.select(valid, pdf, 0) / len(indices)
+            return density, values
+
+        def eval_pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
+        ) -> tuple[mi.Spectrum, mi.Float]:  # fmt: skip
+            if self.alpha is None:
+                return mi.Spectrum(0), mi.Float(0)
+            density, values = self._rough(ctx, si, wo, self.indices(si))
+            return dr.select(active, _spectrum(values), 0), dr.select(active, density, 0)
+
+        def eval(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
+        ) -> mi.Spectrum:  # fmt: skip
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
+        ) -> mi.Float:  # fmt: skip
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def class_name(self) -> str:
+            return GLASS_CLASS
+
+        def to_string(self) -> str:
+            rough = "" if self.alpha is None else f", alpha = {self.alpha[0]:g}"
+            return f"{GLASS_CLASS}[nd = {self.nd[0]:g}, Vd = {self.Vd[0]:g}{rough}]"
+
+    return DispersiveDielectric
+
+
+def _glass_of(props: mi.Properties) -> Glass | None:
+    """Return the glass of a plugin's `material` or `sellmeier`. Raises ValueError if it has both, or a wrong one."""
+    if "material" in props and "sellmeier" in props:
+        raise ValueError(f"{GLASS} has both `material` and `sellmeier`; remove one")
+    if "material" in props:
+        return find_glass(props["material"])
+    if "sellmeier" not in props:
+        return None
+    numbers = [float(word) for word in str(props["sellmeier"]).replace(",", " ").split()]
+    half = len(numbers) // 2
+    if not numbers or len(numbers) % 2:
+        raise ValueError("sellmeier needs as many coefficients B as C, such as `1.04, 0.23, 1.01, 0.006, 0.02, 103.6`")
+    return Glass(tuple(numbers[:half]), tuple(numbers[half:]))
+
+
+def _spectrum(values: list[Any]) -> mi.Spectrum:
+    return mi.Spectrum(values[0]) if len(values) == 1 else mi.Spectrum(*values)

@@ -1,0 +1,216 @@
+"""Colours as parameters of a scene in a spectral variant: recovered values are linear RGB, and the scene has spectra.
+
+Mitsuba replaces a colour by a smooth spectrum with three coefficients c (Jakob and Hanika 2019).
+
+    S(l) = 1/2 + v / (2 sqrt(1 + v^2)),    v = c_0 l^2 + c_1 l + c_2
+
+A table in Mitsuba's package maps colours to coefficients. Here, Dr.Jit interpolates the table as Mitsuba does, so the
+coefficients have a derivative with respect to the colour. Emission with the colour E is the spectrum of D65 times
+2 max(E) times the spectrum S of E / (2 max(E)).
+
+A step adds its gradient to the coefficients, and `collect` propagates it to the colours (`Leaf` in `deformation.py`).
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.backend.installation import package_folder
+from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.scene.deformation import Leaf, collect, push
+
+Array = np.ndarray[Any, Any]
+
+#: Distance of colours from 0 and 1. Nearer, the spectrum's derivative has no precision left.
+DARKEST = 1e-4
+
+
+def is_upsampled(params: mi.SceneParameters, key: str) -> bool:
+    """True if the scene parameter `key` has coefficients of a colour's spectrum."""
+    if not mi.is_spectral:
+        return False
+    node, name = params.properties[key][2], key.rpartition(".")[2]
+    if node.class_name() in ("SRGBReflectanceSpectrum", "D65Spectrum"):
+        return name == "value"
+    if not node.class_name().startswith("BitmapTexture") or name != "data":
+        return False
+    return params[key].shape[2] == 3 and not re.search(r"^ *raw = 1,$", str(node), re.MULTILINE)
+
+
+def emitted(key: str) -> str:
+    """Return the key of the spectrum of D65 that belongs to the colour `key` of an emitter."""
+    return f"{key.removesuffix('.value')}.d65.values"
+
+
+@functools.lru_cache(maxsize=2)
+def _table(variant: str) -> tuple[mi.Float, mi.Float, int]:
+    """Return the coefficients, the places along the axis of the largest channel, and the number of places."""
+    path = package_folder() / "data" / "srgb.coeff"
+    content = path.read_bytes()
+    size = int(np.frombuffer(content, np.uint32, 1, 4)[0])
+    scale = np.frombuffer(content, np.float32, size, 8)
+    data = np.frombuffer(content, np.float32, 9 * size**3, 8 + 4 * size)
+    return own_memory(mi.Float, data.copy()), own_memory(mi.Float, scale.copy()), size
+
+
+def coefficients(rgb: mi.Color3f) -> mi.Color3f:
+    """Return the coefficients of the spectrum of a linear colour. Channels outside of [0, 1] are clipped, and have the
+    derivative at the limit.
+    """
+    data, scale, size = _table(mi.variant())
+    rgb = dr.replace_grad(dr.clip(rgb, DARKEST, 1 - DARKEST), rgb)
+    green, blue = rgb.y >= rgb.x, rgb.z >= dr.maximum(rgb.x, rgb.y)
+    first = dr.select(blue, mi.UInt32(2), dr.select(green, mi.UInt32(1), 0))
+    z = dr.select(blue, rgb.z, dr.select(green, rgb.y, rgb.x))
+    x = dr.select(blue, rgb.x, dr.select(green, rgb.z, rgb.y)) * ((size - 1) / z)
+    y = dr.select(blue, rgb.y, dr.select(green, rgb.x, rgb.z)) * ((size - 1) / z)
+    xi, yi = (dr.minimum(mi.UInt32(dr.detach(value)), size - 2) for value in (x, y))
+    level = dr.detach(z)
+    zi = dr.binary_search(0, size - 1, lambda index: dr.gather(mi.Float, scale, index) <= level)
+    zi = dr.clip(mi.UInt32(zi), 1, size - 1) - 1
+    low, high = (dr.gather(mi.Float, scale, zi + step) for step in (0, 1))
+    shares = [(1 - t, t) for t in (x - mi.Float(xi), y - mi.Float(yi), (z - low) / (high - low))]
+    result = mi.Color3f(0)
+    for corner in range(8):
+        dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
+        index = ((first * size + zi + dz) * size + yi + dy) * size + xi + dx
+        result += dr.gather(mi.Color3f, data, index) * (shares[0][dx] * shares[1][dy] * shares[2][dz])
+    # As in Mitsuba, greys have constant spectra.
+    is_grey = (rgb.x == rgb.y) & (rgb.y == rgb.z)
+    grey = mi.Color3f(0, 0, (z - 0.5) * dr.rsqrt(z * (1 - z)))
+    return dr.select(is_grey, dr.replace_grad(dr.detach(grey), result), result)
+
+
+def spectra_of(value: Any) -> mi.Float:
+    """Return the values at a few visible wavelengths of the spectra with these coefficients, one after the other."""
+    c = dr.detach(value)
+    count = value.shape[0] * value.shape[1] if dr.is_tensor_v(value) else 1
+    c = dr.gather(mi.Color3f, value.array, dr.arange(mi.UInt32, count)) if dr.is_tensor_v(value) else mi.Color3f(c)
+    found = []
+    for wavelength in (420.0, 500.0, 580.0, 660.0):
+        v = (c.x * wavelength + c.y) * wavelength + c.z
+        found.append(0.5 + 0.5 * v * dr.rsqrt(dr.square(v) + 1))
+    return dr.ravel(mi.Vector4f(*found))
+
+
+#: Wavelengths of the sums over the visible range, in nm.
+_GRID = np.linspace(360.0, 830.0, 95)
+
+
+@functools.lru_cache(maxsize=2)
+def _responses(variant: str) -> tuple[Array, Array]:
+    """Return D65 (95,), and the responses (95, 3) of linear RGB to reflected D65, which sum to 1 in each channel."""
+    wavelengths = mi.Float(_GRID.astype(np.float32))
+    d65 = np.array(mi.cie_d65(wavelengths), np.float64)
+    responses = np.array(mi.linear_rgb_rec(wavelengths), np.float64).reshape(3, -1).T * d65[:, None]
+    return d65, responses / responses.sum(0)
+
+
+def colours_of(found: Array) -> Array:
+    """Return the linear colours (..., 3) under D65 of the spectra with the coefficients (..., 3)."""
+    c = np.asarray(found, np.float64)
+    responses, result = _responses(mi.variant())[1], np.zeros(c.shape)
+    for wavelength, weight in zip(_GRID, responses, strict=True):
+        v = (c[..., 0] * wavelength + c[..., 1]) * wavelength + c[..., 2]
+        with np.errstate(invalid="ignore"):
+            S = np.where(np.isinf(c[..., 2]), c[..., 2] > 0, 0.5 + 0.5 * v / np.sqrt(1 + np.square(v)))
+        result += S[..., None] * weight
+    return result
+
+
+def colour_in_scene(params: mi.SceneParameters, key: str) -> Array:
+    """Return the linear colours of an upsampled parameter, float32: (3,), or (H, W, 3) for a texture."""
+    value = np.array(dr.detach(params[key]), np.float64)
+    colours = np.clip(colours_of(value.reshape(-1, 3)), 0, None).reshape(value.shape).astype(np.float32)
+    if value.ndim == 2:
+        colours = colours[:, 0] if colours.shape[1] == 1 else colours
+    if emitted(key) in params.properties:
+        spectrum, d65 = np.array(dr.detach(params[emitted(key)]), np.float64), _responses(mi.variant())[0]
+        colours = colours * np.float32(spectrum.sum() / d65.sum())
+    return colours
+
+
+@dataclass
+class _Upsampled:
+    """Colour `value` with its spectrum in the scene: keys of the coefficients, and leaves by key."""
+
+    keys: list[str]
+    value: Any
+    leaves: dict[str, Leaf] = field(default_factory=dict)
+
+
+@dataclass
+class Upsampling:
+    """All recovered colours of a scene with these `params`. A mapping from keys to colours."""
+
+    params: mi.SceneParameters
+    _found: dict[str, _Upsampled] = field(default_factory=dict)
+
+    @property
+    def properties(self) -> Any:
+        """Entries of the scene's parameters, by key."""
+        return self.params.properties
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._found
+
+    def __getitem__(self, key: str) -> Any:
+        return self._found[key].value
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        self._found[key].value = value
+
+    def add(self, key: str, others: Sequence[str] = ()) -> None:
+        """Recover the colour of `key`. The parameters `others` share it."""
+        array, kind = colour_in_scene(self.params, key), type(self.params[key])
+        value = kind(array) if dr.is_tensor_v(kind) else kind(*(mi.Float(float(channel)) for channel in array))
+        dr.make_opaque(value)
+        self._found[key] = _Upsampled([key, *others], value)
+
+    @property
+    def keys(self) -> list[str]:
+        """Scene parameters that are functions of the colours."""
+        own = [key for found in self._found.values() for key in found.keys]
+        return [*own, *(emitted(key) for key in own if emitted(key) in self.params.properties)]
+
+    def place(self) -> list[Any]:
+        """Set the scene's parameters from the colours, as `Deformation.place`."""
+        placed = []
+        for found in self._found.values():
+            for key in found.keys:
+                for name, value in self._spectra(key, found.value).items():
+                    leaf = found.leaves.setdefault(name, Leaf())
+                    placed.append(leaf.place(value))
+                    self.params[name] = leaf.leaf
+        return placed
+
+    def _spectra(self, key: str, value: Any) -> dict[str, Any]:
+        """Return the values of the scene's parameters for a colour."""
+        if dr.is_tensor_v(value):
+            texel = dr.arange(mi.UInt32, value.shape[0] * value.shape[1])
+            found = coefficients(dr.gather(mi.Color3f, value.array, texel))
+            return {key: mi.TensorXf(dr.ravel(found), value.shape)}
+        if emitted(key) not in self.params.properties:
+            return {key: coefficients(value)}
+        scale = 2 * dr.maximum(dr.max(value), DARKEST)
+        d65 = mi.Float(_responses(mi.variant())[0].astype(np.float32))
+        return {key: coefficients(value / scale), emitted(key): d65 * scale}
+
+    def collect(self) -> None:
+        """Propagate the gradients at the scene's spectra to the colours."""
+        collect(self._leaves())
+
+    def push(self) -> None:
+        """Propagate tangents of the colours to the scene's spectra."""
+        push(self._leaves())
+
+    def _leaves(self) -> list[Leaf]:
+        return [leaf for found in self._found.values() for leaf in found.leaves.values()]

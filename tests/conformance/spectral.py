@@ -1,0 +1,144 @@
+"""Tests of the spectral variants alone. `test_spectral.py` runs them in a process of their own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from agreement import compare, renders
+from conformance.scenes import camera, lamp, rgb, stage
+
+from reslrb_cli.integrators.step import render_image
+from reslrb_cli.measure.gradients import Case, integrator, seeds
+from reslrb_cli.scene.upsampling import coefficients, colours_of
+
+#: Wavelengths in nm, and spectra with these nodes.
+NODES = np.linspace(400, 700, 7)
+RHO = np.array([0.2, 0.3, 0.6, 0.4, 0.7, 0.5, 0.8])
+EMITTED = np.array([0.5, 1.5, 1.0, 3.0, 2.0, 2.5, 1.0])
+DEPTH = 6
+PATHS = ["light", "camera", "both"]
+
+
+def spectrum(values: np.ndarray, kind: str) -> dict[str, Any]:
+    """Return a spectrum with the values at NODES."""
+    text = ", ".join(map(str, values))
+    if kind == "regular":
+        return {"type": kind, "wavelength_min": 400.0, "wavelength_max": 700.0, "values": text}
+    return {"type": kind, "wavelengths": ", ".join(map(str, NODES)), "values": text}
+
+
+def furnace(kind: str = "regular") -> dict[str, Any]:
+    """Return a sensor in a sphere with one reflectance and one emission."""
+    return {
+        "type": "scene",
+        "wall": {"type": "sphere", "flip_normals": True,
+                 "bsdf": {"type": "diffuse", "reflectance": spectrum(RHO, kind)},
+                 "emitter": {"type": "area", "radiance": spectrum(EMITTED, kind)}},
+        "sensor": {"type": "perspective", "fov": 60, "film": {
+            "type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb", "rfilter": {"type": "box"}}},
+    }  # fmt: skip
+
+
+def closed_form() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the colour of the furnace, and its derivatives (NODES, 3) by the values of reflectance and emission."""
+    fine = np.linspace(400, 700, 3001)
+    step = fine[1] - fine[0]
+    weights = np.full(fine.size, step)
+    weights[[0, -1]] *= 0.5
+    responses = np.array(mi.linear_rgb_rec(mi.Float(fine.astype(np.float32))), np.float64).reshape(3, -1).T
+    responses *= weights[:, None] * float(mi.MI_CIE_Y_NORMALIZATION)
+    rho, Le = np.interp(fine, NODES, RHO), np.interp(fine, NODES, EMITTED)
+    hats = np.stack([np.interp(fine, NODES, row) for row in np.eye(len(NODES))])
+    series = sum(rho**k for k in range(DEPTH))
+    slope = sum(k * rho ** (k - 1) for k in range(1, DEPTH))
+    return (Le * series) @ responses, (hats * Le * slope) @ responses, (hats * series) @ responses
+
+
+@pytest.mark.parametrize("kind", ["regular", "irregular"])
+@pytest.mark.parametrize("paths", PATHS)
+def test_the_furnace_has_its_colour(paths: str, kind: str) -> None:
+    scene = Case(furnace(kind), []).scene
+    tracer = integrator("reslrb", DEPTH, paths=paths)
+    found = renders(lambda seed: render_image(tracer, scene, 0, seed, 256), range(16)).mean((1, 2))
+    expected, *_ = closed_form()
+    z = (found.mean(0) - expected) / (found.std(0, ddof=1) / 4)
+    print(paths, kind, found.mean(0), expected, z)
+    assert np.abs(z).max() < 4.5
+    assert found.std(0).max() < 0.05 * expected.mean()
+
+
+@pytest.mark.parametrize("kind", ["regular", "irregular"])
+@pytest.mark.parametrize("estimator", ["stack", "reservoir", "gather", "event"])
+@pytest.mark.parametrize("paths", PATHS)
+def test_the_furnace_has_its_derivatives(paths: str, estimator: str, kind: str) -> None:
+    if paths == "camera" and estimator != "stack":
+        pytest.skip("camera paths have one estimator")
+    keys = ["wall.bsdf.reflectance.values", "wall.emitter.radiance.values"]
+    case = Case(furnace(kind), keys)
+    tracer = integrator("reslrb", DEPTH, paths=paths, estimator=estimator)
+    found = case.gradients(tracer, seeds(16), 256)
+    _, by_rho, by_Le = closed_form()
+    weights = np.array(case.weights).sum((0, 1))
+    expected = np.concatenate([by_rho @ weights, by_Le @ weights])
+    z = (found.mean(0) - expected) / (found.std(0, ddof=1) / 4)
+    print(paths, estimator, kind, np.round(z, 1))
+    assert np.abs(z).max() < 5.5
+    assert (found.std(0) / 4).max() < 0.05 * np.abs(expected).max()
+
+
+def test_coefficients_are_those_of_mitsuba() -> None:
+    colours = np.random.default_rng(1).random((200, 3)).astype(np.float32)
+    colours[:20] = colours[:20, :1]
+    found = np.array(coefficients(mi.Color3f(*(mi.Float(np.ascontiguousarray(column)) for column in colours.T)))).T
+    expected = np.array([np.ravel(mi.srgb_model_fetch(mi.ScalarColor3f(*map(float, colour)))) for colour in colours])
+    wavelengths = np.linspace(400, 700, 7)[:, None]
+    ours, theirs = (0.5 + 0.5 * v / np.sqrt(1 + v**2) for v in (
+        (c[:, 0] * wavelengths + c[:, 1]) * wavelengths + c[:, 2] for c in (found, expected)))  # fmt: skip
+    np.testing.assert_allclose(ours, theirs, atol=2e-4)
+    np.testing.assert_allclose(colours_of(expected), colours, atol=0.01)
+
+
+def test_coefficients_have_derivatives() -> None:
+    colour = mi.Color3f([0.3, 0.8, 0.1], [0.5, 0.2, 0.1], [0.2, 0.4, 0.6])
+    dr.enable_grad(colour)
+    c = coefficients(colour)
+    v = (c.x * 530 + c.y) * 530 + c.z
+    dr.backward(0.5 + 0.5 * v * dr.rsqrt(dr.square(v) + 1))
+    gradient = np.array(dr.grad(colour))
+
+    def value(change: np.ndarray) -> np.ndarray:
+        moved = np.array(dr.detach(colour)) + change
+        c = np.array(coefficients(mi.Color3f(*(mi.Float(row.astype(np.float32)) for row in moved))), np.float64)
+        v = (c[0] * 530 + c[1]) * 530 + c[2]
+        return 0.5 + 0.5 * v / np.sqrt(1 + v**2)
+
+    for channel in range(3):
+        change = np.zeros((3, 1))
+        change[channel] = 2e-3
+        np.testing.assert_allclose((value(change) - value(-change)) / 4e-3, gradient[channel], rtol=0.05, atol=0.02)
+
+
+SPECFILM = {
+    "type": "specfilm", "width": 8, "height": 6, "rfilter": {"type": "gaussian"},
+    "blue": {"type": "regular", "wavelength_min": 400.0, "wavelength_max": 500.0, "values": "0, 1, 0"},
+    "green": {"type": "regular", "wavelength_min": 470.0, "wavelength_max": 600.0, "values": "0, 1, 1, 0"},
+    "red": {"type": "regular", "wavelength_min": 560.0, "wavelength_max": 700.0, "values": "0, 1, 0.5"},
+    "wide": {"type": "regular", "wavelength_min": 420.0, "wavelength_max": 680.0, "values": "1, 2"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("paths", PATHS)
+def test_a_film_with_its_own_responses(paths: str) -> None:
+    """The image equals that of `path`, in each channel."""
+    scene = stage({"lamp": lamp(radiance=rgb(8, 7, 6))}, camera() | {"film": SPECFILM})
+    tracer, reference = integrator("reslrb", 4, paths=paths), integrator("path", 4)
+    ours = renders(lambda seed: render_image(tracer, scene, 0, seed, 256), range(8))
+    theirs = renders(lambda seed: render_image(reference, scene, 0, seed, 256), range(100, 108))
+    inner = (slice(None), slice(1, -1), slice(1, -1))
+    result = compare(ours[inner], theirs[inner], block=2)
+    assert ours.shape[-1] == 4
+    assert result, result
