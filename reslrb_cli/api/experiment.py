@@ -372,12 +372,13 @@ def check_estimator(
         return found
 
 
-def export(run: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Path:
+def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], tolerances: bool = False) -> Path:
     """Write the scene of a run with the recovered values for plain Mitsuba, and return the path of `scene.xml`.
 
     `run` is the run folder. `folder` must not exist or must be empty. `mi.load_file` loads the returned file.
 
-    For a lens or a mirror, the folder also holds the solid in millimetres.
+    For a lens or a mirror, the folder also holds the solid in millimetres. `tolerances` adds how deviations from the
+    plan change the image, as `reslrb export` does.
 
     Sets the experiment's Mitsuba variant if none is set. Raises ConfigError and UnsupportedScene.
     """
@@ -387,7 +388,7 @@ def export(run: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Path:
         config = recovered(path, ())
         from reslrb_cli.runs.export import check_export, write_export
 
-        check_export(out)
+        check_export(config, out, tolerances)
         keep_variant(config.variant, config.source)
-        write_export(config, path, out, logger.info)
+        write_export(config, path, out, tolerances, logger.info)
         return out / "scene.xml"

@@ -17,7 +17,10 @@ from reslrb_cli.cli.terminal import echo
     "-o", "--output", required=True, type=click.Path(path_type=Path),
     help="Folder to create, which must not exist yet.",
 )  # fmt: skip
-def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
+@click.option("--tolerances", is_flag=True, help=
+        "For a lens or a mirror, also render its image with errors of light, distance and index; takes "
+        "about 15 images of run.final_spp.")  # fmt: skip
+def command(run: Path, overrides: tuple[str, ...], output: Path, tolerances: bool) -> None:
     """Write the scene of a run with the recovered values. RUN is the run folder.
 
     Mitsuba needs only FOLDER/scene.xml and the files beside it: `mi.load_file("FOLDER/scene.xml")`. Variables and
@@ -32,6 +35,6 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     from reslrb_cli.runs.export import check_export, write_export
 
     config = recovered(run, overrides)
-    check_export(output)
+    check_export(config, output, tolerances)
     start_variant(config)
-    write_export(config, run, output, echo)
+    write_export(config, run, output, tolerances, echo)

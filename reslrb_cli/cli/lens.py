@@ -182,7 +182,7 @@ def command(**given: Any) -> None:
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
             "scene.xml": experiment.scene_xml(surface, film, columns, power, sun).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun).encode(),
         }
         for name, content in texts.items():
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]

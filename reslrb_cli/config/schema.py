@@ -88,6 +88,9 @@ class Fabrication(Section):
     """Outline of the solid. `round`: the ellipse inside the face; the face outside of it is cut off."""
     rim: Annotated[float, Field(ge=0)] = Field(default=0.0, description="Width of a flat rim around the face, in mm.")
     ior: Annotated[float, Field(gt=1, le=5)] = Field(default=1.49, description="Index of refraction of a lens.")
+    sun: Annotated[float, Field(ge=0, lt=90)] = Field(
+        default=0.53, description="Angular diameter of the light source, in degrees."
+    )
     picture: ConfigPath | None = None
     """The picture before its dark parts were lifted, as the film sees it. The result is compared with it as well as
     with the target. null: only with the target."""

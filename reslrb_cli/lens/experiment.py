@@ -264,11 +264,12 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, power: float
 """
 
 
-def lens_yaml(surface: Surface, heights: NDArray[Any], name: str, iterations: int) -> str:
+def lens_yaml(surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float = 0.0) -> str:
     """Return the configuration. The run starts at `heights` (ny, nx), which are stored in `start.exr`."""
     s, (ny, nx) = surface.setting, heights.shape
     least = min(_LEAST * max(s.size), float(heights.min()) + s.thickness)
     plate = f"type: thickness, thickness: {s.thickness:.9g}, least: {least:.4g}, weight: {1e6 / max(s.size) ** 4:.4g}"
+    also = f" sun: {sun:g}," if sun else ""
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
 # Start with
 #     reslrb optimize lens.yaml
@@ -294,7 +295,7 @@ run:
   final_spp: 1024  # of the image that is compared: what it has of noise counts against the lens
   certainty: false  # of a design there is no true value
 fabrication:  # mm; what `reslrb export` makes a solid of
-  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},
+  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {s.ior:g},{also}
    picture: picture.exr}}  # as it was, without a floor
 """
 

@@ -33,7 +33,7 @@ from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.records.run_folder import FABRICATION_FILE, exposures, workshop_file
-from reslrb_cli.runs.workshop import add_sheet
+from reslrb_cli.runs.workshop import OpticalBench, add_sheet, add_tolerances
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.scene.images import read_photo
@@ -58,8 +58,10 @@ _SOLIDS = (*WRITERS, ".ply", ".obj", ".step", ".stp", ".iges", ".igs", ".dxf", "
 Say = Callable[[str], None]
 
 
-def check_export(output: Path) -> None:
+def check_export(config: Config, output: Path, tolerances: bool) -> None:
     """Raise ConfigError if the export cannot be written to the folder `output`."""
+    if tolerances and config.fabrication is None:
+        raise ConfigError("--tolerances", "", "needs a configuration with a section `fabrication`")
     if output.suffix.lower() in _SOLIDS:
         reason = f"{output} is the name of a file; give a folder, into which the solid is written as .stl and .3mf"
         raise ConfigError("--output", "", reason)
@@ -67,7 +69,7 @@ def check_export(output: Path) -> None:
         raise ConfigError("--output", "", f"{output} exists; give a new or empty folder")
 
 
-def write_export(config: Config, run: Path, output: Path, say: Say) -> None:
+def write_export(config: Config, run: Path, output: Path, tolerances: bool, say: Say) -> None:
     """Export `config`, the experiment of `run` with its recovered values, to the folder `output`.
 
     A variant must be set. `say` is called with a line about each thing written. Raises ConfigError and
@@ -88,11 +90,17 @@ def write_export(config: Config, run: Path, output: Path, say: Say) -> None:
     pictures: dict[str, Array] = {}
     if plan is not None:
         numbers = measured(solid, sheet, plan)
-        target = read_target(config, scene.sensors()[sensors[0]])
+        target = read_target(config, scene.sensors()[sensors[0]], needed=tolerances)
         if target is not None:
             tracer, spp = mi.load_dict(dict(integrator)), config.run.final_spp
             image = luminance(np.array(mi.render(scene, integrator=tracer, sensor=sensors[0], spp=spp)))
             pictures = add_sheet(numbers, plan, scene, sensors[0], sheet, image, luminance(target))
+            if tolerances:
+                try:
+                    bench = OpticalBench(scene, selection.params, plan, tracer, sensors[0])
+                except ConfigError as error:
+                    raise ConfigError(config.source, error.key, error.message) from None
+                pictures |= add_tolerances(numbers, bench, image, luminance(target), spp, say)
         pictures |= pictures_of(solid)
         beside = solid_files(plan, sheet, solid, numbers, pictures)
     exposure = exposure_line(run)
@@ -194,15 +202,24 @@ def read_solid(config: Config, plan: Fabrication, params: mi.SceneParameters) ->
         raise ConfigError(config.source, error.key, error.message) from None
 
 
-def read_target(config: Config, sensor: mi.Sensor) -> Array | None:
+def read_target(config: Config, sensor: mi.Sensor, needed: bool) -> Array | None:
     """Return the target image (H, W, C) of a sensor. Return None if `target.file` is not set, or does not have the size
     of the film.
+
+    Raises ConfigError instead of returning None if the target is `needed` for tolerances.
     """
-    if config.target.file is None:
-        return None
-    target = read_photo(config.target.file).image[:, :, :3]
-    width, height = (int(n) for n in sensor.film().crop_size())
-    return target if target.shape[:2] == (height, width) else None
+    file = config.target.file
+    if file is None:
+        reason = "the caustic is compared with target.file, which is missing"
+    else:
+        target = read_photo(file).image[:, :, :3]
+        width, height = (int(n) for n in sensor.film().crop_size())
+        if target.shape[:2] == (height, width):
+            return target
+        reason = f"target.file has {target.shape[1]}x{target.shape[0]} pixels, the film {width}x{height}"
+    if needed:
+        raise ConfigError("--tolerances", "", reason)
+    return None
 
 
 def solid_files(

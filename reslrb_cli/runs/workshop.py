@@ -1,27 +1,47 @@
 """Figures and pictures of the sheet for the workshop that makes a lens or a mirror (`report/page/workshop.py`).
 
-`setup_of` measures the set-up in its scene: distances, direction of
+`OpticalBench` and `tolerances` render images with errors of light, position or glass. For each error, a stock
+integrator of Mitsuba renders the scene with the changed part. If a rotation shifts the whole picture, the shift is
+reported, and removed before images are compared. `setup_of` measures the set-up in its scene: distances, direction of
 the light, orientation of the picture. Lengths are in mm. Directions are unit vectors in the axes of the scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.ndimage
 
 from reslrb_cli.config.schema import Fabrication
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens.solid import Sheet
 from reslrb_cli.records.images import luminance
+from reslrb_cli.report.page.workshop import shown_ssim
 from reslrb_cli.scene.images import read_image
 
 Array = np.ndarray[Any, Any]
 
+#: Loss of SSIM that counts as still acceptable.
+ALLOWED_LOSS = 0.05
+
+#: Errors that a careful workshop keeps: distance in mm, rotations in degrees, index of refraction.
+TOLERANCES = {"distance": 1.0, "light turned": 0.5, "solid turned": 0.5, "index": 0.002}
+
+#: Assumed errors of the distance, of the index, and of rotations in degrees.
+DISTANCE, INDEX, TURN = 0.02, 0.005, 1.0
+
 #: Rays for the shares of lost light, which are 0.1 % to 5 %, and the maximum number of faces that each ray meets.
 SHARE_RAYS, BOUNCES = 2**19, 8
+
+#: Directions within a light as wide as the sun, in units of its radius: the centre, and six on a circle with the mean
+#: squared distance of an even disc (one half).
+_DIRECTIONS = [(0.0, 0.0), *((np.cos(a) * (7 / 12) ** 0.5, np.sin(a) * (7 / 12) ** 0.5)
+                             for a in np.arange(6) * np.pi / 3)]  # fmt: skip
 
 
 def figures(image: Array, target: Array) -> dict[str, float]:
@@ -67,7 +87,7 @@ def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, targ
     sampler, ray, light = _from_lamps(scene, SHARE_RAYS)
     context = mi.BSDFContext(mi.TransportMode.Importance)
     left, active = dr.zeros(mi.Bool, SHARE_RAYS), light > 0
-    dr.make_opaque(ray, light, left, active)  # so that each round launches one kernel
+    dr.make_opaque(ray, light, left, active)  # so that each rotation launches one kernel
     totals = dict.fromkeys(("inside", "beside", "beyond"), 0.0)
     for _ in range(BOUNCES):
         si = scene.ray_intersect(ray, active)
@@ -109,6 +129,152 @@ def _is_any(shape: mi.ShapePtr, others: Sequence[mi.Shape]) -> mi.Bool:
     return found
 
 
+def shift_between(image: Array, reference: Array) -> Array:
+    """Return the shift (rows, columns) of `image` relative to `reference`, to a tenth of a pixel."""
+    from skimage.registration import phase_cross_correlation
+
+    return -np.asarray(phase_cross_correlation(reference, image, upsample_factor=10)[0])
+
+
+class OpticalBench:
+    """Scene of a lens or mirror whose parts can be changed. `plan` describes the lens or mirror. `params` are the
+    scene's parameters.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, params: mi.SceneParameters, plan: Fabrication, integrator: mi.Integrator, sensor: int
+    ) -> None:
+        self.scene, self.params, self.plan, self.sensor = scene, params, plan, sensor
+        self._integrator = integrator
+        self.lamps = [shape.id() for shape in scene.shapes() if shape.is_emitter()]
+        self.camera = scene.sensors()[sensor].id()
+        if f"{plan.receiver}.to_world" not in params.properties:
+            raise ConfigError("", "fabrication.receiver", f"there is no `{plan.receiver}` in the scene with a to_world")
+
+    def render(self, spp: int, seed: int = 0) -> Array:
+        """Render the luminance (H, W)."""
+        image = np.array(mi.render(self.scene, integrator=self._integrator, sensor=self.sensor, spp=spp, seed=seed))
+        return luminance(image.reshape(*image.shape[:2], -1))
+
+    @contextmanager
+    def _changed(self, values: dict[str, Any]) -> Iterator[None]:
+        before = {key: type(self.params[key])(self.params[key]) for key in values}
+        try:
+            for key, value in values.items():
+                self.params[key] = value
+            self.params.update()
+            yield
+        finally:
+            for key, value in before.items():
+                self.params[key] = value
+            self.params.update()
+
+    def moved(self, ids: Sequence[str], by: mi.ScalarTransform4f) -> dict[str, Any]:
+        """Return the parameters of the objects with these ids, moved by `by`."""
+        values: dict[str, Any] = {}
+        for id in ids:
+            if (key := f"{id}.vertex_positions") in self.params.properties and f"{id}.to_world" not in (
+                self.params.properties
+            ):
+                points = np.array(self.params[key]).reshape(-1, 3)
+                matrix = np.array(by.matrix)
+                values[key] = mi.Float((points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32).ravel())
+            elif (key := f"{id}.to_world") in self.params.properties:
+                values[key] = type(self.params[key])(by.matrix) @ self.params[key]
+        return values
+
+    def turned(self, ids: Sequence[str], axis: Sequence[float], degrees: float) -> dict[str, Any]:
+        """Return the parameters of the objects with these ids, rotated about an axis through the face's centre."""
+        return self.moved(ids, mi.ScalarTransform4f().rotate(list(axis), degrees))
+
+    def farther(self, part: float) -> dict[str, Any]:
+        """Return the parameters of receiver and camera after a move away from the origin. The move is the fraction
+        `part` of the receiver's distance.
+        """
+        key = f"{self.plan.receiver}.to_world"
+        middle = np.ravel(self.params[key] @ mi.Point3f(0)).astype(float)
+        way = mi.ScalarTransform4f().translate((part * middle).tolist())
+        return self.moved([self.plan.receiver, self.camera], way)
+
+    def denser(self, by: float) -> dict[str, Any]:
+        """Return the refractive index of the glass, changed by `by`."""
+        found = {}
+        for key in self.params.properties:
+            if key.endswith(".eta"):
+                with suppress(TypeError, ValueError):
+                    value = float(np.ravel(self.params[key])[0])
+                    if abs(value - self.plan.ior) < 1e-4:
+                        found[key] = type(self.params[key])(value + by)
+        return found
+
+    def solid_parts(self) -> list[str]:
+        """Return the ids of the face and of the flat back."""
+        return [self.plan.face, "back"]
+
+    def image(self, values: dict[str, Any], spp: int, seed: int = 0) -> Array:
+        """Render the scene with these parameters."""
+        with self._changed(values):
+            return self.render(spp, seed)
+
+    def sun(self, spp: int) -> Array:
+        """Render light with the angular diameter `plan.sun` as the mean over several directions."""
+        half, images = self.plan.sun / 2, []
+        for i, (x, y) in enumerate(_DIRECTIONS):  # each has its own noise, so that it averages out
+            angle = float(np.hypot(x, y))
+            turned = {} if angle == 0 else self.turned(self.lamps, (x / angle, y / angle, 0), half * angle)
+            images.append(self.image(turned, max(1, spp // len(_DIRECTIONS)), i))
+        return np.asarray(np.mean(images, axis=0))
+
+
+def tolerances(
+    bench: OpticalBench,
+    planned: Array,
+    target: Array,
+    spp: int,
+    say: Callable[[str], None] = lambda _: None,
+    original: Array | None = None,
+    keep: Callable[[str, Array], None] = lambda name, image: None,
+) -> dict[str, dict[str, Any]]:
+    """Return `figures` by name, for the image `planned` and for the image of each error. `target` (H, W) is the
+    luminance for comparison.
+
+    A rotation shifts the whole picture by `shift` (columns, rows) in pixels. The shift is removed before the
+    comparison. `original` (H, W) is the picture before its dark parts were raised. If `original` is given,
+    `ssim_of_picture` is the SSIM of the image and `original`. `keep` receives the name and the luminance (H, W) of each
+    image.
+    """
+    plan, both = bench.plan, bench.solid_parts()
+    found: dict[str, dict[str, Any]] = {}
+
+    def tell(name: str, image: Array, turned: bool = False) -> None:
+        entry: dict[str, Any] = {}
+        keep(name, image)
+        if turned:
+            rows, columns = (float(value) for value in shift_between(image, planned))
+            image = scipy.ndimage.shift(image, (-rows, -columns), order=1)
+            entry["shift"] = [columns + 0.0, rows + 0.0]  # no -0
+        if original is not None:
+            entry["ssim_of_picture"] = figures(image, original)["ssim"]
+        found[name] = figures(image, target) | {"spp": spp} | entry
+        moved = f", shifted by {np.hypot(*entry['shift']):.2g} pixels" if turned else ""
+        say(f"{name}: SSIM {found[name]['ssim']:.3f}, {100 * found[name]['inside']:.3g} % of the light inside{moved}")
+
+    tell("as planned", planned)
+    if plan.sun > 0 and bench.lamps:
+        tell(f"light of {plan.sun:g} degrees", bench.sun(spp))
+    for sign in (1, -1):
+        tell(f"distance {sign * 100 * DISTANCE:+g} %", bench.image(bench.farther(sign * DISTANCE), spp))
+    if plan.kind == "lens":
+        for sign in (1, -1):
+            tell(f"index {sign * INDEX:+g}", bench.image(bench.denser(sign * INDEX), spp))
+    for what, ids in (("light", bench.lamps), (plan.kind, both)):
+        for name, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
+            if ids:
+                turned = bench.image(bench.turned(ids, axis, TURN), spp)
+                tell(f"{what} turned by {TURN:g} degree about {name}", turned, turned=True)
+    return found
+
+
 # --- the sheet --------------------------------------------------------------------------------------------------------
 
 
@@ -138,6 +304,32 @@ def add_sheet(
     return {"picture": as_picture(shown, shown, inside), "caustic": as_picture(thrown, shown, inside)}
 
 
+def add_tolerances(
+    numbers: dict[str, Any],
+    bench: OpticalBench,
+    planned: Array,
+    wanted: Array,
+    spp: int,
+    say: Callable[[str], None],
+) -> dict[str, Array]:
+    """Add measured tolerances and allowed errors to `numbers`. Returns the picture of each deviation by name."""
+    original, inside = original_of(bench.plan, wanted), picture_within(wanted)
+    shown = wanted if original is None else original
+    pictures: dict[str, Array] = {}
+
+    def keep(name: str, image: Array) -> None:
+        pictures[name] = as_picture(image, shown, inside)
+
+    found = tolerances(bench, planned, wanted, spp, say, original, keep)
+    setup = numbers.get("setup")
+    deviations = {"turn": TURN, "index": INDEX}
+    if setup is not None:
+        deviations["distance"] = DISTANCE * setup["receiver_distance"]
+    numbers["tolerances"] = found
+    numbers["allowed_errors"] = allowed_errors(found, bench.plan.kind, deviations)
+    return pictures
+
+
 def original_of(plan: Fabrication, wanted: Array) -> Array | None:
     """Return the luminance (H, W) of the picture before its dark parts were raised. Return None if the picture is
     unknown, or does not have the size of `wanted`.
@@ -157,6 +349,54 @@ def as_picture(image: Array, original: Array, inside: tuple[slice, slice]) -> Ar
     seen, wanted = image[inside], original[inside]
     scaled = seen / max(float(seen.mean()), 1e-30) * (wanted.mean() / max(float(wanted.max()), 1e-30))
     return np.asarray(scaled, dtype=np.float32)[:, :, None]
+
+
+# --- allowed errors ---------------------------------------------------------------------------------------------------
+
+
+def allowed_errors(
+    found: Mapping[str, Mapping[str, Any]], kind: str, deviations: Mapping[str, float]
+) -> dict[str, dict[str, Any]]:
+    """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, for each measured kind of deviation.
+
+    `found` holds the figures of each image, by image name, as returned by `tolerances`. `kind` is `lens` or `mirror`.
+    `deviations` are the measured amounts: `distance` in mm, `index`, and `turn` in degrees. The result has the keys of
+    `TOLERANCES`.
+
+    Each entry has the `value`, its `unit` and the stated `tolerance`. `at_least` is true if SSIM falls by less than
+    `ALLOWED_LOSS` even at the measured deviation. `passes` tells whether the tolerance is met. `passes` is None if the
+    answer is unknown. The answer is unknown if the measured deviation is below the tolerance and SSIM falls by less
+    than `ALLOWED_LOSS`.
+    """
+    planned = found.get("as planned")
+    if planned is None:
+        return {}
+    kinds = {
+        "distance": ("distance ", "mm", deviations.get("distance")),
+        "light turned": ("light turned", "degrees", deviations["turn"]),
+        "solid turned": (f"{kind} turned", "degrees", deviations["turn"]),
+        "index": ("index ", "", deviations["index"]),
+    }
+    allowed = {}
+    for name, (prefix, unit, deviation) in kinds.items():
+        entries = [entry for key, entry in found.items() if key.startswith(prefix)]
+        if entries and deviation:
+            fall = max(shown_ssim(planned) - shown_ssim(entry) for entry in entries)
+            value, tolerance = allowed_error(fall, deviation), TOLERANCES[name]
+            at_least = fall < ALLOWED_LOSS
+            passes = None if at_least and value < tolerance else value >= tolerance
+            allowed[name] = {"value": value, "unit": unit, "tolerance": tolerance, "at_least": at_least,
+                             "passes": passes}  # fmt: skip
+    return allowed
+
+
+def allowed_error(fall: float, deviation: float) -> float:
+    """Return the deviation at which SSIM has fallen by `ALLOWED_LOSS`, at most `deviation`.
+
+    The function assumes that SSIM falls linearly, and that SSIM has fallen by `fall` at `deviation`. Nothing larger was
+    measured.
+    """
+    return deviation * min(1.0, ALLOWED_LOSS / fall) if fall > 0 else deviation
 
 
 # --- the set-up -------------------------------------------------------------------------------------------------------

@@ -313,7 +313,7 @@ reveal_type((run.config, run.folder, run.status, run.iteration, run.records))
 run.close()
 rl.register()
 reveal_type((run.parameters, run.gradients, run.images, run.targets, run.truth))
-reveal_type((rl.gradient(config), rl.render(config, values={"a": 3}), rl.export("x", "y")))
+reveal_type((rl.gradient(config), rl.render(config, values={"a": 3}), rl.export("x", "y", tolerances=True)))
 reveal_type([(check.holds, check.verdict, check.to_json()) for check in rl.gradcheck(config)])
 reveal_type(rl.__version__)
 

@@ -1,4 +1,4 @@
-"""Sheet for the workshop that makes a lens or a mirror: pictures, set-up, solid, tool and material."""
+"""Sheet for the workshop that makes a lens or a mirror: pictures, set-up, allowed errors, solid, tool and material."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MATERIALS = {"acrylic (PMMA)": 1.491, "crown glass (N-BK7)": 1.517, "polycarbona
 #: Largest difference of an index from that of a material that the sheet names.
 NEAR = 0.01
 
-#: Names of the pictures with their captions.
+#: Names of the pictures with their captions. The other pictures of a sheet are those of deviations.
 CAPTIONS = {
     "picture": "the original picture",
     "caustic": "the caustic, as computed",
@@ -43,16 +43,21 @@ def workshop(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> Marku
     """Return the workshop sheet as a part of the run's page.
 
     `numbers` is the content of fabrication.json. `pictures` are linear images (H, W, C). Their names are in `CAPTIONS`
-    and `VIEWS`. Pictures and numbers that are missing are left out.
+    and `VIEWS`, or are names of deviations. Pictures and numbers that are missing are left out.
     """
     return Markup().join(lay_out("heading", title) + body for title, body in parts(numbers, pictures).items() if body)
 
 
 def parts(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> dict[str, Markup]:
     """Return the parts of the sheet by title. Parts that do not apply are empty."""
-    kind, setup = numbers["kind"], numbers.get("setup")
-    large = [_picture(name, caption, pictures) for name, caption in CAPTIONS.items()]
+    kind, found = numbers["kind"], numbers.get("tolerances") or {}
+    setup = numbers.get("setup")
+    light = next((name for name in found if name.startswith("light of ")), "")
+    shown = [*CAPTIONS, light]
+    large = [_picture(name, CAPTIONS.get(name, f"the caustic in {name}"), pictures) for name in shown]
     views = [_picture(name, f"the {kind}, {caption}", pictures) for name, caption in VIEWS.items()]
+    off = [_picture(name, f"{name}: SSIM {number(shown_ssim(entry), 3)}", pictures)
+           for name, entry in found.items() if name not in (*shown, "as planned")]  # fmt: skip
     return {
         "Picture": (
             lay_out("note", numbers.get("warnings") or [])
@@ -60,11 +65,21 @@ def parts(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> dict[str
             + lay_out("workshop.quality", numbers)
         ),
         "Set-up": Markup() if setup is None else lay_out("facts", setup_facts(setup)),
+        "Allowed errors of the set-up": lay_out("workshop.allowed", numbers.get("allowed_errors") or {}),
         "Solid": (
             lay_out("gallery", [each for each in views if each])
             + lay_out("workshop.solid", numbers, material(kind, numbers.get("ior")))
         ),
+        "Deviations": lay_out("gallery", [each for each in off if each]) + lay_out("workshop.deviations", found),
     }  # fmt: skip
+
+
+def shown_ssim(entry: Mapping[str, Any]) -> float:
+    """Return the SSIM that the sheet shows. The SSIM refers to the original picture if that picture is known, otherwise
+    to the target.
+    """
+    value = entry.get("ssim_of_picture")
+    return float(entry["ssim"] if value is None else value)
 
 
 def _picture(name: str, caption: str, pictures: Mapping[str, Array]) -> Any:
