@@ -63,24 +63,21 @@ def save_checkpoint(
     iteration: int,
     arrays: Mapping[str, Array],
     values: Mapping[str, Any] | None = None,
-    name: str = STATE_FILE,
 ) -> None:
     """Write the state after `iteration` updates into `folder`, atomically and durably.
 
     The entries are `iteration`, the `arrays` under their names, and `values` as JSON. The earlier state becomes
-    `previous.npz`, unless `name` is another file name. Raises OSError if writing fails. Both earlier states then still
-    exist.
+    `previous.npz`. Raises OSError if writing fails. Both earlier states then still exist.
     """
     entries: dict[str, Array] = {"iteration": np.array(iteration), **arrays}
     if values is not None:
         text = json.dumps({"format": FORMAT, "iteration": iteration, **values}, allow_nan=False)
         entries["state"] = np.frombuffer(text.encode(), np.uint8)
-    path, new = folder / name, folder / _NEXT_FILE
+    path, new = folder / STATE_FILE, folder / _NEXT_FILE
     try:
         write_archive(new, entries, durable=True)
-        if name == STATE_FILE:
-            with contextlib.suppress(FileNotFoundError):  # there is no earlier state yet
-                os.replace(path, folder / PREVIOUS_FILE_NAME)
+        with contextlib.suppress(FileNotFoundError):  # there is no earlier state yet
+            os.replace(path, folder / PREVIOUS_FILE_NAME)
         os.replace(new, path)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error

@@ -47,9 +47,7 @@ def test_a_scene_end_to_end(folder: Path) -> None:
     for line in points:
         assert line["elapsed_s"] == pytest.approx(line["steps"] * points[0]["elapsed_s"])
     reference = next(line for line in lines if line["kind"] == "reference")
-    assert (reference["label"], reference["bias_reference"], reference["biased"]) == (
-        "reslrb:stack(paths=both,light_share=0.5)", "prb", False
-    )  # fmt: skip
+    assert (reference["label"], reference["bias_reference"], reference["biased"]) == ("reslrb:stack", "ptracer", False)
     assert printed[-1].startswith("Best for this scene: ")
     assert sum("16 rounds " in line for line in printed) == len(names)  # one row for each method
     assert any(line.startswith(f"{names[0]}: first step") for line in printed)  # compilation has its own line
