@@ -146,9 +146,18 @@ def test_each_wavelength_scatters_as_in_mitsubas_dielectric(rough: float | None,
         return values.mean(1), values.std(1) / np.sqrt(count)
 
     mixed, errors = means(si)
+    bs, weight = glass.sample(context, si, sample1, sample2)
     for c in range(4):
         alone = type(si)(si)
         alone.wavelengths = mi.Spectrum(si.wavelengths[c])
+        if rough is None:  # whatever arrives at this wavelength is reflected, or follows Snell's law
+            n = find_glass("N-SF11").index(si.wavelengths[c])
+            bent = -si.wi.x * dr.select(si.wi.z > 0, 1 / n, n)
+            follows = (bs.wo.z * si.wi.z > 0) | (dr.abs(bs.wo.x - bent) < 1e-5)
+            assert dr.all(follows | (weight[c] == 0))
+        else:
+            together, single = (glass.eval(context, each, wo) for each in (si, alone))
+            assert np.allclose(np.array(together[c]), np.array(single[c]), rtol=1e-4)
         wanted, noise = means(alone)
         part = slice(4 * c, 4 * c + 4)
         z = (mixed[part] - wanted[part]) / np.hypot(errors[part], noise[part])
