@@ -165,9 +165,9 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
     sides = [(side.plan, side.spp, side.width) for side in samples.sides()]
 
     def on_samples(scene: mi.Scene, sensor: mi.Sensor, *given: Any) -> Any:
-        film, made = Film(sensor, sides[0][0].whole), []
+        film, made = Film(sensor, sides[0][0].whole, given[0][-1]), []
         for (plan, spp, width), arrays in zip(sides, given, strict=False):
-            seed, *others = arrays
+            seed, *others, _ = arrays
             made.append(Samples(scene, sensor, plan, film, seed, spp, width, *others))
         first, *camera = made
         if camera:
@@ -178,6 +178,8 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
 
 
 def _arrays(samples: Samples) -> tuple[Any, ...]:
-    """Return the arrays in `samples` that a recording takes as inputs, in the order of the members of `Samples`."""
+    """Return the arrays in `samples` that a recording takes as inputs, in the order of the members of `Samples`. The last
+    one belongs to the film.
+    """
     s = samples
-    return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters, s.shares, s.edges
+    return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters, s.shares, s.edges, s.film.responses
