@@ -178,8 +178,8 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
 
 
 def _arrays(samples: Samples) -> tuple[Any, ...]:
-    """Return the arrays in `samples` that a recording takes as inputs, in the order of the members of `Samples`. The last
-    one belongs to the film.
+    """Return the arrays in `samples` that a recording takes as inputs, in the order of the members of `Samples`. The
+    last one belongs to the film.
     """
     s = samples
     return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters, s.shares, s.edges, s.film.responses
