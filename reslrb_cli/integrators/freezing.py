@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
-from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.graph import SceneGraph, look_up
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.samples import Samples
 
@@ -140,7 +140,7 @@ def has_software_textures(scene: mi.Scene) -> bool:
     with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         for texture in SceneGraph.of(scene).bitmaps():
             dr.kernel_history_clear()
-            dr.eval(texture.eval(dr.zeros(mi.SurfaceInteraction3f)))
+            dr.eval(look_up(texture))
             kernels = [kernel["ir"].getvalue() for kernel in dr.kernel_history([dr.KernelType.JIT])]
             if not any("tex.2d" in code for code in kernels):
                 return True

@@ -72,7 +72,7 @@ class Film:
         Recordings pass the `responses` of `responses_of` as an input.
         """
         self.film, self.whole = sensor.film(), whole
-        self.responses = responses_of(sensor) if responses is None else responses
+        self.responses = responses_of(self.film) if responses is None else responses
         #: Number of colour channels in a block.
         self.colors = int(self.film.base_channels_count()) if _is_spectral(self.film) else N_COLOR
         self.integrals = _integrals(self.film.rfilter()) if whole else []
@@ -251,26 +251,32 @@ def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
 VISIBLE, FINE, COARSE = (360.0, 830.0), 940, 94
 
 
-@functools.lru_cache(maxsize=16)
-def responses_of(sensor: mi.Sensor) -> mi.Float | None:
+def responses_of(film: mi.Film) -> mi.Float | None:
     """Return the responses of a film's channels at evenly spaced wavelengths, one channel after the other. Without
     wavelengths, the result is None.
     """
     if not mi.is_spectral:
         return None
-    film, channels = sensor.film(), int(sensor.film().base_channels_count())
-    is_own = _is_spectral(film)
+    if not _is_spectral(film):
+        return _rgb_responses(mi.variant())
+    channels = int(film.base_channels_count())
     film.prepare([])
-    wavelengths = mi.Float(np.linspace(*VISIBLE, (FINE if is_own else COARSE) + 1, dtype=np.float32))
-    if not is_own:
-        values = np.array(mi.linear_rgb_rec(wavelengths)) * float(mi.MI_CIE_Y_NORMALIZATION)
-        return own_memory(mi.Float, np.ravel(values).astype(np.float32))
     si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wavelengths = mi.Spectrum(wavelengths)
+    si.wavelengths = mi.Spectrum(_visible(FINE))
     # The film divides each value by the sum of all responses, by which its sensor multiplies radiance.
     total = film.sensor_response_function().eval(si)
     parts = film.prepare_sample(total, si.wavelengths, channels + 1)
     return own_memory(mi.Float, np.ravel([np.array(part) for part in parts[:channels]]).astype(np.float32))
+
+
+@functools.lru_cache(maxsize=2)
+def _rgb_responses(variant: str) -> mi.Float:
+    values = np.array(mi.linear_rgb_rec(_visible(COARSE))) * float(mi.MI_CIE_Y_NORMALIZATION)
+    return own_memory(mi.Float, np.ravel(values).astype(np.float32))
+
+
+def _visible(steps: int) -> mi.Float:
+    return mi.Float(np.linspace(*VISIBLE, steps + 1, dtype=np.float32))
 
 
 def responses_at(table: mi.Float, channels: int, wavelengths: mi.Wavelength) -> list[mi.Spectrum]:
