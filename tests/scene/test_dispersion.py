@@ -172,6 +172,7 @@ def test_variants_without_wavelengths_have_the_index_at_d(llvm: str) -> None:
     for ours, theirs in zip(*(bsdf.sample(mi.BSDFContext(), si, sample1, sample2)[0].wo for bsdf in (glass, stock)),
                             strict=True):  # fmt: skip
         assert np.allclose(np.array(ours), np.array(theirs), atol=1e-6)
+    assert set(mi.traverse(glass).properties) == {"nd"}  # V_d has no effect
 
 
 @pytest.mark.parametrize(
