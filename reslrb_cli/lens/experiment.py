@@ -274,6 +274,7 @@ def lens_yaml(
     least = min(_LEAST * max(s.size), float(heights.min()) + s.thickness)
     plate = f"type: thickness, thickness: {s.thickness:.9g}, least: {least:.4g}, weight: {1e6 / max(s.size) ** 4:.4g}"
     also = f" sun: {sun:g}," if sun else ""
+    index = ior if isinstance(ior, str) else f"{ior:g}"
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
 # Start with
 #     reslrb optimize lens.yaml
@@ -299,7 +300,7 @@ run:
   final_spp: 1024  # of the image that is compared: what it has of noise counts against the lens
   certainty: false  # of a design there is no true value
 fabrication:  # mm; what `reslrb export` makes a solid of
-  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {ior if isinstance(ior, str) else f"{ior:g}"},{also}
+  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {index},{also}
    picture: picture.exr}}  # as it was, without a floor
 """
 
