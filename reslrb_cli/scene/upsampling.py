@@ -63,10 +63,11 @@ def _table(variant: str) -> tuple[mi.Float, mi.Float, int]:
 
 def coefficients(rgb: mi.Color3f) -> mi.Color3f:
     """Return the coefficients of the spectrum of a linear colour. Channels outside of [0, 1] are clipped, and have the
-    derivative at the limit.
+    derivative at the limit. Colours that are not finite have no finite coefficients.
     """
     data, scale, size = _table(mi.variant())
-    rgb = dr.replace_grad(dr.clip(rgb, DARKEST, 1 - DARKEST), rgb)
+    is_finite = dr.all(dr.isfinite(rgb))
+    rgb = dr.replace_grad(dr.select(is_finite, dr.clip(rgb, DARKEST, 1 - DARKEST), 0.5), rgb)
     green, blue = rgb.y >= rgb.x, rgb.z >= dr.maximum(rgb.x, rgb.y)
     first = dr.select(blue, mi.UInt32(2), dr.select(green, mi.UInt32(1), 0))
     z = dr.select(blue, rgb.z, dr.select(green, rgb.y, rgb.x))
@@ -86,7 +87,8 @@ def coefficients(rgb: mi.Color3f) -> mi.Color3f:
     # As in Mitsuba, greys have constant spectra.
     is_grey = (rgb.x == rgb.y) & (rgb.y == rgb.z)
     grey = mi.Color3f(0, 0, (z - 0.5) * dr.rsqrt(z * (1 - z)))
-    return dr.select(is_grey, dr.replace_grad(dr.detach(grey), result), result)
+    result = dr.select(is_grey, dr.replace_grad(dr.detach(grey), result), result)
+    return dr.select(is_finite, result, dr.nan)
 
 
 def spectra_of(value: Any) -> mi.Float:
