@@ -44,8 +44,8 @@ REACH = 0.1
 RELIEF = 0.02
 
 #: Size of a direction of a motion's component (rotations are in degrees), and of a glass's n_d and V_d. None: `REACH`
-#: times the scene's size.
-UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.02, "Vd": 5.0}
+#: times the scene's size. A thousandth of the size is a step beyond the rounding of rays: a V_d of 10 was too small.
+UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.05, "Vd": 50.0}
 
 #: Maximum number of wavelengths across a displaced object.
 WAVES = 1.5
