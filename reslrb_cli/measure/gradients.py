@@ -30,6 +30,7 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job, first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
+from reslrb_cli.measure.comparison import ROUNDING
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import Deformation
@@ -396,6 +397,16 @@ def seeds(count: int, block: int = 0) -> range:
 def integrator(name: str, max_depth: int = 4, rr_depth: int = 1000, **options: Any) -> Any:
     """Create an integrator for `gradient_step`, by default without roulette."""
     return make_integrator(name, max_depth=max_depth, rr_depth=rr_depth, **options)
+
+
+#: Relative error of single precision in gradients by colours in a spectral variant. They are sums of gradients by
+#: coefficients, which cancel.
+SPECTRAL_ROUNDING = 2e-3
+
+
+def rounding() -> float:
+    """Return the relative error of single precision in a gradient."""
+    return SPECTRAL_ROUNDING if mi.is_spectral else ROUNDING
 
 
 def relative(a: np.ndarray, b: np.ndarray) -> float:
