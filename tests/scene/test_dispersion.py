@@ -16,7 +16,8 @@ from reslrb_cli.glasses import C_LINE, D_LINE, F_LINE, GLASSES, find_glass
 from reslrb_cli.scene.dispersion import register
 from reslrb_cli.scene.load import load_scene
 
-PRISM = Path(__file__).resolve().parents[2] / "scenes" / "prism" / "scene.xml"
+ROOT = Path(__file__).resolve().parents[2]
+PRISM = ROOT / "scenes" / "prism" / "scene.xml"
 #: Indices at the lines F, d and C, and Abbe's number, from data sheets.
 SHEETS = {
     "N-BK7": (1.52238, 1.51680, 1.51432, 64.17),
@@ -47,6 +48,9 @@ def test_the_catalogue_has_the_indices_of_data_sheets() -> None:
         assert glass.Vd == pytest.approx(Vd, abs=0.011), name
     for name, nd in OTHERS.items():
         assert find_glass(name).nd == pytest.approx(nd, abs=5e-4), name
+    page = (ROOT / "docs" / "spectral.md").read_text(encoding="utf-8")
+    for name, glass in GLASSES.items():
+        assert f"| `{name}` | {glass.nd:.5f} | {glass.Vd:.2f} | {glass.source} |" in page
     with pytest.raises(ValueError, match="did you mean N-BK7"):
         find_glass("BK7")
 
