@@ -263,7 +263,9 @@ class Upsampling:
             return {key: coefficients(value)}
         scale = 2 * dr.maximum(dr.max(value), DARKEST)
         d65 = mi.Float(_responses(mi.variant())[0].astype(np.float32))
-        return {key: coefficients(value / scale), emitted(key): d65 * scale}
+        # Double precision, because the derivative has the square of the scale.
+        ratio = mi.Color3f(mi.Vector3d(value) / mi.Float64(scale))
+        return {key: coefficients(ratio), emitted(key): d65 * scale}
 
     def collect(self) -> None:
         """Propagate the gradients at the scene's spectra to the colours."""

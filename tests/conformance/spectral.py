@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -9,8 +10,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare, renders
+from click.testing import CliRunner
 from conformance.scenes import camera, lamp, rgb, stage
 
+import reslrb_cli as rl
+from reslrb_cli.cli import main
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.scene.upsampling import coefficients, colours_of
@@ -145,3 +149,37 @@ def test_a_film_with_its_own_responses(paths: str) -> None:
     result = compare(ours[inner], theirs[inner], block=2)
     assert ours.shape[-1] == 4
     assert result, result
+
+
+SCENE = """<scene version="3.0.0">
+    <sensor type="perspective"><film type="hdrfilm">
+        <integer name="width" value="4"/><integer name="height" value="4"/><rfilter type="box"/></film></sensor>
+    <shape type="sphere" id="wall"><boolean name="flip_normals" value="true"/>
+        <bsdf type="diffuse"><spectrum name="reflectance" value="400:0.2, 550:0.6, 700:0.4"/></bsdf>
+        <emitter type="area"><spectrum type="regular" name="radiance"><string name="values" value="1, 2, 1"/>
+            <float name="wavelength_min" value="400"/><float name="wavelength_max" value="700"/></spectrum></emitter>
+    </shape>
+</scene>
+"""
+
+
+def test_a_run_recovers_spectra_and_exports_them(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(SCENE)
+    keys = ["wall.bsdf.reflectance.values", "wall.emitter.radiance.values"]
+    config = {
+        "variant": mi.variant(),
+        "scene": {"file": str(tmp_path / "scene.xml")},
+        "target": {"render": {"spp": 16384, "parameters": {keys[0]: [0.3, 0.5, 0.4], keys[1]: [1.5, 2.5, 1.0]}}},
+        "parameters": [{"key": keys[0], "bounds": [0, 1]}, {"key": keys[1], "bounds": [0.1, 5]}],
+        "integrator": {"type": "reslrb", "max_depth": 4, "paths": "light"},
+        "optimizer": {"type": "adam", "learning_rate": 0.05},
+        "run": {"iterations": 30, "spp": 1024, "output": str(tmp_path)},
+    }
+    run = rl.optimize(rl.load(config), folder=str(tmp_path / "run"))
+    records = list(run)
+    assert records[-1].loss < 0.5 * records[0].loss
+    result = CliRunner().invoke(main, ["export", str(tmp_path / "run"), "-o", str(tmp_path / "made")])
+    assert result.exit_code == 0, result.output
+    made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
+    for key in keys:
+        np.testing.assert_allclose(np.ravel(made[key]), np.ravel(run.parameters[key]), rtol=1e-5)
