@@ -77,7 +77,7 @@ def make_illuminant(props: mi.Properties) -> mi.Texture:
         made = mi.Properties("srgb")
         made["color"] = mi.ScalarColor3f(*(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB @ xyz))
         made["unbounded"] = True
-    made.set_id(props.id())
+    # Without the id of the illuminant, so that `export` replaces it by a spectrum with the recovered values.
     return mi.PluginManager.instance().create_object(made)
 
 
