@@ -30,7 +30,7 @@ STEPS = {"glass.nd": 1e-4, "glass.Vd": 0.1}
 @pytest.fixture
 def prism(llvm: str) -> Iterator[mi.Scene]:
     """The shipped scene in the spectral variant."""
-    mi.set_variant("llvm_ad_spectral")
+    mi.set_variant(f"{llvm.rpartition('_')[0]}_spectral")
     register()
     yield load_scene(ROOT / "scenes" / "prism" / "scene.xml")
     mi.set_variant(llvm)
