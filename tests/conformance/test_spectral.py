@@ -17,7 +17,7 @@ QUICK = [
     f"{OWN}::test_the_furnace_has_its_colour[both-regular]",
     f"{OWN}::test_the_furnace_has_its_derivatives[light-stack-regular]",
     f"{OWN}::test_the_furnace_has_its_derivatives[light-reservoir-irregular]",
-    "tests/conformance/test_gradients.py::test_exact_estimators_equal_naive_ad[texture-correlated]",
+    "tests/conformance/test_gradients.py::test_exact_estimators_equal_naive_ad[roulette-correlated]",
 ]
 #: Files whose default tests do not assume that a path's values are the channels of the film.
 FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "guiding", "image_paths", "kernels",
