@@ -250,7 +250,8 @@ class Case:
         film = self.scene.sensors()[sensor].film()
         width, height = film.crop_size()
         self.channels = int(film.base_channels_count())
-        shape = (int(height), int(width), 1 if self.channels <= 2 else 3)
+        colors = self.channels if mi.has_flag(film.flags(), mi.FilmFlags.Spectral) else 1 if self.channels <= 2 else 3
+        shape = (int(height), int(width), colors)
         # The mean is 1, so that entries do not cancel. Random weights reveal wrong film positions.
         self.weigh(np.random.default_rng(7).uniform(0.2, 1.8, shape))
 

@@ -160,6 +160,8 @@ def ptracer_image(at: Situation) -> str | None:
     """
     if any(_is_turned(emitter) for emitter in at.scene.emitters()):
         return "it has wrong emission from a rotated environment map"
+    if any(sensor.film().class_name() == "SpecFilm" for sensor in at.scene.sensors()):
+        return "it does not splat on a specfilm"
     if at.needs.has_null:
         return "it does not connect through masks"
     if any(_is_mirrored(shape) for shape in at.scene.shapes()):

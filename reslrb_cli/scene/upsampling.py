@@ -31,6 +31,8 @@ Array = np.ndarray[Any, Any]
 
 #: Distance of colours from 0 and 1. Nearer, the spectrum's derivative has no precision left.
 DARKEST = 1e-4
+#: Least emission, because a lamp without light has no spectrum.
+DIMMEST = 1e-30
 #: Centre and half of the range of wavelengths, in nm.
 CENTRE, WIDTH = 595.0, 235.0
 NEWTON_STEPS = 3
@@ -261,7 +263,7 @@ class Upsampling:
             return {key: mi.TensorXf(dr.ravel(found), value.shape)}
         if emitted(key) not in self.params.properties:
             return {key: coefficients(value)}
-        scale = 2 * dr.maximum(dr.max(value), DARKEST)
+        scale = 2 * dr.maximum(dr.max(value), DIMMEST)
         d65 = mi.Float(_responses(mi.variant())[0].astype(np.float32))
         # Double precision, because the derivative has the square of the scale.
         ratio = mi.Color3f(mi.Vector3d(value) / mi.Float64(scale))

@@ -73,6 +73,8 @@ class Film:
         """
         self.film, self.whole = sensor.film(), whole
         self.responses = responses_of(self.film) if responses is None else responses
+        #: Whether recordings take all data of the film. Mitsuba 3.9 leaves out a film's own responses.
+        self.is_recordable = not _is_spectral(self.film)
         #: Number of colour channels in a block.
         self.colors = int(self.film.base_channels_count()) if _is_spectral(self.film) else N_COLOR
         self.integrals = _integrals(self.film.rfilter()) if whole else []

@@ -187,6 +187,22 @@ def exact(
     return ExtremeCase(name, about, lambda: known().scene(), tuple(keys.values()), Exact(known), **shared)
 
 
+_NO_BLACK_LAMP = "Mitsuba loads no lamp without light"
+#: Cases that are left out in spectral variants, with the reason.
+NOT_SPECTRAL = {
+    "lamp_0": _NO_BLACK_LAMP,
+    "black_lamp": _NO_BLACK_LAMP,
+    "pure_colours": "differences are too large beside colours without a spectrum",
+}
+
+
+def left_out(case: ExtremeCase) -> str | None:
+    """Return the reason why the case has no reference in the current variant, or None."""
+    if not mi.is_spectral:
+        return None
+    return "its closed form is that of RGB" if isinstance(case.source, Exact) else NOT_SPECTRAL.get(case.name)
+
+
 def without_roulette(case: ExtremeCase) -> dict[str, Any]:
     """Return a case's options for integrators whose gradients Russian roulette would bias. The options have no
     `rr_depth`.
