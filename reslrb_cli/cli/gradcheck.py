@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 #: Options of comparisons; `--missing` makes none.
 COMPARING = {"suite": "--suite", "integrators": "--integrators"}
 
-#: Options of a configuration; a suite has none.
-CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp"}
+#: Options of a configuration; a suite has none but the variant.
+CONFIGURED = {"config_file": "CONFIG", "budget": "--budget", "spp": "--spp"}
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,8 @@ class GradcheckOptions(ExperimentOptions):
             raise ConfigError("--missing", "", "needs a CONFIG with parameters and a loss")
         if self.suite is not None and (option := _given(CONFIGURED)):
             raise ConfigError("--suite", "", f"{option} has no effect on a suite; remove it")
+        if self.suite is not None and any(not text.startswith("variant=") for text in self.overrides):
+            raise ConfigError("--suite", "", "--set has no effect on a suite, except for variant; remove it")
         if self.suite is not None and self.suite.partition(":")[0] != "extreme":
             raise ConfigError("--suite", "", f"there is no suite `{self.suite}`; write extreme, or extreme:CASE")
 
@@ -95,9 +97,10 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
 def run_suite(options: GradcheckOptions) -> int:
     """Run the named cases, or all cases without names. Print a line for each case and write the file."""
     chosen = None if options.integrators is None else _estimators(options.integrators)
-    variant = set_variant("auto")
+    variant = set_variant(options.config().variant)
 
     from reslrb_cli.measure.extreme import CASES, case_records
+    from reslrb_cli.measure.extreme.suite import left_out
     from reslrb_cli.report.tables import summary_lines
 
     listed = str(options.suite).partition(":")[2]
@@ -111,6 +114,9 @@ def run_suite(options: GradcheckOptions) -> int:
     keeper = Keeper(options.json_file, origin_of(variant), lambda: records)
     with Interrupts() as interrupts:
         for name in names or CASES:
+            if (reason := left_out(CASES[name])) is not None:
+                echo(f"{name:40s}  left out: {reason}")
+                continue
             rows = case_records(lambda: interrupts.requested, name, chosen, options.seeds)
             if interrupts.requested:  # this case may be incomplete
                 break

@@ -165,7 +165,6 @@ def command(**given: Any) -> None:
                           f"{longer} pixels")  # fmt: skip
     rows, columns = image.shape
     at, is_mirror = options.light_distance, options.mirror is not None
-    glass = options.ior if isinstance(options.ior, str) else None
     if options.outline == "round" and at is not None and (is_mirror or rows != columns):
         raise ConfigError("--outline", "", "round needs parallel light, or a point light, a lens and a square picture: "
                           "the cone of a point light fits no other face")  # fmt: skip
@@ -175,7 +174,7 @@ def command(**given: Any) -> None:
         size=tuple(size * share),
         distance=options.distance,
         picture_size=tuple((size if options.picture_size is None else options.picture_size) * share),
-        ior=options.ior if glass is None else find_glass(glass).nd,
+        ior=find_glass(options.ior).nd if isinstance(options.ior, str) else options.ior,
         thickness=size / 4 if options.thickness is None else options.thickness,
         outline=options.outline,
         light_distance=np.inf if at is None else at,
@@ -202,7 +201,7 @@ def command(**given: Any) -> None:
         texts = {
             "face.ply": experiment.face_ply(setting, nx, ny),
             "scene.xml": experiment.scene_xml(surface, film, columns, power, sun).encode(),
-            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun, glass).encode(),
+            "lens.yaml": experiment.lens_yaml(surface, heights, picture.name, ITERATIONS, sun, options.ior).encode(),
         }
         for name, content in texts.items():
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]

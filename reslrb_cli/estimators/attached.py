@@ -217,7 +217,8 @@ class AttachedFrame:
 
         Takes the adjoint of the segment's outgoing ray, and returns the adjoint of the ray that reaches the vertex.
         """
-        assert p.adjoint is not None and p.colours is not None
+        assert p.adjoint is not None
+        assert p.colours is not None
         plan, P, B = p.plan, self.prefix, adjoint.B
         connected = self.connected != 0
         scattered = dr.any(B != 0) | dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)

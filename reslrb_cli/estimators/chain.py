@@ -244,7 +244,8 @@ class KeptConnection:
     @staticmethod
     def of(p: Pass, slot: ChainSlot, share: mi.Float) -> KeptConnection:
         """Return the connection of a slot. dL/dI must be known."""
-        assert p.adjoint is not None and p.colours is not None
+        assert p.adjoint is not None
+        assert p.colours is not None
         C = slot.C.value() * share
         with dr.resume_grad():
             u = mi.Point2f(slot.u)

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
-from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.graph import SceneGraph, look_up
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.samples import Samples
 
@@ -140,7 +140,7 @@ def has_software_textures(scene: mi.Scene) -> bool:
     with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         for texture in SceneGraph.of(scene).bitmaps():
             dr.kernel_history_clear()
-            dr.eval(texture.eval(dr.zeros(mi.SurfaceInteraction3f)))
+            dr.eval(look_up(texture))
             kernels = [kernel["ir"].getvalue() for kernel in dr.kernel_history([dr.KernelType.JIT])]
             if not any("tex.2d" in code for code in kernels):
                 return True
@@ -165,9 +165,9 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
     sides = [(side.plan, side.spp, side.width) for side in samples.sides()]
 
     def on_samples(scene: mi.Scene, sensor: mi.Sensor, *given: Any) -> Any:
-        film, made = Film(sensor, sides[0][0].whole), []
+        film, made = Film(sensor, sides[0][0].whole, given[0][-1]), []
         for (plan, spp, width), arrays in zip(sides, given, strict=False):
-            seed, *others = arrays
+            seed, *others, _ = arrays
             made.append(Samples(scene, sensor, plan, film, seed, spp, width, *others))
         first, *camera = made
         if camera:
@@ -178,6 +178,8 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
 
 
 def _arrays(samples: Samples) -> tuple[Any, ...]:
-    """Return the arrays in `samples` that a recording takes as inputs, in the order of the members of `Samples`."""
+    """Return the arrays in `samples` that a recording takes as inputs, in the order of the members of `Samples`. The
+    last one belongs to the film.
+    """
     s = samples
-    return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters, s.shares, s.edges
+    return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters, s.shares, s.edges, s.film.responses

@@ -24,7 +24,7 @@ from reslrb_cli.estimators.base import one_of
 from reslrb_cli.scene.catalog import entry_value, parameter_kind
 from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
 from reslrb_cli.scene.dispersion import bends_light
-from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
+from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals, look_up
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_emission
@@ -190,7 +190,7 @@ def set_up(scene: mi.Scene) -> None:
     """
     with dr.suspend_grad():
         for texture in SceneGraph.of(scene).bitmaps():
-            texture.eval(dr.zeros(mi.SurfaceInteraction3f))
+            look_up(texture)
         _, weight = emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
         dr.eval(weight)
 

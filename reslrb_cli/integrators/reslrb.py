@@ -251,7 +251,8 @@ class LightTracer(StepIntegrator):
 
     def freezes(self, parts: list[Samples]) -> bool:
         """True if a recording traces these samples. Large sets of samples gain little from a recording."""
-        return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
+        [first, *others] = parts
+        return self.freeze and not others and first.width <= freezing.MOST_PATHS and first.film.is_recordable
 
 
 class Reslrb(LightTracer):

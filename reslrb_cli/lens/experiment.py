@@ -265,15 +265,16 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, power: float
 
 
 def lens_yaml(
-    surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float = 0.0, glass: str | None = None
+    surface: Surface, heights: NDArray[Any], name: str, iterations: int, sun: float, ior: float | str
 ) -> str:  # fmt: skip
-    """Return the configuration. The run starts at `heights` (ny, nx), which are stored in `start.exr`. `glass` is the
-    name of the material, if known.
+    """Return the configuration. The run starts at `heights` (ny, nx), which are stored in `start.exr`. `ior` is the
+    index, or the name of the material.
     """
     s, (ny, nx) = surface.setting, heights.shape
     least = min(_LEAST * max(s.size), float(heights.min()) + s.thickness)
     plate = f"type: thickness, thickness: {s.thickness:.9g}, least: {least:.4g}, weight: {1e6 / max(s.size) ** 4:.4g}"
     also = f" sun: {sun:g}," if sun else ""
+    index = ior if isinstance(ior, str) else f"{ior:g}"
     return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
 # Start with
 #     reslrb optimize lens.yaml
@@ -299,7 +300,7 @@ run:
   final_spp: 1024  # of the image that is compared: what it has of noise counts against the lens
   certainty: false  # of a design there is no true value
 fabrication:  # mm; what `reslrb export` makes a solid of
-  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {glass or f"{s.ior:g}"},{also}
+  {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {index},{also}
    picture: picture.exr}}  # as it was, without a floor
 """
 

@@ -23,13 +23,12 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.arena import NO_TIME
 from reslrb_cli.measure.comparison import (
-    ROUNDING,
     Family,
     compare_equal_seeds,
     compare_expectations,
     entry_count,
 )
-from reslrb_cli.measure.gradients import seeds
+from reslrb_cli.measure.gradients import rounding, seeds
 from reslrb_cli.measure.methods import plays_roulette, records_of
 from reslrb_cli.measure.participants import CheckSettings, Participants, Way
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
@@ -305,11 +304,11 @@ class Gradcheck:
             least = min(len(ours), len(reference))
             ours, reference = ours[:least], reference[:least]
         if row.kind is Kind.EQUAL_SEEDS:
-            figures = compare_equal_seeds(ours, reference)
+            figures = compare_equal_seeds(ours, reference, rounding())
         else:
             ours_too = row.reference in (Reference.WALK_AD, Reference.UNGUIDED)
-            rounding = ROUNDING if shape is None or ours_too else STOCK_ROUNDING
-            figures = compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=rounding)
+            share = rounding() if shape is None or ours_too else max(rounding(), STOCK_ROUNDING)
+            figures = compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=share)
         return self._record(row, figures, len(ours))
 
     def _record(self, row: Row, figures: Comparison, seeds: int) -> GradcheckRecord:

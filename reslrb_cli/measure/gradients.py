@@ -30,6 +30,7 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job, first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
+from reslrb_cli.measure.comparison import ROUNDING
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import Deformation
@@ -44,8 +45,8 @@ REACH = 0.1
 RELIEF = 0.02
 
 #: Size of a direction of a motion's component (rotations are in degrees), and of a glass's n_d and V_d. None: `REACH`
-#: times the scene's size.
-UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.02, "Vd": 5.0}
+#: times the scene's size. A thousandth of the size is a step beyond the rounding of rays: a V_d of 10 was too small.
+UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.05, "Vd": 50.0}
 
 #: Maximum number of wavelengths across a displaced object.
 WAVES = 1.5
@@ -249,7 +250,8 @@ class Case:
         film = self.scene.sensors()[sensor].film()
         width, height = film.crop_size()
         self.channels = int(film.base_channels_count())
-        shape = (int(height), int(width), 1 if self.channels <= 2 else 3)
+        colors = self.channels if mi.has_flag(film.flags(), mi.FilmFlags.Spectral) else 1 if self.channels <= 2 else 3
+        shape = (int(height), int(width), colors)
         # The mean is 1, so that entries do not cancel. Random weights reveal wrong film positions.
         self.weigh(np.random.default_rng(7).uniform(0.2, 1.8, shape))
 
@@ -396,6 +398,16 @@ def seeds(count: int, block: int = 0) -> range:
 def integrator(name: str, max_depth: int = 4, rr_depth: int = 1000, **options: Any) -> Any:
     """Create an integrator for `gradient_step`, by default without roulette."""
     return make_integrator(name, max_depth=max_depth, rr_depth=rr_depth, **options)
+
+
+#: Relative error of single precision in gradients by colours in a spectral variant. They are sums of gradients by
+#: coefficients, which cancel.
+SPECTRAL_ROUNDING = 2e-3
+
+
+def rounding() -> float:
+    """Return the relative error of single precision in a gradient."""
+    return SPECTRAL_ROUNDING if mi.is_spectral else ROUNDING
 
 
 def relative(a: np.ndarray, b: np.ndarray) -> float:

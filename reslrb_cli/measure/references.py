@@ -26,6 +26,7 @@ from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import PrimaryHits, SceneNeeds, look, scene_needs, stock_clip
+from reslrb_cli.scene.upsampling import is_upsampled, spectra_of
 
 #: References that trace paths from the sensor.
 CAMERA_PATHS = (Reference.PRB, Reference.PATH)
@@ -159,6 +160,8 @@ def ptracer_image(at: Situation) -> str | None:
     """
     if any(_is_turned(emitter) for emitter in at.scene.emitters()):
         return "it has wrong emission from a rotated environment map"
+    if any(sensor.film().class_name() == "SpecFilm" for sensor in at.scene.sensors()):
+        return "it does not splat on a specfilm"
     if at.needs.has_null:
         return "it does not connect through masks"
     if any(_is_mirrored(shape) for shape in at.scene.shapes()):
@@ -222,7 +225,7 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
         return reason
     if moves_light(at.params, key):
         return _ptracer_motion(at, (key,) if key in at.params.properties else at.moved)
-    if _all_zero_somewhere(at.params[key]):
+    if _all_zero_somewhere(values_of(at.params, key)):
         return "it stops paths with throughput 0"
     if parameter_kind(at.params, key) == "emitter":
         return None if key.endswith(".value") else "it differentiates the sampling of a textured emitter"
@@ -260,7 +263,7 @@ def prb_gradient(at: Situation, key: str) -> str | None:
     reason = prb_image(at)
     if reason is not None:
         return reason
-    if np.any(np.array(at.params[key]) == 0):
+    if np.any(np.array(values_of(at.params, key)) == 0):
         return "it loses derivatives if a channel is exactly 0"
     if parameter_kind(at.params, key) != "emitter" and any(
         int(bsdf.flags()) & int(mi.BSDFFlags.Delta) for bsdf in bsdfs_of(at, key)
@@ -294,6 +297,11 @@ def _is_mirrored(shape: mi.Shape) -> bool:
     a, b, c = np.moveaxis(np.array(params["faces"]).reshape(-1, 3), 1, 0)
     across = np.cross(points[b] - points[a], points[c] - points[a])
     return float(np.median(np.sum(across * (normals[a] + normals[b] + normals[c]), axis=1))) < 0
+
+
+def values_of(params: mi.SceneParameters, key: str) -> Any:
+    """Return the value of a parameter. In place of the coefficients of a colour, return values of its spectrum."""
+    return spectra_of(params[key]) if is_upsampled(params, key) else params[key]
 
 
 def _all_zero_somewhere(value: Any) -> bool:

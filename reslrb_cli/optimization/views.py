@@ -341,6 +341,8 @@ def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
 
 def color_channels(film: mi.Film) -> int:
     """Return how many channels an image of `film` has without alpha."""
+    if mi.has_flag(film.flags(), mi.FilmFlags.Spectral):
+        return int(film.base_channels_count())
     return 1 if int(film.base_channels_count()) <= 2 else 3
 
 

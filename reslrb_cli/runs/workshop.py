@@ -210,34 +210,27 @@ class OpticalBench:
         return found
 
     def landings(self, values: dict[str, Any]) -> tuple[Array, Array]:
-        """Return where refracted light meets the receiver, (n, 3), with these parameters, and which rays do, (n,).
-
-        The rays come from the lamps, and are the same for all parameters.
-        """
+        """Return where refracted rays from the lamps meet the receiver with these parameters, (n, 3), and which do."""
         receiver = next(shape for shape in self.scene.shapes() if shape.id() == self.plan.receiver)
         with self._changed(values):
             _, ray, light = _from_lamps(self.scene, RAYS)
             active, met, place = light > 0, dr.zeros(mi.Bool, RAYS), dr.zeros(mi.Point3f, RAYS)
             for _ in range(BOUNCES):
                 si = self.scene.ray_intersect(ray, active)
-                here = active & si.is_valid() & (si.shape == mi.ShapePtr(receiver))
+                active = active & si.is_valid()
+                here = active & (si.shape == mi.ShapePtr(receiver))
                 met, place = met | here, dr.select(here, si.p, place)
                 # The largest number below 1 chooses refraction.
                 bs, factor = si.bsdf(ray).sample(mi.BSDFContext(), si, 1 - 2**-24, mi.Point2f(0.5), active)
-                active = active & si.is_valid() & ~here & dr.any(factor != 0)
-                ray = si.spawn_ray(si.to_world(bs.wo))
+                ray, active = si.spawn_ray(si.to_world(bs.wo)), active & ~here & dr.any(factor != 0)
                 dr.eval(ray, active, met, place)
         return np.array(place, dtype=float).reshape(3, -1).T, np.array(met)
 
     def spread(self, glass: Glass) -> float:
-        """Return the mean distance in mm between the places where blue and red light (lines F and C) of the same rays
-        meet the receiver.
-        """
-        (blue, some), (red, others) = (
-            self.landings(self.denser(glass.index(line) - glass.nd)) for line in (F_LINE, C_LINE)
-        )
-        both = some & others
-        return float(np.linalg.norm(blue[both] - red[both], axis=1).mean()) if both.any() else 0.0
+        """Return the mean distance in mm between the places where blue and red light of the same rays land."""
+        lands = [self.landings(self.denser(glass.index(line) - glass.nd)) for line in (F_LINE, C_LINE)]
+        both = lands[0][1] & lands[1][1]
+        return float(np.linalg.norm((lands[0][0] - lands[1][0])[both], axis=1).mean()) if both.any() else 0.0
 
     def solid_parts(self) -> list[str]:
         """Return the ids of the face and of the flat back."""
@@ -299,10 +292,9 @@ def tolerances(
     if plan.kind == "lens":
         for sign in (1, -1):
             tell(f"index {sign * INDEX:+g}", bench.image(bench.denser(sign * INDEX), spp))
-    if plan.kind == "lens" and plan.glass is not None:
-        for name, line in (("blue", F_LINE), ("red", C_LINE)):
-            by = plan.glass.index(line) - plan.glass.nd
-            tell(f"{name} light ({line:.0f} nm)", bench.image(bench.denser(by), spp))
+        for name, line in (("blue light (486 nm)", F_LINE), ("red light (656 nm)", C_LINE)):
+            if plan.glass is not None:
+                tell(name, bench.image(bench.denser(plan.glass.index(line) - plan.glass.nd), spp))
     for what, ids in (("light", bench.lamps), (plan.kind, both)):
         for name, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
             if ids:

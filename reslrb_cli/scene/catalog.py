@@ -185,7 +185,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None
     if kind in ("sensor", "film"):
         return f"belongs to the {kind}; {only}"
-    if mi.is_spectral and (reason := _spectral_obstacle(node, name)) is not None:
+    if mi.is_spectral and (reason := _spectral_obstacle(node, key)) is not None:
         return reason
     if not mi.is_spectral and node.class_name() in _SPECTRA:
         return "is a constant of a spectrum; give the colour as <rgb>"
@@ -205,9 +205,11 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
     return f"is not a number with derivatives ({type(value).__name__})" if bits is None else None
 
 
-def _spectral_obstacle(node: Any, name: str) -> str | None:
+def _spectral_obstacle(node: Any, key: str) -> str | None:
     """Return the reason why a parameter cannot be recovered in a spectral variant, or None."""
-    kind = node.class_name()
+    kind, name = node.class_name(), key.rpartition(".")[2]
+    if key.endswith(".d65.values"):
+        return f"belongs to the colour `{key.removesuffix('.d65.values')}.value`"
     if kind == "IrregularSpectrum" and name == "wavelengths":
         return "has the wavelengths of a spectrum; its `values` have derivatives"
     if kind == "BlackBodySpectrum":

@@ -77,7 +77,7 @@ def make_illuminant(props: mi.Properties) -> mi.Texture:
         made = mi.Properties("srgb")
         made["color"] = mi.ScalarColor3f(*(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB @ xyz))
         made["unbounded"] = True
-    made.set_id(props.id())
+    # Without the id of the illuminant, so that `export` replaces it by a spectrum with the recovered values.
     return mi.PluginManager.instance().create_object(made)
 
 
@@ -99,16 +99,12 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
                 raise ValueError(f"{GLASS} does not support polarization")
             glass = _glass_of(props)
             self.shape = cauchy_shape if glass is None else glass.shape
-            values = {"nd": None, "Vd": None} if glass is None else {"nd": glass.nd, "Vd": glass.Vd}
-            for name in values:
-                if name in props:
-                    values[name] = float(props[name])
-                if values[name] is None:
-                    raise ValueError(f"{GLASS} needs `material`, `sellmeier`, or both `nd` and `Vd`")
+            nd, Vd = (float(props[name]) if name in props else getattr(glass, name, None) for name in ("nd", "Vd"))
+            if nd is None or Vd is None:
+                raise ValueError(f"{GLASS} needs `material`, `sellmeier`, or both `nd` and `Vd`")
             self.ext_ior = float(props.get("ext_ior", 1.0))
             self.alpha = mi.Float(props["alpha"]) if "alpha" in props else None
             self.distribution = props.get("distribution", "beckmann")
-            nd, Vd = float(values["nd"]), float(values["Vd"])
             if not (nd > 1 and Vd > 0 and self.ext_ior >= 1):
                 raise ValueError(f"{GLASS} needs nd above 1, Vd above 0, and ext_ior of at least 1")
             if self.distribution not in ("ggx", "beckmann"):
@@ -124,7 +120,8 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
         def traverse(self, callback: mi.TraversalCallback) -> None:
             flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
             callback.put("nd", self.nd, flags)
-            callback.put("Vd", self.Vd, flags)
+            if mi.is_spectral:  # it has no effect in other variants
+                callback.put("Vd", self.Vd, flags)
             if self.alpha is not None:
                 callback.put("alpha", self.alpha, flags)
 

@@ -186,6 +186,17 @@ def no_wavelengths() -> mi.Wavelength:
     return mi.Spectrum(0) if mi.is_spectral else mi.Color0f()
 
 
+def look_up(texture: mi.Texture) -> mi.Spectrum:
+    """Return the value of a texture at its origin. The first lookup sets up the texture's data."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    try:
+        return texture.eval(si)
+    except RuntimeError:
+        if not mi.is_spectral:
+            raise
+        return texture.eval_3(si)  # such as normals, which are no spectra
+
+
 def brightness(value: mi.Spectrum, wavelengths: mi.Wavelength) -> mi.Float:
     """Return the luminance of light with the values (C,)."""
     if mi.is_spectral:

@@ -206,9 +206,9 @@ def set_values(
             if key in selection.deformation.keys:
                 raise place.fail("", f"`{key}` depends on {' and '.join(f'`{name}`' for name in names)} here")
             given[key] = pattern
-            if key not in selection.colours and key in selection.params.properties:
-                if is_upsampled(selection.params, key):
-                    selection.colours.add(key)
+            unknown = key in selection.params.properties and key not in selection.colours
+            if unknown and is_upsampled(selection.params, key):
+                selection.colours.add(key)
             slot = selection.slot(key)
             slot.set(initial_array(slot, value, None, place, any_size=key in names))
     # Tied parameters get the value of the first one, unless they have their own.

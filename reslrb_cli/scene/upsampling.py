@@ -4,9 +4,9 @@ Mitsuba replaces a colour by a smooth spectrum with three coefficients c (Jakob 
 
     S(l) = 1/2 + v / (2 sqrt(1 + v^2)),    v = c_0 l^2 + c_1 l + c_2
 
-A table in Mitsuba's package maps colours to coefficients. Here, Dr.Jit interpolates the table as Mitsuba does, so the
-coefficients have a derivative with respect to the colour. Emission with the colour E is the spectrum of D65 times
-2 max(E) times the spectrum S of E / (2 max(E)).
+A table in Mitsuba's package maps colours to coefficients. Here, the coefficients are the solution of the equations
+colour(c) = rgb, so they have a derivative with respect to the colour. Emission with the colour E is the spectrum of D65
+times 2 max(E) times the spectrum S of E / (2 max(E)).
 
 A step adds its gradient to the coefficients, and `collect` propagates it to the colours (`Leaf` in `deformation.py`).
 """
@@ -31,6 +31,11 @@ Array = np.ndarray[Any, Any]
 
 #: Distance of colours from 0 and 1. Nearer, the spectrum's derivative has no precision left.
 DARKEST = 1e-4
+#: Least emission, because a lamp without light has no spectrum.
+DIMMEST = 1e-30
+#: Centre and half of the range of wavelengths, in nm.
+CENTRE, WIDTH = 595.0, 235.0
+NEWTON_STEPS = 3
 
 
 def is_upsampled(params: mi.SceneParameters, key: str) -> bool:
@@ -62,19 +67,80 @@ def _table(variant: str) -> tuple[mi.Float, mi.Float, int]:
 
 
 def coefficients(rgb: mi.Color3f) -> mi.Color3f:
-    """Return the coefficients of the spectrum of a linear colour. Channels outside of [0, 1] are clipped, and have the
-    derivative at the limit.
+    """Return the coefficients of the spectrum with a linear colour under D65, with their derivative. Channels outside
+    of [0, 1] are clipped, and have the derivative at the limit. Colours that are not finite have no finite
+    coefficients.
+
+    Mitsuba interpolates a table, whose colours are off by up to 0.001, and whose derivative by some percent. Newton's
+    method starts from it.
     """
+    is_finite = dr.all(dr.isfinite(rgb))
+    with dr.suspend_grad():
+        goal = dr.select(is_finite, dr.clip(dr.detach(rgb), DARKEST, 1 - DARKEST), 0.5)
+        found = _centred(_from_table(goal))
+        colour, columns = _colour(found)
+        for _ in range(NEWTON_STEPS):
+            tried = found + _solved(columns, mi.Vector3d(goal) - colour)
+            new_colour, new_columns = _colour(tried)
+            before, after = (dr.squared_norm(mi.Vector3d(goal) - value) for value in (colour, new_colour))
+            found, colour, *columns = (
+                dr.select(after < before, new, old)
+                for new, old in zip((tried, new_colour, *new_columns), (found, colour, *columns), strict=True)
+            )
+    moved = mi.Vector3d(rgb) - dr.detach(mi.Vector3d(rgb))  # 0, with a derivative
+    found = found + dr.select(is_finite, _solved(columns, moved), dr.nan)
+    a, b, c = found
+    m, s = CENTRE, 1 / WIDTH
+    return mi.Color3f(a * s**2, b * s - 2 * a * m * s**2, a * (m * s) ** 2 - b * m * s + c)
+
+
+def _centred(c: mi.Color3f) -> mi.Vector3d:
+    """Return the coefficients for wavelengths in units of WIDTH from CENTRE."""
+    x, y, z = (mi.Float64(part) for part in c)
+    return mi.Vector3d(x * WIDTH**2, (y + 2 * x * CENTRE) * WIDTH, (x * CENTRE + y) * CENTRE + z)
+
+
+def _solved(columns: Sequence[mi.Vector3d], value: mi.Vector3d) -> mi.Vector3d:
+    """Return the solution x of the equations x_0 columns_0 + x_1 columns_1 + x_2 columns_2 = value."""
+    a, b, c = columns
+    normals = dr.cross(b, c), dr.cross(c, a), dr.cross(a, b)
+    return mi.Vector3d(*(dr.dot(normal, value) for normal in normals)) / dr.dot(a, normals[0])
+
+
+def _colour(found: mi.Vector3d) -> tuple[mi.Vector3d, list[mi.Vector3d]]:
+    """Return the colour of the spectrum with centred coefficients, and its derivatives by them."""
+    a, b, c = found
+    zero = mi.Vector3d(0)
+    responses = mi.Float64(_responses(mi.variant())[1].ravel())
+
+    def add(
+        number: mi.UInt32, colour: mi.Vector3d, by_a: mi.Vector3d, by_b: mi.Vector3d, by_c: mi.Vector3d
+    ) -> tuple[mi.UInt32, mi.Vector3d, mi.Vector3d, mi.Vector3d, mi.Vector3d]:
+        t = (mi.Float64(number) * (470 / 94) + 360 - CENTRE) / WIDTH
+        response = dr.gather(mi.Vector3d, responses, number)
+        v = (a * t + b) * t + c
+        inverse = dr.rsqrt(dr.square(v) + 1)
+        slope = response * (0.5 * inverse * dr.square(inverse))
+        return (
+            number + 1, colour + response * (0.5 + 0.5 * v * inverse), by_a + slope * dr.square(t), by_b + slope * t,
+            by_c + slope,
+        )  # fmt: skip
+
+    state = mi.UInt32(0), mi.Vector3d(zero), mi.Vector3d(zero), mi.Vector3d(zero), mi.Vector3d(zero)
+    _, colour, *columns = dr.while_loop(state, lambda number, *_: number < len(_GRID), add, label="colour")
+    return colour, columns
+
+
+def _from_table(rgb: mi.Color3f) -> mi.Color3f:
+    """Return the coefficients that Mitsuba's table has for a colour within (0, 1)."""
     data, scale, size = _table(mi.variant())
-    rgb = dr.replace_grad(dr.clip(rgb, DARKEST, 1 - DARKEST), rgb)
     green, blue = rgb.y >= rgb.x, rgb.z >= dr.maximum(rgb.x, rgb.y)
     first = dr.select(blue, mi.UInt32(2), dr.select(green, mi.UInt32(1), 0))
     z = dr.select(blue, rgb.z, dr.select(green, rgb.y, rgb.x))
     x = dr.select(blue, rgb.x, dr.select(green, rgb.z, rgb.y)) * ((size - 1) / z)
     y = dr.select(blue, rgb.y, dr.select(green, rgb.x, rgb.z)) * ((size - 1) / z)
-    xi, yi = (dr.minimum(mi.UInt32(dr.detach(value)), size - 2) for value in (x, y))
-    level = dr.detach(z)
-    zi = dr.binary_search(0, size - 1, lambda index: dr.gather(mi.Float, scale, index) <= level)
+    xi, yi = (dr.minimum(mi.UInt32(value), size - 2) for value in (x, y))
+    zi = dr.binary_search(0, size - 1, lambda index: dr.gather(mi.Float, scale, index) <= z)
     zi = dr.clip(mi.UInt32(zi), 1, size - 1) - 1
     low, high = (dr.gather(mi.Float, scale, zi + step) for step in (0, 1))
     shares = [(1 - t, t) for t in (x - mi.Float(xi), y - mi.Float(yi), (z - low) / (high - low))]
@@ -83,10 +149,7 @@ def coefficients(rgb: mi.Color3f) -> mi.Color3f:
         dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
         index = ((first * size + zi + dz) * size + yi + dy) * size + xi + dx
         result += dr.gather(mi.Color3f, data, index) * (shares[0][dx] * shares[1][dy] * shares[2][dz])
-    # As in Mitsuba, greys have constant spectra.
-    is_grey = (rgb.x == rgb.y) & (rgb.y == rgb.z)
-    grey = mi.Color3f(0, 0, (z - 0.5) * dr.rsqrt(z * (1 - z)))
-    return dr.select(is_grey, dr.replace_grad(dr.detach(grey), result), result)
+    return result
 
 
 def spectra_of(value: Any) -> mi.Float:
@@ -129,9 +192,9 @@ def colours_of(found: Array) -> Array:
 def colour_in_scene(params: mi.SceneParameters, key: str) -> Array:
     """Return the linear colours of an upsampled parameter, float32: (3,), or (H, W, 3) for a texture."""
     value = np.array(dr.detach(params[key]), np.float64)
-    colours = np.clip(colours_of(value.reshape(-1, 3)), 0, None).reshape(value.shape).astype(np.float32)
-    if value.ndim == 2:
-        colours = colours[:, 0] if colours.shape[1] == 1 else colours
+    colours: Array = np.clip(colours_of(value.reshape(-1, 3)), 0, None).reshape(value.shape).astype(np.float32)
+    if value.ndim == 2:  # width 1
+        colours = colours.ravel()
     if emitted(key) in params.properties:
         spectrum, d65 = np.array(dr.detach(params[emitted(key)]), np.float64), _responses(mi.variant())[0]
         colours = colours * np.float32(spectrum.sum() / d65.sum())
@@ -200,9 +263,11 @@ class Upsampling:
             return {key: mi.TensorXf(dr.ravel(found), value.shape)}
         if emitted(key) not in self.params.properties:
             return {key: coefficients(value)}
-        scale = 2 * dr.maximum(dr.max(value), DARKEST)
+        scale = 2 * dr.maximum(dr.max(value), DIMMEST)
         d65 = mi.Float(_responses(mi.variant())[0].astype(np.float32))
-        return {key: coefficients(value / scale), emitted(key): d65 * scale}
+        # Double precision, because the derivative has the square of the scale.
+        ratio = mi.Color3f(mi.Vector3d(value) / mi.Float64(scale))
+        return {key: coefficients(ratio), emitted(key): d65 * scale}
 
     def collect(self) -> None:
         """Propagate the gradients at the scene's spectra to the colours."""

@@ -14,6 +14,7 @@ from reslrb_cli.config.parameters import RunValue, Settings
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.run_folder import read_value
 from reslrb_cli.scene.catalog import halo
+from reslrb_cli.scene.graph import look_up
 from reslrb_cli.scene.images import read_image
 
 Array = np.ndarray[Any, Any]
@@ -223,7 +224,7 @@ def settle(params: mi.SceneParameters, keys: Iterable[str]) -> list[Any]:
     for key in keys:
         node = params.properties[key][2]
         if isinstance(node, mi.Texture):
-            node.eval(dr.zeros(mi.SurfaceInteraction3f))
+            look_up(node)
         elif isinstance(node, mi.Mesh) and node.has_vertex_normals():
             normals.append(node.vertex_normals_buffer())
     return normals

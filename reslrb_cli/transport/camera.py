@@ -18,7 +18,8 @@ from reslrb_cli.transport.bsdf import EventNumbers, Scattering, begins_caustic, 
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import density_of_rays
 from reslrb_cli.transport.factors import Product, play
-from reslrb_cli.transport.film import Colours, keep_one
+from reslrb_cli.transport.film import Colours
+from reslrb_cli.transport.lamps import keep_one
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex, intersect

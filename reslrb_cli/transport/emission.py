@@ -19,9 +19,9 @@ import numpy as np
 
 from reslrb_cli.scene.graph import sensor_rays
 from reslrb_cli.transport.connection import forward_derivatives
-from reslrb_cli.transport.film import AdjointImage, Colours, keep_one
+from reslrb_cli.transport.film import AdjointImage, Colours
 from reslrb_cli.transport.lamp_light import moving_splats, small_splat
-from reslrb_cli.transport.lamps import environment_ray, lamp_ray
+from reslrb_cli.transport.lamps import environment_ray, keep_one, lamp_ray
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import VISIBLE_STREAM, Samples
 

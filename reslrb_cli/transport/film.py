@@ -15,7 +15,6 @@ wavelengths to channels, and adjoints from channels to wavelengths.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,14 +64,17 @@ Channels = Any
 class Film:
     """Film of one sensor in light tracing: image blocks for splatting, adjoint images for lookups."""
 
-    def __init__(self, sensor: mi.Sensor, whole: bool = False) -> None:
+    def __init__(self, sensor: mi.Sensor, whole: bool = False, responses: mi.Float | None = None) -> None:
         """Prepare the film of a sensor.
 
         With `whole`, each pixel is divided by the part of its filter that lies on the film, as Mitsuba's camera
         integrators do. Otherwise, pixels at the border lack the light that falls off the film, as with `ptracer`.
+        Recordings pass the `responses` of `responses_of` as an input.
         """
         self.film, self.whole = sensor.film(), whole
-        self.responses = responses_of(sensor)
+        self.responses = responses_of(self.film) if responses is None else responses
+        #: Whether recordings take all data of the film. Mitsuba 3.9 leaves out a film's own responses.
+        self.is_recordable = not _is_spectral(self.film)
         #: Number of colour channels in a block.
         self.colors = int(self.film.base_channels_count()) if _is_spectral(self.film) else N_COLOR
         self.integrals = _integrals(self.film.rfilter()) if whole else []
@@ -82,8 +84,10 @@ class Film:
 
     def colours(self, wavelengths: mi.Wavelength) -> Colours:
         """Return the response of the film to paths with these wavelengths."""
+        if self.responses is None:
+            return Colours(wavelengths, [])
         wavelengths = dr.detach(wavelengths)
-        return Colours(wavelengths, self.responses(wavelengths))
+        return Colours(wavelengths, responses_at(self.responses, self.colors, wavelengths))
 
     def block(self) -> mi.ImageBlock:
         """Return an empty image block that covers the crop window. Filter weights are normalised per splat."""
@@ -244,41 +248,55 @@ def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
 
 # ---- Response to wavelengths ----
 
-
-def keep_one(ray: mi.Ray3f, weight: mi.Spectrum) -> mi.Spectrum:
-    """Give a ray its first wavelength in place of all, and return the weight (C,) of the ray.
-
-    Behind a smooth boundary of glass with dispersion, only one wavelength goes on (`scene/dispersion.py`). Rays that
-    carry one wavelength from the start lose no light there.
-    """
-    ray.wavelengths = mi.Spectrum(ray.wavelengths[0])
-    return mi.Spectrum(weight[0])
+#: Range of wavelengths in nm, and the number of steps for a film's own responses. Mitsuba's colour matching functions
+#: have steps of 5 nm.
+VISIBLE, FINE, COARSE = (360.0, 830.0), 940, 94
 
 
-def responses_of(sensor: mi.Sensor) -> Callable[[mi.Wavelength], list[mi.Spectrum]]:
-    """Return a function from wavelengths to the responses of the film's channels, divided by the number of wavelengths.
-
-    Without wavelengths, the responses are empty.
+def responses_of(film: mi.Film) -> mi.Float | None:
+    """Return the responses of a film's channels at evenly spaced wavelengths, one channel after the other. Without
+    wavelengths, the result is None.
     """
     if not mi.is_spectral:
-        return lambda wavelengths: []
-    count, normalization, film = len(mi.Spectrum(0)), float(mi.MI_CIE_Y_NORMALIZATION), sensor.film()
-    units = [mi.Spectrum(*(float(k == each) for k in range(count))) for each in range(count)]
+        return None
+    if not _is_spectral(film):
+        return _rgb_responses(mi.variant())
+    channels = int(film.base_channels_count())
+    film.prepare([])
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wavelengths = mi.Spectrum(_visible(FINE))
+    # The film divides each value by the sum of all responses, by which its sensor multiplies radiance.
+    total = film.sensor_response_function().eval(si)
+    parts = film.prepare_sample(total, si.wavelengths, channels + 1)
+    return own_memory(mi.Float, np.ravel([np.array(part) for part in parts[:channels]]).astype(np.float32))
 
-    def own(wavelengths: mi.Wavelength) -> list[mi.Spectrum]:
-        # The film divides each value by the sum of all responses, by which its sensor multiplies radiance.
-        channels = int(film.base_channels_count())
-        parts = [film.prepare_sample(unit, wavelengths, channels + 1) for unit in units]
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wavelengths = wavelengths
-        total = film.sensor_response_function().eval(si)
-        return [mi.Spectrum(*(part[c] for part in parts)) * total for c in range(channels)]
 
-    def rgb(wavelengths: mi.Wavelength) -> list[mi.Spectrum]:
-        colors = [mi.linear_rgb_rec(wavelength) for wavelength in wavelengths]
-        return [mi.Spectrum(*(color[c] for color in colors)) * (normalization / count) for c in range(N_COLOR)]
+@functools.lru_cache(maxsize=2)
+def _rgb_responses(variant: str) -> mi.Float:
+    values = np.array(mi.linear_rgb_rec(_visible(COARSE))) * float(mi.MI_CIE_Y_NORMALIZATION)
+    return own_memory(mi.Float, np.ravel(values).astype(np.float32))
 
-    return own if _is_spectral(film) else rgb
+
+def _visible(steps: int) -> mi.Float:
+    return mi.Float(np.linspace(*VISIBLE, steps + 1, dtype=np.float32))
+
+
+def responses_at(table: mi.Float, channels: int, wavelengths: mi.Wavelength) -> list[mi.Spectrum]:
+    """Return the response of each channel at the wavelengths, divided by the number of wavelengths. `table` is that of
+    `responses_of`.
+    """
+    count = dr.width(table) // channels
+    low, high = VISIBLE
+    place = (wavelengths - low) * ((count - 1) / (high - low))
+    visible = (wavelengths >= low) & (wavelengths <= high)
+    result = [mi.Spectrum(0) for _ in range(channels)]
+    for k in range(len(wavelengths)):
+        below = dr.clip(mi.UInt32(place[k]), 0, count - 2)
+        share = place[k] - mi.Float(below)
+        for c in range(channels):
+            values = [dr.gather(mi.Float, table, below + (c * count + step), visible[k]) for step in (0, 1)]
+            result[c][k] = dr.lerp(*values, share) * (1 / len(wavelengths))
+    return result
 
 
 def _is_spectral(film: mi.Film) -> bool:

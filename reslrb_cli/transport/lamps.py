@@ -140,6 +140,16 @@ def wavelengths_of(number: mi.Float) -> tuple[mi.Wavelength, mi.Spectrum]:
     return dr.detach(wavelengths), dr.detach(inverse)
 
 
+def keep_one(ray: mi.Ray3f, weight: mi.Spectrum) -> mi.Spectrum:
+    """Give a ray its first wavelength in place of all, and return the weight (C,) of the ray.
+
+    Behind a smooth boundary of glass with dispersion, only one wavelength goes on (`scene/dispersion.py`). Rays that
+    carry one wavelength from the start lose no light there.
+    """
+    ray.wavelengths = mi.Spectrum(ray.wavelengths[0])
+    return mi.Spectrum(weight[0])
+
+
 # ---- Environment maps ----
 
 

@@ -48,6 +48,8 @@ ADDED: dict[str, str | tuple[str, ...]] = {
     "loss: {type: huba}": "loss.type: must be one of l2, l1, relative_l2, ssim, custom, not",
     "optimiser: {}": ("optimiser: unknown key", "`optimizer`"),
     "run: {iteration: 3}": ("run.iteration: unknown key", "`iterations`"),
+    "fabrication: {thickness: 3, ior: PMA}": "fabrication.ior: there is no glass 'PMA'; did you mean PMMA?",
+    "fabrication: {thickness: 3, ior: 1}": "fabrication.ior: must be above 1 and at most 5, or the name of a material",
     "run: {xyz: 3}": "run.xyz: unknown key; known here: name, output",
     "spp: 3": ("spp: unknown key", "`run.spp`"),
     "run: {spp: 0, seed: -1, iterations: x}": ("run.", "(and 2 more)"),

@@ -17,6 +17,7 @@ from agreement import Agreement, compare
 import reslrb_cli
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import render_image
+from reslrb_cli.measure.scenes.small import texels
 
 #: Largest allowed relative difference between images from the same random numbers.
 SAME = 3e-4
@@ -39,7 +40,7 @@ def rgb(*value: float) -> dict[str, Any]:
 def bitmap(width: int, height: int, seed: int = 1, low: float = 0.1, high: float = 1.0, channels: int = 3) -> Any:
     """Return a random texture."""
     data = np.random.default_rng(seed).uniform(low, high, (height, width, channels)).astype(np.float32)
-    return {"type": "bitmap", "raw": not (mi.is_spectral and channels == 3), "data": mi.TensorXf(data)}
+    return {"type": "bitmap", **texels(data)}
 
 
 def camera(width: int = 32, height: int = 24, rfilter: str = "box", film: dict[str, Any] | None = None,
@@ -144,6 +145,8 @@ def difference_from_ptracer(
     surface.
     """
     options = {"max_depth": 6, "rr_depth": 3, "hide_emitters": True} | options
+    if mi.is_spectral:
+        options["rr_depth"] = 100  # our roulette weighs wavelengths as the film sees them
     ours = images(scene, "reslrb", range(2), spp, **options, **(reslrb or {}))
     theirs = images(scene, "ptracer", range(2), spp, **options)
     assert theirs.mean() > 1e-3, "no pixel to compare"

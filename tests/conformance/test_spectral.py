@@ -1,4 +1,4 @@
-"""The spectral variant, in a process of its own: its own tests, and a part of the conformance tests."""
+"""The spectral variant, in a process of its own: its own tests (`spectral.py`), and a part of the conformance tests."""
 
 from __future__ import annotations
 
@@ -9,29 +9,44 @@ from pathlib import Path
 
 import pytest
 
-HERE = Path(__file__).parent
-#: Tests of other files that also run in the spectral variant.
+ROOT = Path(__file__).resolve().parents[2]
+OWN = "tests/conformance/spectral.py"
 QUICK = [
-    "test_gradients.py::test_exact_estimators_equal_naive_ad[texture-correlated]",
+    f"{OWN}::test_coefficients_have_their_colour",
+    f"{OWN}::test_coefficients_have_derivatives",
+    f"{OWN}::test_the_furnace_has_its_colour[both-regular]",
+    f"{OWN}::test_the_furnace_has_its_derivatives[light-stack-regular]",
+    f"{OWN}::test_the_furnace_has_its_derivatives[light-reservoir-irregular]",
+    "tests/conformance/test_gradients.py::test_exact_estimators_equal_naive_ad[roulette-correlated]",
 ]
-LONG = ["test_gradients.py", "test_image_paths.py", "test_image_plugins.py", "test_camera_paths.py", "test_edges.py",
-        "test_attached.py", "test_attached_camera.py", "test_moving_emitters.py", "test_guiding.py"]  # fmt: skip
+#: Files whose default tests do not assume that a path's values are the channels of the film.
+FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "guiding", "image_paths", "kernels",
+         "memory", "moving_emitters", "sequences", "small_lamps"]  # fmt: skip
 
 
 def run(*arguments: str) -> None:
     """Run tests in the spectral variant, and assert that they pass."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", *arguments]
     environment = os.environ | {"RESLRB_TEST_VARIANT": "llvm_ad_spectral"}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=HERE.parents[1], env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    print(done.stdout[-3000:])
 
 
 def test_the_spectral_variant() -> None:
-    run(str(HERE / "spectral.py"), *(str(HERE / one) for one in QUICK))
+    run(*QUICK)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("file", LONG)
+@pytest.mark.parametrize("file", [OWN, *(f"tests/conformance/test_{name}.py" for name in FILES)])
 def test_the_conformance_of_the_spectral_variant(file: str) -> None:
-    run(str(HERE / file))
+    run(file)
+
+
+@pytest.mark.long
+def test_emitters_and_bsdfs_in_the_spectral_variant() -> None:
+    run("tests/conformance/test_image_plugins.py", "-k", "not furnace")
+
+
+@pytest.mark.long
+def test_exact_estimators_in_the_spectral_variant() -> None:
+    run("tests/conformance/test_gradients.py", "-k", "equal_naive_ad")

@@ -19,6 +19,7 @@ from turns import a_few
 from reslrb_cli.integrators.plugin import make_integrator, make_reslrb
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import gradient_step
+from reslrb_cli.measure.scenes import small
 from reslrb_cli.transport.camera import camera_walk
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import walk
@@ -49,7 +50,7 @@ def rgb(*value: float) -> dict[str, Any]:
 
 def texels(height: int, width: int) -> dict[str, Any]:
     data = np.random.default_rng(3).uniform(0.4, 20, (height, width, 3)).astype(np.float32)
-    return {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+    return {"type": "bitmap", **small.texels(data), "filter_type": "nearest", "wrap_mode": "clamp"}
 
 
 def bitmap(height: int, width: int, channels: int = 3) -> Any:

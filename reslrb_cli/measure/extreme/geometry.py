@@ -272,7 +272,13 @@ def normal_map() -> dict:
     """A floor with a normal map whose normals lean by up to 60 degrees."""
     random = np.random.default_rng(5)
     lean = np.concatenate([random.uniform(0.2, 0.8, (4, 4, 2)), np.full((4, 4, 1), 0.75)], -1)
-    return room(floor={"type": "normalmap", "normalmap": bitmap(lean, "bilinear"), "bsdf": diffuse(0.7, 0.5, 0.6)})
+    return room(
+        floor={
+            "type": "normalmap",
+            "normalmap": bitmap(lean, "bilinear") | {"raw": True},
+            "bsdf": diffuse(0.7, 0.5, 0.6),
+        }
+    )
 
 
 def vertical_light() -> dict:

@@ -64,10 +64,16 @@ def texture(height: int, width: int, low: float = 0.2, high: float = 0.8, seed: 
 
 
 def bitmap(data: np.ndarray, filter_type: str = "nearest") -> dict:
-    """A bitmap texture with unchanged `data` (H, W, C). In a spectral variant, three channels are a colour."""
-    is_raw = not (mi.is_spectral and data.shape[2] == 3)
-    return {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(data, np.float32)), "raw": is_raw,
-            "filter_type": filter_type, "wrap_mode": "clamp"}  # fmt: skip
+    """A bitmap texture with unchanged `data` (H, W, C)."""
+    return {"type": "bitmap", **texels(data), "filter_type": filter_type, "wrap_mode": "clamp"}
+
+
+def texels(data: np.ndarray) -> dict:
+    """The texels (H, W, C) of a bitmap texture. In a spectral variant, three channels are a colour."""
+    data = np.ascontiguousarray(data, np.float32)
+    if mi.is_spectral and data.shape[2] == 3:
+        return {"bitmap": mi.Bitmap(data)}  # Mitsuba would take `data` for coefficients
+    return {"data": mi.TensorXf(data), "raw": True}
 
 
 def rgb(*value: float) -> dict:

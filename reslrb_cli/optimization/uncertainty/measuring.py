@@ -24,6 +24,7 @@ from reslrb_cli.optimization.uncertainty.posterior import Measured
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.tree import to_array
+from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.statistics import Array, rms
 
 _PURPOSE = "certainty"
@@ -158,10 +159,12 @@ class Certainty:
 
         The scale is the largest root mean square among three arrays. The arrays are the initial values, the final
         values, and the difference of both. For parameters without a unit of light, the scale is at least half of the
-        range between the bounds. If all are 0, it is 1.
+        range between the bounds. For the index of a glass, only the difference counts. If all are 0, it is 1.
         """
         first, last = self._initial[key], row_of(self.problem, key)
         sizes = [rms(first), rms(last), rms(last - first)]
+        if bends_light(self.problem.selection.params, key):
+            return sizes[-1] or 1.0  # a share of an index would move the light out of the picture
         low, high = self.problem.selection.specs[key].bounds or (-np.inf, np.inf)
         emits = self.problem.quantities.get(key, "") in ("radiance", "irradiance", "intensity")
         if np.isfinite(high - low) and (not emits or not any(sizes)):

@@ -196,6 +196,8 @@ def mend(description: Description) -> list[Note]:
     if root.is_object:
         mender.mend_element(root)
     mender.mend_below(root)
+    if mi.is_spectral:
+        upsample_bitmaps(description)
     for spectrum in convert_spectra(root) if not mi.is_spectral else ():
         wrong = f"RGB variants have no spectrum `{spectrum.type}`"
         mender.notes.append(Note(spectrum, wrong, done="read as its colour"))
@@ -294,6 +296,36 @@ class _Mender:
                 dropped.add(earlier)
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]
+
+
+# --- colours as spectra ---
+
+#: Parameters that are colours, by the ends of their names.
+_COLOURS = re.compile(r"(reflectance|transmittance|base_color|color\d|radiance|irradiance|intensity|^texture)$")
+#: Files of linear floating-point numbers.
+_LINEAR = (".exr", ".hdr", ".pfm", ".rgbe")
+
+
+def upsample_bitmaps(description: Description) -> None:
+    """Remove `raw` from the scene's bitmaps that are colours. In a spectral variant, Mitsuba would not convert raw
+    colours to spectra. Raises ConfigError if the file of a colour is not linear. Bitmaps with one channel stay.
+    """
+    root = description.root
+    named = root.by_id()
+    for owner in root.objects():
+        for child in owner.children:
+            bitmap = named.get(child.id, child) if child.tag == "ref" else child
+            raw = bitmap.find("raw") if bitmap.type == "bitmap" else None
+            if raw is None or raw.value != "true" or not _COLOURS.search(child.name or bitmap.name):
+                continue
+            file = bitmap.find("filename")
+            path = None if file is None else description.find_file(file.value)
+            if file is not None and path is not None and not file.value.lower().endswith(_LINEAR):
+                if mi.Bitmap(str(path)).channel_count() <= 2:
+                    continue
+                why = "is not a file of linear colours; remove `raw`, or use an EXR file"
+                raise bitmap.fail("raw", f"{quoted(file.value)} {why}")
+            bitmap.children.remove(raw)
 
 
 # --- spectra by wavelength --------------------------------------------------------------------------------------------
