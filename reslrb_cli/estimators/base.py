@@ -14,7 +14,6 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.graph import no_wavelengths
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks
 from reslrb_cli.transport.connection import Connection, stand_in, transmittance
@@ -47,7 +46,7 @@ class Pass:
 
     def with_colours(self) -> Pass:
         """Return this pass with the wavelengths of its light paths, which are sampled again."""
-        wavelengths = self.emission().ray.wavelengths if mi.is_spectral else no_wavelengths()
+        wavelengths = self.emission().ray.wavelengths if mi.is_spectral else mi.Color0f()
         return replace(self, colours=self.samples.film.colours(wavelengths))
 
     @property

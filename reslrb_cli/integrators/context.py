@@ -313,7 +313,9 @@ class Preparation:
         about = known[these]
         # Kept once needed: otherwise kernels would be recompiled whenever a texel becomes or stops being zero.
         least = about.which.least.items()
-        values = {key: spectra_of(value) if is_upsampled(params, key) else value for key, value in enabled.items()}
+        values: dict[str, Any] = dict(enabled)
+        if mi.is_spectral:
+            values = {key: spectra_of(value) if is_upsampled(params, key) else value for key, value in values.items()}
         about.track_zeros |= any(_has_singular(key, values[key], value) for key, value in least)
         return about
 

@@ -52,7 +52,7 @@ class Differentiated:
         attributes are textures.
     - `emission_nodes` are the nodes of emission: emitters and their textures.
     - `shapes` are moving shapes, and `emitters` are emitters with moving rays. `bends` is true if a parameter changes
-        directions of refraction.
+        directions of refraction. `moves_light` is true for any of these; derivatives are then attached.
     - `least` has a value for each parameter that is a factor of a path. A parameter up to this value counts as zero.
     - `entries` is the number of differentiated entries for each node.
     - `sampled_spectra` are as in `Plan`.
@@ -66,11 +66,7 @@ class Differentiated:
     entries: dict[mi.Object, int]
     sampled_spectra: tuple[tuple[mi.Emitter, mi.Texture], ...] = ()
     bends: bool = False
-
-    @property
-    def moves_light(self) -> bool:
-        """Whether a parameter moves light, so that its derivatives are attached."""
-        return bool(self.shapes or self.emitters or self.bends)
+    moves_light: bool = False
 
     @staticmethod
     def of(params: mi.SceneParameters, keys: Iterable[str]) -> Differentiated:
@@ -120,6 +116,7 @@ class Differentiated:
             entries,
             spectra if mi.is_spectral else (),
             bends,
+            bool(shapes or emitters or bends),
         )
 
 
