@@ -225,8 +225,7 @@ class AdjointImage:
             color = [dr.gather(mi.Float, self.image, index * self.channels + c, active) for c in colors]
         return self._channels([color[c] for c in range(self.film.colors)])
 
-    @staticmethod
-    def _channels(color: list[mi.Float]) -> Channels:
+    def _channels(self, color: list[mi.Float]) -> Channels:
         if mi.is_spectral:
             return mi.Color3f(*color) if len(color) == N_COLOR else mi.ArrayXf(color)
         return mi.Spectrum(*color) if mi.is_rgb else mi.Spectrum(sum(color))

@@ -207,7 +207,7 @@ FAULTS = [
     # ---- Adjoints and derivatives: paths are right, and naive AD of them is a reference ----
     Fault("adjoint_without_filter", "wide_filter", "transport.film:AdjointImage.lookup",
           "self.film.film.rfilter().is_box_filter()", "True", by("gather stack", "walk_ad", "ptracer")),
-    Fault("channels_of_adjoint_swapped", "cornell", "transport.film:AdjointImage._pixel",
+    Fault("channels_of_adjoint_swapped", "cornell", "transport.film:AdjointImage._channels",
           "mi.Spectrum(*color)", "mi.Spectrum(*color[::-1])", by("gather stack", "walk_ad", "ptracer")),
     Fault("emission_not_differentiated", "lamp", "estimators.base:differentiate_emission",
           "p.plan.differentiate_emission", "False", by("reservoir event gather stack", "walk_ad", "ptracer")),

@@ -192,6 +192,7 @@ _NO_BLACK_LAMP = "Mitsuba loads no lamp without light"
 NOT_SPECTRAL = {
     "lamp_0": _NO_BLACK_LAMP,
     "black_lamp": _NO_BLACK_LAMP,
+    "white_box_100": "colours near 1 have too few digits for a hundred bounces",
     "pure_colours": "differences are too large beside colours without a spectrum",
 }
 
