@@ -83,8 +83,7 @@ class Before:
 
     @staticmethod
     def of(plan: Plan, vertex: Vertex, scattering: Scattering, before: Sequence[Before] = ()) -> list[Before]:
-        """Return the state that a vertex passes to the next one. On camera paths, `before` is the state that it received.
-        """
+        """Return the state that a vertex passes to the next one. On camera paths, `before` is the state that it received."""
         if not plan.stays:
             return []
         stays = stays_behind(plan, vertex.bsdf, scattering.is_delta)

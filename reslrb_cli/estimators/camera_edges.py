@@ -128,8 +128,7 @@ class Importance:
 
     `slid` is the contribution of light that goes from the point directly to the sensor, times <v, n> / <v, m> for the
     point's velocity v. m is the normal `normal`. `rest` is the contribution of other light, and `all` is the sum
-    of both contributions. `counts` is 0 behind a specular point. `behind` is 1 behind the point, 2 behind a specular
-    chain that begins at the point, and 0 elsewhere. It is empty without mirrors and glass.
+    of both contributions. `counts` is 0 behind a specular point.
     """
 
     all: mi.Float
@@ -137,7 +136,6 @@ class Importance:
     rest: mi.Float
     normal: mi.Vector3f
     counts: mi.Float
-    behind: list[mi.UInt32]
 
     def motion(self, outline: mi.Vector3f, part: mi.Float) -> mi.Vector3f:
         """Return the adjoint of the position of the point. The point counts with the factor `part`."""
@@ -146,19 +144,15 @@ class Importance:
 
 class ImportanceHooks(Hooks):
     """Hooks of a light path that starts with a ray to the point. `outline` is the normal n of the outline. `first` is
-    the number of the path's first vertex. `direct` is true if the light comes directly from a lamp. The sensor may see
-    the point over a vertex and a specular chain. Then, the point moves with the chain, and `chain_edges.py` has its
-    shadow.
+    the number of the path's first vertex. `direct` is true if the light comes directly from a lamp.
     """
 
     def __init__(self, p: Pass, outline: mi.Vector3f, first: mi.UInt32, direct: bool) -> None:
         self.p, self.outline, self.first = p, outline, first
         self.ends_class = direct and p.plan.by_class
-        self.excludes = direct and p.plan.needs.has_delta_lobes
 
     def start(self, product: Product) -> Importance:
-        behind = [mi.UInt32(0)] if self.excludes else []
-        return Importance(mi.Float(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Float(1), behind)
+        return Importance(mi.Float(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Float(1))
 
     def vertex(
         self, state: Importance, vertex: Vertex, connection: Connection, scattering: Scattering,
@@ -168,10 +162,6 @@ class ImportanceHooks(Hooks):
         own = dr.dot(C, self.p.delta(connection.u, connection.active)) * state.counts
         own = dr.select(connection.active, own, 0)
         first, si = vertex.depth == self.first, vertex.si
-        specular = dr.select(scattering.is_delta, mi.UInt32(2), 0)
-        behind = [dr.select(first, 1, dr.select(was > 0, specular, 0)) for was in state.behind]
-        for was in state.behind:
-            own = dr.select(was == 2, 0, own)
         # Behind a caustic's first surface, the light belongs to light paths.
         ends = begins_caustic(vertex.bsdf, scattering.is_delta) if self.ends_class else scattering.is_delta
         normal = dr.select(first, mi.Vector3f(si.n), state.normal)
@@ -184,7 +174,6 @@ class ImportanceHooks(Hooks):
             rest=state.rest + dr.select(first, 0, own),
             normal=normal,
             counts=dr.select(first & ends, 0, state.counts),
-            behind=behind,
         )
 
 

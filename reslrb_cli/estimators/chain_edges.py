@@ -25,18 +25,18 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.attached import Adjoint, find_following_vertex
+from reslrb_cli.estimators.attached import Adjoint
 from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.camera import Radiance
 from reslrb_cli.estimators.edges import AROUND, MAY_LACK, Contribution, edge_samples, for_camera, moved_by, ray_offset
 from reslrb_cli.estimators.stack import Ring, StackState, pop
-from reslrb_cli.transport.bsdf import EventNumbers, Hit, begins_caustic, evaluate, scatter
+from reslrb_cli.transport.bsdf import EventNumbers, evaluate, scatter
 from reslrb_cli.transport.camera import FilmRay, camera_walk
-from reslrb_cli.transport.chains import MOST_VERTICES, Chain, Chains, LampChains, Prefix, SensorChains, VertexChains
+from reslrb_cli.transport.chains import MOST_VERTICES, Chain, Chains, LampChains, SensorChains
 from reslrb_cli.transport.edges import pick
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.factors import Product, showing
-from reslrb_cli.transport.jumps import ChainEdge, ScanLine, random_interval, random_lines, sample_edge
+from reslrb_cli.transport.jumps import ChainEdge, random_interval, random_lines, sample_edge
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.sobol import unit
@@ -48,7 +48,7 @@ PROBES = 16
 #: because it stores one number for each.
 INTERVALS_PER_EDGE, MOST_INTERVALS = 16, 1 << 20
 #: Streams of random numbers, mixed into the seed.
-CHAIN_EDGES, CELLS, VERTEX_EDGES, SIDE = 0xED6E4, 0xED6E5, 0xED6E6, 0x0E4
+CHAIN_EDGES, CELLS, SIDE = 0xED6E4, 0xED6E5, 0x0E4
 
 
 def has_edges_behind_chains(plan: Plan) -> bool:
@@ -64,37 +64,28 @@ def _samples_of(samples: Samples, stream: int, each: int = 1) -> Samples:
     return replace(edges, plan=replace(edges.plan, by_class=False, paths="light"))
 
 
-def _chains(samples: Samples, number: mi.UInt32, pixels: mi.Float | None = None) -> Chains:
-    """Return chains from the sensor or from lamps. With the cumulative weights `pixels`, return chains from vertices of
-    camera paths.
-    """
+def _chains(samples: Samples, number: mi.UInt32) -> Chains:
     key = mi.sample_tea_32(number, samples.seed)[0]
-    if pixels is not None:
-        return VertexChains.of(samples, key, pixels)
     return SensorChains(samples, key) if samples.plan.camera else LampChains(samples, key)
 
 
-def _light(p: Pass, chains: Chains, edge: ChainEdge, over: mi.Bool) -> mi.Float:
+def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Float:
     """Return <delta, g L_p> or W_p in the lanes `over`. In other lanes, return minus the value for x.
 
     At the edge of a shadow, return minus half of the value for x in all lanes.
     """
     samples, camera = p.samples, p.plan.camera
     continues, shadow = edge.active & ~edge.shadow, edge.active & edge.shadow
-    ray, depth = dr.select(over, edge.over.ray, edge.past.ray), edge.over.count + 1 + chains.before
+    ray, depth = dr.select(over, edge.over.ray, edge.past.ray), edge.over.count + 1
     x = edge.past.vertex(shadow)
     target = edge.here.target
     f = evaluate(p.plan, x.si, x.bsdf, target.wo, shadow)
-    # If the sensor sees the vertex before the chain directly, light paths have the caustics.
-    caustics = mi.UInt32(chains.before) == 1
-    if p.plan.by_class:
-        f = dr.select(caustics & begins_caustic(x.bsdf, False), 0, f)
     lost = edge.weight * f * target.weight
     if camera:
-        u = chains.film_place(edge.u)
-        first = FilmRay(ray, u, mi.Spectrum(1), depth=depth, excluded=caustics)
-        _, L = camera_walk(samples, Radiance(tracked=False), continues, first)
-        delta = p.delta(u, edge.active)
+        _, L = camera_walk(
+            samples, Radiance(tracked=False), continues, FilmRay(ray, edge.u, mi.Spectrum(1), depth=depth)
+        )
+        delta = p.delta(edge.u, edge.active)
         found, lost = dr.dot(delta * edge.weight, L), dr.dot(delta, lost)
     else:
         emission = Emission(ray, edge.weight, dr.zeros(mi.EmitterPtr))
@@ -129,32 +120,18 @@ def weigh_cells(own: Samples) -> list[mi.Float]:
 
 
 def with_intervals(own: Samples, cells: list[mi.Float], passes: int) -> list[mi.Float]:
-    """Return the weights of `weigh_cells`, and cumulative weights of random intervals for each start of chains. A weight
-    is 1 if the chain changes within the interval. `own` are the samples of one of several `passes`.
+    """Return the weights of `weigh_cells`, and cumulative weights of random intervals. A weight is 1 if the chain
+    changes within the interval. `own` are the samples of one of several `passes`.
     """
-    found = []
-    for stream, pixels in _starts(own.plan, cells):
-        samples = _samples_of(own, stream, -(-own.width * passes // MOST_INTERVALS))
-        number = dr.arange(mi.UInt32, samples.width)
-        chains = _chains(samples, number, *pixels)
-        line = _lines(chains, cells, number, dr.opaque(mi.UInt32, samples.width))
-        found.append(dr.cumsum(dr.select(random_interval(chains, line).differs, mi.Float(1), 0)))
+    if not cells:
+        return []
+    samples = _samples_of(own, CHAIN_EDGES, -(-own.width * passes // MOST_INTERVALS))
+    number = dr.arange(mi.UInt32, samples.width)
+    chains = _chains(samples, number)
+    line = random_lines(chains, cells[0], number, dr.opaque(mi.UInt32, samples.width))
+    found = dr.cumsum(dr.select(random_interval(chains, line).differs, mi.Float(1), 0))
     dr.make_opaque(found)
-    return [*cells, *found]
-
-
-def _starts(plan: Plan, cells: list[mi.Float]) -> list[tuple[int, list[mi.Float]]]:
-    """Return the stream of random numbers for each start of chains. For chains from vertices of camera paths, also
-    return `cells`, the weights of pixels.
-    """
-    starts = [(CHAIN_EDGES, [])] if cells else []
-    return starts + [(VERTEX_EDGES, cells)] * (bool(cells) and plan.camera and plan.max_depth > 2)
-
-
-def _lines(chains: Chains, cells: list[mi.Float], number: mi.UInt32, count: mi.UInt32) -> ScanLine:
-    """Return random lines. The lines of chains from vertices are distributed evenly."""
-    even = isinstance(chains, VertexChains)
-    return random_lines(chains, None if even else cells[0], number, count)
+    return [*cells, found]
 
 
 def _behind_chains(samples: Samples, cell: mi.UInt32) -> tuple[mi.Float, mi.Float]:
@@ -179,18 +156,15 @@ def _behind_chains(samples: Samples, cell: mi.UInt32) -> tuple[mi.Float, mi.Floa
 
 @dataclass
 class SpecularFrame:
-    """Vertex of a specular chain on the stack. `sample` is the random number of its event. `stays` is 1 if the vertex
-    moves with its surface. It is empty if no vertex does.
-    """
+    """Vertex of a specular chain on the stack. `sample` is the random number of its event."""
 
     point: SurfacePoint
     sample: mi.Float
-    stays: list[mi.UInt32]
 
     @staticmethod
-    def blank(plan: Plan, stays: bool) -> SpecularFrame:
+    def blank(plan: Plan) -> SpecularFrame:
         """Return a frame of zeros."""
-        return SpecularFrame(SurfacePoint.blank(plan), mi.Float(0), [mi.UInt32(0)] if stays else [])
+        return SpecularFrame(SurfacePoint.blank(plan), mi.Float(0))
 
     def differentiate(self, p: Pass, adjoint: Adjoint) -> Adjoint:
         """Add the derivatives of the vertex. Takes the adjoint of the outgoing ray, and returns that of the ray that
@@ -202,9 +176,6 @@ class SpecularFrame:
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
             hit = find_vertex(ray, pi, active)
-            for stays in self.stays:
-                stayed, reaching, _ = find_following_vertex(ray, pi, active & (stays != 0))
-                hit = Hit(dr.select(stays != 0, stayed, hit.si), hit.bsdf, dr.select(stays != 0, reaching, hit.ray))
             scattering, _ = scatter(
                 p.plan, hit, EventNumbers(mi.Point2f(0.5), self.sample), active, None, attached=True
             )
@@ -215,80 +186,56 @@ class SpecularFrame:
             return Adjoint(origin, direction, adjoint.B)
 
 
-def _walk_back(p: Pass, chains: Chains, u: mi.Point2f, count: mi.UInt32, adjoint: Adjoint) -> Adjoint:
-    """Differentiate the first `count` vertices of the chain from place `u`. Takes the adjoint of the ray behind them, and
-    returns that of the first ray.
-    """
-    ring, stays = Ring(MOST_VERTICES + 1, False), isinstance(chains, VertexChains)
+def _stack_of(p: Pass, chains: Chains, edge: ChainEdge, ring: Ring) -> StackState:
+    """Return a stack with the specular vertices of the chain to an edge."""
 
     def body(active: mi.Bool, chain: Chain, stack: StackState) -> tuple[mi.Bool, Chain, StackState]:
         hit, scattering, passes, product = chains.event(chain, active)
         one = Product.one(False, False)
         vertex = Vertex(hit.si, hit.bsdf, chain.ray, chain.pi, chain.count, one, active)
-        first = [dr.select(chain.count == 0, mi.UInt32(1), 0)] if stays else []
-        frame = SpecularFrame(SurfacePoint.of(p.plan, vertex), scattering.sample_1, first)
-        stack = stack.pushed(frame, ring, passes, passes)
+        stack = stack.pushed(SpecularFrame(SurfacePoint.of(p.plan, vertex), scattering.sample_1), ring, passes, passes)
         chain = chains.onward(chain, hit, scattering, passes, product)
-        return passes & (chain.count < count), chain, stack
+        return passes & (chain.count < edge.over.count), chain, stack
 
-    blank, active = SpecularFrame.blank(p.plan, stays), count > 0
-    state = active, chains.start(u, active), StackState.begin(blank, ring, mi.Float(1))
-    stack = dr.while_loop(state, lambda active, *_: active, body, label="chain to an edge")[2]
-    return pop(p, blank, ring, stack, count, mi.UInt32(0), adjoint)
+    stack = StackState.begin(SpecularFrame.blank(p.plan), ring, mi.Float(1))
+    state = edge.active, chains.start(edge.u, edge.active), stack
+    return dr.while_loop(state, lambda active, *_: active, body, label="chain to an edge")[2]
 
 
 def differentiate_edges_behind_chains(own: Pass) -> None:
     """Add the derivatives of the edges behind specular chains. dL/dI must be known."""
     assert own.samples.edges is not None
-    cells, *found = own.samples.edges.chains
-    for (stream, pixels), intervals in zip(_starts(own.plan, [cells]), found, strict=True):
-        _differentiate_edges(own, stream, [cells], pixels, intervals)
-
-
-def _differentiate_edges(
-    own: Pass, stream: int, cells: list[mi.Float], pixels: list[mi.Float], found: mi.Float
-) -> None:  # fmt: skip
-    """Add the derivatives for one start of chains. `found` are the weights of `with_intervals`."""
+    cells, found = own.samples.edges.chains
     intervals = dr.width(found)
-    samples = _samples_of(own.samples, stream, INTERVALS_PER_EDGE * max(own.samples.width // intervals, 1))
+    samples = _samples_of(own.samples, CHAIN_EDGES, INTERVALS_PER_EDGE * max(own.samples.width // intervals, 1))
     p = Pass(samples, None, own.adjoint)
-    lane = dr.arange(mi.UInt32, samples.width)
+    lane, ring = dr.arange(mi.UInt32, samples.width), Ring(MOST_VERTICES + 1, False)
     pairs = dr.opaque(mi.Float, (samples.width + 1) // 2)  # two lanes share an edge
     offset = unit(mi.sample_tea_32(samples.seed, mi.UInt32(SIDE))[0])
     number, chance = pick(found, (mi.Float(lane // 2) + offset) / pairs)
     count = dr.opaque(mi.UInt32, intervals)
-    chains = _chains(samples, number, *pixels)
-    edge = sample_edge(chains, _lines(chains, cells, number, count))
+    chains = _chains(samples, number)
+    edge = sample_edge(chains, random_lines(chains, cells, number, count))
     edge.weight *= dr.select(chance > 0, dr.rcp(chance * mi.Float(count)), 0)
     shadow = edge.shadow
     # If the edge touches the surface in its shadow, the chain itself meets it.
     touches = shadow & (edge.here.pi.t < 2 * AROUND * ray_offset(edge.here.p))
-    size = dr.select(edge.active & ~touches, 2 * _light(p, chains, edge, lane % 2 == 0), 0)
+    size = dr.select(edge.active & ~touches, 2 * _light(p, edge, lane % 2 == 0), 0)
     active = size != 0
     at_p = size * edge.n
     with dr.resume_grad(), dr.isolate_grad():
         dr.backward_from(moved_by(edge.here.pi, edge.here.ray, at_p, active), flags=MAY_LACK)
-    at_x = _end_of_chain(edge.over, -edge.s * at_p, active & shadow)
-    adjoint = Adjoint(
-        dr.select(active, dr.select(shadow, at_x.origin, -at_p), 0),
-        dr.select(active, dr.select(shadow, at_x.direction, -at_p * edge.over.pi.t), 0),
-        mi.Spectrum(0),
-    )
-    adjoint = _walk_back(own, chains, edge.u, dr.select(active, edge.over.count, 0), adjoint)
-    if isinstance(chains, VertexChains):
-        adjoint = _end_of_chain(chains.first, adjoint.origin, active)
-        vertices = dr.select(active, chains.first.count, 0)
-        _walk_back(own, Prefix(samples, chains.key), chains.place, vertices, adjoint)
-
-
-def _end_of_chain(chain: Chain, adjoint: mi.Vector3f, active: mi.Bool) -> Adjoint:
-    """Add the derivatives of the point at the end of a chain. Takes the point's `adjoint`, and returns that of the ray
-    that reaches the point.
-    """
-    ray = mi.Ray3f(chain.ray)
+    end, ray = active & shadow, mi.Ray3f(edge.over.ray)
     with dr.resume_grad():
         ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
         dr.enable_grad(ray.o, ray.d)
-        x = find_vertex(ray, chain.pi, active).si.p
-        dr.backward_from(dr.select(active, dr.dot(x, adjoint), 0), flags=MAY_LACK)
-        return Adjoint(mi.Vector3f(dr.grad(ray.o)), mi.Vector3f(dr.grad(ray.d)), mi.Spectrum(0))
+        x = find_vertex(ray, edge.over.pi, end).si.p
+        dr.backward_from(dr.select(end, dr.dot(x, -edge.s * at_p), 0), flags=MAY_LACK)
+        origin, direction = mi.Vector3f(dr.grad(ray.o)), mi.Vector3f(dr.grad(ray.d))
+    adjoint = Adjoint(
+        dr.select(active, dr.select(shadow, origin, -at_p), 0),
+        dr.select(active, dr.select(shadow, direction, -at_p * edge.over.pi.t), 0),
+        mi.Spectrum(0),
+    )
+    vertices = dr.select(active, edge.over.count, 0)
+    pop(own, SpecularFrame.blank(own.plan), ring, _stack_of(own, chains, edge, ring), vertices, mi.UInt32(0), adjoint)

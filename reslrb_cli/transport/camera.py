@@ -30,8 +30,7 @@ class FilmRay:
 
     `weight` (C,) is the sensor's importance, normalised so that a sum over lanes gives an image. If `continues` is
     true, the ray is the later part of a path, and the sensor sees a surface that is not specular before it. `depth` is
-    the number of the vertex that the ray reaches. It is above 1 behind specular vertices. In the lanes `excluded`, light
-    paths have the light of a lamp that the ray hits.
+    the number of the vertex that the ray reaches. It is above 1 behind specular vertices.
     """
 
     ray: mi.Ray3f
@@ -39,7 +38,6 @@ class FilmRay:
     weight: mi.Spectrum
     continues: bool = False
     depth: mi.UInt32 | int = 1
-    excluded: mi.Bool | bool = False
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
@@ -191,12 +189,6 @@ class PathClass:
     before: mi.UInt32
     last: mi.UInt32
 
-    @staticmethod
-    def start(first: FilmRay) -> PathClass:
-        """Return the class at the start of a ray."""
-        excluded = dr.select(first.excluded, mi.UInt32(1), 0)
-        return PathClass(mi.UInt32(1) if first.continues else excluded, excluded)
-
     def excludes_hit(self) -> mi.Bool:
         """Return the lanes in which an emitter that the path hits belongs to light paths."""
         return (self.before & self.last) != 0
@@ -239,7 +231,7 @@ def camera_walk(
     path = CameraPath(
         active, mi.UInt32(first.depth), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
         mi.Point3f(first.ray.o), mi.UInt32(first.depth) - 1, M, rivals,
-        [PathClass.start(first)] if plan.by_class else [],
+        [PathClass(mi.UInt32(1 if first.continues else 0), mi.UInt32(0))] if plan.by_class else [],
     )  # fmt: skip
 
     def body(path: CameraPath, state: Any, sampler: mi.Sampler) -> tuple[CameraPath, Any, mi.Sampler]:

@@ -10,16 +10,15 @@ visible from x. `jumps.py` finds these places.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.scene.graph import sensor_rays
-from reslrb_cli.transport.bsdf import EventNumbers, Hit, Scattering, evaluate, scatter
+from reslrb_cli.transport.bsdf import EventNumbers, Hit, Scattering, scatter
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect
-from reslrb_cli.transport.edges import chance_of, pick
 from reslrb_cli.transport.emission import emission_of
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.sobol import unit
@@ -30,10 +29,8 @@ REFLECTS = 0.3
 MOST_VERTICES = 8
 #: Cells of the square of a lamp's random numbers, along each axis.
 LAMP_CELLS = 64
-#: Cells of the square of the random numbers of a direction, along each axis.
-VERTEX_CELLS = 32
 #: Streams of random numbers, mixed into the key of a chain.
-EVENTS, APERTURE, TARGET, PLACE, VERTEX = 0x5E1, 0xA9E, 0x1A4, 0x9C3, 0x7E3
+EVENTS, APERTURE, TARGET, PLACE = 0x5E1, 0xA9E, 0x1A4, 0x9C3
 
 _WITH_NORMALS = mi.RayFlags.All | mi.RayFlags.dNSdUV
 
@@ -90,13 +87,10 @@ class Target:
 
 @dataclass
 class Chains(ABC):
-    """Specular chains. `key` is a random seed for each lane. Equal keys make equal choices. `before` is the number of
-    vertices before the chain.
-    """
+    """Specular chains. `key` is a random seed for each lane. Equal keys make equal choices."""
 
     samples: Samples
     key: mi.UInt32
-    before: mi.UInt32 | int = field(default=0, kw_only=True)
 
     @property
     @abstractmethod
@@ -118,12 +112,8 @@ class Chains(ABC):
 
     @property
     @abstractmethod
-    def most(self) -> mi.UInt32 | int:
+    def most(self) -> int:
         """Largest number of specular vertices of a chain."""
-
-    def film_place(self, u: mi.Point2f) -> mi.Point2f:
-        """Return the film position of the chain from place `u`."""
-        return u
 
     def random(self, number: mi.UInt32, stream: int) -> mi.Point2f:
         """Return two random numbers of the chain."""
@@ -165,8 +155,7 @@ class Chains(ABC):
     def lit(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> tuple[Target, mi.Bool]:
         """Return the point y of a vertex, and the lanes in which a surface hides it."""
         smooth = mi.has_flag(hit.bsdf.flags(), mi.BSDFFlags.Smooth)
-        able = (count > 0) & smooth & (count + 2 + self.before <= self.samples.plan.max_depth)
-        target = self.target(hit, count, active & able)
+        target = self.target(hit, count, active & (count > 0) & smooth & (count + 2 <= self.samples.plan.max_depth))
         target.active &= dr.any(target.weight > 0)
         return target, self.samples.scene.ray_test(hit.si.spawn_ray_to(target.y), target.active)
 
@@ -215,76 +204,8 @@ class SensorChains(Chains):
         return bool(self.samples.plan.samples_emitters)
 
     @property
-    def most(self) -> mi.UInt32 | int:
+    def most(self) -> int:
         return min(self.samples.plan.max_depth - 1, MOST_VERTICES)
-
-
-class Prefix(SensorChains):
-    """Chains from the sensor to the first vertex that is not specular. Lamps do not matter."""
-
-    @property
-    def has_targets(self) -> bool:
-        return False
-
-
-@dataclass
-class VertexChains(SensorChains):
-    """Chains from the first vertex of a camera path that is not specular. The plane is the square of the random numbers
-    of a cosine-weighted direction.
-
-    `place` is the film position of the path, and `first` the chain to the vertex `origin`. `weight` (C,) is the
-    throughput before the vertex, divided by the density of `place` relative to an even one. In `usable` lanes, the
-    vertex exists.
-    """
-
-    place: mi.Point2f
-    first: Chain
-    origin: Hit
-    weight: mi.Spectrum
-    usable: mi.Bool
-
-    @staticmethod
-    def of(samples: Samples, key: mi.UInt32, pixels: mi.Float) -> VertexChains:
-        """Return chains from random film positions. Half of them have the cumulative weights `pixels`."""
-        prefix = Prefix(samples, key)
-        width, height = prefix.cells
-        number, within = prefix.random(mi.UInt32(0), VERTEX), prefix.random(mi.UInt32(1), VERTEX)
-        pixel = dr.minimum(mi.UInt32(number.x * (width * height)), width * height - 1)
-        pixel = dr.select(number.y < 0.5, pixel, pick(pixels, number.x)[0])
-        density = 0.5 + 0.5 * chance_of(pixels, pixel) * (width * height)
-        place = mi.Point2f(pixel % width, pixel // width) + within
-        first = prefix.follow(place)
-        valid = first.pi.is_valid()
-        hit, _, passes, _ = prefix.event(first, valid)
-        flags = hit.bsdf.flags()
-        usable = valid & ~passes & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        # With a delta lobe, some chains pass the vertex.
-        ends = dr.select(mi.has_flag(flags, mi.BSDFFlags.Delta), 1 - REFLECTS, 1)
-        weight = first.product / (ends * density)
-        return VertexChains(samples, key, place, first, hit, weight, usable, before=first.count + 1)
-
-    @property
-    def cells(self) -> tuple[int, int]:
-        return VERTEX_CELLS, VERTEX_CELLS
-
-    def begin(self, u: mi.Point2f) -> tuple[mi.Ray3f, mi.Spectrum]:
-        there, si = dr.clip(u / VERTEX_CELLS, 0, 1), self.origin.si
-        wo = mi.warp.square_to_cosine_hemisphere(there)
-        wo.z = dr.mulsign(wo.z, mi.Frame3f.cos_theta(si.wi))
-        f = evaluate(self.samples.plan, si, self.origin.bsdf, wo, self.usable)
-        weight = dr.select(wo.z != 0, self.weight * f * (dr.pi / dr.abs(wo.z)), 0)
-        return dr.detach(si.spawn_ray(si.to_world(wo))), weight
-
-    def start(self, u: mi.Point2f, active: mi.Bool) -> Chain:
-        return super().start(u, active & self.usable)
-
-    def film_place(self, u: mi.Point2f) -> mi.Point2f:
-        return self.place
-
-    @property
-    def most(self) -> mi.UInt32 | int:
-        most = max(self.samples.plan.max_depth - 1, 0)
-        return dr.minimum(most - dr.minimum(mi.UInt32(self.before), most), MOST_VERTICES)
 
 
 class LampChains(Chains):
@@ -321,5 +242,5 @@ class LampChains(Chains):
         return True
 
     @property
-    def most(self) -> mi.UInt32 | int:
+    def most(self) -> int:
         return min(max(self.samples.plan.max_depth - 2, 0), MOST_VERTICES)

@@ -129,13 +129,8 @@ def pick(weights: mi.Float, number: mi.Float) -> tuple[mi.UInt32, mi.Float]:
     last = dr.width(weights) - 1
     number, total = dr.minimum(number, dr.one_minus_epsilon(mi.Float)), dr.gather(mi.Float, weights, last)
     entry = mi.UInt32(dr.binary_search(0, last, lambda i: dr.gather(mi.Float, weights, i) <= number * total))
-    return entry, chance_of(weights, entry)
-
-
-def chance_of(weights: mi.Float, entry: mi.UInt32) -> mi.Float:
-    """Return the probability of an entry of cumulative `weights`."""
     below = dr.select(entry > 0, dr.gather(mi.Float, weights, dr.maximum(entry, 1) - 1), 0)
-    return (dr.gather(mi.Float, weights, entry) - below) / dr.gather(mi.Float, weights, dr.width(weights) - 1)
+    return entry, (dr.gather(mi.Float, weights, entry) - below) / total
 
 
 def sample_outline(

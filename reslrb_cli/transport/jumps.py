@@ -59,19 +59,15 @@ class ScanLine:
         return self.u + self.along * t
 
 
-def random_lines(chains: Chains, weights: mi.Float | None, number: mi.UInt32, count: mi.UInt32) -> ScanLine:
+def random_lines(chains: Chains, weights: mi.Float, number: mi.UInt32, count: mi.UInt32) -> ScanLine:
     """Return line `number` of `count` lines. Half of the lines run along each axis.
 
-    `weights` are the cumulative weights of the cells. If they are None, all cells have equal weights.
+    `weights` are the cumulative weights of the cells.
     """
     seed, width = chains.samples.seed, chains.cells[0]
     axis, y, place = evenly(seed, LINES, number)
     jitter = unit(mi.sample_tea_32(number, mi.sample_tea_32(seed, mi.UInt32(LINES + 1))[1])[0])
-    place_of_cell, total = (mi.Float(number) + jitter) / mi.Float(count), width * chains.cells[1]
-    if weights is None:
-        cell, chance = dr.minimum(mi.UInt32(place_of_cell * total), total - 1), mi.Float(1 / total)
-    else:
-        cell, chance = pick(weights, place_of_cell)
+    cell, chance = pick(weights, (mi.Float(number) + jitter) / mi.Float(count))
     along = dr.select(axis < 0.5, mi.Vector2f(1, 0), mi.Vector2f(0, 1))
     across = mi.Vector2f(along.y, along.x)
     return ScanLine(mi.Point2f(cell % width, cell // width) + across * y, along, across, place, chance)
