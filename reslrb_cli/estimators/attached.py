@@ -68,9 +68,9 @@ from reslrb_cli.transport.walk import (
 
 @dataclass
 class Before:
-    """Vertex before the current one. `stays` is 0 if the previous vertex is specular. Otherwise, the current vertex stays
-    at its place on its surface. `stays` is then 2 if the previous vertex slides over its surface behind a specular
-    vertex, and 1 if not.
+    """Vertex before the current one. `stays` is 0 if the previous vertex is specular. Otherwise, the current vertex
+    stays at its place on its surface. `stays` is then 2 if the previous vertex slides over its surface behind a
+    specular vertex, and 1 if not.
     """
 
     point: SurfacePoint
@@ -83,7 +83,9 @@ class Before:
 
     @staticmethod
     def of(plan: Plan, vertex: Vertex, scattering: Scattering, before: Sequence[Before] = ()) -> list[Before]:
-        """Return the state that a vertex passes to the next one. On camera paths, `before` is the state that it received."""
+        """Return the state that a vertex passes to the next one. On camera paths, `before` is the state that it
+        received.
+        """
         if not plan.stays:
             return []
         stays = stays_behind(plan, vertex.bsdf, scattering.is_delta)
