@@ -161,7 +161,7 @@ class AttachedCameraSweep(CameraHooks):
             before=state.before,
         )
         stack = state.stack.pushed(frame, self.ring, here, contributes)
-        return AttachedCameraState(stack, Before.of(plan, vertex, scattering), L)
+        return AttachedCameraState(stack, Before.of(plan, vertex, scattering, state.before), L)
 
     def survived(self, state: AttachedCameraState, factor: mi.Float) -> AttachedCameraState:
         return AttachedCameraState(state.stack.scaled(factor), state.before, state.L)

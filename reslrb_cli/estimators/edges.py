@@ -16,8 +16,8 @@ Creases need this term, too. A crease is an edge between two flat-shaded faces t
 the light jumps there, because the faces have different normals. At a crease, x is a point on the second face.
 
 At the end of a light path, y is a place on the sensor, and x moves with the light that reaches it. L_x is the radiance
-from x. A camera walk estimates L_x. Light that reaches x through a specular chain is missing if only light paths find
-it.
+from x. A camera walk estimates L_x. Light that reaches x from a lamp over a specular chain does not count here. This
+light moves x in another way, and `chain_edges.py` has its edges.
 
     dL/dtheta  -=  w delta(u) L_x <v_p - s v_x, n>,    s = |p - y| / |x - y|
 
@@ -382,7 +382,8 @@ class Arrived:
     `all` is the whole radiance. `slid` is the radiance of light that arrives at x directly from a lamp, times
     <v_x, n> / <v, n_x>. `rest` is the radiance of other light. `counts` is 0 if x is specular, because light paths do
     not connect from specular surfaces. `n_x` is the normal at x. If a lamp moves, `direct` is one contribution of light
-    that arrives at x directly.
+    that arrives at x directly. `chain` is 1 at x and behind a specular chain that begins at x, and 0 elsewhere. It is
+    empty without mirrors and glass.
     """
 
     all: mi.Spectrum
@@ -391,17 +392,21 @@ class Arrived:
     counts: mi.Float
     n_x: mi.Vector3f
     direct: list[Pick]
+    chain: list[mi.UInt32]
 
 
 class Behind(CameraHooks):
-    """Hooks that sum the radiance from x. `normal` is the normal of the outline. `numbers` is None if no lamp moves."""
+    """Hooks that sum the radiance from x. `normal` is the normal of the outline. `numbers` is None if no lamp moves. If
+    `excludes` is true, light that arrives at x over a specular chain does not count.
+    """
 
-    def __init__(self, normal: mi.Vector3f, numbers: mi.PCG32 | None) -> None:
-        self.normal, self.numbers = normal, numbers
+    def __init__(self, normal: mi.Vector3f, numbers: mi.PCG32 | None, excludes: bool) -> None:
+        self.normal, self.numbers, self.excludes = normal, numbers, excludes
 
     def start(self, first: FilmRay) -> Arrived:
         direct = [] if self.numbers is None else [Pick.start(self.numbers)]
-        return Arrived(mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Vector3f(0), direct)
+        chain = [mi.UInt32(1)] if self.excludes else []
+        return Arrived(mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Vector3f(0), direct, chain)
 
     def vertex(
         self, state: Arrived, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
@@ -417,6 +422,8 @@ class Behind(CameraHooks):
         if met is not None:
             L = dr.select(met.active, P * met.Le * met.weight, 0)
             direct = vertex.depth == 2
+            for behind in state.chain:
+                L = dr.select((behind != 0) & (vertex.depth > 2), 0, L)
             total = total + L
             slid = slid + dr.select(direct, L * slope(vertex.ray.d), 0)
             rest = rest + dr.select(direct, 0, L)
@@ -429,7 +436,8 @@ class Behind(CameraHooks):
             emitter = event.ds.emitter
             picked = [one.offered(L, first, vertex.depth, first, event.ds.d, emitter) for one in picked]
         counts = dr.select(first & scattering.is_delta, 0, state.counts)
-        return Arrived(total, slid, rest, counts, n_x, picked)
+        chain = [dr.select(first | (behind != 0) & scattering.is_delta, behind, 0) for behind in state.chain]
+        return Arrived(total, slid, rest, counts, n_x, picked, chain)
 
 
 def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
@@ -444,7 +452,8 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     # once, as seen from the lamps.
     touches = touches_behind(outline, beside)
     beside.active = beside.active & ~touches
-    behind = Behind(n, numbers if samples.plan.moving_emission else None)
+    moves, needs = samples.plan.moving_emission, samples.plan.needs
+    behind = Behind(n, numbers if moves else None, excludes=needs.has_delta_lobes and not moves)
     _, L = camera_walk(samples, behind, beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
     weight = p.delta(outline.view.u, beside.active, behind.colours) * outline.weight * p.scale
     still, slid, rest = (showing(dr.dot(weight, part)) for part in (L.all, L.slid, L.rest))

@@ -224,7 +224,7 @@ class Preparation:
                     raise UnsupportedScene(f"attached_sampling: {why}", "attached_sampling")
                 if motion.sampling == "auto":
                     motion = replace(motion, sampling="stay")  # as in the terms of the edges
-                if paths != "camera" and not about.near:  # once, because another number would recompile kernels
+                if not about.near:  # once, because another number would recompile kernels
                     near = edged.moving or edged.occluders
                     about.near = NEAR * min(float(dr.norm(shape.bbox().extents())) for shape in near)
             plan = attach(plan, which, motion, scene, sensor)

@@ -298,7 +298,8 @@ class Plan:
         """Return the plan of the camera paths of a pass. Their vertices stay behind all surfaces that are not
         specular.
         """
-        return replace(self, camera=True, stays=self.attached, glossy_follows=False, near=0.0)
+        near = self.near if self.needs.has_delta_lobes else 0.0
+        return replace(self, camera=True, stays=self.attached, glossy_follows=False, near=near)
 
     def differentiating(
         self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[mi.BSDF, ...] = ()

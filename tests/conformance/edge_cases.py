@@ -203,7 +203,7 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
     # The camera sees the plate far behind the box.
     "two": lambda: {"shape": _box(0.2, -1.6, 1.35, 0.4),
                     "plate": rectangle(TWO_SIDED, transform(translate=[0.1, 0, 0.5], scale=0.7))},
-    **dict.fromkeys(("hidden", "behind", "shaded"), lambda: {"shape": _box(0.1, -0.1, 0.9)}),
+    **dict.fromkeys(("hidden", "behind", "shaded", "glazed"), lambda: {"shape": _box(0.1, -0.1, 0.9)}),
     "reflector": lambda: {"shape": rectangle(TWO_SIDED, transform(translate=[0, 0, 2.6], scale=0.5))},
     "slab": lambda: {"shape": mesh(*split_box((0.1, 0, 0.5), (0.6, 0.6, 0.1)), GLASS)},
     "mirror": lambda: {"shape": rectangle(MIRROR, transform(translate=[0.2, 0.8, 0.8], rotate=([1, 0, 0], 75),
@@ -227,6 +227,8 @@ STILL: dict[str, Callable[[], dict[str, Any]]] = {
     # The shadow of the sheet falls on the box.
     "shaded": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.35, 0.05, 1.7], scale=0.2))},
     "reflector": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.1, 0.1, 1.2], scale=0.4))},
+    # All light comes through a pane of glass that the camera does not see.
+    "glazed": lambda: {"pane": mesh(*split_box((0.5, 0.1, 2.3), (1.2, 1.2, 0.05)), GLASS)},
     # The camera sees the sphere and its shadow in a mirror, too.
     "reflected": lambda: {"sheet": rectangle(MIRROR, transform(translate=[0.2, 1.6, 1], rotate=([1, 0, 0], 80),
                                                                scale=1.3))},
@@ -322,6 +324,7 @@ RECORDED = [
     EdgeCase("none", "room", 3, lamp_moves=True, spp=1024),
     EdgeCase("reflected", "area", 3, spp=512, reference_spp=8192, options=BOTH),
     EdgeCase("mirror", "constant", 3, reference_spp=8192, options=BOTH),
+    EdgeCase("glazed", "area", 4, ("x", "z"), spp=1280, reference_spp=8192, options={"paths": "light"}),
     EdgeCase("slab", "area", 4, spp=768, reference_spp=16384, step=0.02, options=BOTH),
 ]  # fmt: skip
 CASES = [

@@ -139,6 +139,8 @@ FAULTS = [
           " + (shares[1] - shares[0])", ""),
     Fault("solid_angle_of_a_lamp_left_out", "sphere-near-2", "transport.edges:_from",
           "first.weight * solid", "first.weight"),
+    Fault("light_through_glass_counted_twice", "glazed-area-4", "estimators.edges:_from_sensor",
+          "excludes=needs.has_delta_lobes and not moves", "excludes=False"),
     Fault("edges_in_glass_left_out", "slab-area-4", "estimators.chain_edges:has_edges_behind_chains",
           "bool(plan.needs.has_delta_lobes)", "not plan.camera"),
     Fault("edges_behind_glass_left_out", "slab-area-4", "estimators.chain_edges:has_edges_behind_chains",
