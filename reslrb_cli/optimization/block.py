@@ -4,12 +4,13 @@ Colours that light each other, a lamp and the surfaces that it lights, and an ex
 curvature H is therefore measured as a whole, by differences of images (`loop.measure_block`). Near the optimum x*, a
 gradient is g = H (x - x*) + noise. With the means of the last n gradients and of their values, a step is
 
-    y = mean g - H (mean x - x),   x <- x - (H H + s v/n C^-1)^-1 H y
+    y = mean g - H (mean x - x),   x <- x - (n H V^-1 H + s C^-1)^-1 n H V^-1 y
 
-in units in which the diagonal of H is 1. C is diagonal, with the squares of twice the longest steps. v is the variance
-of the noise of a gradient, so noise limits the steps in directions that the images hardly determine. v comes from
-consecutive gradients: g - g' - H (x - x') has the variance 2 v. Where the loss is not quadratic, v is larger, and the
-steps are shorter.
+in units in which the diagonal of H is 1. C is diagonal, with the squares of twice the longest steps. V is the
+covariance of the noise of a gradient, so noise limits the steps in directions that the images hardly determine. V has
+the eigenvectors of H, and two variances: one for the half of the eigenvectors with the larger curvature, and one for
+the others, along which noise is smaller as well. They come from consecutive gradients: g - g' - H (x - x') has the
+covariance 2 V. Where the loss is not quadratic, V is larger, and the steps are shorter.
 
 n rises by 1 if a gradient points against the last step (Kesten 1958), and falls by a quarter otherwise. While the
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.
@@ -26,14 +27,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reslrb_cli.optimization.uncertainty.posterior import positive
 from reslrb_cli.statistics import Array
 
-#: s, decay of v, and decrease of n.
+#: s, decay of V, and decrease of n.
 NOISE, MEMORY, SHRINK = 0.3, 0.8, 0.25
+#: Smallest variance of V as a share of the largest.
+LEAST_NOISE = 1e-4
 #: Standard errors to the end of an interval with a confidence of 85 %.
 SURE = 1.04
-#: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, v, n.
-FIELDS = 8
+#: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, and
+#: the variances along the smaller and the larger curvatures.
+FIELDS = 9
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ class Block:
         curvature.
         """
         size = np.diag(self.rows[:, FIELDS:])[self.at[key]].astype(np.float64)
-        return np.asarray(np.where(size > 0, size * np.maximum(self.rows[self.at[key], 7], 1), np.inf))
+        return np.asarray(np.where(size > 0, size * np.maximum(self.rows[self.at[key], 6], 1), np.inf))
 
     def to_go(self, key: str) -> float:
         """Return a limit of the root mean square distance to the optimum. It is infinite if it is not known."""
@@ -89,26 +94,32 @@ class Block:
         if not use.any():
             return np.zeros(len(H))
         root = np.sqrt(np.where(use, np.diag(H), 1.0))
-        K = _positive(np.where(np.outer(use, use), H / np.outer(root, root), 0.0))
+        K = positive(np.where(np.outer(use, use), H / np.outer(root, root), 0.0))
         mean_g, mean_x, last_g, last_x, last_step = rows[:, :5].T
         y, x = np.where(use, now.gradient / root, 0.0), now.value * root
-        v, n = rows[0, 6], rows[0, 7]
+        n, variances = rows[0, 6], rows[0, 7:FIELDS]
         before = K @ (x - last_x * root) if n > 0 else np.zeros_like(x)
-        new = float(np.mean((y - last_g / root - before)[use] ** 2)) / 2
-        v = v**MEMORY * new ** (1 - MEMORY) if v > 0 else new
+        vectors = np.linalg.eigh(K[np.ix_(use, use)])[1]
+        squares = np.square(vectors.T @ (y - last_g / root - before)[use]) / 2
+        half = (len(squares) + 1) // 2
+        new = np.array([np.mean(squares[:half]), np.mean(squares[-half:])])
+        variances = np.where(variances > 0, variances**MEMORY * new ** (1 - MEMORY), new)
         n = n + 1 if now.gradient @ last_step > 0 else max(1.0, n - SHRINK)
         mean_g = np.where(now.known, mean_g + (now.gradient - mean_g) / n, mean_g)
         mean_x = mean_x + (now.value - mean_x) / n
         Y = np.where(use, mean_g / root, 0.0) - K @ (mean_x * root - x)
         free = use & ~((now.value <= now.low) & (Y > 0) | (now.value >= now.high) & (Y < 0))
-        A = K[np.ix_(free, free)]
-        damping = v / n / (2 * now.longest * root)[free] ** 2
-        inverse = np.linalg.inv(A @ A + np.diag(NOISE * damping + 1e-8))
+        A, C = K[np.ix_(free, free)], np.square(2 * now.longest * root)[free]
+        vectors, noise = np.linalg.eigh(A)[1], max(float(variances.max()), 1e-300)
+        places = (np.arange(len(A)) >= len(A) // 2).astype(int)
+        precision = (vectors * (noise / np.maximum(variances[places], LEAST_NOISE * noise))) @ vectors.T
+        inverse = np.linalg.inv(A @ precision @ A + np.diag(NOISE * noise / n / C + 1e-8))
         step, error = np.zeros_like(x), np.zeros_like(x)
-        step[free] = -(inverse @ A @ Y[free]) / root[free]
-        error[free] = np.sqrt(np.diag(inverse) * v / n) / root[free]
-        rows[:, :8] = np.stack([mean_g, mean_x, now.gradient, now.value, step, np.abs(step) + SURE * error,
-                                np.full_like(x, v), np.full_like(x, n)], axis=1)  # fmt: skip
+        step[free] = -(inverse @ A @ precision @ Y[free]) / root[free]
+        error[free] = np.sqrt(np.diag(inverse) * noise / n) / root[free]
+        distance = np.abs(step) + SURE * error
+        fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, *variances]
+        rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
         change = np.clip(step, -now.longest, now.longest)
         if (tied := now.exposure >= 0).any():
             du = change[now.exposure[tied]]
@@ -116,9 +127,3 @@ class Block:
             change[tied] = ((1 + du) * colour + change[tied]) * np.exp(-du) - colour
         self.rows = rows.astype(np.float32)
         return change
-
-
-def _positive(matrix: Array) -> Array:
-    """Return the nearest symmetric matrix without negative eigenvalues. Noise causes negative eigenvalues."""
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
