@@ -42,7 +42,7 @@ FIELDS = 9
 
 
 @dataclass(frozen=True)
-class Coordinates:
+class JointState:
     """Values, gradients, longest steps and bounds of all coordinates (M,).
 
     `known` marks coordinates with a gradient. `exposure` has the place of the exposure that a colour compensates for,
@@ -87,7 +87,7 @@ class Block:
         """Return a limit of the root mean square distance to the optimum. It is infinite if it is not known."""
         return float(np.sqrt(np.mean(np.square(self.rows[self.at[key], 5], dtype=np.float64))))
 
-    def steps(self, now: Coordinates) -> Array:
+    def steps(self, now: JointState) -> Array:
         """Return the changes (M,) of the values. Coordinates without curvature do not move."""
         rows, H = self.rows.astype(np.float64), self.rows[:, FIELDS:].astype(np.float64)
         use = now.known & (np.diag(H) > 0)

@@ -77,7 +77,7 @@ class Rule:
         raise NotImplementedError
 
 
-class Adam(Rule, dropt.Adam):
+class AdamRule(Rule, dropt.Adam):
     """Adam with the interface of `Rule`."""
 
     keeps_length = True

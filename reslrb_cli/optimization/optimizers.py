@@ -46,8 +46,8 @@ import drjit as dr
 import numpy as np
 import scipy.fft
 
-from reslrb_cli.optimization.block import Block, Coordinates
-from reslrb_cli.optimization.newton import DISPLACEMENT, Adam, Descent, Joint, Newton
+from reslrb_cli.optimization.block import Block, JointState
+from reslrb_cli.optimization.newton import DISPLACEMENT, AdamRule, Descent, Joint, Newton
 from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
 from reslrb_cli.statistics import Array, rms
 
@@ -195,7 +195,7 @@ def _opaque(like: Any, number: float) -> Any:
 
 
 OPTIMIZERS: dict[str, Callable[..., Any]] = {
-    "adam": Adam,
+    "adam": AdamRule,
     "sgd": Descent,
     "auto": Newton,
 }
@@ -357,14 +357,16 @@ class Optimizer:
                 place = block.at[balanced]
                 own = np.arange(place.start, place.stop)
                 exposure[at] = own if len(own) in (1, at.stop - at.start) else -1
-        change = block.steps(Coordinates(value, gradient, longest, low, high, known, exposure))
+        change = block.steps(JointState(value, gradient, longest, low, high, known, exposure))
         return {key: value[at] + change[at] for key, at in block.at.items() if key not in skip}
 
     def _move_variable(self, key: str, row: Array) -> None:
         """Set the optimiser's variable of a small parameter to `row`, within its bounds."""
         own, variable = self._own[key], self.variable(key)
         old = dr.detach(own[key])
-        own[key] = variable.clamp(type(old)(row.reshape(np.array(old).shape).astype(np.float32)))
+        new = type(old)(row.reshape(np.array(old).shape).astype(np.float32)) + _opaque(old, 0)  # in Dr.Jit's own memory
+        dr.eval(new)
+        own[key] = variable.clamp(new)
         if key in self._variables:
             self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
 
