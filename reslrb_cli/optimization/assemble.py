@@ -193,9 +193,8 @@ def assemble_scene(config: Config, scene: Any = None) -> Problem:
     if isinstance(problem.integrator, LightTracer):
         problem.integrator.expect(pass_spp(config))
     problem.apply()
-    if config.optimizer.type == "auto" and (moves or selection.factors):
-        lacks = "what moves geometry or lamps" if moves else "an unknown exposure"
-        reason = f"auto has no steps for {lacks}; use adam, with a learning_rate and a schedule"
+    if config.optimizer.type == "auto" and moves:
+        reason = "auto has no steps for what moves geometry or lamps; use adam, with a learning_rate and a schedule"
         raise ConfigError(config.source, "optimizer.type", reason)
     _check_moving(problem)
     return problem

@@ -33,6 +33,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
 from reslrb_cli.optimization.state import State, put, standing
+from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
@@ -85,7 +86,7 @@ LEAST_ITERATIONS, CLOSE, LEAST_SHARE = 20, 0.025, 0.2
 def close_enough(problem: Problem, iteration: int) -> str:
     """Return a message if more iterations would not help, otherwise "". `iteration` is the number of iterations."""
     optimizer = problem.optimizer
-    measured = 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last iteration of `measures_now`
+    measured = 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last measurement of large parameters
     is_long = iteration >= max(LEAST_ITERATIONS, 1.5 * measured)
     if not optimizer.measures_curvature or not is_long:
         return ""
@@ -97,17 +98,42 @@ def close_enough(problem: Problem, iteration: int) -> str:
     return f"every parameter is within {100 * CLOSE:g} % of the optimum"
 
 
-def measures_now(problem: Problem, iteration: int) -> bool:
-    """True if `auto` measures the curvature in `iteration`, which is 0, 2, 6, 14, 30, and so on."""
-    return problem.optimizer.measures_curvature and (iteration + 2) & (iteration + 1) == 0
+#: Displacement of small parameters as a share of half their extent, and the divisor of a step's samples for each of the
+#: two sets that measure their curvature.
+DISPLACEMENT, PART = 0.05, 4
 
 
 def measure_curvature(problem: Problem, iteration: int) -> None:
-    """Measure the curvature for `auto`, with the samples of `iteration`. Its gradient must be accumulated."""
-    random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
-    with problem.optimizer.displaced(random):
+    """Measure the curvature for `auto`, if it is due. The gradient of `iteration` must be accumulated.
+
+    The curvature of large parameters is measured in the iterations 0, 2, 6, 14, 30 and so on, with the samples of the
+    iteration. The joint curvature of small parameters is measured in the iterations 0, 1, 2, 4, 7, 11 and so on.
+    """
+    optimizer, due = problem.optimizer, 0
+    while due < iteration:
+        due += due // 2 + 1
+    if optimizer.block.at and due == iteration:
+        measure_block(problem)
+    if len(optimizer.block.at) < len(optimizer.keys()) and (iteration + 2) & (iteration + 1) == 0:
+        random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
+        with optimizer.displaced(random):
+            problem.apply()
+            gradient(problem, iteration)
         problem.apply()
-        gradient(problem, iteration)
+
+
+def measure_block(problem: Problem) -> None:
+    """Measure the joint curvature of all small parameters for `auto`, by differences of images."""
+    optimizer, block, unit = problem.optimizer, problem.optimizer.block, problem.samples_per_pass or 1
+    scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
+              else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
+    curvature = LossCurvature(problem, max(problem.config.run.spp // PART // unit, 1) * unit, of_target=False)
+    directions, H, _ = curvature.along(plan_changes(problem, scales, DISPLACEMENT), lambda: True)
+    at = np.array([block.at[each.key].start + (each.entry or 0) for each in directions])
+    slopes = np.concatenate([optimizer.slopes(key) for key in block.at])
+    whole = np.zeros((len(slopes), len(slopes)))
+    whole[np.ix_(at, at)] = H * np.outer(slopes[at], slopes[at])
+    block.bend(np.nan_to_num(whole))
     problem.apply()
 
 
@@ -160,7 +186,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
-    if measures_now(problem, iteration):
+    if optimizer.measures_curvature:
         with clock.counted():
             measure_curvature(problem, iteration)
     factor = learning_rate_factor(

@@ -23,7 +23,7 @@ its moments and its number of steps.
 
     adam      m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)    Kingma and Ba 2015
     sgd       v = momentum · v + g; p -= lr · v
-    auto      steps from measured curvature, without a rate (`newton.py`)
+    auto      steps from measured curvature, without a rate (`newton.py`, and `block.py` for small parameters)
 
 Exposure (`balance`): an image hardly changes if an exposure E rises and the colours c of the surfaces fall by the same
 factor. Separate steps in E and c would cross this valley of the loss again and again. Therefore a step of E divides the
@@ -43,11 +43,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
-import drjit.opt as dropt
 import numpy as np
 import scipy.fft
 
-from reslrb_cli.optimization.newton import DISPLACEMENT, Newton
+from reslrb_cli.optimization.block import Block, JointState
+from reslrb_cli.optimization.newton import DISPLACEMENT, AdamRule, Descent, Joint, Newton
 from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
 from reslrb_cli.statistics import Array, rms
 
@@ -140,6 +140,11 @@ class Variable:
     gain: float = 1.0
     smoother: Smoother | None = None
 
+    @property
+    def ends(self) -> Bounds:
+        """Smallest and largest u."""
+        return self.bounds if self.transform is None else (self.transform.low, self.transform.high)
+
     def to_scene(self, v: Any) -> Any:
         """Return x for v."""
         u = self._u(v)
@@ -155,7 +160,7 @@ class Variable:
 
     def clamp(self, v: Any) -> Any:
         """Return v if its x is within the bounds, otherwise the nearest allowed value."""
-        ends = self.bounds if self.transform is None else (self.transform.low, self.transform.high)
+        ends = self.ends
         if ends is None:
             return v
         if self.smoother is None:
@@ -190,13 +195,16 @@ def _opaque(like: Any, number: float) -> Any:
 
 
 OPTIMIZERS: dict[str, Callable[..., Any]] = {
-    "adam": dropt.Adam,
-    "sgd": dropt.SGD,
+    "adam": AdamRule,
+    "sgd": Descent,
     "auto": Newton,
 }
 
 #: Extent of a parameter with a transform, in units of u.
 EXTENT_OF_TRANSFORM = 2.0
+#: Largest number of entries of a parameter that `auto` moves together with others, and their longest step as a share of
+#: the extent, or in the unit of a transform.
+SMALL, LONGEST_OF_SMALL, LONGEST_OF_TRANSFORM = 4, 0.25, 0.3
 
 
 class Optimizer:
@@ -222,7 +230,14 @@ class Optimizer:
         self._rates = {key: float(rates[key] or learning_rate) for key in values}
         self._bounds = {key: bounds[key] for key in values}
         named = {"alpha" if name == "decay" else name: value for name, value in options.items()}
-        self._own = {key: OPTIMIZERS[type](lr=self._rates[key], **named) for key in values}
+        small = {key: size for key, value in values.items() if (size := np.array(dr.detach(value)).size) <= SMALL}
+        #: Joint steps of small parameters, for `auto`.
+        self.block = Block(small if type == "auto" else {})
+        self._own = {
+            key: Joint(self.block) if key in self.block.at else OPTIMIZERS[type](lr=self._rates[key], **named)
+            for key in values
+        }
+        self._measures = type == "auto"
         self._variables: dict[str, Variable] = {}
         #: The scene's values of the parameters with variables.
         self._scene: dict[str, Any] = {}
@@ -264,16 +279,15 @@ class Optimizer:
         self._own[key][key] = variable.from_scene(value)
 
     def balance(self, exposure: str, colours: Sequence[str]) -> None:
-        """From now on, divide `colours` by the change of `exposure`, a single number, in each step. The arguments are
-        keys. Entries without a gradient stay, because no image shows them.
+        """From now on, divide `colours` by the change of `exposure` in each step. The arguments are keys. Entries
+        without a gradient stay, because no image shows them.
         """
         self._balanced = exposure, list(colours)
 
     def forget(self) -> None:
         """Set the moments of all parameters to zero. `auto` has no long memory, and keeps its measured curvature."""
         for own in self._own.values():
-            if not isinstance(own, Newton):
-                own.reset()
+            own.forget()
 
     def gradient(self, key: str) -> Any:
         """Return the gradient that has been accumulated into `self[key]`."""
@@ -290,7 +304,7 @@ class Optimizer:
         its old optimiser state. Returns the number of non-finite entries of updates by key.
         """
         self.stands_at = None
-        exposure, colours = self._moving(skip)
+        exposure, colours = self._moving(skip) if not self._measures else ("", [])
         reached = {key: self.gradient(key) != 0 for key in colours}
         if colours:
             old = dr.detach(self[exposure])
@@ -298,12 +312,14 @@ class Optimizer:
             dr.set_grad(self[exposure], self.gradient(exposure) - sum(products) / old)
         # Dr.Jit makes the rate opaque, so a changing rate compiles no new kernel.
         moved, before, counts = [key for key in self._own if key not in skip], {}, {}
+        joint = self._joint_steps(skip)
         for key in moved:
             own = self._own[key]
             before[key] = own.state[key], self[key]
-            is_auto = isinstance(own, Newton)
-            own.set_learning_rate(own.limit(key) * self.extent(key) if is_auto else self._rates[key] * factor)
-            if key in self._variables:
+            own.set_learning_rate(self._rates[key] * factor if own.longest is None else own.longest * self.extent(key))
+            if key in joint:
+                self._move_variable(key, joint[key])
+            elif key in self._variables:
                 self._step_variable(key)
             else:
                 own.step(eval=False)
@@ -324,6 +340,42 @@ class Optimizer:
             self.set_value(key, dr.select(reached[key], moved, value))
         return overflowed
 
+    def _joint_steps(self, skip: Collection[str]) -> dict[str, Array]:
+        """Return the new values of the variables of small parameters, for `auto`."""
+        block, M = self.block, len(self.block.rows)
+        known, exposure = np.ones(M, bool), np.full(M, -1)
+        gradient, value, longest, low, high = np.zeros((5, M))
+        balanced, colours = self._balanced or ("", [])
+        for key, at in block.at.items():
+            variable, v = self.variable(key), dr.detach(self._own[key][key])
+            value[at], known[at] = np.array(v).ravel(), key not in skip
+            if key not in skip:
+                gradient[at] = np.array(variable.chain(v, self.gradient(key))).ravel()
+            longest[at] = LONGEST_OF_TRANSFORM if variable.transform else LONGEST_OF_SMALL * self.extent(key)
+            low[at], high[at] = variable.ends or (-math.inf, math.inf)
+            if key in colours and variable.transform is None:
+                place = block.at[balanced]
+                own = np.arange(place.start, place.stop)
+                exposure[at] = own if len(own) in (1, at.stop - at.start) else -1
+        change = block.steps(JointState(value, gradient, longest, low, high, known, exposure))
+        return {key: value[at] + change[at] for key, at in block.at.items() if key not in skip}
+
+    def _move_variable(self, key: str, row: Array) -> None:
+        """Set the optimiser's variable of a small parameter to `row`, within its bounds."""
+        own, variable = self._own[key], self.variable(key)
+        old = dr.detach(own[key])
+        new = type(old)(row.reshape(np.array(old).shape).astype(np.float32)) + _opaque(old, 0)  # in Dr.Jit's own memory
+        dr.eval(new)
+        own[key] = variable.clamp(new)
+        if key in self._variables:
+            self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
+
+    def slopes(self, key: str) -> Array:
+        """Return dx/dv of each entry of a parameter's variable, as a flat array."""
+        variable, v = self.variable(key), dr.detach(self._own[key][key])
+        ones = dr.zeros(type(v), dr.shape(v)) + 1
+        return np.array(variable.chain(v, ones), dtype=np.float64).ravel() / variable.gain
+
     def _moving(self, skip: Collection[str]) -> tuple[str, list[str]]:
         """Return the exposure and the colours that move together in this step, or no colours."""
         exposure, colours = self._balanced or ("", [])
@@ -340,14 +392,15 @@ class Optimizer:
 
     @contextmanager
     def displaced(self, random: np.random.Generator) -> Iterator[None]:
-        """Displace all entries by random signs, and measure the curvature for `auto`.
+        """Displace all entries of large parameters by random signs, and measure the curvature for `auto`.
 
         Accumulate the gradient before, and within the block the gradient at the displaced values, with the same
         samples. Afterwards, values and gradients are as before.
         """
+        large = {key: own for key, own in self._own.items() if isinstance(own, Newton)}
         kept = self.stands_at, {key: (own.state[key], self._scene.get(key)) for key, own in self._own.items()}
         before, steps = self._descents(), {}
-        for key, own in self._own.items():
+        for key, own in large.items():
             v, variable = dr.detach(own[key]), self.variable(key)
             signs = random.choice([-1.0, 1.0], size=np.array(v).shape) * DISPLACEMENT * self.extent(key)
             ahead = v + type(v)(signs.astype(np.float32))
@@ -362,6 +415,7 @@ class Optimizer:
             own.state[key], value = kept[1][key]
             if value is not None:
                 self._scene[key] = value
+        for key, own in large.items():
             own.bend(key, ((after[key] - before[key]) / steps[key]).array)
 
     def _descents(self) -> dict[str, Any]:
@@ -376,8 +430,7 @@ class Optimizer:
         """Return an upper limit of the distance to the optimum as a share of the extent. Only for `auto`; infinity
         otherwise.
         """
-        own = self._own[key]
-        return own.to_go(key) / self.extent(key) if isinstance(own, Newton) else math.inf
+        return float(self._own[key].to_go(key) / self.extent(key))
 
     def _step_variable(self, key: str) -> None:
         own, variable = self._own[key], self._variables[key]
@@ -394,16 +447,7 @@ class Optimizer:
         momentum, because the response to a gradient is summed over many steps. The next step is the returned movement
         times the schedule's factor and the parameter's rate (`rate`). It is 0 if no step was taken.
         """
-        own, extra = self._own[key], self._own[key].state[key][3]
-        value = np.array(dr.detach(own[key]), dtype=np.float64).ravel()
-        if isinstance(own, dropt.Adam):
-            steps = int(np.array(extra[0]).ravel()[0])
-            mean = np.array(extra[2], dtype=np.float64).ravel() / max(1 - own.beta_2**steps, 1e-300)
-            steepness = (np.sqrt(mean) + own.epsilon) if steps else np.full_like(value, np.inf)
-        elif isinstance(own, Newton):
-            steepness = own.steepness(key)
-        else:
-            steepness = np.full_like(value, 1 - own.momentum)
+        steepness = self._own[key].steepness(key)
         if key not in self._variables:
             return 1 / steepness
         variable, moved = self._variables[key], dr.detach(self._own[key][key])
@@ -414,7 +458,7 @@ class Optimizer:
     @property
     def measures_curvature(self) -> bool:
         """True for `auto`."""
-        return all(isinstance(own, Newton) for own in self._own.values())
+        return self._measures
 
     def rate(self, key: str) -> float:
         """Return the learning rate of a parameter, before any schedule."""
@@ -424,7 +468,7 @@ class Optimizer:
         """Return the root mean square change of the scene's current value in one step at the parameter's learning rate.
         Return None if the step length depends on the gradient.
         """
-        if isinstance(self._own[key], (dropt.SGD, Newton)):
+        if not self._own[key].keeps_length:
             return None
         if key not in self._variables:
             return self._rates[key]
@@ -444,7 +488,8 @@ class Optimizer:
         for key, own in self._own.items():
             kept = {str(place): entry for place, entry in enumerate(_entries(own, key)) if dr.is_array_v(entry)}
             moved = {"variable": dr.detach(own[key])} if key in self._variables else {}
-            found[key] = moved | kept
+            joint = {"block": self.block.rows[self.block.at[key]]} if key in self.block.at else {}
+            found[key] = moved | kept | joint
         return found
 
     def restore(
@@ -463,6 +508,8 @@ class Optimizer:
             value, promoted, rate, extra = own.state[key]
             entries = tuple(kept.get(str(place), entry) for place, entry in enumerate(_entries(own, key)))
             own.state[key] = value, promoted, rate, entries if isinstance(extra, tuple) else entries[0]
+        if self.block.at:
+            self.block.rows = np.concatenate([np.asarray(moments[key]["block"]) for key in self.block.at])
 
 
 def _entries(own: Any, key: str) -> tuple[Any, ...]:

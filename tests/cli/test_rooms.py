@@ -182,12 +182,14 @@ def test_a_dark_room_beside_an_unknown_exposure_is_recovered(tmp_path: Path) -> 
     assert exposure == pytest.approx(0.6, rel=0.03)
 
 
+@pytest.mark.parametrize("sets", [(), ("optimizer={type: auto}",)], ids=["adam", "auto"])
 @pytest.mark.parametrize("name", ROOMS)
-def test_colours_of_rooms_from_blender_are_recovered(tmp_path: Path, name: str) -> None:
+def test_colours_of_rooms_from_blender_are_recovered(tmp_path: Path, name: str, sets: tuple[str, ...]) -> None:
     write_room(tmp_path, ROOMS[name], (160, 100), 1024)
-    errors, exposure = recover(tmp_path, ROOMS[name])
+    errors, exposure = recover(tmp_path, ROOMS[name], *sets)
     off = abs(exposure / ROOMS[name].exposure - 1)
-    print(f"{name}: largest colour error {max(errors.values()):.3f}, exposure {off:.1%} off")
+    iterations = tiny.manifest("runs/room")["results"]["iterations"]
+    print(f"{name}, {iterations} iterations: largest colour error {max(errors.values()):.3f}, exposure {off:.1%} off")
     assert len(errors) >= len(PARTS) - 1
     assert max(errors.values()) < 0.05, errors
     assert exposure == pytest.approx(ROOMS[name].exposure, rel=0.1)

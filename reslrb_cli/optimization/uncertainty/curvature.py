@@ -118,14 +118,17 @@ def separates(problem: Problem, key: str) -> bool:
     return isinstance(problem.optimizer[key], mi.Color3f)
 
 
-def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, most: int) -> list[ParameterChange]:
-    """Return the renderings for the directions of all parameters. Small parameters come first.
+def plan_changes(
+    problem: Problem, scales: Mapping[str, float], share: float, most: int = MOST_VALUES
+) -> list[ParameterChange]:
+    """Return the renderings for the directions of all parameters in `scales`. Small parameters come first.
 
     Steps are `share` of the scale. There are at most `most` renderings. Parameters without a rendering have no
     directions.
     """
-    small = [key for key in problem.selection.keys if problem.selection.array(key).size <= MOST_ENTRIES]
-    textures = [key for key in problem.selection.keys if problem.selection.array(key).ndim == 3]
+    keys = [key for key in problem.selection.keys if key in scales]
+    small = [key for key in keys if problem.selection.array(key).size <= MOST_ENTRIES]
+    textures = [key for key in keys if problem.selection.array(key).ndim == 3]
     changes: list[ParameterChange] = []
     for key in (*small, *(key for key in textures if key not in small)):
         made = _entries(problem, key, scales[key], share) if key in small else _wholes(problem, key, share)
@@ -247,10 +250,10 @@ def _correlation(one: Array, other: Array) -> Array:
 class LossCurvature:
     """Measurement of the curvature at the current values of `problem`. The problem needs its targets.
 
-    There are two sets of samples, each with `spp` samples per pixel.
+    There are two sets of samples, each with `spp` samples per pixel. `of_target` includes the noise of the target.
     """
 
-    def __init__(self, problem: Problem, spp: int) -> None:
+    def __init__(self, problem: Problem, spp: int, of_target: bool = True) -> None:
         self.problem, self.spp = problem, spp
         self.integrator = unrecorded(problem.integrator)
         self._base = [see_images(problem, spp, -1 - half, _PURPOSE) for half in (0, 1)]
@@ -260,7 +263,7 @@ class LossCurvature:
         self._picked = None if values <= MOST_VALUES else np.sort(random.choice(values, MOST_VALUES, replace=False))
         self._thinned = max(values / MOST_VALUES, 1.0)
         #: Samples of the targets' noise by view; empty if no target was rendered.
-        self.noises = self._target_noises()
+        self.noises = self._target_noises() if of_target else []
 
     def along(
         self, changes: Sequence[ParameterChange], go_on: Callable[[], bool]

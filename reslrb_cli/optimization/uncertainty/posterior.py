@@ -195,13 +195,13 @@ def joint(gradients: Array, offsets: Array, scale: Array, curvature: Array, fixe
     therefore well-conditioned.
     """
     units, one = np.outer(scale, scale), np.eye(len(scale))
-    H, B = _positive(curvature * units), _positive(fixed * units)
+    H, B = positive(curvature * units), positive(fixed * units)
     y = gradients * scale - (offsets / scale) @ H
     blocks = np.array([block.mean(axis=0) for block in np.array_split(y, min(BLOCKS, len(y)))])
     V = noise_covariance(blocks.T, blocks.var(axis=0, ddof=1), H) / len(blocks)
     seen = H @ H + V
     gain = np.linalg.solve(seen + one * max(1e-9 * float(np.trace(seen)), 1e-30), H).T
-    to_go, C = gain @ blocks.mean(axis=0), _positive(one - gain @ H)
+    to_go, C = gain @ blocks.mean(axis=0), positive(one - gain @ H)
     pulled = to_go + gain @ H @ (offsets.mean(axis=0) / scale)
     of_target = np.minimum(np.sqrt(np.maximum(np.diag(gain @ B @ gain.T), 0.0)), 1.0)
     alone = 1 / np.sqrt(1 + np.diag(H) ** 2 / np.maximum(np.diag(V), 1e-300))
@@ -256,7 +256,7 @@ def _quantile(freedom: int) -> float:
     return float(stdtrit(freedom, CONFIDENCE))
 
 
-def _positive(matrix: Array) -> Array:
+def positive(matrix: Array) -> Array:
     """Return the nearest symmetric matrix without negative eigenvalues. Noise causes negative eigenvalues."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
