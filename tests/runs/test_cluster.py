@@ -17,7 +17,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
@@ -27,7 +26,6 @@ from runs.hosts import hosts, make_certificates, missing
 from reslrb_cli.cluster.connection import Place, connected
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError, MachineError
-from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import set_targets, target_arrays
