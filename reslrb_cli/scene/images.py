@@ -55,7 +55,7 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
             if photograph is not None and photograph.format != "PNG":
                 photograph.load()  # Mitsuba's reader would fill missing data of a JPEG with grey
                 data = read_file(path)  # zeros in place of missing data have no end of image (FF D9) after a scan
-                if data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+                if data.rfind(b"\xff\xd9") <= data.rfind(b"\xff\xda"):
                     raise ConfigError(path, "", _NO_IMAGE)
             bitmap = mi.Bitmap(str(path))
         except Exception as error:
