@@ -48,6 +48,11 @@ class Glass:
         return float(self.index(F_LINE) - self.index(C_LINE))
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """The differences n_F - n_d of blue light and n_C - n_d of red light."""
+        return float(self.index(F_LINE)) - self.nd, float(self.index(C_LINE)) - self.nd
+
+    @property
     def Vd(self) -> float:
         """Abbe's number V_d."""
         return (self.nd - 1) / self.dispersion
@@ -101,10 +106,9 @@ GLASSES = {
 
 def find_glass(name: str) -> Glass:
     """Return a material of the catalogue. Case does not matter. Raises ValueError with the known names."""
-    known = {each.lower(): glass for each, glass in GLASSES.items()}
+    known = {each.lower(): each for each in GLASSES}
     if name.lower() in known:
-        return known[name.lower()]
+        return GLASSES[known[name.lower()]]
     near = difflib.get_close_matches(name.lower(), known, n=1)
-    meant = next((each for each in GLASSES if near and each.lower() == near[0]), None)
-    hint = f"did you mean {meant}?" if meant else f"known are {', '.join(GLASSES)}"
+    hint = f"did you mean {known[near[0]]}?" if near else f"known are {', '.join(GLASSES)}"
     raise ValueError(f"there is no glass {name!r}; {hint}")

@@ -34,7 +34,7 @@ from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.edges import EdgeSet, has_edges
 from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
-from reslrb_cli.scene.upsampling import is_upsampled, spectra_of
+from reslrb_cli.scene.upsampling import values_of
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
@@ -312,11 +312,9 @@ class Preparation:
             known[these] = AboutParameters(Differentiated.of(params, enabled))
         about = known[these]
         # Kept once needed: otherwise kernels would be recompiled whenever a texel becomes or stops being zero.
-        least = about.which.least.items()
-        values: dict[str, Any] = dict(enabled)
-        if mi.is_spectral:
-            values = {key: spectra_of(value) if is_upsampled(params, key) else value for key, value in values.items()}
-        about.track_zeros |= any(_has_singular(key, values[key], value) for key, value in least)
+        for key, value in about.which.least.items():
+            own = values_of(params, key) if mi.is_spectral else enabled[key]
+            about.track_zeros = about.track_zeros or _has_singular(key, own, value)
         return about
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:

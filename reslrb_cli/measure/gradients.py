@@ -36,7 +36,7 @@ from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import Deformation
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import Selection
-from reslrb_cli.scene.upsampling import Upsampling, is_upsampled
+from reslrb_cli.scene.upsampling import Upsampling
 
 #: Size of a direction that moves an object, relative to the object's size.
 REACH = 0.1
@@ -240,8 +240,7 @@ class Case:
             params = mi.traverse(self.scene)
             values = Selection(params, {}, {}, Deformation(params), Upsampling(params))
             for key in keys:
-                if is_upsampled(params, key):
-                    values.colours.add(key)
+                values.colours.add(key)
         self.values, self.params = values, values.params
         self.keys = list(keys)
         self.initial = {key: np.array(values.value(key), dtype=np.float64).ravel() for key in self.keys}

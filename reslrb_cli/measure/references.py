@@ -26,7 +26,7 @@ from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import PrimaryHits, SceneNeeds, look, scene_needs, stock_clip
-from reslrb_cli.scene.upsampling import is_upsampled, spectra_of
+from reslrb_cli.scene.upsampling import values_of
 
 #: References that trace paths from the sensor.
 CAMERA_PATHS = (Reference.PRB, Reference.PATH)
@@ -297,11 +297,6 @@ def _is_mirrored(shape: mi.Shape) -> bool:
     a, b, c = np.moveaxis(np.array(params["faces"]).reshape(-1, 3), 1, 0)
     across = np.cross(points[b] - points[a], points[c] - points[a])
     return float(np.median(np.sum(across * (normals[a] + normals[b] + normals[c]), axis=1))) < 0
-
-
-def values_of(params: mi.SceneParameters, key: str) -> Any:
-    """Return the value of a parameter. In place of the coefficients of a colour, return values of its spectrum."""
-    return spectra_of(params[key]) if is_upsampled(params, key) else params[key]
 
 
 def _all_zero_somewhere(value: Any) -> bool:

@@ -194,7 +194,7 @@ def assemble_scene(config: Config, scene: Any = None) -> Problem:
         problem.integrator.expect(pass_spp(config))
     problem.apply()
     if config.optimizer.type == "auto" and moves:
-        reason = "auto has no steps for what moves geometry or lamps; use adam, with a learning_rate and a schedule"
+        reason = "auto has no steps for parameters that move light; use adam, with a learning_rate and a schedule"
         raise ConfigError(config.source, "optimizer.type", reason)
     _check_moving(problem)
     return problem

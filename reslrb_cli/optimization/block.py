@@ -9,10 +9,10 @@ gradient is g = H (x - x*) + noise. With the means of the last n gradients and o
 in units in which the diagonal of H is 1. C is diagonal, with the squares of twice the longest steps. V is the
 covariance of the noise of a gradient, so noise limits the steps in directions that the images hardly determine. V has
 the eigenvectors of H, and two variances: one for the half of the eigenvectors with the larger curvature, and one for
-the others, along which noise is smaller as well. They come from consecutive gradients: g - g' - H (x - x') has the
-covariance 2 V. Where the loss is not quadratic, V is larger, and the steps are shorter.
+the others, along which noise is smaller as well. Consecutive gradients give both variances, because
+g - g' - H (x - x') has the covariance 2 V. Where the loss is not quadratic, V is larger, and the steps are shorter.
 
-n rises by 1 if a gradient points against the last step (Kesten 1958), and falls by a quarter otherwise. While the
+n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.
 
 The images hardly change if an exposure E rises and all colours c fall. A step dE, dc is therefore taken in E and E c,
@@ -34,7 +34,7 @@ from reslrb_cli.statistics import Array
 NOISE, MEMORY, SHRINK = 0.3, 0.8, 0.25
 #: Smallest variance of V as a share of the largest.
 LEAST_NOISE = 1e-4
-#: Standard errors to the end of an interval with a confidence of 85 %.
+#: Standard errors from the estimate to a limit that holds with a probability of 85 %.
 SURE = 1.04
 #: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, and
 #: the variances along the smaller and the larger curvatures.

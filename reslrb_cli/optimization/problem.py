@@ -287,7 +287,8 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
             if spec.smoothing is not None
         },
     )
-    # Images with an exposure of their own would fix the colours. Only Adam's steps are long where gradients are small.
+    # Images with an exposure of their own would fix the colours. Steps of `sgd` are short where gradients are small, so
+    # they do not cross the valley.
     is_shared = config.target.exposure == "auto" and all(view.exposure is None for view in config.views or ())
     if is_shared and SHARED in selection.factors and config.optimizer.type != "sgd":
         optimizer.balance(SHARED, [key for key in selection.keys if COLOUR.search(key)])

@@ -5,13 +5,13 @@ Colours are linear sRGB (BT.709 primaries, D65), as in Mitsuba's RGB variants. A
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from reslrb_cli.backend.installation import import_colour
 from reslrb_cli.records.images import load_image
 from reslrb_cli.report.tonemap import encode, shown_exposures
 
@@ -24,12 +24,12 @@ def ciede2000(first: Array, second: Array) -> Array:
     A difference of about 1 is just noticeable side by side, and a difference of about 10 at a glance.
     """
     labs = [to_lab(np.clip(values, 0.0, 1.0)) for values in (first, second)]
-    return np.asarray(_colour().delta_E(*labs, method="CIE 2000"))
+    return np.asarray(import_colour().delta_E(*labs, method="CIE 2000"))
 
 
 def to_lab(values: Array) -> Array:
     """Convert linear sRGB to CIE L*a*b* under D65."""
-    colour = _colour()
+    colour = import_colour()
     space = colour.RGB_COLOURSPACES["sRGB"]
     xyz = values.astype(np.float64) @ space.matrix_RGB_to_XYZ.T
     return np.asarray(colour.XYZ_to_Lab(xyz, space.whitepoint))
@@ -38,16 +38,6 @@ def to_lab(values: Array) -> Array:
 def _mean_and_max(differences: Array) -> dict[str, float]:
     """Return the mean and the maximum of `differences`, which must not be empty."""
     return {"mean": float(np.mean(differences)), "max": float(np.max(differences))}
-
-
-def _colour() -> Any:
-    """Import the package `colour` late, because the import takes a second. Hide its warnings about optional
-    packages.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import colour
-    return colour
 
 
 #: Standard deviation and side length of the SSIM window in pixels, as in Wang et al. 2004.

@@ -19,7 +19,7 @@ import scipy.ndimage
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.glasses import C_LINE, F_LINE, Glass
+from reslrb_cli.glasses import Glass
 from reslrb_cli.lens.solid import Sheet
 from reslrb_cli.records.images import luminance
 from reslrb_cli.report.page.workshop import shown_ssim
@@ -210,7 +210,7 @@ class OpticalBench:
         return found
 
     def landings(self, values: dict[str, Any]) -> tuple[Array, Array]:
-        """Return where refracted rays from the lamps meet the receiver with these parameters, (n, 3), and which do."""
+        """Return points (n, 3) where refracted light meets the receiver with these values, and a mask (n,) of hits."""
         receiver = next(shape for shape in self.scene.shapes() if shape.id() == self.plan.receiver)
         with self._changed(values):
             _, ray, light = _from_lamps(self.scene, RAYS)
@@ -228,7 +228,7 @@ class OpticalBench:
 
     def spread(self, glass: Glass) -> float:
         """Return the mean distance in mm between the places where blue and red light of the same rays land."""
-        lands = [self.landings(self.denser(glass.index(line) - glass.nd)) for line in (F_LINE, C_LINE)]
+        lands = [self.landings(self.denser(by)) for by in glass.ends]
         both = lands[0][1] & lands[1][1]
         return float(np.linalg.norm((lands[0][0] - lands[1][0])[both], axis=1).mean()) if both.any() else 0.0
 
@@ -292,9 +292,9 @@ def tolerances(
     if plan.kind == "lens":
         for sign in (1, -1):
             tell(f"index {sign * INDEX:+g}", bench.image(bench.denser(sign * INDEX), spp))
-        for name, line in (("blue light (486 nm)", F_LINE), ("red light (656 nm)", C_LINE)):
-            if plan.glass is not None:
-                tell(name, bench.image(bench.denser(plan.glass.index(line) - plan.glass.nd), spp))
+        ends = () if plan.glass is None else plan.glass.ends
+        for name, by in zip(("blue light (486 nm)", "red light (656 nm)"), ends, strict=False):
+            tell(name, bench.image(bench.denser(by), spp))
     for what, ids in (("light", bench.lamps), (plan.kind, both)):
         for name, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
             if ids:

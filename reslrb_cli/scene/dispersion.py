@@ -17,14 +17,15 @@ In variants without wavelengths, the index is n_d.
 from __future__ import annotations
 
 import functools
-import warnings
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.backend.installation import import_colour
 from reslrb_cli.glasses import Glass, cauchy_shape, find_glass, index_of
+from reslrb_cli.scene.graph import visible
 
 #: Names of our plugins in scene files.
 GLASS, ILLUMINANT = "dispersivedielectric", "illuminant"
@@ -33,8 +34,6 @@ GLASS_CLASS = "DispersiveDielectric"
 #: Shortest wavelength in nm at which an index is evaluated: idle lanes have none, and Sellmeier's formula has poles
 #: in the ultraviolet.
 _SHORTEST = 300.0
-#: Range in nm and step of an illuminant's spectrum.
-_RANGE, _STEP = (360.0, 830.0), 5.0
 
 
 def register() -> None:
@@ -55,22 +54,20 @@ def make_illuminant(props: mi.Properties) -> mi.Texture:
     The luminance at a scale of 1 equals that of a uniform spectrum of 1. Variants without wavelengths have the colour
     of the illuminant. Raises ValueError for an unknown name.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import colour  # late, because it takes a second
+    colour = import_colour()
     name, scale = props["name"], float(props.get("scale", 1.0))
     known = {each.lower(): spectrum for each, spectrum in colour.SDS_ILLUMINANTS.items()}
     if name.lower() not in known:
         names = ", ".join(each for each in colour.SDS_ILLUMINANTS if not each.startswith("ISO"))
         raise ValueError(f"there is no illuminant {name!r}; known are {names}")
-    wavelengths = np.arange(_RANGE[0], _RANGE[1] + _STEP, _STEP)
+    wavelengths = visible()
     spectrum, observer = known[name.lower()], colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     values = np.interp(wavelengths, spectrum.wavelengths, spectrum.values, left=0, right=0)
     matching = np.stack([np.interp(wavelengths, observer.wavelengths, observer.values[:, i]) for i in range(3)])
     values *= scale * matching[1].sum() / (matching[1] @ values)
     if mi.is_spectral:
         made = mi.Properties("regular")
-        made["wavelength_min"], made["wavelength_max"] = _RANGE
+        made["wavelength_min"], made["wavelength_max"] = float(wavelengths[0]), float(wavelengths[-1])
         made["values"] = ", ".join(f"{value:.9g}" for value in values)
     else:
         xyz = matching @ values / matching[1].sum()
@@ -88,9 +85,10 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
     class DispersiveDielectric(mi.BSDF):
         """Boundary to a glass with dispersion, on the side against the normal. `ext_ior` is the index outside.
 
-        The glass is `material` of the catalogue, or has `nd` and `Vd`, or `sellmeier` coefficients B1 ... C1 ... (C in
-        square micrometres). `nd` and `Vd` may also change a material, which keeps the shape of its dispersion. With
-        `alpha`, the boundary is rough; `distribution` is that of its normals.
+        The glass has the name `material` of the catalogue, or the numbers `nd` and `Vd`, or the coefficients
+        `sellmeier` (B1, ..., C1, ..., with C in square micrometres). `nd` and `Vd` may also replace those of a
+        material. Its shape g of the dispersion stays the same. With `alpha`, the boundary is rough, and its normals
+        have the `distribution`.
         """
 
         def __init__(self, props: mi.Properties) -> None:

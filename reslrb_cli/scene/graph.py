@@ -181,6 +181,11 @@ def emitted_rays(
     return ray, weight
 
 
+def visible(spacing: float = 5.0) -> np.ndarray:
+    """Return evenly spaced visible wavelengths in nm. Mitsuba's colour matching functions have values every 5 nm."""
+    return np.arange(360.0, 830.0 + spacing / 2, spacing)
+
+
 def no_wavelengths() -> mi.Wavelength:
     """Return the wavelengths of light that has none yet: zeros in a spectral variant, otherwise an empty array."""
     return mi.Spectrum(0) if mi.is_spectral else mi.Color0f()

@@ -20,7 +20,7 @@ import numpy as np
 from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings, Thickness
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
-from reslrb_cli.scene.upsampling import Upsampling, is_upsampled
+from reslrb_cli.scene.upsampling import Upsampling
 from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
 
 
@@ -206,9 +206,7 @@ def set_values(
             if key in selection.deformation.keys:
                 raise place.fail("", f"`{key}` depends on {' and '.join(f'`{name}`' for name in names)} here")
             given[key] = pattern
-            unknown = key in selection.params.properties and key not in selection.colours
-            if unknown and is_upsampled(selection.params, key):
-                selection.colours.add(key)
+            selection.colours.add(key)
             slot = selection.slot(key)
             slot.set(initial_array(slot, value, None, place, any_size=key in names))
     # Tied parameters get the value of the first one, unless they have their own.
@@ -251,8 +249,7 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
         chosen |= dict.fromkeys(keys, spec.settings())
     colours = Upsampling(params)
     for key in chosen:
-        if key in params.properties and is_upsampled(params, key):
-            colours.add(key, tied.get(key, ()))
+        colours.add(key, tied.get(key, ()))
     return Selection(params, chosen, tied, deformation, colours), origin
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from reslrb_cli.backend.installation import package_folder
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.scene.deformation import Leaf, collect, push
+from reslrb_cli.scene.graph import visible
 
 Array = np.ndarray[Any, Any]
 
@@ -111,12 +112,12 @@ def _colour(found: mi.Vector3d) -> tuple[mi.Vector3d, list[mi.Vector3d]]:
     """Return the colour of the spectrum with centred coefficients, and its derivatives by them."""
     a, b, c = found
     zero = mi.Vector3d(0)
-    responses = mi.Float64(_responses(mi.variant())[1].ravel())
+    responses, wavelengths = mi.Float64(_responses(mi.variant())[1].ravel()), mi.Float64(visible())
 
     def add(
         number: mi.UInt32, colour: mi.Vector3d, by_a: mi.Vector3d, by_b: mi.Vector3d, by_c: mi.Vector3d
     ) -> tuple[mi.UInt32, mi.Vector3d, mi.Vector3d, mi.Vector3d, mi.Vector3d]:
-        t = (mi.Float64(number) * (470 / 94) + 360 - CENTRE) / WIDTH
+        t = (dr.gather(mi.Float64, wavelengths, number) - CENTRE) / WIDTH
         response = dr.gather(mi.Vector3d, responses, number)
         v = (a * t + b) * t + c
         inverse = dr.rsqrt(dr.square(v) + 1)
@@ -127,7 +128,7 @@ def _colour(found: mi.Vector3d) -> tuple[mi.Vector3d, list[mi.Vector3d]]:
         )  # fmt: skip
 
     state = mi.UInt32(0), mi.Vector3d(zero), mi.Vector3d(zero), mi.Vector3d(zero), mi.Vector3d(zero)
-    _, colour, *columns = dr.while_loop(state, lambda number, *_: number < len(_GRID), add, label="colour")
+    _, colour, *columns = dr.while_loop(state, lambda number, *_: number < len(visible()), add, label="colour")
     return colour, columns
 
 
@@ -152,8 +153,13 @@ def _from_table(rgb: mi.Color3f) -> mi.Color3f:
     return result
 
 
-def spectra_of(value: Any) -> mi.Float:
-    """Return the values at a few visible wavelengths of the spectra with these coefficients, one after the other."""
+def values_of(params: mi.SceneParameters, key: str) -> Any:
+    """Return the value of a parameter. In place of the coefficients of colours, return the values of their spectra at a
+    few visible wavelengths, one after the other.
+    """
+    value = params[key]
+    if not is_upsampled(params, key):
+        return value
     c = dr.detach(value)
     count = value.shape[0] * value.shape[1] if dr.is_tensor_v(value) else 1
     c = dr.gather(mi.Color3f, value.array, dr.arange(mi.UInt32, count)) if dr.is_tensor_v(value) else mi.Color3f(c)
@@ -164,14 +170,10 @@ def spectra_of(value: Any) -> mi.Float:
     return dr.ravel(mi.Vector4f(*found))
 
 
-#: Wavelengths of the sums over the visible range, in nm.
-_GRID = np.linspace(360.0, 830.0, 95)
-
-
 @functools.lru_cache(maxsize=2)
 def _responses(variant: str) -> tuple[Array, Array]:
     """Return D65 (95,), and the responses (95, 3) of linear RGB to reflected D65, which sum to 1 in each channel."""
-    wavelengths = mi.Float(_GRID.astype(np.float32))
+    wavelengths = mi.Float(visible().astype(np.float32))
     d65 = np.array(mi.cie_d65(wavelengths), np.float64)
     responses = np.array(mi.linear_rgb_rec(wavelengths), np.float64).reshape(3, -1).T * d65[:, None]
     return d65, responses / responses.sum(0)
@@ -181,7 +183,7 @@ def colours_of(found: Array) -> Array:
     """Return the linear colours (..., 3) under D65 of the spectra with the coefficients (..., 3)."""
     c = np.asarray(found, np.float64)
     responses, result = _responses(mi.variant())[1], np.zeros(c.shape)
-    for wavelength, weight in zip(_GRID, responses, strict=True):
+    for wavelength, weight in zip(visible(), responses, strict=True):
         v = (c[..., 0] * wavelength + c[..., 1]) * wavelength + c[..., 2]
         with np.errstate(invalid="ignore"):
             S = np.where(np.isinf(c[..., 2]), c[..., 2] > 0, 0.5 + 0.5 * v / np.sqrt(1 + np.square(v)))
@@ -232,7 +234,11 @@ class Upsampling:
         self._found[key].value = value
 
     def add(self, key: str, others: Sequence[str] = ()) -> None:
-        """Recover the colour of `key`. The parameters `others` share it."""
+        """Recover the colour of `key`, unless the parameter is no colour or is recovered already. The parameters
+        `others` share it.
+        """
+        if key in self._found or key not in self.params.properties or not is_upsampled(self.params, key):
+            return
         array, kind = colour_in_scene(self.params, key), type(self.params[key])
         value = kind(array) if dr.is_tensor_v(kind) else kind(*(mi.Float(float(channel)) for channel in array))
         dr.make_opaque(value)

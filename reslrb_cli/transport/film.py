@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.scene.graph import visible
 from reslrb_cli.transport.factors import showing
 
 N_COLOR = 3  # a film's block holds R, G, B, optional alpha, and a weight that light tracing leaves at 0
@@ -247,9 +248,8 @@ def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
 
 # ---- Response to wavelengths ----
 
-#: Range of wavelengths in nm, and the number of steps for a film's own responses. Mitsuba's colour matching functions
-#: have steps of 5 nm.
-VISIBLE, FINE, COARSE = (360.0, 830.0), 940, 94
+#: Distance in nm between wavelengths at which a film's own responses are evaluated.
+FINE = 0.5
 
 
 def responses_of(film: mi.Film) -> mi.Float | None:
@@ -263,7 +263,7 @@ def responses_of(film: mi.Film) -> mi.Float | None:
     channels = int(film.base_channels_count())
     film.prepare([])
     si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wavelengths = mi.Spectrum(_visible(FINE))
+    si.wavelengths = mi.Spectrum(mi.Float(visible(FINE).astype(np.float32)))
     # The film divides each value by the sum of all responses, by which its sensor multiplies radiance.
     total = film.sensor_response_function().eval(si)
     parts = film.prepare_sample(total, si.wavelengths, channels + 1)
@@ -272,12 +272,8 @@ def responses_of(film: mi.Film) -> mi.Float | None:
 
 @functools.lru_cache(maxsize=2)
 def _rgb_responses(variant: str) -> mi.Float:
-    values = np.array(mi.linear_rgb_rec(_visible(COARSE))) * float(mi.MI_CIE_Y_NORMALIZATION)
+    values = np.array(mi.linear_rgb_rec(mi.Float(visible().astype(np.float32)))) * float(mi.MI_CIE_Y_NORMALIZATION)
     return own_memory(mi.Float, np.ravel(values).astype(np.float32))
-
-
-def _visible(steps: int) -> mi.Float:
-    return mi.Float(np.linspace(*VISIBLE, steps + 1, dtype=np.float32))
 
 
 def responses_at(table: mi.Float, channels: int, wavelengths: mi.Wavelength) -> list[mi.Spectrum]:
@@ -285,7 +281,7 @@ def responses_at(table: mi.Float, channels: int, wavelengths: mi.Wavelength) -> 
     `responses_of`.
     """
     count = dr.width(table) // channels
-    low, high = VISIBLE
+    low, high = mi.MI_CIE_MIN, mi.MI_CIE_MAX
     place = (wavelengths - low) * ((count - 1) / (high - low))
     visible = (wavelengths >= low) & (wavelengths <= high)
     result = [mi.Spectrum(0) for _ in range(channels)]

@@ -215,7 +215,7 @@ def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
             load(tmp_path / "tiny.yaml", sets)
         assert where in str(error.value)
     motion = "parameters=[{motion: {of: wall, free: [x]}}]"
-    with pytest.raises(ConfigError, match="auto has no steps for what moves"):
+    with pytest.raises(ConfigError, match="auto has no steps for parameters that move"):
         assemble(load(tmp_path / "tiny.yaml", [AUTO, motion]))
 
 
