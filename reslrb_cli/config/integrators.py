@@ -147,9 +147,9 @@ class Reslrb(AttachingTracer):
     paths find all light and a few steps before the first iteration show that they are more efficient. It is `light` if
     `both` and `camera` cannot render the scene or find none of its light, or if guided light paths are more efficient.
     If shapes move, `both` divides the light: light paths have the light that meets a mirror, glass or metal first, and
-    camera paths have the rest. `auto` is then `camera` if no surface is a mirror, clear glass or metal, and otherwise
-    `light`. Runs that move lamps always use `light`. The default is `auto` with
-    estimator `auto`, and `light` with an estimator that you name."""
+    camera paths have the rest. `auto` is then `camera` if no surface is a mirror, clear glass or metal, `both` if the
+    sensor sees a mirror or clear glass, and otherwise `light`. Runs that move lamps always use `light`. The default is
+    `auto` with estimator `auto`, and `light` with an estimator that you name."""
     light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), Undecided(0.5)] = 0.5
     """Fraction of the samples that are light paths, with `paths: both`. With 0 or 1 the code of the other side is not
     compiled."""
@@ -160,8 +160,8 @@ class Reslrb(AttachingTracer):
     on, this reduces noise where few paths contribute, as in a room lit through windows or in a caustic. A few of the
     first steps, and one in sixteen later steps, trace as many paths again to learn. `auto`: `on` if a few steps with
     and without guiding, before the first iteration, show that it is more efficient. Runs that move geometry or lamps
-    are not guided. The default is `auto` with
-    estimator `auto`, and `off` with an estimator that you name."""
+    are guided only with `paths: both`. The default is `auto` with estimator `auto`, and `off` with an estimator that
+    you name."""
     sequence: Annotated[Literal["auto", "independent", "low_discrepancy"], Undecided("independent")] = "auto"
     """Random numbers that decide where light paths start and how they first scatter. `low_discrepancy`: spread evenly
     over all paths of a step, and independent between steps. This reduces noise where little else decides where light

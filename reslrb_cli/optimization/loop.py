@@ -59,6 +59,18 @@ def learning_rate_factor(
     return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
 
 
+#: The part of a run after which images are no longer blurred.
+BLURRED = 0.5
+
+
+def blur_factor(iteration: int, iterations: int, least: float = 0.0) -> float:
+    """Return the factor on `run.blur` in `iteration` (0-based) of `iterations`. It falls linearly from 1 to 0.
+
+    `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
+    """
+    return max(1.0 - max(iteration / max(iterations - 1, 1), least) / BLURRED, 0.0)
+
+
 def time_share(limit_s: float | None, state: State) -> float:
     """Return the elapsed share of a run's time, or 0 without a limit. The first iteration does not count, because it
     compiles kernels.
@@ -182,6 +194,9 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
             scaling = rescale(problem) if config.optimizer.scale == "auto" else measure_curvatures(problem)
     errors = problem.meter.errors(problem.selection.array)
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
+    elapsed = time_share(problem.limit_s, state)
+    for view in problem.trained:
+        view.blur = config.run.blur * blur_factor(iteration, config.run.iterations, elapsed)
     with clock.step() as times:
         loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)
@@ -194,7 +209,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         iteration,
         config.run.iterations,
         config.optimizer.final_fraction,
-        time_share(problem.limit_s, state),
+        elapsed,
     )
     with clock.counted():
         value = float(loss[0])

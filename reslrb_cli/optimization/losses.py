@@ -21,6 +21,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.fft import dctn, idctn
 
 from reslrb_cli.config.code import guarded, load_named
 from reslrb_cli.config.loader import check_code
@@ -113,6 +114,38 @@ def _windows(image: mi.TensorXf) -> mi.TensorXf:
             total += factor * dr.gather(mi.Float, image.array, start + place * step)
         image = mi.TensorXf(total, tuple(shape))
     return image
+
+
+class _Blur(dr.CustomOp):
+    """Gaussian blur of an image (H, W, C), reflected at its borders. The blur is a symmetric linear operator, and its
+    own adjoint.
+    """
+
+    def eval(self, image: mi.TensorXf, sigma: float) -> mi.TensorXf:
+        self.sigma = sigma
+        return self._blurred(image)
+
+    def _blurred(self, image: mi.TensorXf) -> mi.TensorXf:
+        # A cosine series is even at the borders, and each of its terms decays by itself.
+        decay = [np.exp(-0.5 * np.square(np.pi * self.sigma / size * np.arange(size))) for size in image.shape[:2]]
+        factors = np.multiply.outer(*decay)[:, :, None].astype(np.float32)
+        series = dctn(np.array(image), axes=(0, 1), norm="ortho") * factors
+        return mi.TensorXf(np.ascontiguousarray(idctn(series, axes=(0, 1), norm="ortho")))
+
+    def forward(self) -> None:
+        self.set_grad_out(self._blurred(self.grad_in("image")))
+
+    def backward(self) -> None:
+        self.set_grad_in("image", self._blurred(self.grad_out()))
+
+    def name(self) -> str:
+        return "blur"
+
+
+def blur(image: mi.TensorXf, sigma: float) -> mi.TensorXf:
+    """Return an image (H, W, C) blurred by a Gaussian with a standard deviation of `sigma` pixels, attached."""
+    result: mi.TensorXf = dr.custom(_Blur, image, sigma)
+    return result
 
 
 LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "ssim": ssim}

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
@@ -50,11 +50,12 @@ Engine = Callable[[Problem, Callable[..., Any], Sequence[tuple[Any, ...]]], Iter
 
 
 class Part(NamedTuple):
-    """Samples of one view in a shard: its sensor, the factor of its loss, and the seed."""
+    """Samples of one view in a shard: its sensor, the factor of its loss, the seed, and the blur (`View.blur`)."""
 
     sensor: int
     scale: float
     seed: int
+    blur: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[T
             iteration,
             shard,
             tuple(
-                Part(view.sensor, scale, seed(config.run.seed, iteration, view.sensor, f"image, shard {shard}"))
+                Part(view.sensor, scale, seed(config.run.seed, iteration, view.sensor, name), view.blur)
                 for view, scale in own
             ),
             config.share_spp,
@@ -112,6 +113,7 @@ def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[T
             images or shares > 1,
         )
         for shard, own in enumerate(sets)
+        for name in [f"image, shard {shard}"]
     ]
 
 
@@ -134,7 +136,7 @@ def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> 
         _clear(problem)
         views = {view.sensor: view for view in problem.views}
         for part in task.parts:
-            view = views[part.sensor]
+            view = replace(views[part.sensor], blur=part.blur)
             at = problem.integrator, problem.scene, part.sensor
             own: dict[str, Any] = {"params": problem.selection.params, "on_samples": problem.on_samples(view)}
             if delta is not None:

@@ -30,7 +30,7 @@ from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors
-from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, OwnLoss, l2, make_loss, weighted
+from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, OwnLoss, blur, l2, make_loss, weighted
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.visibility import sees_specular
@@ -144,6 +144,7 @@ class View:
         file and mask in the configuration.
     - `per_channel` is true if the exposure is recovered for each channel.
     - `codes` are the user's losses.
+    - `blur` is the standard deviation in pixels of the blur of this iteration (`run.blur`).
     - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`). `fixed` is None if no such
         mask is used.
     """
@@ -162,6 +163,7 @@ class View:
     mask_key: str = "target.mask"
     masked: Masked = field(default_factory=Masked)
     codes: list[OwnLoss] = field(default_factory=list)
+    blur: float = 0.0
     fixed: Array | None = None
 
     @property
@@ -203,12 +205,20 @@ class View:
         return self.judge(self.exposure.applied(first_channels(image, self.target.shape[2])))
 
     def judge(self, image: mi.TensorXf) -> mi.Float:
-        """Return the loss of an image. The exposure is already applied, and the image has the target's channels."""
+        """Return the loss of an image. The exposure is already applied, and the image has the target's channels.
+
+        With `blur`, the derivative is that of the loss of blurred images.
+        """
         target = self.target
-        if self.weights is None:
-            return self.loss(image, target)
-        # Excluded pixels, even with non-finite values, have neither loss nor derivative.
-        return self.loss(dr.select(self.weights > 0, image, target), target, self.weights)
+        if self.weights is not None:
+            # Excluded pixels, even with non-finite values, have neither loss nor derivative.
+            image = dr.select(self.weights > 0, image, target)
+        given = () if self.weights is None else (self.weights,)
+        loss = self.loss(image, target, *given)
+        if not self.blur or not dr.grad_enabled(image):
+            return loss
+        finite = dr.select(dr.isfinite(image), image, target)  # a blur would spread a NaN to all pixels
+        return dr.replace_grad(dr.detach(loss), self.loss(blur(finite, self.blur), blur(target, self.blur), *given))
 
     def curvature(self, known: bool) -> Array:
         """Return the loss's curvature (H, W) in each pixel, scaled to a mean of 1. If it is not `known`, return that of

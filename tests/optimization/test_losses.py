@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from agreement import compare
 from cli.tiny import KEY, write_experiment
+from optimization.toy import make_problem
+from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 from turns import taking_turns
 
@@ -17,9 +19,11 @@ from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.identifiability import check_exposures, find_ambiguous
-from reslrb_cli.optimization.loop import optimize
-from reslrb_cli.optimization.losses import LOSSES, weighted
+from reslrb_cli.optimization.loop import optimize, step
+from reslrb_cli.optimization.losses import LOSSES, blur, weighted
 from reslrb_cli.optimization.sensitivity import measure_sensitivities, sample_gradient, see_images, take_gradient
+from reslrb_cli.optimization.shards import make_tasks
+from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.views import View, make_loss, make_views, slope, view_records
 
 # Losses: values and gradients, compared with NumPy.
@@ -74,6 +78,69 @@ def test_black_and_negative_pixels_stay_finite(name):
 def test_a_nan_is_not_hidden(name):
     image = mi.TensorXf(np.array([[[np.nan], [1.0]]], dtype=np.float32))
     assert np.isnan(np.array(make_loss(name)(image, mi.TensorXf(np.ones((1, 2, 1), dtype=np.float32)))))
+
+
+# Blurred images (`run.blur`).
+
+
+def blurred(image, sigma):
+    return gaussian_filter(image, (sigma, sigma, 0), mode="reflect", truncate=8)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 3.0])
+def test_a_blur_is_a_reflected_gaussian(sigma):
+    image = images((23, 18, 3))[0]
+    found = np.array(blur(mi.TensorXf(image.astype(np.float32)), sigma))
+    # A cosine series has no frequencies beyond the pixels' own, which are 1 % of a Gaussian of one pixel.
+    np.testing.assert_allclose(found, blurred(image, sigma), atol=1e-2 if sigma == 1 else 1e-5)
+    assert found.sum() == pytest.approx(image.sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_blurred_view_has_the_plain_loss_and_the_derivative_of_blurred_images(masked):
+    image, target = images((23, 18, 3))
+    weights = np.ones((23, 18))
+    weights[:4] = 1 - masked
+    view = View(0, make_loss("l2"), blur=3.0)
+    view.see(target, weights.astype(np.float32))
+    attached = mi.TensorXf(image.astype(np.float32))
+    dr.enable_grad(attached)
+    loss = view.compare(attached)
+    dr.backward(loss)
+    difference, factor = (image - target) * (weights > 0)[..., None], (weights / weights.mean())[..., None]
+    assert float(loss[0]) == pytest.approx((factor * difference**2).mean(), rel=1e-5)
+    expected = blurred(factor * blurred(difference, 3.0), 3.0) * (weights > 0)[..., None] * 2 / image.size
+    np.testing.assert_allclose(np.array(attached.grad), expected, atol=1e-4 * abs(expected).max())
+
+
+def test_a_blur_does_not_spread_a_nan():
+    image, target = images((23, 18, 3))
+    image[11, 9, 1] = np.nan
+    view = View(0, make_loss("l2"), blur=3.0)
+    view.see(target)
+    attached = mi.TensorXf(image.astype(np.float32))
+    dr.enable_grad(attached)
+    loss = view.compare(attached)
+    dr.backward(loss)
+    derivative = np.array(attached.grad)
+    assert np.isnan(loss[0])
+    assert np.isfinite(derivative).all()
+    assert (derivative != 0).sum() == derivative.size - 1
+
+
+def test_the_blur_falls_to_zero_at_half_of_a_run_and_reaches_shards(tmp_path, monkeypatch):
+    problem, seen = make_problem(tmp_path, sets=["run.blur=2", "run.iterations=9", "run.shards=1"]), []
+    monkeypatch.setattr(
+        "reslrb_cli.optimization.loop.gradient",
+        lambda problem, iteration: (
+            seen.append([part.blur for task in make_tasks(problem, iteration) for part in task.parts]),
+            (mi.Float(1), {"albedo": mi.Float(0)}, {"albedo": mi.UInt32(0)}, [], None),
+        )[1],
+    )
+    state = standing(problem)
+    for _ in range(9):
+        state, _ = step(problem, state)
+    assert np.ravel(seen) == pytest.approx([2, 1.5, 1, 0.5, 0, 0, 0, 0, 0])
 
 
 # SSIM, and sums of losses.

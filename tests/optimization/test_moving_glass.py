@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -86,11 +87,39 @@ def test_the_mask_follows_the_glass(llvm: str, tmp_path: Path) -> None:
     assert np.array_equal(left_out(problem), start)
 
 
+#: Starts up to half the ball's size from its place: one random start for each octant.
+RANDOM = np.random.default_rng(5)
+STARTS = [
+    np.array(octant) * np.abs(way) / np.linalg.norm(way) * 0.5 * RANDOM.random() ** (1 / 3)
+    for octant in itertools.product((1, -1), repeat=3)
+    for way in [RANDOM.normal(size=3)]
+]
+
+
 @pytest.mark.long
-def test_a_glass_ball_is_found_in_a_picture(llvm: str, tmp_path: Path) -> None:
-    """The ball ends within 2 % of its size, which is 1. With the mask of the start, the ball ends 0.9 away."""
-    sets = ["run.iterations=300", "run.spp=32", "optimizer.schedule=cosine", "scene.options.size=64"]
-    sets += ["parameters[0].initial=[0.25, 0.3, 0]", "parameters[0].learning_rate=0.02"]
-    problem = make(tmp_path, *sets)
-    list(optimize(find_reached(problem)))
-    assert np.linalg.norm(problem.selection.array(BALL)) < 0.02
+def test_a_glass_ball_is_found_by_its_caustic(llvm: str, tmp_path: Path) -> None:
+    """From at least seven of eight starts, the ball ends within 1 % of its size, which is 1. The target is an image by
+    `path`.
+
+    Without the blur, the ball ends in local minima up to its own size away.
+    """
+    sets = ["run.iterations=120", "run.spp=32", "run.blur=4", "optimizer.schedule=cosine", "scene.options.size=64"]
+    sets += ["target.render.integrator={type: path, max_depth: 6}", "integrator={max_depth: 6}"]
+    distances = []
+    for start in STARTS:
+        first = "[" + ", ".join(f"{value:.4f}" for value in start) + "]"
+        problem = make(tmp_path, *sets, f"parameters[0].initial={first}", "parameters[0].learning_rate=0.02")
+        list(optimize(find_reached(problem)))
+        distances.append(float(np.linalg.norm(problem.selection.array(BALL))))
+        print(first, distances[-1])
+    assert sum(distance < 0.01 for distance in distances) >= 7, distances
+
+
+def test_light_paths_that_only_carry_bundled_light_are_guided(llvm: str, tmp_path: Path) -> None:
+    """A lamp sends few paths to the ball. All other light comes from camera paths."""
+    problem = make(tmp_path, "integrator={max_depth: 6}", "run.measuring=0", "target.render.spp=16")
+    decided = {each.setting: each.value for each in problem.decisions}
+    assert decided["paths"] == "both"
+    assert decided["guiding"] == "on"
+    assert decided["sequence"] == "independent"
+    assert problem.integrator.preparation.guiding is not None

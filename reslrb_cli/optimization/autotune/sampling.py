@@ -18,8 +18,9 @@ ways (`race.py`), with dL/dI fixed at one image.
     then stays fixed. The time of a guided step includes the step's share of the run's learning: one more walk per
     lesson, and the Python code for a new table. Short steps underestimate the table of a run, because the run's table
     has learned from more paths. If light paths find all light, the guided steps use light paths only. With both kinds
-    of paths, the weights ignore guiding and take away most of its benefit. If a parameter moves light, guiding is off
-    (rule), because low-discrepancy numbers help most there.
+    of paths, the weights ignore guiding and take away most of its benefit. If a parameter moves light and all paths are
+    light paths, guiding is off (rule), because low-discrepancy numbers help most there. If a shape moves and there are
+    both kinds, guiding is on (rule), because light paths then have only the light that mirrors and glass bundle.
 - `edges` (measured after all others, by `measure/missing.py`): on if the derivative lacks a significant share without
     them.
 """
@@ -277,7 +278,11 @@ def _guiding(tuner: Tuner) -> None:
     off = Decision(setting="guiding", value="off", why="it pays in long runs")
     independent = {"sequence": "independent"} if is_auto(config, "sequence") else {}
     if independent and problem.moves:
-        tuner.take(replace(off, why="for moving light, low-discrepancy numbers help most"))
+        if problem.integrator.paths == "light":
+            tuner.take(replace(off, why="for moving light, low-discrepancy numbers help most"))
+        else:
+            why = "only light paths that meet mirrors or glass first contribute"
+            tuner.take(_independent(), replace(off, value="on", why=why))
         return
     plan = sizes(problem, GUIDING_LONGER)
 
