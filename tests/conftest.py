@@ -78,6 +78,9 @@ def pytest_configure(config: pytest.Config) -> None:
         # tests start would inherit this, but some of these runs must be interrupted.
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    # Otherwise every process that tests start would compile the package anew, which takes half a second.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
     if is_quick(config) and leave_out_optimisations():
         show_fatal_errors(os.dup(2))  # before pytest captures it
 
