@@ -103,7 +103,7 @@ class Case:
         found = [np.concatenate([*moving.gradient(tracer, seed, 64).values()]) for seed in seeds(8)]
 
         def difference(seed: int, name: str) -> float:
-            ends = [moving.value(path, seed, 512, **{name: step}) for step in (STEP, -STEP)]
+            ends = [moving.value(path, seed, 256, **{name: step}) for step in (STEP, -STEP)]
             return (ends[0] - ends[1]) / (2 * STEP)
 
         differences = np.array([[difference(seed, name) for name in MOTION] for seed in seeds(8, 1)])
