@@ -83,10 +83,9 @@ def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, targ
     the lens, do not count. If no light leaves the lens, all shares are 0.
     """
     rows, columns = picture_within(target)
-    si, light, left = _ends(scene, plan, SHARE_RAYS)
-    receiver = next(shape for shape in scene.shapes() if shape.id() == plan.receiver)
+    si, light, left, met = _ends(scene, plan, SHARE_RAYS)
     ds, importance = sensor.sample_direction(si, mi.Point2f(0.5), left)
-    on_film = left & (si.shape == mi.ShapePtr(receiver)) & (dr.max(importance) > 0)
+    on_film = left & met & (dr.max(importance) > 0)
     inside = on_film & (ds.uv.x >= columns.start) & (ds.uv.x < columns.stop)
     inside &= (ds.uv.y >= rows.start) & (ds.uv.y < rows.stop)
     parts = {"inside": inside, "beside": on_film & ~inside, "beyond": left & ~on_film}
@@ -97,9 +96,9 @@ def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, targ
 
 def _ends(
     scene: mi.Scene, plan: Fabrication, count: int, refracted: bool = False
-) -> tuple[mi.SurfaceInteraction3f, mi.Float, mi.Bool]:
+) -> tuple[mi.SurfaceInteraction3f, mi.Float, mi.Bool, mi.Bool]:
     """Trace `count` rays from the lamps to the first surface beyond the solid. Return this surface, the light of each
-    ray, and the rays that left the solid by its front face.
+    ray, the rays that left the solid by its front face, and the rays that met the receiver.
 
     The surface is invalid if the ray leaves the scene. With `refracted`, no ray is reflected in the glass.
     """
@@ -124,7 +123,7 @@ def _ends(
         dr.eval(ray, light, active, left, end)
         if not dr.any(active):
             break
-    return end, light, left & ~active
+    return end, light, left & ~active, end.shape == mi.ShapePtr(shapes[plan.receiver])
 
 
 def _from_lamps(scene: mi.Scene, count: int) -> tuple[mi.Sampler, mi.Ray3f, mi.Float]:
@@ -222,11 +221,9 @@ class OpticalBench:
 
     def landings(self, values: dict[str, Any]) -> tuple[Array, Array]:
         """Return points (n, 3) where refracted light meets the receiver with these values, and a mask (n,) of hits."""
-        receiver = next(shape for shape in self.scene.shapes() if shape.id() == self.plan.receiver)
         with self._changed(values):
-            si, light, left = _ends(self.scene, self.plan, RAYS, refracted=True)
-            met = left & (light > 0) & (si.shape == mi.ShapePtr(receiver))
-        return np.array(si.p, dtype=float).reshape(3, -1).T, np.array(met)
+            si, light, left, met = _ends(self.scene, self.plan, RAYS, refracted=True)
+            return np.array(si.p, dtype=float).reshape(3, -1).T, np.array(left & met & (light > 0))
 
     def spread(self, glass: Glass) -> float:
         """Return the mean distance in mm between the places where blue and red light of the same rays land."""
