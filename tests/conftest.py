@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from compilation import combine, compute_alone, leave_out_optimisations, show_fatal_errors
-from kit import work_in
+from kit import with_wavelengths, work_in
 from report.chromium import Chromium, find_chromium
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
@@ -78,6 +78,9 @@ def pytest_configure(config: pytest.Config) -> None:
         # tests start would inherit this, but some of these runs must be interrupted.
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    # Otherwise every process that tests start would compile the package anew, which takes half a second.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
     if is_quick(config) and leave_out_optimisations():
         show_fatal_errors(os.dup(2))  # before pytest captures it
 
@@ -102,6 +105,19 @@ def llvm(pytestconfig: pytest.Config) -> str:
     if variant.startswith("llvm") and is_quick(pytestconfig):
         compute_alone()
     return variant
+
+
+@pytest.fixture
+def spectral(llvm: str) -> Iterator[None]:
+    """The spectral variant of the tests' backend, with the plugins."""
+    import mitsuba as mi
+
+    from reslrb_cli.integrators.plugin import register
+
+    mi.set_variant(with_wavelengths(llvm))
+    register()
+    yield
+    mi.set_variant(llvm)
 
 
 @pytest.fixture

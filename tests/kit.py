@@ -7,6 +7,11 @@ from pathlib import Path
 import pytest
 
 
+def with_wavelengths(variant: str) -> str:
+    """Return the spectral variant of the same backend."""
+    return f"{variant.rpartition('_')[0]}_spectral"
+
+
 def work_in(folder: Path, patch: pytest.MonkeyPatch) -> None:
     """Make `folder` the working directory, with a cache of its own."""
     patch.chdir(folder)

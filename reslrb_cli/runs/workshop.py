@@ -83,37 +83,47 @@ def where_light_goes(scene: mi.Scene, sensor: mi.Sensor, plan: Fabrication, targ
     the lens, do not count. If no light leaves the lens, all shares are 0.
     """
     rows, columns = picture_within(target)
+    si, light, left, met = _ends(scene, plan, SHARE_RAYS)
+    ds, importance = sensor.sample_direction(si, mi.Point2f(0.5), left)
+    on_film = left & met & (dr.max(importance) > 0)
+    inside = on_film & (ds.uv.x >= columns.start) & (ds.uv.x < columns.stop)
+    inside &= (ds.uv.y >= rows.start) & (ds.uv.y < rows.stop)
+    parts = {"inside": inside, "beside": on_film & ~inside, "beyond": left & ~on_film}
+    totals = {name: float(dr.sum(dr.select(part, light, 0))[0]) for name, part in parts.items()}
+    whole = sum(totals.values())
+    return {name: total / max(whole, 1e-30) for name, total in totals.items()}
+
+
+def _ends(
+    scene: mi.Scene, plan: Fabrication, count: int, refracted: bool = False
+) -> tuple[mi.SurfaceInteraction3f, mi.Float, mi.Bool, mi.Bool]:
+    """Trace `count` rays from the lamps to the first surface beyond the solid. Return this surface, the light of each
+    ray, the rays that left the solid by its front face, and the rays that met the receiver.
+
+    The surface is invalid if the ray leaves the scene. With `refracted`, no ray is reflected in the glass.
+    """
     shapes = {shape.id(): shape for shape in scene.shapes()}
-    front, receiver = mi.ShapePtr(shapes[plan.face]), mi.ShapePtr(shapes[plan.receiver])
-    solid = [shape for name, shape in shapes.items() if name in (plan.face, "back")]
-    sampler, ray, light = _from_lamps(scene, SHARE_RAYS)
-    context = mi.BSDFContext(mi.TransportMode.Importance)
-    left, active = dr.zeros(mi.Bool, SHARE_RAYS), light > 0
-    dr.make_opaque(ray, light, left, active)  # so that each rotation launches one kernel
-    totals = dict.fromkeys(("inside", "beside", "beyond"), 0.0)
+    solid = [shapes[name] for name in (plan.face, "back") if name in shapes]
+    sampler, ray, light = _from_lamps(scene, count)
+    context, end = mi.BSDFContext(mi.TransportMode.Importance), dr.zeros(mi.SurfaceInteraction3f, count)
+    left, active = dr.zeros(mi.Bool, count), light > 0
+    dr.make_opaque(ray, light, left, active)  # so that each bounce launches one kernel
     for _ in range(BOUNCES):
         si = scene.ray_intersect(ray, active)
         again = active & si.is_valid() & _is_any(si.shape, solid)
-        ended = active & left & ~again
-        ds, importance = sensor.sample_direction(si, mi.Point2f(0.5), ended)
-        on_film = ended & (si.shape == receiver) & (dr.max(importance) > 0)
-        inside = on_film & (ds.uv.x >= columns.start) & (ds.uv.x < columns.stop)
-        inside &= (ds.uv.y >= rows.start) & (ds.uv.y < rows.stop)
-        parts = {"inside": inside, "beside": on_film & ~inside, "beyond": ended & ~on_film}
-        sums = {name: dr.sum(dr.select(part, light, 0)) for name, part in parts.items()}
-        bs, factor = si.bsdf(ray).sample(context, si, sampler.next_1d(again), sampler.next_2d(again), again)
+        end = dr.select(active & ~again, si, end)
+        # The largest number below 1 chooses refraction.
+        lobe = mi.Float(1 - 2**-24) if refracted else sampler.next_1d(again)
+        bs, factor = si.bsdf(ray).sample(context, si, lobe, sampler.next_2d(again), again)
         towards = si.to_world(bs.wo)
-        ray = si.spawn_ray(towards)
-        light = dr.select(again, light * (mi.luminance(factor) if mi.is_rgb else dr.mean(factor)), 0)
-        active = again & (light > 0)
-        left = active & (si.shape == front) & (dr.dot(towards, si.n) * dr.sign(si.n.z) > 0)
-        dr.eval(ray, light, active, left, sums)
-        for name, part in sums.items():
-            totals[name] += float(part[0])
+        ray = dr.select(again, si.spawn_ray(towards), ray)
+        light = dr.select(again, light * (mi.luminance(factor) if mi.is_rgb else dr.mean(factor)), light)
+        outward = (si.shape == mi.ShapePtr(shapes[plan.face])) & (dr.dot(towards, si.n) * dr.sign(si.n.z) > 0)
+        left, active = dr.select(again, outward, left), again & (light > 0)
+        dr.eval(ray, light, active, left, end)
         if not dr.any(active):
             break
-    whole = sum(totals.values())
-    return {name: total / max(whole, 1e-30) for name, total in totals.items()}
+    return end, light, left & ~active, end.shape == mi.ShapePtr(shapes[plan.receiver])
 
 
 def _from_lamps(scene: mi.Scene, count: int) -> tuple[mi.Sampler, mi.Ray3f, mi.Float]:
@@ -211,20 +221,9 @@ class OpticalBench:
 
     def landings(self, values: dict[str, Any]) -> tuple[Array, Array]:
         """Return points (n, 3) where refracted light meets the receiver with these values, and a mask (n,) of hits."""
-        receiver = next(shape for shape in self.scene.shapes() if shape.id() == self.plan.receiver)
         with self._changed(values):
-            _, ray, light = _from_lamps(self.scene, RAYS)
-            active, met, place = light > 0, dr.zeros(mi.Bool, RAYS), dr.zeros(mi.Point3f, RAYS)
-            for _ in range(BOUNCES):
-                si = self.scene.ray_intersect(ray, active)
-                active = active & si.is_valid()
-                here = active & (si.shape == mi.ShapePtr(receiver))
-                met, place = met | here, dr.select(here, si.p, place)
-                # The largest number below 1 chooses refraction.
-                bs, factor = si.bsdf(ray).sample(mi.BSDFContext(), si, 1 - 2**-24, mi.Point2f(0.5), active)
-                ray, active = si.spawn_ray(si.to_world(bs.wo)), active & ~here & dr.any(factor != 0)
-                dr.eval(ray, active, met, place)
-        return np.array(place, dtype=float).reshape(3, -1).T, np.array(met)
+            si, light, left, met = _ends(self.scene, self.plan, RAYS, refracted=True)
+            return np.array(si.p, dtype=float).reshape(3, -1).T, np.array(left & met & (light > 0))
 
     def spread(self, glass: Glass) -> float:
         """Return the mean distance in mm between the places where blue and red light of the same rays land."""

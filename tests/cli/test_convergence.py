@@ -23,8 +23,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_scene_end_to_end(folder: Path) -> None:
-    """The bias of each method stays below its limit, and the error of averages falls at the expected rate."""
-    names = ["reslrb:reservoir(capacity=2)"]
+    """The bias of each method stays below its limit, and the error of averages falls at the expected rate. `ptracer` is
+    also the independent reference, so three processes are enough.
+    """
+    names = ["ptracer"]
     args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16",
             "--reference", "reslrb:stack"]  # fmt: skip
     (folder / "out").mkdir()
@@ -32,7 +34,6 @@ def test_a_scene_end_to_end(folder: Path) -> None:
     lines = measured(folder / "out/c.jsonl")
     methods = [line for line in lines if line["kind"] == "method"]
     assert [(line["label"], line["parameter"]) for line in methods] == [(n, KEY) for n in names]
-    assert [line["capacity"] for line in methods] == [2]
     for line in methods:
         assert (line["status"], line["spp"], line["adjoint"], line["biased"]) == ("ok", 16, None, False)
         assert abs(line["bias_z"]) < line["bias_z_limit"]

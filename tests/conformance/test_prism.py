@@ -4,7 +4,6 @@ glass.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import drjit as dr
@@ -14,7 +13,6 @@ import pytest
 from cli.tiny import done
 from conformance.prism import FILM, image, index, picture
 
-from reslrb_cli.integrators.plugin import register
 from reslrb_cli.measure.gradients import smooth_weights
 from reslrb_cli.records.images import write_file
 from reslrb_cli.records.manifest import read_manifest
@@ -28,12 +26,9 @@ STEPS = {"glass.nd": 1e-4, "glass.Vd": 0.1}
 
 
 @pytest.fixture
-def prism(llvm: str) -> Iterator[mi.Scene]:
+def prism(spectral: None) -> mi.Scene:
     """The shipped scene in the spectral variant."""
-    mi.set_variant(f"{llvm.rpartition('_')[0]}_spectral")
-    register()
-    yield load_scene(ROOT / "scenes" / "prism" / "scene.xml")
-    mi.set_variant(llvm)
+    return load_scene(ROOT / "scenes" / "prism" / "scene.xml")
 
 
 def differences() -> dict[str, np.ndarray]:

@@ -1,24 +1,32 @@
-"""The spectral variant, in a process of its own: its own tests (`spectral.py`), and a part of the conformance tests."""
+"""The spectral variant: its own tests (`spectral.py`), and a part of the conformance tests.
+
+The default suite changes the variant of its process. `-m long` has a process for each file.
+"""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from conformance import spectral as own
+from conformance import test_gradients
+from conformance.gradient_cases import CASES
 
 ROOT = Path(__file__).resolve().parents[2]
 OWN = "tests/conformance/spectral.py"
-QUICK = [
-    f"{OWN}::test_coefficients_have_their_colour",
-    f"{OWN}::test_coefficients_have_derivatives",
-    f"{OWN}::test_the_furnace_has_its_colour[both-regular]",
-    f"{OWN}::test_the_furnace_has_its_derivatives[light-stack-regular]",
-    f"{OWN}::test_the_furnace_has_its_derivatives[light-reservoir-irregular]",
-    "tests/conformance/test_gradients.py::test_exact_estimators_equal_naive_ad[roulette-correlated]",
-]
+ROULETTE = next(case for case in CASES if case.name == "roulette")
+QUICK: dict[str, Callable[[], None]] = {
+    "colours": own.test_coefficients_have_their_colour,
+    "derivatives of colours": own.test_coefficients_have_derivatives,
+    "furnace": lambda: own.test_the_furnace_has_its_colour("both", "regular"),
+    "derivatives by stack": lambda: own.test_the_furnace_has_its_derivatives("light", "stack", "regular"),
+    "derivatives by reservoir": lambda: own.test_the_furnace_has_its_derivatives("light", "reservoir", "irregular"),
+    "naive AD": lambda: test_gradients.test_exact_estimators_equal_naive_ad(ROULETTE, "correlated"),
+}
 #: Files whose default tests do not assume that a path's values are the channels of the film.
 FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "guiding", "image_paths", "kernels",
          "memory", "moving_emitters", "sequences", "small_lamps"]  # fmt: skip
@@ -32,8 +40,9 @@ def run(*arguments: str) -> None:
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
 
 
-def test_the_spectral_variant() -> None:
-    run(*QUICK)
+@pytest.mark.parametrize("check", QUICK)
+def test_the_spectral_variant(check: str, spectral: None) -> None:
+    QUICK[check]()
 
 
 @pytest.mark.long

@@ -103,6 +103,11 @@ def test_an_ended_independent_reference_is_replaced(tmp_path: Path) -> None:
     assert of(results, "reslrb:event").bias_reference == "reslrb:stack"
 
 
+def test_records_have_the_options_of_their_method(tmp_path: Path) -> None:
+    session, _, _ = play(tmp_path, Stage(), plan("reslrb:reservoir(capacity=2)", rounds=4))
+    assert [(m.method.estimator, m.method.capacity) for m in session.of(Role.CASE)] == [("reservoir", 2)]
+
+
 @pytest.mark.parametrize("default", [True, False])
 def test_only_unnamed_methods_are_left_out(tmp_path: Path, default: bool) -> None:
     stage = Stage({"without": {"ptracer": "it emits wrongly"}})

@@ -135,7 +135,7 @@ def test_offsets_are_as_wide_as_stated(target):
     """Over many runs, the estimated distance is right on average, and its errors are as large as stated. The values
     move during the run. Noise of the target, which all gradients of a run share, is a part of the spread.
     """
-    random, runs, count, z, found = np.random.default_rng(3), 2000, 60, [], []
+    random, runs, count, z, found = np.random.default_rng(3), 1000, 60, [], []
     B = target**2 * np.diag(SD**2)
     for _ in range(runs):
         final = random.normal(size=3) * SCALE
@@ -423,7 +423,7 @@ def test_a_fall_within_a_few_iterations_is_found(iterations, decay):
     assert found[Change.FLAT] + found[Change.ROSE] < 0.01
 
 
-@pytest.mark.parametrize("iterations", [50, 200])
+@pytest.mark.parametrize("iterations", a_few([50, 200], ["50"]))
 def test_fireflies_do_not_hide_a_fall(iterations):
     found = shares_of_verdicts(fireflies(lambda i: 1 + 5 * np.exp(-8 * i / len(i))), iterations)
     assert found[Change.FELL] > 0.8
@@ -437,7 +437,7 @@ def test_a_firefly_near_the_end_does_not_hide_a_fall():
     assert find_trend(values).change is Change.FELL
 
 
-@pytest.mark.parametrize("iterations", a_few([50, 200, 1000], ["50", "200"]))
+@pytest.mark.parametrize("iterations", a_few([50, 200, 1000], ["50"]))
 def test_fireflies_do_not_count_as_a_rise(iterations):
     assert shares_of_verdicts(fireflies(lambda i: np.ones(len(i))), iterations)[Change.ROSE] < 0.04
 

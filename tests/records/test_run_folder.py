@@ -168,7 +168,7 @@ for number in range(count):
 """
 
 
-@pytest.mark.parametrize(("count", "each"), [(3, 4), pytest.param(8, 40, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("count", "each"), [(2, 6), pytest.param(8, 40, marks=pytest.mark.long)])
 def test_concurrent_runs_have_folders_of_their_own(tmp_path, count, each):
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     command = [sys.executable, "-c", CONTEND, str(tmp_path), str(each)]

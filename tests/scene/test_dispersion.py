@@ -4,13 +4,13 @@ plugins against Mitsuba's dielectrics at each wavelength.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from kit import with_wavelengths
 
 from reslrb_cli.glasses import C_LINE, D_LINE, F_LINE, GLASSES, find_glass
 from reslrb_cli.scene.dispersion import register
@@ -29,20 +29,6 @@ SHEETS = {
 OTHERS = {"PMMA": 1.491, "polycarbonate": 1.585, "water": 1.3334, "diamond": 2.4175}
 #: The angle of incidence in the scene of the prism, and the angle between its faces, in degrees.
 INCIDENCE, APEX = 54.0, 60.0
-
-
-def with_wavelengths(variant: str) -> str:
-    """Return the spectral variant of the same backend."""
-    return f"{variant.rpartition('_')[0]}_spectral"
-
-
-@pytest.fixture
-def spectral(llvm: str) -> Iterator[None]:
-    """The spectral variant with the plugins."""
-    mi.set_variant(with_wavelengths(llvm))
-    register()
-    yield
-    mi.set_variant(llvm)
 
 
 def test_the_catalogue_has_the_indices_of_data_sheets() -> None:
