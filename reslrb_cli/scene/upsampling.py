@@ -78,7 +78,10 @@ def coefficients(rgb: mi.Color3f) -> mi.Color3f:
     is_finite = dr.all(dr.isfinite(rgb))
     with dr.suspend_grad():
         goal = dr.select(is_finite, dr.clip(dr.detach(rgb), DARKEST, 1 - DARKEST), 0.5)
-        found = _centred(_from_table(goal))
+        # -c is the spectrum 1 - S. The table is precise at dark colours, but not near white.
+        is_bright = dr.min(goal) + dr.max(goal) > 1
+        start = _from_table(dr.select(is_bright, 1 - goal, goal))
+        found = _centred(dr.select(is_bright, -start, start))
         colour, columns = _colour(found)
         for _ in range(NEWTON_STEPS):
             tried = found + _solved(columns, mi.Vector3d(goal) - colour)
