@@ -164,6 +164,7 @@ def values_of(params: mi.SceneParameters, key: str) -> Any:
     if not is_upsampled(params, key):
         return value
     c = dr.detach(value)
+    dr.eval()  # scheduled variables, which would change this kernel in the first step
     count = value.shape[0] * value.shape[1] if dr.is_tensor_v(value) else 1
     c = dr.gather(mi.Color3f, value.array, dr.arange(mi.UInt32, count)) if dr.is_tensor_v(value) else mi.Color3f(c)
     found = []
@@ -281,6 +282,33 @@ class Upsampling:
     def collect(self) -> None:
         """Propagate the gradients at the scene's spectra to the colours."""
         collect(self._leaves())
+
+    def cancellation(self) -> dict[str, float]:
+        """Return the condition number of each colour's gradient: the norm of the sums of its terms' magnitudes, divided
+        by the norm of the sums. A term belongs to one coefficient of one texel.
+
+        The scene's spectra have gradients, and the colours have none yet. Without a gradient, the number is 1.
+        """
+        result = {}
+        for key, found in self._found.items():
+            total, magnitude = 0.0, 0.0
+            for leaf in found.leaves.values():
+                gradient = dr.grad(leaf.leaf)
+                flat = gradient.array if dr.is_tensor_v(gradient) else dr.ravel(gradient)
+                parts = 1 if isinstance(gradient, mi.Float) else 3
+                for part in range(parts):
+                    own = dr.select(dr.arange(mi.UInt32, dr.width(flat)) % parts == part, flat, 0)
+                    kind = type(leaf.tracked)
+                    whole = kind(own, gradient.shape) if dr.is_tensor_v(kind) else dr.unravel(kind, own)
+                    dr.set_grad(leaf.tracked, whole)
+                    dr.enqueue(dr.ADMode.Backward, leaf.tracked)
+                    dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)
+                    term = np.array(dr.grad(found.value), np.float64)
+                    dr.clear_grad(found.value)
+                    total, magnitude = total + term, magnitude + np.abs(term)
+            size = np.linalg.norm(total)
+            result[key] = float(np.linalg.norm(magnitude) / size) if size > 0 else 1.0
+        return result
 
     def push(self) -> None:
         """Propagate tangents of the colours to the scene's spectra."""

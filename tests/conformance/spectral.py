@@ -132,6 +132,32 @@ def test_coefficients_have_derivatives() -> None:
         np.testing.assert_allclose((value(change) - value(-change)) / 4e-3, gradient[channel], rtol=0.01, atol=0.005)
 
 
+def test_the_condition_of_gradients_by_colours() -> None:
+    """The condition number is that of the product of the Jacobian matrix and the spectrum's gradient. The gradient is
+    collected as before.
+    """
+    key = "wall.bsdf.reflectance.value"
+    scene = furnace()
+    scene["wall"]["bsdf"]["reflectance"] = rgb(0.3, 0.8, 0.1)
+    case = Case(scene, [key])
+    leaves = case.leaves()
+    [found] = case.values.colours._found.values()
+    gradient = np.array([3.5e5, 590.0, 1.0])
+    dr.set_grad(found.leaves[key].leaf, mi.Color3f(*gradient.tolist()))
+    jacobian = []
+    for part in range(3):
+        colour = mi.Color3f(leaves[key])
+        dr.enable_grad(colour)
+        dr.backward(coefficients(colour)[part])
+        jacobian.append(np.array(dr.grad(colour)).ravel())
+    terms = np.array(jacobian) * gradient[:, None]
+    expected = np.linalg.norm(np.abs(terms).sum(0)) / np.linalg.norm(terms.sum(0))
+    assert expected > 1.5
+    assert case.values.colours.cancellation() == {key: pytest.approx(expected, rel=1e-3)}
+    case.values.collect()
+    np.testing.assert_allclose(np.ravel(dr.grad(leaves[key])), terms.sum(0), rtol=1e-3)
+
+
 SPECFILM = {
     "type": "specfilm", "width": 8, "height": 6, "rfilter": {"type": "gaussian"},
     "blue": {"type": "regular", "wavelength_min": 400.0, "wavelength_max": 500.0, "values": "0, 1, 0"},

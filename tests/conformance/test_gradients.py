@@ -29,7 +29,7 @@ from turns import a_few, taking_turns
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
-from reslrb_cli.measure.gradients import Case, integrator, relative, rounding, seeds
+from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room, texture, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -65,7 +65,7 @@ def test_exact_estimators_equal_naive_ad(case: GradientCase, adjoint: str):
         ours = scene.gradient(estimator(case, name, options), 5, case.spp, adjoint=adjoint)
         error = relative(ours, reference)
         print(case.name, adjoint, name, f"{error:.1e}")
-        assert error < rounding(), f"{name}, {adjoint}: {error:.1e}"
+        assert error < scene.rounding(), f"{name}, {adjoint}: {error:.1e}"
 
 
 def agree(case: GradientCase, count: int, candidates: dict[str, dict], adjoint: str) -> None:
