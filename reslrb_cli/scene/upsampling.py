@@ -51,6 +51,10 @@ def is_upsampled(params: mi.SceneParameters, key: str) -> bool:
     return params[key].shape[2] == 3 and not re.search(r"^ *raw = 1,$", str(node), re.MULTILINE)
 
 
+def _flat(value: Any) -> mi.Float:
+    return value.array if dr.is_tensor_v(value) else dr.ravel(value)
+
+
 def emitted(key: str) -> str:
     """Return the key of the spectrum of D65 that belongs to the colour `key` of an emitter."""
     return f"{key.removesuffix('.value')}.d65.values"
@@ -291,20 +295,18 @@ class Upsampling:
         """
         result = {}
         for key, found in self._found.items():
-            total, magnitude = 0.0, 0.0
-            for leaf in found.leaves.values():
-                gradient = dr.grad(leaf.leaf)
-                flat = gradient.array if dr.is_tensor_v(gradient) else dr.ravel(gradient)
-                parts = 1 if isinstance(gradient, mi.Float) else 3
+            total, magnitude = np.zeros(1), np.zeros(1)
+            for own, name in ((own, name) for own in found.keys for name in (own, emitted(own))):
+                if name not in found.leaves:
+                    continue
+                gradient = _flat(dr.grad(found.leaves[name].leaf))
+                parts = 3 if name == own else 1  # coefficients, or the values of D65 times a scale
                 for part in range(parts):
-                    own = dr.select(dr.arange(mi.UInt32, dr.width(flat)) % parts == part, flat, 0)
-                    kind = type(leaf.tracked)
-                    whole = kind(own, gradient.shape) if dr.is_tensor_v(kind) else dr.unravel(kind, own)
-                    dr.set_grad(leaf.tracked, whole)
-                    dr.enqueue(dr.ADMode.Backward, leaf.tracked)
-                    dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)
-                    term = np.array(dr.grad(found.value), np.float64)
-                    dr.clear_grad(found.value)
+                    here = dr.select(dr.arange(mi.UInt32, dr.width(gradient)) % parts == part, gradient, 0)
+                    colour = type(found.value)(dr.detach(found.value))
+                    dr.enable_grad(colour)
+                    dr.backward(_flat(self._spectra(own, colour)[name]) * here)
+                    term = np.array(dr.grad(colour), np.float64)
                     total, magnitude = total + term, magnitude + np.abs(term)
             size = np.linalg.norm(total)
             result[key] = float(np.linalg.norm(magnitude) / size) if size > 0 else 1.0

@@ -14,6 +14,7 @@ OWN = "tests/conformance/spectral.py"
 QUICK = [
     f"{OWN}::test_coefficients_have_their_colour",
     f"{OWN}::test_coefficients_have_derivatives",
+    f"{OWN}::test_the_condition_of_gradients_by_colours",
     f"{OWN}::test_the_furnace_has_its_colour[both-regular]",
     f"{OWN}::test_the_furnace_has_its_derivatives[light-stack-regular]",
     f"{OWN}::test_the_furnace_has_its_derivatives[light-reservoir-irregular]",
