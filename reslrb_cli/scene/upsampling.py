@@ -294,9 +294,9 @@ class Upsampling:
         The scene's spectra have gradients, and the colours have none yet. Without a gradient, the number is 1.
         """
         result = {}
-        for key, found in self._found.items():
+        for colour_key, found in self._found.items():
             total, magnitude = np.zeros(1), np.zeros(1)
-            for own, name in ((own, name) for own in found.keys for name in (own, emitted(own))):
+            for own, name in ((key, name) for key in found.keys for name in (key, emitted(key))):
                 if name not in found.leaves:
                     continue
                 gradient = _flat(dr.grad(found.leaves[name].leaf))
@@ -309,7 +309,7 @@ class Upsampling:
                     term = np.array(dr.grad(colour), np.float64)
                     total, magnitude = total + term, magnitude + np.abs(term)
             size = np.linalg.norm(total)
-            result[key] = float(np.linalg.norm(magnitude) / size) if size > 0 else 1.0
+            result[colour_key] = float(np.linalg.norm(magnitude) / size) if size > 0 else 1.0
         return result
 
     def push(self) -> None:

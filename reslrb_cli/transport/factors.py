@@ -47,7 +47,7 @@ DIM = 0.1  # minimum value of a factor in a magnitude, as a fraction of its stan
 
 
 def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
-    """Return `value` with positive infinity in place of NaN and infinities, so that images and gradients show the fault.
+    """Return `value` with positive infinity in place of NaN and infinities. Images and gradients then show the fault.
 
     In Dr.Jit 1.5, `x != 0` is false for NaN. On a CPU, atomic sums ignore a NaN unless it shares its address with other
     numbers of the same packet. Infinities of both signs would become NaN in a sum over channels or wavelengths.

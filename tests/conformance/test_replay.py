@@ -20,7 +20,7 @@ from reslrb_cli.estimators.reservoir import ReservoirSelection
 from reslrb_cli.integrators.protocol import Job, first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, load, rgb, room, texture, transform
+from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, rgb, room, texture, transform
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import Hooks
 
