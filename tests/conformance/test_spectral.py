@@ -23,7 +23,7 @@ QUICK = [
 #: Files whose default tests do not assume that a path's values are the channels of the film.
 FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "freezing", "gradients", "guiding",
          "guiding_tables", "image_paths", "image_plugins", "kernels", "memory", "moving_emitters", "plan", "plugin",
-         "replay", "shuffled", "small_lamps", "survival"]  # fmt: skip
+         "replay", "sequences", "shuffled", "small_lamps", "survival"]  # fmt: skip
 
 
 def run(*arguments: str) -> None:
