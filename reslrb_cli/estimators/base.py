@@ -150,11 +150,11 @@ def adjoint_of_factor(
     """
     f, value, zeros = dr.detach(f), adjoint.value, adjoint.product.zero
     if not zeros:
-        return mi.Spectrum(dr.select(f != 0, showing(value / f), 0))
+        return mi.Spectrum(dr.select(f == 0, 0, showing(value / f)))  # passes NaN on
     result, rest = mi.Spectrum(0), mi.Spectrum(rest)
     for c, zero in enumerate(zeros):
         at_zero = dr.select(zero == mi.Int32(index), value[c] * rest[c], 0)
-        result[c] = dr.select((zero == NO_ZERO) & (f[c] != 0), value[c] / f[c], at_zero)
+        result[c] = dr.select((zero == NO_ZERO) & ~(f[c] == 0), value[c] / f[c], at_zero)
     return showing(result)
 
 

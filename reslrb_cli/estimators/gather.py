@@ -111,7 +111,7 @@ class AdjointSum:
         The factor must come before all connections in the sum.
         """
         f, total = dr.detach(f), self.value + self.rest
-        result = mi.Spectrum(dr.select(f != 0, total / f, 0))
+        result = mi.Spectrum(dr.select(f == 0, 0, total / f))  # passes NaN on
         if self.behind_zero:
             behind = (self.behind_zero[0] + self.behind_zero[1]) * rest
             for c, zero in enumerate(prefix.zero):

@@ -29,7 +29,7 @@ from reslrb_cli.estimators.base import (
 )
 from reslrb_cli.transport.bsdf import Scattering, tracked_factor
 from reslrb_cli.transport.connection import Connection, connect, stand_in
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import Product, showing
 from reslrb_cli.transport.film import Colours
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
@@ -58,18 +58,19 @@ class Chosen(Protocol):
 
 
 def selection_weight(p: Pass, weight: str, connection: Connection, C: Product, colours: Colours) -> mi.Float:
-    """Return w of a connection: the luminance of C for `luminance`, or sum_c |delta_c C_c| for `adjoint`.
+    """Return w of a connection: the luminance of C for `luminance`, or sum_c |delta_c C_c| for `adjoint`. It is
+    infinite if it is not finite, so that the connection is selected.
 
     Raises ValueError for `adjoint` if delta is not known.
     """
     value = C.magnitude()
     if weight == "luminance":
         if mi.is_spectral:
-            return dr.sum(colours.seen(value))
-        return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
+            return showing(dr.sum(colours.seen(value)))
+        return showing(mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0]))
     if p.adjoint is None:
         raise ValueError('weight "adjoint" needs dL/dI before the paths are traced, which correlated samples lack')
-    return dr.sum(dr.abs(p.delta(connection.u, connection.active, colours) * value))
+    return showing(dr.sum(dr.abs(p.delta(connection.u, connection.active, colours) * value)))
 
 
 def is_taken(number: mi.Float, w: mi.Float, W: mi.Float) -> mi.Bool:

@@ -8,8 +8,7 @@
     (`_batched`).
 
 Entries of dL/dI that are not finite are set to 0, and counted (`Refused`). One NaN in dL/dI would turn the gradients of
-all parameters on that pixel's paths into NaN. It might also be lost: with `weight: adjoint`, `reservoir` and `event` do
-not select a connection whose weight is NaN. The kernel that computes dL/dI also counts the non-finite entries. Only
+all parameters on that pixel's paths into NaN. The kernel that computes dL/dI also counts the non-finite entries. Only
 code that reads the count waits for the kernel.
 """
 

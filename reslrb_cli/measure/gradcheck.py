@@ -23,12 +23,13 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.arena import NO_TIME
 from reslrb_cli.measure.comparison import (
+    ROUNDING,
     Family,
     compare_equal_seeds,
     compare_expectations,
     entry_count,
 )
-from reslrb_cli.measure.gradients import rounding, seeds
+from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import plays_roulette, records_of
 from reslrb_cli.measure.participants import CheckSettings, Participants, Way
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
@@ -288,6 +289,7 @@ class Gradcheck:
     def _result(self, row: Row, family: Family) -> GradcheckRecord:
         parts, (mine, *its) = self.participants, self._needs(row)
         ours, shape, bias = self.sampling.of(mine), None, np.zeros(1)
+        rounding = ROUNDING if row.key is None else parts.case.rounding(row.key)
         reference = self.sampling.of(its[0]) if its else parts.exact[str(row.key)]
         if row.key is None:
             shape = tuple(parts.case.weights.shape)
@@ -304,10 +306,10 @@ class Gradcheck:
             least = min(len(ours), len(reference))
             ours, reference = ours[:least], reference[:least]
         if row.kind is Kind.EQUAL_SEEDS:
-            figures = compare_equal_seeds(ours, reference, rounding())
+            figures = compare_equal_seeds(ours, reference, rounding)
         else:
             ours_too = row.reference in (Reference.WALK_AD, Reference.UNGUIDED)
-            share = rounding() if shape is None or ours_too else max(rounding(), STOCK_ROUNDING)
+            share = rounding if shape is None or ours_too else max(rounding, STOCK_ROUNDING)
             figures = compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=share)
         return self._record(row, figures, len(ours))
 

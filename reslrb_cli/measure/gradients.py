@@ -48,6 +48,9 @@ RELIEF = 0.02
 #: times the scene's size. A thousandth of the size is a step beyond the rounding of rays: a V_d of 10 was too small.
 UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.05, "Vd": 50.0}
 
+#: Least number of paths whose values are added to a sum in memory at once.
+PACKET = 8
+
 #: Maximum number of wavelengths across a displaced object.
 WAVES = 1.5
 
@@ -243,6 +246,7 @@ class Case:
                 values.colours.add(key)
         self.values, self.params = values, values.params
         self.keys = list(keys)
+        self._rounding: dict[str, float] = {}
         self.initial = {key: np.array(values.value(key), dtype=np.float64).ravel() for key in self.keys}
         self.places = places({key: len(row) for key, row in self.initial.items()})
         self.size = sum(map(len, self.initial.values()))
@@ -288,10 +292,29 @@ class Case:
         leaves = self.leaves()
         objective = objective or self.objective
         step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
+        self._note_rounding(spp)
         self.values.collect()
         result = [np.array(dr.grad(leaf), dtype=np.float64).ravel() for leaf in leaves.values()]
         self.release(leaves)
         return np.concatenate(result)
+
+    def _note_rounding(self, spp: int) -> None:
+        """Store the rounding errors of the gradients by colours. Called before the gradients are collected."""
+        if not mi.is_spectral or not isinstance(self.values, Selection):
+            return
+        sums = dr.prod(self.weights.shape[:2]) * spp / PACKET
+        for key, condition in self.values.colours.cancellation().items():
+            self._rounding[key] = max(self.rounding(key), 2.0**-24 * np.sqrt(sums) * condition)
+
+    def rounding(self, key: str | None = None) -> float:
+        """Return the relative error of single precision in the gradients so far by the parameter `key`, or by all.
+
+        In a spectral variant, gradients by colours are sums of gradients by coefficients, which cancel
+        (`Upsampling.cancellation`). Each coefficient's gradient is a sum of k values in single precision. If the values
+        are similar, the rounding errors of its partial sums add up to a standard error of about 2^-24 sqrt(k) / 4. Four
+        of them are the limit.
+        """
+        return max([ROUNDING, *(value for name, value in self._rounding.items() if key in (None, name))])
 
     def known_step(self, integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
         """Take a step with dL/dI known before the image, as the `step` argument of `gradient`."""
@@ -397,16 +420,6 @@ def seeds(count: int, block: int = 0) -> range:
 def integrator(name: str, max_depth: int = 4, rr_depth: int = 1000, **options: Any) -> Any:
     """Create an integrator for `gradient_step`, by default without roulette."""
     return make_integrator(name, max_depth=max_depth, rr_depth=rr_depth, **options)
-
-
-#: Relative error of single precision in gradients by colours in a spectral variant. They are sums of gradients by
-#: coefficients, which cancel.
-SPECTRAL_ROUNDING = 2e-3
-
-
-def rounding() -> float:
-    """Return the relative error of single precision in a gradient."""
-    return SPECTRAL_ROUNDING if mi.is_spectral else ROUNDING
 
 
 def relative(a: np.ndarray, b: np.ndarray) -> float:

@@ -51,6 +51,10 @@ def is_upsampled(params: mi.SceneParameters, key: str) -> bool:
     return params[key].shape[2] == 3 and not re.search(r"^ *raw = 1,$", str(node), re.MULTILINE)
 
 
+def _flat(value: Any) -> mi.Float:
+    return value.array if dr.is_tensor_v(value) else dr.ravel(value)
+
+
 def emitted(key: str) -> str:
     """Return the key of the spectrum of D65 that belongs to the colour `key` of an emitter."""
     return f"{key.removesuffix('.value')}.d65.values"
@@ -78,7 +82,10 @@ def coefficients(rgb: mi.Color3f) -> mi.Color3f:
     is_finite = dr.all(dr.isfinite(rgb))
     with dr.suspend_grad():
         goal = dr.select(is_finite, dr.clip(dr.detach(rgb), DARKEST, 1 - DARKEST), 0.5)
-        found = _centred(_from_table(goal))
+        # -c is the spectrum 1 - S. The table is precise at dark colours, but not near white.
+        is_bright = dr.min(goal) + dr.max(goal) > 1
+        start = _from_table(dr.select(is_bright, 1 - goal, goal))
+        found = _centred(dr.select(is_bright, -start, start))
         colour, columns = _colour(found)
         for _ in range(NEWTON_STEPS):
             tried = found + _solved(columns, mi.Vector3d(goal) - colour)
@@ -161,6 +168,7 @@ def values_of(params: mi.SceneParameters, key: str) -> Any:
     if not is_upsampled(params, key):
         return value
     c = dr.detach(value)
+    dr.eval()  # scheduled variables, which would change this kernel in the first step
     count = value.shape[0] * value.shape[1] if dr.is_tensor_v(value) else 1
     c = dr.gather(mi.Color3f, value.array, dr.arange(mi.UInt32, count)) if dr.is_tensor_v(value) else mi.Color3f(c)
     found = []
@@ -278,6 +286,31 @@ class Upsampling:
     def collect(self) -> None:
         """Propagate the gradients at the scene's spectra to the colours."""
         collect(self._leaves())
+
+    def cancellation(self) -> dict[str, float]:
+        """Return the condition number of each colour's gradient: the norm of the sums of its terms' magnitudes, divided
+        by the norm of the sums. A term belongs to one coefficient of one texel.
+
+        The scene's spectra have gradients, and the colours have none yet. Without a gradient, the number is 1.
+        """
+        result = {}
+        for colour_key, found in self._found.items():
+            total, magnitude = np.zeros(1), np.zeros(1)
+            for own, name in ((key, name) for key in found.keys for name in (key, emitted(key))):
+                if name not in found.leaves:
+                    continue
+                gradient = _flat(dr.grad(found.leaves[name].leaf))
+                parts = 3 if name == own else 1  # coefficients, or the values of D65 times a scale
+                for part in range(parts):
+                    here = dr.select(dr.arange(mi.UInt32, dr.width(gradient)) % parts == part, gradient, 0)
+                    colour = type(found.value)(dr.detach(found.value))
+                    dr.enable_grad(colour)
+                    dr.backward(_flat(self._spectra(own, colour)[name]) * here)
+                    term = np.array(dr.grad(colour), np.float64)
+                    total, magnitude = total + term, magnitude + np.abs(term)
+            size = np.linalg.norm(total)
+            result[colour_key] = float(np.linalg.norm(magnitude) / size) if size > 0 else 1.0
+        return result
 
     def push(self) -> None:
         """Propagate tangents of the colours to the scene's spectra."""

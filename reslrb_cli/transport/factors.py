@@ -47,12 +47,12 @@ DIM = 0.1  # minimum value of a factor in a magnitude, as a fraction of its stan
 
 
 def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
-    """Return `value` with infinity in place of NaN, so that images and gradients show the fault.
+    """Return `value` with positive infinity in place of NaN and infinities. Images and gradients then show the fault.
 
     In Dr.Jit 1.5, `x != 0` is false for NaN. On a CPU, atomic sums ignore a NaN unless it shares its address with other
-    numbers of the same packet.
+    numbers of the same packet. Infinities of both signs would become NaN in a sum over channels or wavelengths.
     """
-    return type(value)(dr.select(dr.isnan(value), dr.inf, value))
+    return type(value)(dr.select(dr.isfinite(value), value, dr.inf))
 
 
 @dataclass
@@ -118,8 +118,10 @@ class Product:
         return self._where(self.raised[0] if self.raised else self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
     def alive(self) -> mi.Bool:
-        """Whether the value or derivative of any channel can be nonzero. Both vanish with two or more zero factors."""
-        return dr.any(self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero]) != 0)
+        """Whether the value or derivative of any channel can be nonzero, or is not finite. Both vanish with two or more
+        zero factors.
+        """
+        return ~dr.all(self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero]) == 0)  # passes NaN on
 
     @staticmethod
     def _where(values: mi.Spectrum, keep: list[mi.Bool]) -> mi.Spectrum:

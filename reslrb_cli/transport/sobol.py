@@ -105,10 +105,10 @@ class Coordinates:
 
 def make_coordinates(used: Sequence[bool], emitters: int, max_depth: int) -> Coordinates:
     """Return the coordinates for this number of emitters. `used` tells which numbers of place and direction the
-    emitters use.
+    emitters use. One number chooses the emitter and the wavelengths.
     """
     bounces = min(max(max_depth - 2, 0), BOUNCES)
-    return Coordinates(emitters > 1, (used[0], used[1]), (used[2], used[3]), bounces)
+    return Coordinates(emitters > 1 or mi.is_spectral, (used[0], used[1]), (used[2], used[3]), bounces)
 
 
 @dataclass

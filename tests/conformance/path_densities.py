@@ -263,6 +263,17 @@ def cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs((a * b).sum(-1))
 
 
+def brightness(texels: np.ndarray) -> np.ndarray:
+    """Return the numbers (H, W) to which Mitsuba samples texels (H, W, 3) in proportion: the luminance of colours, or
+    the mean of the spectra with these coefficients at 16 wavelengths.
+    """
+    if not mi.is_spectral:
+        return texels @ np.array([0.212671, 0.715160, 0.072169])
+    wavelengths = np.linspace(mi.MI_CIE_MIN, mi.MI_CIE_MAX, 16)
+    v = (texels[..., :1] * wavelengths + texels[..., 1:2]) * wavelengths + texels[..., 2:]
+    return np.asarray((0.5 + 0.5 * v / np.sqrt(1 + v**2)).mean(-1))
+
+
 class Densities:
     """Number of paths of each kind that find a given path, for one scene, one sensor and given numbers of samples.
     `cutoff` and `fov` are the angles of the scene's spots and projectors, in degrees.
@@ -386,12 +397,10 @@ class Densities:
         area = float(np.ravel(shape.surface_area())[0])  # for textured lamps, area per unit of texture coordinates
         own = sampled = np.ones(len(x))
         if "radiance.data" in params:  # sampled over equal-area texels
-            texture = next(t for t in self.samples.plan.needs.lamps if t.emitter == emitter).texture
-            si = dr.zeros(mi.SurfaceInteraction3f)
-            si.uv = mi.Point2f(uv.T.astype(np.float32))
-            luminance = np.array([0.212671, 0.715160, 0.072169])
-            texels = np.array(params["radiance.data"], np.float64) @ luminance
-            sampled = own = luminance @ np.array(texture.eval(si), np.float64) / texels.mean()
+            texels = brightness(np.array(params["radiance.data"], np.float64))
+            rows, columns = texels.shape
+            row, column = ((uv[:, k] * n).astype(int).clip(0, n - 1) for k, n in ((1, rows), (0, columns)))
+            sampled = own = texels[row, column] / texels.mean()
             if self.samples.plan.evened_lamps:
                 own = 0.9 * own + 0.1
             stretch = {"Sphere": np.pi / 2 * np.sin(np.pi * uv[:, 1]), "Disk": 2 * uv[:, 0]}
@@ -415,8 +424,7 @@ class Densities:
         frame = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
         frame = frame / length(frame.T)
         cos = d @ frame[:, 2]
-        half, texels = np.tan(self.fov / 2), np.array(params["irradiance.data"], np.float64)
-        picture = texels @ np.array([0.212671, 0.715160, 0.072169])
+        half, picture = np.tan(self.fov / 2), brightness(np.array(params["irradiance.data"], np.float64))
         rows, columns = picture.shape
         column = ((d @ frame[:, 0]) / cos / half * -0.5 + 0.5) * columns
         row = ((d @ frame[:, 1]) / cos / (half * rows / columns) * -0.5 + 0.5) * rows

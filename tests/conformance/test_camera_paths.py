@@ -326,7 +326,7 @@ def test_gradients_equal_naive_ad(case: GradientCase, paths: str, steps: tuple[s
         ours = scene.gradient(integrator("reslrb", **options_of(case, paths, **more)), 5, case.spp, **step)
         error = relative(ours, reference)
         print(case.name, paths, name, f"{error:.1e}")
-        assert error < 1e-4, f"{name}: {error:.1e}"
+        assert error < scene.rounding(), f"{name}: {error:.1e}"
 
 
 @pytest.mark.parametrize("name", a_few([case.name for case in BOTH], ["texture"]))

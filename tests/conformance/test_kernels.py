@@ -100,7 +100,10 @@ def test_second_step_compiles_nothing_on_shipped_scenes(name: str, adjoint: str)
 
 
 def test_zero_texels_come_and_go():
-    """A texel that reaches zero requires new kernels once. The texel requires no new kernels when it leaves zero."""
+    """A texel that reaches zero requires new kernels once. The texel requires no new kernels when it leaves zero.
+
+    In a spectral variant, no spectrum of a colour is zero.
+    """
     case = next(case for case in CASES if case.name == "texture")
     scene = Case(case.scene(), case.keys)
     ours = integrator("reslrb")
@@ -113,7 +116,7 @@ def test_zero_texels_come_and_go():
 
     kernels = Kernels()
     kernels.new(lambda: step(1, initial))
-    assert kernels.new(lambda: step(2, zero)), "zeros are not tracked"
+    assert bool(kernels.new(lambda: step(2, zero))) != mi.is_spectral
     assert not kernels.new(lambda: step(3, zero))
     assert not kernels.new(lambda: step(4, initial))
     assert not kernels.new(lambda: step(5, zero))

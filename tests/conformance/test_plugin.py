@@ -211,7 +211,8 @@ def test_mi_render_backward_through_a_latent_variable(case: Case):
     for seed in seeds(12):
         latent = mi.Float(0.8)
         dr.enable_grad(latent)
-        case.params[key] = mi.TensorXf(case.initial[key].reshape(case.params[key].shape)) * latent
+        value = mi.TensorXf(case.initial[key].reshape(case.params[key].shape)) * latent
+        case.params[key] = case.values.colours._spectra(key, value)[key] if mi.is_spectral else value
         case.params.update()
         image = mi.render(case.scene, case.params, integrator=ours, seed=seed, spp=64)
         dr.backward(case.objective(image))

@@ -22,14 +22,16 @@ ROULETTE = next(case for case in CASES if case.name == "roulette")
 QUICK: dict[str, Callable[[], None]] = {
     "colours": own.test_coefficients_have_their_colour,
     "derivatives of colours": own.test_coefficients_have_derivatives,
+    "condition of gradients by colours": own.test_the_condition_of_gradients_by_colours,
     "furnace": lambda: own.test_the_furnace_has_its_colour("both", "regular"),
     "derivatives by stack": lambda: own.test_the_furnace_has_its_derivatives("light", "stack", "regular"),
     "derivatives by reservoir": lambda: own.test_the_furnace_has_its_derivatives("light", "reservoir", "irregular"),
     "naive AD": lambda: test_gradients.test_exact_estimators_equal_naive_ad(ROULETTE, "correlated"),
 }
 #: Files whose default tests do not assume that a path's values are the channels of the film.
-FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "guiding", "image_paths", "kernels",
-         "memory", "moving_emitters", "sequences", "small_lamps"]  # fmt: skip
+FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "freezing", "gradients", "guiding",
+         "guiding_tables", "image_paths", "image_plugins", "kernels", "memory", "moving_emitters", "plan", "plugin",
+         "replay", "sequences", "shuffled", "small_lamps", "survival"]  # fmt: skip
 
 
 def run(*arguments: str) -> None:
@@ -49,13 +51,3 @@ def test_the_spectral_variant(check: str, spectral: None) -> None:
 @pytest.mark.parametrize("file", [OWN, *(f"tests/conformance/test_{name}.py" for name in FILES)])
 def test_the_conformance_of_the_spectral_variant(file: str) -> None:
     run(file)
-
-
-@pytest.mark.long
-def test_emitters_and_bsdfs_in_the_spectral_variant() -> None:
-    run("tests/conformance/test_image_plugins.py", "-k", "not furnace")
-
-
-@pytest.mark.long
-def test_exact_estimators_in_the_spectral_variant() -> None:
-    run("tests/conformance/test_gradients.py", "-k", "equal_naive_ad")

@@ -245,8 +245,9 @@ def test_later_contributions_are_collected_at_the_ray_of_the_bounce() -> None:
 
         def vertex(self, state: Any, vertex: Any, connection: Any, scattering: Any, numbers: Any) -> Any:
             C = vertex.product.times(connection.c, vertex.depth).value()
-            self.keep(8, vertex.depth == 2, dr.select(connection.active, dr.squared_norm(C), 0), 1)
-            weight = dr.max(vertex.product.times(scattering.s, vertex.depth).value())
+            image = dr.squared_norm(self.colours.seen(C))
+            self.keep(8, vertex.depth == 2, dr.select(connection.active, image, 0), 1)
+            weight = dr.max(self.colours.seen(vertex.product.times(scattering.s, vertex.depth).magnitude()))
             self.keep(0, (vertex.depth == 1) & scattering.active, 1, weight, *vertex.si.p, *scattering.d)
             return state
 
