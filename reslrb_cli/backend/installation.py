@@ -15,7 +15,6 @@ import importlib.util
 import os
 import re
 import sys
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,16 +33,6 @@ _UNSAFE = frozenset({"blender"})
 
 #: Names that Mitsuba knows without a library.
 _BUILT_IN = frozenset({"scene", "rgb", "spectrum"})
-
-
-def import_colour() -> Any:
-    """Import the package `colour` late, because the import takes a second. Hide its warnings about optional
-    packages.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import colour
-    return colour
 
 
 def package_folder() -> Path:

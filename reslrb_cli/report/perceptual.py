@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.backend.installation import import_colour
+from reslrb_cli.colorimetry import import_colour
 from reslrb_cli.records.images import load_image
 from reslrb_cli.report.tonemap import encode, shown_exposures
 

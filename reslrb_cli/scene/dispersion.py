@@ -1,4 +1,4 @@
-"""Plugins of `reslrb`: glass with dispersion, and spectra of standard illuminants.
+"""Plugins of `reslrb`: glass with dispersion, and spectra of standard illuminants and cameras.
 
 `dispersivedielectric` is a boundary to a glass whose index depends on the wavelength (`glasses.py`). Mitsuba's own
 dielectrics have one index.
@@ -23,12 +23,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.backend.installation import import_colour
+from reslrb_cli.colorimetry import colour_of, illuminant, sensitivity
 from reslrb_cli.glasses import Glass, cauchy_shape, find_glass, index_of
 from reslrb_cli.scene.graph import visible
 
 #: Names of our plugins in scene files.
-GLASS, ILLUMINANT = "dispersivedielectric", "illuminant"
+GLASS, ILLUMINANT, SENSITIVITY = "dispersivedielectric", "illuminant", "sensitivity"
 #: Name of the class of `GLASS`.
 GLASS_CLASS = "DispersiveDielectric"
 #: Shortest wavelength in nm at which an index is evaluated: idle lanes have none, and Sellmeier's formula has poles
@@ -40,6 +40,7 @@ def register() -> None:
     """Register the plugins for the current variant. A second call has no effect."""
     mi.register_bsdf(GLASS, lambda props: _glass_class(mi.variant())(props))
     mi.register_texture(ILLUMINANT, make_illuminant)
+    mi.register_texture(SENSITIVITY, make_sensitivity)
 
 
 def bends_light(params: mi.SceneParameters, key: str) -> bool:
@@ -54,27 +55,37 @@ def make_illuminant(props: mi.Properties) -> mi.Texture:
     The luminance at a scale of 1 equals that of a uniform spectrum of 1. Variants without wavelengths have the colour
     of the illuminant. Raises ValueError for an unknown name.
     """
-    colour = import_colour()
-    name, scale = props["name"], float(props.get("scale", 1.0))
-    known = {each.lower(): spectrum for each, spectrum in colour.SDS_ILLUMINANTS.items()}
-    if name.lower() not in known:
-        names = ", ".join(each for each in colour.SDS_ILLUMINANTS if not each.startswith("ISO"))
-        raise ValueError(f"there is no illuminant {name!r}; known are {names}")
     wavelengths = visible()
-    spectrum, observer = known[name.lower()], colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    values = np.interp(wavelengths, spectrum.wavelengths, spectrum.values, left=0, right=0)
-    matching = np.stack([np.interp(wavelengths, observer.wavelengths, observer.values[:, i]) for i in range(3)])
-    values *= scale * matching[1].sum() / (matching[1] @ values)
+    values = float(props.get("scale", 1.0)) * illuminant(props["name"], wavelengths)
     if mi.is_spectral:
-        made = mi.Properties("regular")
-        made["wavelength_min"], made["wavelength_max"] = float(wavelengths[0]), float(wavelengths[-1])
-        made["values"] = ", ".join(f"{value:.9g}" for value in values)
-    else:
-        xyz = matching @ values / matching[1].sum()
-        made = mi.Properties("srgb")
-        made["color"] = mi.ScalarColor3f(*(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB @ xyz))
-        made["unbounded"] = True
-    # Without the id of the illuminant, so that `export` replaces it by a spectrum with the recovered values.
+        return _regular(wavelengths, values)
+    made = mi.Properties("srgb")
+    made["color"] = mi.ScalarColor3f(*colour_of(values, wavelengths))
+    made["unbounded"] = True
+    return mi.PluginManager.instance().create_object(made)
+
+
+def make_sensitivity(props: mi.Properties) -> mi.Texture:
+    """Return the spectrum of a `channel` (red, green or blue) of a `camera`, for a film's response.
+
+    A uniform spectrum of 1 gives 1 in the most sensitive channel. Raises ValueError for unknown names, and in variants
+    without wavelengths.
+    """
+    curve = sensitivity(props["camera"], props["channel"])
+    if not mi.is_spectral:
+        raise ValueError(f"{SENSITIVITY} needs a spectral variant")
+    return _regular(*curve)
+
+
+def _regular(wavelengths: np.ndarray, values: np.ndarray) -> mi.Texture:
+    """Return a spectrum that is linear between its values.
+
+    The spectrum does not have the id of the plugin that makes it, so that `export` replaces this plugin by a spectrum
+    with the recovered values.
+    """
+    made = mi.Properties("regular")
+    made["wavelength_min"], made["wavelength_max"] = float(wavelengths[0]), float(wavelengths[-1])
+    made["values"] = ", ".join(f"{value:.9g}" for value in values)
     return mi.PluginManager.instance().create_object(made)
 
 
