@@ -26,11 +26,11 @@ D_LINE, F_LINE, C_LINE = 587.5618, 486.1327, 656.2725
 class Glass:
     """Material with Sellmeier's formula n^2 = 1 + sum_i B_i lambda^2 / (lambda^2 - C_i), for lambda in micrometres.
 
-    `source` is the publication of the coefficients.
+    Coefficients are numbers, or arrays of Dr.Jit. `source` is their publication.
     """
 
-    B: tuple[float, ...]
-    C: tuple[float, ...]
+    B: tuple[Any, ...]
+    C: tuple[Any, ...]
     source: str = ""
 
     def index(self, wavelength: Any) -> Any:

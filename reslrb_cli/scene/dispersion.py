@@ -17,6 +17,7 @@ In variants without wavelengths, the index is n_d.
 from __future__ import annotations
 
 import functools
+import re
 from typing import Any
 
 import drjit as dr
@@ -29,6 +30,8 @@ from reslrb_cli.scene.graph import visible
 
 #: Names of our plugins in scene files.
 GLASS, ILLUMINANT, SENSITIVITY = "dispersivedielectric", "illuminant", "sensitivity"
+#: Keys of Sellmeier coefficients.
+COEFFICIENT = re.compile(r"\.([BC])\d$")
 #: Name of the class of `GLASS`.
 GLASS_CLASS = "DispersiveDielectric"
 #: Shortest wavelength in nm at which an index is evaluated: idle lanes have none, and Sellmeier's formula has poles
@@ -44,9 +47,9 @@ def register() -> None:
 
 
 def bends_light(params: mi.SceneParameters, key: str) -> bool:
-    """True if a parameter changes directions of refraction: n_d or V_d of a glass with dispersion."""
+    """True if a parameter changes directions of refraction: n_d, V_d, or a coefficient of a glass with dispersion."""
     node = params.properties[key][2] if key in params.properties else None
-    return node is not None and node.class_name() == GLASS_CLASS and key.endswith((".nd", ".Vd"))
+    return node is not None and node.class_name() == GLASS_CLASS and not key.endswith(".alpha")
 
 
 def make_illuminant(props: mi.Properties) -> mi.Texture:
@@ -98,8 +101,10 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
 
         The glass has the name `material` of the catalogue, or the numbers `nd` and `Vd`, or the coefficients
         `sellmeier` (B1, ..., C1, ..., with C in square micrometres). `nd` and `Vd` may also replace those of a
-        material. Its shape g of the dispersion stays the same. With `alpha`, the boundary is rough, and its normals
-        have the `distribution`.
+        material or of coefficients. The shape g of the dispersion stays the same. With `alpha`, the boundary is rough,
+        and its normals have the `distribution`.
+
+        What the scene gives has derivatives: the coefficients if there is only `sellmeier`, otherwise `nd` and `Vd`.
         """
 
         def __init__(self, props: mi.Properties) -> None:
@@ -119,6 +124,10 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
             if self.distribution not in ("ggx", "beckmann"):
                 raise ValueError(f"distribution must be ggx or beckmann, not {self.distribution!r}")
             self.nd, self.Vd = mi.Float(nd), mi.Float(Vd)
+            #: The glass by its coefficients, if these are the parameters.
+            self.coefficients: Glass | None = None
+            if mi.is_spectral and "sellmeier" in props and not {"nd", "Vd"} & {*props.keys()}:
+                self.coefficients = Glass(*(tuple(map(mi.Float, each)) for each in (glass.B, glass.C)))
             sides, flags = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide, mi.BSDFFlags
             smooth = self.alpha is None
             reflection = flags.DeltaReflection if smooth else flags.GlossyReflection
@@ -128,9 +137,14 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
-            callback.put("nd", self.nd, flags)
-            if mi.is_spectral:  # it has no effect in other variants
-                callback.put("Vd", self.Vd, flags)
+            if self.coefficients is not None:
+                for letter, values in (("B", self.coefficients.B), ("C", self.coefficients.C)):
+                    for number, value in enumerate(values, 1):
+                        callback.put(f"{letter}{number}", value, flags)
+            else:
+                callback.put("nd", self.nd, flags)
+                if mi.is_spectral:  # it has no effect in other variants
+                    callback.put("Vd", self.Vd, flags)
             if self.alpha is not None:
                 callback.put("alpha", self.alpha, flags)
 
@@ -138,7 +152,11 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
             """Return the index inside, divided by that outside, for each wavelength of the ray."""
             if not mi.is_spectral:
                 return [self.nd / self.ext_ior]
-            n = index_of(self.nd, self.Vd, self.shape, dr.maximum(si.wavelengths, _SHORTEST))
+            wavelengths = dr.maximum(si.wavelengths, _SHORTEST)
+            if self.coefficients is not None:
+                n = self.coefficients.index(wavelengths)
+            else:
+                n = index_of(self.nd, self.Vd, self.shape, wavelengths)
             return [each / self.ext_ior for each in n]
 
         def sample(
@@ -250,13 +268,19 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
 
         def to_string(self) -> str:
             rough = "" if self.alpha is None else f", alpha = {self.alpha[0]:g}"
-            return f"{GLASS_CLASS}[nd = {self.nd[0]:g}, Vd = {self.Vd[0]:g}{rough}]"
+            glass = self.coefficients
+            if glass is None:
+                return f"{GLASS_CLASS}[nd = {self.nd[0]:g}, Vd = {self.Vd[0]:g}{rough}]"
+            numbers = ", ".join(f"{value[0]:g}" for value in (*glass.B, *glass.C))
+            return f"{GLASS_CLASS}[sellmeier = {numbers}{rough}]"
 
     return DispersiveDielectric
 
 
 def _glass_of(props: mi.Properties) -> Glass | None:
-    """Return the glass of a plugin's `material` or `sellmeier`. Raises ValueError if it has both, or a wrong one."""
+    """Return the glass of a plugin's `material`, or of its `sellmeier`. `B1`, ..., `C1`, ... replace its coefficients.
+    Raises ValueError if there are both, or a wrong one.
+    """
     if "material" in props and "sellmeier" in props:
         raise ValueError(f"{GLASS} has both `material` and `sellmeier`; remove one")
     if "material" in props:
@@ -267,7 +291,19 @@ def _glass_of(props: mi.Properties) -> Glass | None:
     half = len(numbers) // 2
     if not numbers or len(numbers) % 2:
         raise ValueError("sellmeier needs as many coefficients B as C, such as `1.04, 0.23, 1.01, 0.006, 0.02, 103.6`")
-    return Glass(tuple(numbers[:half]), tuple(numbers[half:]))
+    names = [f"{letter}{number}" for letter in "BC" for number in range(1, half + 1)]
+    numbers = [float(props.get(name, value)) for name, value in zip(names, numbers, strict=True)]
+    B, C = tuple(numbers[:half]), tuple(numbers[half:])
+    ends = [(float(end) / 1000) ** 2 for end in visible()[[0, -1]]]
+    if any(ends[0] <= pole <= ends[1] for pole in C):
+        raise ValueError(f"sellmeier has a pole at a visible wavelength; C must be below {ends[0]:.3f} or above "
+                         f"{ends[1]:.3f}")  # fmt: skip
+    glass = Glass(B, C)
+    with np.errstate(invalid="ignore"):
+        least = glass.index(visible()).min()
+    if not least > 1:
+        raise ValueError("sellmeier gives an index that is not above 1 at all visible wavelengths")
+    return glass
 
 
 def _spectrum(values: list[Any]) -> mi.Spectrum:

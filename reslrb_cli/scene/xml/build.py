@@ -94,7 +94,7 @@ REFUSED_PLUGINS = {
     ("texture", "curvature"): f"{_OLD}; use `mesh_attribute`",
     ("texture", "vertexcolors"): f"{_OLD}; use `mesh_attribute`",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
-    ("film", "specfilm"): "needs wavelengths, which RGB variants lack; use `hdrfilm`",
+    ("film", "specfilm"): "needs wavelengths: set `variant` to llvm_ad_spectral or cuda_ad_spectral, or use `hdrfilm`",
     ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; use a `perspective` one",
 }
 
