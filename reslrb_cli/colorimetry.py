@@ -71,8 +71,8 @@ def sensitivity(camera: str, channel: str) -> tuple[Array, Array]:
 def adaptation(before: str, after: str) -> Array:
     """Return the matrix (3, 3) by which colours under the illuminant `before` become colours under `after`.
 
-    It is Bradford's. Factors for the channels of sRGB, which also make white surfaces white, give other surfaces three
-    times the error.
+    The matrix is Bradford's. Factors for the channels of sRGB are less accurate. On a colour chart under A, their mean
+    CIEDE2000 is 3.1 instead of 1.9.
     """
     colour, wavelengths = import_colour(), np.arange(360.0, 831.0, 1.0)
     observer, to_xyz = _observer(wavelengths), colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ

@@ -126,8 +126,8 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
             self.nd, self.Vd = mi.Float(nd), mi.Float(Vd)
             #: The glass by its coefficients, if these are the parameters.
             self.coefficients: Glass | None = None
-            if mi.is_spectral and "sellmeier" in props and not {"nd", "Vd"} & {*props.keys()}:
-                self.coefficients = Glass(*(tuple(map(mi.Float, each)) for each in (glass.B, glass.C)))
+            if glass is not None and mi.is_spectral and "sellmeier" in props and not {"nd", "Vd"} & {*props.keys()}:
+                self.coefficients = Glass(tuple(map(mi.Float, glass.B)), tuple(map(mi.Float, glass.C)))
             sides, flags = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide, mi.BSDFFlags
             smooth = self.alpha is None
             reflection = flags.DeltaReflection if smooth else flags.GlossyReflection

@@ -17,6 +17,8 @@ QUICK = [
     f"{OWN}::test_the_furnace_has_its_colour[both-regular]",
     f"{OWN}::test_the_furnace_has_its_derivatives[light-stack-regular]",
     f"{OWN}::test_the_furnace_has_its_derivatives[light-reservoir-irregular]",
+    f"{OWN}::test_a_raw_photograph_gets_the_colours_of_the_lamps",
+    f"{OWN}::test_a_photograph_lacks_a_channel_of_the_film",
     "tests/conformance/test_gradients.py::test_exact_estimators_equal_naive_ad[roulette-correlated]",
 ]
 #: Files whose default tests do not assume that a path's values are the channels of the film.

@@ -246,5 +246,19 @@ def test_a_white_surface_has_the_colour_of_the_illuminant(llvm: str) -> None:
     assert colours[llvm, "D65"] == pytest.approx([0.5, 0.5, 0.5], abs=2e-3)
     for name in ("D65", "A", "LED-B3"):
         assert colours[with_them, name] == pytest.approx(colours[llvm, name], abs=0.015), name
-    with pytest.raises(Exception, match="there is no illuminant 'D64'"):
+    with pytest.raises(Exception, match="there is no illuminant 'D64'; did you mean D65"):
         mi.load_dict({"type": "illuminant", "name": "D64"})
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"camera": "Nikon D5100", "channel": "red"}, "no camera 'Nikon D5100'; did you mean Nikon 5100"),
+        ({"camera": "Nikon 5100", "channel": "R"}, "no channel 'R'; known are red, green, blue"),
+        ({"camera": "Nikon 5100", "channel": "red"}, "needs a spectral variant"),
+    ],
+)
+def test_wrong_cameras_are_refused(options: dict[str, str], said: str, llvm: str) -> None:
+    register()
+    with pytest.raises(Exception, match=said):
+        mi.load_dict({"type": "sensitivity"} | options)
