@@ -228,6 +228,7 @@ def test_a_raw_photograph_gets_the_colours_of_the_lamps(tmp_path: Path, monkeypa
         scene: {{file: plate.xml}}
         target: {{file: raw.png, color_space: linear, white_balance: {{scene: A}}, mask: none}}
         parameters: [{{key: plate.bsdf.reflectance.value}}]
+        integrator: {{type: prb}}
     """, str(tmp_path / "plate.yaml")))  # fmt: skip
     np.testing.assert_allclose(np.array(problem.views[0].target), 0.8 * image, rtol=1e-3)
 
