@@ -76,7 +76,7 @@ def make_sensitivity(props: mi.Properties) -> mi.Texture:
     """
     curve = sensitivity(props["camera"], props["channel"])
     if not mi.is_spectral:
-        raise ValueError(f"{SENSITIVITY} needs a spectral variant")
+        raise ValueError(f"{SENSITIVITY} needs wavelengths: set `variant` to llvm_ad_spectral or cuda_ad_spectral")
     return _regular(*curve)
 
 

@@ -255,7 +255,7 @@ def test_a_white_surface_has_the_colour_of_the_illuminant(llvm: str) -> None:
     [
         ({"camera": "Nikon D5100", "channel": "red"}, "no camera 'Nikon D5100'; did you mean Nikon 5100"),
         ({"camera": "Nikon 5100", "channel": "R"}, "no channel 'R'; known are red, green, blue"),
-        ({"camera": "Nikon 5100", "channel": "red"}, "needs a spectral variant"),
+        ({"camera": "Nikon 5100", "channel": "red"}, "needs wavelengths"),
     ],
 )
 def test_wrong_cameras_are_refused(options: dict[str, str], said: str, llvm: str) -> None:
