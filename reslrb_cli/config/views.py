@@ -17,7 +17,6 @@ from pydantic import (
 from pydantic_core import CoreSchema
 from typing_extensions import Self
 
-from reslrb_cli.colorimetry import WHITE, find_illuminant
 from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, each_once, located, must, wrong
 from reslrb_cli.config.integrators import AnyIntegrator
 from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
@@ -100,6 +99,8 @@ Exposure = Annotated[
 
 
 def _illuminant(value: str) -> str:
+    from reslrb_cli.colorimetry import find_illuminant  # late, because it needs NumPy
+
     try:
         return find_illuminant(value)
     except ValueError as error:
@@ -115,7 +116,7 @@ class WhiteBalance(Section):
     `photograph` in the photographs gets the colour of the illuminant `scene`.
     """
 
-    scene: Illuminant = WHITE
+    scene: Illuminant = "D65"
     """Illuminant of the scene's lamps, such as `A` or `LED-B3`. D65 is white in linear sRGB."""
     photograph: Illuminant | None = None
     """Illuminant whose colour white surfaces have in the photographs. null: they are white, because the camera has

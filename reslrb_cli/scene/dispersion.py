@@ -104,7 +104,7 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
         material or of coefficients. The shape g of the dispersion stays the same. With `alpha`, the boundary is rough,
         and its normals have the `distribution`.
 
-        What the scene gives has derivatives: the coefficients if there is only `sellmeier`, otherwise `nd` and `Vd`.
+        Its parameters are the coefficients if the scene gives only `sellmeier`, otherwise `nd` and `Vd`.
         """
 
         def __init__(self, props: mi.Properties) -> None:
