@@ -4,8 +4,10 @@ never contains a traceback.
 
 from __future__ import annotations
 
+import difflib
 import enum
 import errno
+from collections.abc import Iterable
 
 #: Maximum length of a message, and of the file or key that it names. Quoted text can be as long as a file, so longer
 #: text is shortened in the middle.
@@ -35,6 +37,16 @@ def _shorten(text: str, most: int) -> str:
         return text
     end = (most - 3) // 3
     return f"{text[: most - 3 - end]}...{text[len(text) - end :]}"
+
+
+def known_name(kind: str, name: str, names: Iterable[str]) -> str:
+    """Return `name` as `names` spell it. Case does not matter. Raises ValueError with the nearest names, or all."""
+    known = {each.lower(): each for each in names}
+    if name.lower() in known:
+        return known[name.lower()]
+    near = [known[each] for each in difflib.get_close_matches(name.lower(), known)]
+    hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known.values())}"
+    raise ValueError(f"there is no {kind} {name!r}; {hint}")
 
 
 class ExitCode(enum.IntEnum):

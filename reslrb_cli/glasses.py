@@ -12,10 +12,11 @@ wavelengths are in nm.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+
+from reslrb_cli.errors import known_name
 
 #: Spectral lines of n_d and V_d, in nm: helium d, hydrogen F and C.
 D_LINE, F_LINE, C_LINE = 587.5618, 486.1327, 656.2725
@@ -25,11 +26,11 @@ D_LINE, F_LINE, C_LINE = 587.5618, 486.1327, 656.2725
 class Glass:
     """Material with Sellmeier's formula n^2 = 1 + sum_i B_i lambda^2 / (lambda^2 - C_i), for lambda in micrometres.
 
-    `source` is the publication of the coefficients.
+    Coefficients are numbers, or arrays of Dr.Jit. `source` is their publication.
     """
 
-    B: tuple[float, ...]
-    C: tuple[float, ...]
+    B: tuple[Any, ...]
+    C: tuple[Any, ...]
     source: str = ""
 
     def index(self, wavelength: Any) -> Any:
@@ -105,10 +106,5 @@ GLASSES = {
 
 
 def find_glass(name: str) -> Glass:
-    """Return a material of the catalogue. Case does not matter. Raises ValueError with the known names."""
-    known = {each.lower(): each for each in GLASSES}
-    if name.lower() in known:
-        return GLASSES[known[name.lower()]]
-    near = difflib.get_close_matches(name.lower(), known, n=1)
-    hint = f"did you mean {known[near[0]]}?" if near else f"known are {', '.join(GLASSES)}"
-    raise ValueError(f"there is no glass {name!r}; {hint}")
+    """Return a material of the catalogue. Case does not matter. Raises ValueError for an unknown name."""
+    return GLASSES[known_name("glass", name, GLASSES)]

@@ -110,7 +110,7 @@ def _has_own_section(key: str) -> bool:
     """Return whether a key's section has its own heading. The type of other keys describes their sections.
     `target.render.integrator` equals `integrator`.
     """
-    return key in ("render", "heightmap", "motion", "mask", "regularizers")
+    return key in ("render", "heightmap", "motion", "mask", "regularizers", "white_balance")
 
 
 def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]]:

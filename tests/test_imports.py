@@ -22,6 +22,7 @@ ROWS = [
     "seeds",
     "statistics",
     "glasses",
+    "colorimetry",
     "config",
     "backend",
     "records",
@@ -47,6 +48,7 @@ FOREIGN = {
     "seeds": {"mitsuba", "drjit"},
     "statistics": {"mitsuba", "drjit"},
     "glasses": {"mitsuba", "drjit"},
+    "colorimetry": {"mitsuba", "drjit"},
     "records": {"matplotlib"},
     "lens": {"mitsuba", "drjit", "matplotlib"},
 }

@@ -15,12 +15,11 @@ import importlib.util
 import os
 import re
 import sys
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from reslrb_cli.backend.shared_library import missing_library
 from reslrb_cli.errors import BackendError
@@ -34,16 +33,6 @@ _UNSAFE = frozenset({"blender"})
 
 #: Names that Mitsuba knows without a library.
 _BUILT_IN = frozenset({"scene", "rgb", "spectrum"})
-
-
-def import_colour() -> Any:
-    """Import the package `colour` late, because the import takes a second. Hide its warnings about optional
-    packages.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import colour
-    return colour
 
 
 def package_folder() -> Path:

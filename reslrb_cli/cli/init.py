@@ -27,6 +27,7 @@ from reslrb_cli.records.atomic import write_atomically, writing
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from reslrb_cli.config.schema import Config
     from reslrb_cli.scene.proposal import Photograph, Proposal
     from reslrb_cli.scene.xml.read import Description
 
@@ -164,8 +165,9 @@ _RATIO = 0.01
     "--set",
     "overrides",
     multiple=True,
-    metavar="scene.options.NAME=VALUE",
-    help="Value of a $NAME of the scene file; also written to the configuration. May be repeated.",
+    metavar="KEY=VALUE",
+    help="Value of a $NAME of the scene file (scene.options.NAME), or the variant; also written to the configuration. "
+    "May be repeated.",
 )
 def command(
     scene_file: Path,
@@ -195,9 +197,11 @@ def command(
         raise ConfigError("--output", "", f"{path} must end in .yaml or .yml")
     _check_free(path)
     check_writable("--output", path)
-    options = _read_options(scene_file, overrides)
-    set_variant("auto")
+    given = _read_settings(scene_file, overrides)
+    options = given.scene.options
+    set_variant(given.variant)
 
+    from reslrb_cli.optimization.views import own_channels
     from reslrb_cli.scene.images import turned_line
     from reslrb_cli.scene.load import load_scene
     from reslrb_cli.scene.parameters import select_parameters
@@ -226,10 +230,11 @@ def command(
     if photo is not None and copied:
         image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
         _check_free(image)
+    is_raw = bool(own_channels(film))
     depth, missing = find_depth(scene, index)
     text = _first_config(
         path, options, description.variables, sensors, index, proposals, scene=scene_file, target=image,
-        is_integer=is_integer, size=size, film=own, reason=reason,
+        variant=given.variant, is_raw=is_raw, is_integer=is_integer, size=size, film=own, reason=reason,
         hides_emitters=hides, depth=depth, missing=missing,
     )  # fmt: skip
     specs = loads(text, path).parameters
@@ -237,7 +242,7 @@ def command(
     select_parameters(scene, specs, path)  # raises errors before anything is written
     with writing("--output", path):
         if copied and photo is not None and image is not None:
-            write_smaller(photo, size, image)
+            write_smaller(photo, size, image, is_raw)
         write_atomically(path, lambda file: file.write(text.encode()))
     made = f" and {image}" if copied else ""
     count = sum(proposal.first for proposal in proposals)
@@ -270,16 +275,19 @@ def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Si
     return max(round(width * scale), 1), max(round(height * scale), 1)
 
 
-def _read_options(scene_file: Path, overrides: tuple[str, ...]) -> Mapping[str, bool | int | float | str]:
-    """Return the values of the scene file's variables from `--set`. Raises ConfigError for other settings."""
+def _read_settings(scene_file: Path, overrides: tuple[str, ...]) -> Config:
+    """Return a configuration with the scene file's variables and the variant of `--set`. Raises ConfigError for other
+    settings.
+    """
     for override in map(parse_override, overrides):
-        if override.location[:2] != ("scene", "options"):
+        if override.location[:2] != ("scene", "options") and override.location != ("variant",):
             raise ConfigError(
-                override.label, "", "init takes only scene.options.NAME=VALUE; edit other settings in its output"
-            )
+                override.label, "", "init takes only scene.options.NAME=VALUE and variant=NAME; edit other settings in "
+                "its output",
+            )  # fmt: skip
     stand_ins = {"target": {"render": {}}, "parameters": [{"key": "*"}]}
     text = write({"scene": {"file": str(scene_file.absolute())}, **stand_ins})
-    return loads(text, scene_file, overrides).scene.options
+    return loads(text, scene_file, overrides)
 
 
 def _tell_sensor(index: int, sensors: Sequence[str]) -> None:

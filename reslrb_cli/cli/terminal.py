@@ -174,5 +174,7 @@ def tell(error: BaseException) -> tuple[str, int] | None:
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "reslrb"
-        return f"{where}: {one_line(error.format_message()).rstrip('.')}. See `{where} --help`.", ExitCode.USAGE
+        said = one_line(error.format_message()).rstrip(".")
+        end = "" if said.endswith("?") else "."
+        return f"{where}: {said}{end} See `{where} --help`.", ExitCode.USAGE
     return errors.tell(error)

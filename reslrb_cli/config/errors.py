@@ -252,7 +252,7 @@ def _one_of(known: list[str], value: Any) -> str:
 
 
 def _but_is(message: str, value: Any) -> str:
-    """Add the actual value to `message` if it fits in a line."""
+    """Add the actual value to `message`, unless the message names it."""
     if isinstance(value, bool):
         shown = str(value).lower()
     elif value is None:
@@ -269,4 +269,4 @@ def _but_is(message: str, value: Any) -> str:
         shown = "a mapping"
     else:
         shown = f"a {type(value).__name__}"
-    return message if " not " in message else f"{message}, not {shown}"
+    return message if " not " in message or message.endswith("?") else f"{message}, not {shown}"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
     GetJsonSchemaHandler,
@@ -97,6 +98,31 @@ Exposure = Annotated[
 ]
 
 
+def _illuminant(value: str) -> str:
+    from reslrb_cli.colorimetry import find_illuminant  # late, because it needs NumPy
+
+    try:
+        return find_illuminant(value)
+    except ValueError as error:
+        raise wrong(str(error)) from None
+
+
+#: A standard illuminant of colour-science.
+Illuminant = Annotated[str, AfterValidator(_illuminant)]
+
+
+class WhiteBalance(Section):
+    """Chromatic adaptation of photographs to the lamps of the scene. A surface that has the colour of the illuminant
+    `photograph` in the photographs gets the colour of the illuminant `scene`.
+    """
+
+    scene: Illuminant = "D65"
+    """Illuminant of the scene's lamps, such as `A` or `LED-B3`. D65 is white in linear sRGB."""
+    photograph: Illuminant | None = None
+    """Illuminant whose colour white surfaces have in the photographs. null: they are white, because the camera has
+    balanced the colours."""
+
+
 def _sensor_name(value: Any) -> Any:
     if (isinstance(value, int) and not isinstance(value, bool) and value >= 0) or (isinstance(value, str) and value):
         return value
@@ -138,6 +164,8 @@ class TargetConfig(Section):
     """Whether the target files show the scene with the values in its scene file, as images of another renderer do. The
     run then reports the error of each parameter. Only with files."""
     render: Rendering | None = Field(default=None, description="Render the target from the scene.")
+    white_balance: WhiteBalance | None = None
+    """Illuminants of photograph and scene, if they differ. null: colours stay as they are."""
     mask: AnyMask = Mask()
     """Pixels that the loss leaves out, and weights of the others. `auto`: leave out all kinds of pixels below. `none`:
     leave out none. The path of an image of weights: use only these weights. A section lists the kinds, and may add
@@ -161,12 +189,14 @@ class TargetConfig(Section):
             raise located("", "must have exactly one of `file` and `render`, and has both")
         if self.render is not None and self.color_space != "auto":
             raise located("color_space", "has no effect on a rendered target; remove it")
+        if self.render is not None and self.white_balance is not None:
+            raise located("white_balance", "has no effect on a rendered target; remove it")
         if self.render is not None and self.truth:
             raise located("truth", "has no effect on a rendered target, which has it; remove it")
         return self
 
     def idle(self) -> set[str]:
-        return set() if self.render is None else {"color_space", "truth"}
+        return set() if self.render is None else {"color_space", "truth", "white_balance"}
 
 
 class ViewSpec(Section):

@@ -44,7 +44,7 @@ OPTIONS: dict[str, Any] = {
 
 def register() -> None:
     """Register the plugins with Mitsuba, for the current variant and for variants that are set later: integrators,
-    `dispersivedielectric` and `illuminant`.
+    `dispersivedielectric`, `illuminant` and `sensitivity`.
 
     Dr.Jit replaces each error in `mi.render` by a `RuntimeError` without its reason. `register` therefore also replaces
     `mi.render` by a function that raises the errors of these integrators themselves, such as UnsupportedScene.

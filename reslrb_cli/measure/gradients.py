@@ -34,7 +34,7 @@ from reslrb_cli.measure.comparison import ROUNDING
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import Deformation
-from reslrb_cli.scene.dispersion import bends_light
+from reslrb_cli.scene.dispersion import COEFFICIENT, bends_light
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.upsampling import Upsampling
 
@@ -46,6 +46,7 @@ RELIEF = 0.02
 
 #: Size of a direction of a motion's component (rotations are in degrees), and of a glass's n_d and V_d. None: `REACH`
 #: times the scene's size. A thousandth of the size is a step beyond the rounding of rays: a V_d of 10 was too small.
+#: The size of a glass's coefficients is their own value.
 UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.05, "Vd": 50.0}
 
 #: Least number of paths whose values are added to a sum in memory at once.
@@ -104,7 +105,7 @@ def smooth_rows(key: str, value: Any, extent: float, count: int) -> list[np.ndar
             wave = _waves(grid.reshape(-1, 2), random).reshape(shape[:2])
             row = RELIEF * extent * np.broadcast_to(wave.reshape(*shape[:2], *(1 for _ in shape[2:])), shape)
         else:
-            unit = UNITS.get(name) or REACH * extent
+            unit = np.abs(value) if COEFFICIENT.search(key) else UNITS.get(name) or REACH * extent
             row = unit * random.uniform(0.5, 1, shape) * random.choice([-1.0, 1.0], shape)
         found.append(np.ravel(row))
     return found

@@ -13,7 +13,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.colorimetry import WHITE, adaptation, illuminant
 from reslrb_cli.config.schema import Config
+from reslrb_cli.config.views import WhiteBalance
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.loading import (
     are_upright,
@@ -24,13 +26,15 @@ from reslrb_cli.optimization.loading import (
     render_in_passes,
 )
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.views import Array, Masked, View, color_channels
+from reslrb_cli.optimization.views import Array, Masked, View, color_channels, own_channels
 from reslrb_cli.records.images import luminance
+from reslrb_cli.scene.graph import visible
 from reslrb_cli.scene.images import Photo, read_photo, turned_line
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.values import resample
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
+from reslrb_cli.transport.film import FINE, responses_of
 
 #: The seed of rendered targets.
 TARGET_SEED = 0
@@ -98,6 +102,8 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
     """
     config, upright = problem.config, are_upright(problem.config)
     remarks: list[str] = []
+    if (balance := config.target.white_balance) is not None:
+        say(f"white balance: colours are adapted from {balance.photograph or 'white'} to {balance.scene}")
     for view in problem.views:
         film = problem.scene.sensors()[view.sensor].film()
         if view.file is None:
@@ -105,14 +111,20 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
         size = (int(film.crop_size()[0]), int(film.crop_size()[1]))
         try:
             # Pure spectral colours are outside of sRGB, and have negative channels.
-            signed = mi.is_spectral
-            photo = read_photo(view.file, config.target.color_space, size, upright, nonfinite=True, signed=signed)
+            photo = read_photo(
+                view.file, config.target.color_space, size, upright, nonfinite=True, signed=mi.is_spectral,
+                channels=own_channels(film),
+            )  # fmt: skip
         except ConfigError as error:
             raise ConfigError(config.source, view.file_key, error.message) from None
         line = turned_line(view.file, upright)
         if line is not None:
             remarks.append(line)
-        _see(problem, view, photo.image, photo, remarks.append)
+        image = photo.image
+        if balance is not None:
+            image = (image @ _adapted(balance, film).T).astype(np.float32)
+            image = image if mi.is_spectral else np.maximum(image, 0)  # a few saturated colours are outside of sRGB
+        _see(problem, view, image, photo, remarks.append)
     _say_few(remarks, say)
     if problem.config.target.render is not None:
         problem = replace(problem, truth=_render_targets(problem, say))
@@ -129,6 +141,19 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
         problem.apply()
     _check_light(problem, say)
     return problem
+
+
+def _adapted(balance: WhiteBalance, film: mi.Film) -> Array:
+    """Return the matrix (C, C) by which colours of a photograph become colours under the lamps of the scene."""
+    responses = responses_of(film) if own_channels(film) else None
+    if responses is None:
+        return adaptation(balance.photograph or WHITE, balance.scene)
+    # The channels of a camera have factors. A camera that balances colours keeps the channel with most light.
+    wavelengths = visible(FINE)
+    by_channel = np.array(responses, np.float64).reshape(-1, wavelengths.size)
+    scene = by_channel @ illuminant(balance.scene, wavelengths)
+    shown = by_channel @ illuminant(balance.photograph, wavelengths) if balance.photograph else scene.max()
+    return np.diag(scene / shown)
 
 
 def _say_few(remarks: Sequence[str], say: Callable[[str], None]) -> None:

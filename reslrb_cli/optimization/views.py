@@ -356,6 +356,14 @@ def color_channels(film: mi.Film) -> int:
     return 1 if int(film.base_channels_count()) <= 2 else 3
 
 
+def own_channels(film: mi.Film) -> list[str]:
+    """Return the names of a film's channels if they have responses of their own. RGB films return an empty list."""
+    if not mi.has_flag(film.flags(), mi.FilmFlags.Spectral):
+        return []
+    film.prepare([])
+    return [field.name for field in film.bitmap().struct_()]
+
+
 def to_tensor(array: Array) -> mi.TensorXf:
     """Return an image (H, W, C) in Dr.Jit's own memory."""
     return mi.TensorXf(own_memory(mi.Float, np.ravel(array).astype(np.float32, copy=False)), array.shape)

@@ -80,7 +80,8 @@ class Manifest:
     - `incomplete`: the missing share of the derivative, for each parameter that moves light (`MissingRecord`).
     - `scaling`: the measurements of each parameter for `scale: auto`.
     - `views`: for each view, the share of the loss, the excluded pixels of each kind, and the factor for viewing
-        (`shown`).
+        (`shown`). With a white balance, the illuminant of the scene (`white`). For a film with its own responses, the
+        names of its `channels`.
     - `results`: `iterations`, values and errors by key, `certainty`, `warnings`, perceptual errors (`seen`), ...
     - `error`: the line that the user saw if the run failed.
     - `resumed`: for each resumption, the iteration, the time, the command, the state, and the changed settings and

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.backend.installation import import_colour
+from reslrb_cli.colorimetry import WHITE, adaptation, import_colour
 from reslrb_cli.records.images import load_image
 from reslrb_cli.report.tonemap import encode, shown_exposures
 
@@ -44,9 +44,9 @@ def _mean_and_max(differences: Array) -> dict[str, float]:
 SIGMA, WINDOW = 1.5, 11
 
 
-def image_errors(image: Array, target: Array, exposure: float) -> dict[str, Any]:
+def image_errors(image: Array, target: Array, exposure: float, adapted: Array | None = None) -> dict[str, Any]:
     """Return the errors of an image (H, W, C) of linear values. Only channels shared with `target` count, without
-    alpha.
+    alpha. For CIEDE2000, colours are multiplied by the matrix `adapted`, which makes white surfaces white.
 
     Image and target are multiplied by `exposure`, clipped to [0, 1] and encoded in sRGB, as on a screen. `psnr_db` is
     None if both look the same. `ssim` is None for images smaller than its window. `ciede2000` holds the mean and the
@@ -61,6 +61,8 @@ def image_errors(image: Array, target: Array, exposure: float) -> dict[str, Any]
     found |= {"psnr_db": psnr(*shown), "ssim": ssim(*shown)}
     # CIEDE2000 needs three channels, so grey is repeated.
     rgb = [np.broadcast_to(array * exposure, (*array.shape[:2], 3)) for array in pair]
+    if adapted is not None:
+        rgb = [array @ adapted.T for array in rgb]
     return found | {"ciede2000": _mean_and_max(ciede2000(*rgb))}
 
 
@@ -87,10 +89,14 @@ def seen_errors(folder: Path, views: Sequence[Mapping[str, Any]] | None) -> dict
     """Return the perceptual errors of the images of the run in `folder`, for `results.seen` in its manifest.
 
     Each sensor (`""`, `"-0"`, ...) has the `exposure` for viewing the target, and the `image_errors` of the `initial`
-    and the `final` image. `views` comes from the run's manifest. Missing and damaged files are left out.
+    and the `final` image. `views` comes from the run's manifest. Missing and damaged files are left out. The colours of
+    a film with its own responses, such as those of a camera, have no CIEDE2000.
     """
     images = {}
+    by_sensor = {f"-{view.get('sensor')}": view for view in views or ()}
     for suffix, exposure in shown_exposures(views).items():
+        view = by_sensor[suffix] if suffix else (views or ())[0]
+        adapted = adaptation(view["white"], WHITE) if "white" in view else None
         target = load_image(folder / "images" / f"target{suffix}.exr")
         if target is None:
             continue
@@ -98,7 +104,9 @@ def seen_errors(folder: Path, views: Sequence[Mapping[str, Any]] | None) -> dict
         for moment in ("initial", "final"):
             image = load_image(folder / "images" / f"{moment}{suffix}.exr")
             if image is not None and image.shape[:2] == target.shape[:2]:
-                found[moment] = image_errors(image, target, exposure)
+                found[moment] = image_errors(image, target, exposure, adapted)
+                if "channels" in view:
+                    del found[moment]["ciede2000"]
         if found:
             images[suffix] = {"exposure": exposure} | found
     return images

@@ -33,7 +33,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Images, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty
-from reslrb_cli.optimization.views import view_records
+from reslrb_cli.optimization.views import own_channels, view_records
 from reslrb_cli.records.checkpoint import entries_below, save_checkpoint
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest, commit_of
@@ -141,6 +141,10 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
         # Primary rays may fail, too, in a scene that light paths do not support.
         lamps = sees_lamps(problem.scene, sensor) if unsupported_part(problem.scene, sensor) is None else None
         record["shown"] = exposure_for(np.array(view.target), lamps)
+        if channels := own_channels(sensor.film()):
+            record["channels"] = channels
+        elif (balance := problem.config.target.white_balance) is not None and view.file is not None:
+            record["white"] = balance.scene
     manifest.decisions = [each.to_json() for each in problem.decisions]
     return manifest
 

@@ -1,4 +1,4 @@
-"""Plugins of `reslrb`: glass with dispersion, and spectra of standard illuminants.
+"""Plugins of `reslrb`: glass with dispersion, and spectra of standard illuminants and cameras.
 
 `dispersivedielectric` is a boundary to a glass whose index depends on the wavelength (`glasses.py`). Mitsuba's own
 dielectrics have one index.
@@ -17,18 +17,21 @@ In variants without wavelengths, the index is n_d.
 from __future__ import annotations
 
 import functools
+import re
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.backend.installation import import_colour
+from reslrb_cli.colorimetry import colour_of, illuminant, sensitivity
 from reslrb_cli.glasses import Glass, cauchy_shape, find_glass, index_of
 from reslrb_cli.scene.graph import visible
 
 #: Names of our plugins in scene files.
-GLASS, ILLUMINANT = "dispersivedielectric", "illuminant"
+GLASS, ILLUMINANT, SENSITIVITY = "dispersivedielectric", "illuminant", "sensitivity"
+#: Keys of Sellmeier coefficients.
+COEFFICIENT = re.compile(r"\.([BC])\d$")
 #: Name of the class of `GLASS`.
 GLASS_CLASS = "DispersiveDielectric"
 #: Shortest wavelength in nm at which an index is evaluated: idle lanes have none, and Sellmeier's formula has poles
@@ -40,12 +43,13 @@ def register() -> None:
     """Register the plugins for the current variant. A second call has no effect."""
     mi.register_bsdf(GLASS, lambda props: _glass_class(mi.variant())(props))
     mi.register_texture(ILLUMINANT, make_illuminant)
+    mi.register_texture(SENSITIVITY, make_sensitivity)
 
 
 def bends_light(params: mi.SceneParameters, key: str) -> bool:
-    """True if a parameter changes directions of refraction: n_d or V_d of a glass with dispersion."""
+    """True if a parameter changes directions of refraction: n_d, V_d, or a coefficient of a glass with dispersion."""
     node = params.properties[key][2] if key in params.properties else None
-    return node is not None and node.class_name() == GLASS_CLASS and key.endswith((".nd", ".Vd"))
+    return node is not None and node.class_name() == GLASS_CLASS and not key.endswith(".alpha")
 
 
 def make_illuminant(props: mi.Properties) -> mi.Texture:
@@ -54,27 +58,37 @@ def make_illuminant(props: mi.Properties) -> mi.Texture:
     The luminance at a scale of 1 equals that of a uniform spectrum of 1. Variants without wavelengths have the colour
     of the illuminant. Raises ValueError for an unknown name.
     """
-    colour = import_colour()
-    name, scale = props["name"], float(props.get("scale", 1.0))
-    known = {each.lower(): spectrum for each, spectrum in colour.SDS_ILLUMINANTS.items()}
-    if name.lower() not in known:
-        names = ", ".join(each for each in colour.SDS_ILLUMINANTS if not each.startswith("ISO"))
-        raise ValueError(f"there is no illuminant {name!r}; known are {names}")
     wavelengths = visible()
-    spectrum, observer = known[name.lower()], colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    values = np.interp(wavelengths, spectrum.wavelengths, spectrum.values, left=0, right=0)
-    matching = np.stack([np.interp(wavelengths, observer.wavelengths, observer.values[:, i]) for i in range(3)])
-    values *= scale * matching[1].sum() / (matching[1] @ values)
+    values = float(props.get("scale", 1.0)) * illuminant(props["name"], wavelengths)
     if mi.is_spectral:
-        made = mi.Properties("regular")
-        made["wavelength_min"], made["wavelength_max"] = float(wavelengths[0]), float(wavelengths[-1])
-        made["values"] = ", ".join(f"{value:.9g}" for value in values)
-    else:
-        xyz = matching @ values / matching[1].sum()
-        made = mi.Properties("srgb")
-        made["color"] = mi.ScalarColor3f(*(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB @ xyz))
-        made["unbounded"] = True
-    # Without the id of the illuminant, so that `export` replaces it by a spectrum with the recovered values.
+        return _regular(wavelengths, values)
+    made = mi.Properties("srgb")
+    made["color"] = mi.ScalarColor3f(*colour_of(values, wavelengths))
+    made["unbounded"] = True
+    return mi.PluginManager.instance().create_object(made)
+
+
+def make_sensitivity(props: mi.Properties) -> mi.Texture:
+    """Return the spectrum of a `channel` (red, green or blue) of a `camera`, for a film's response.
+
+    A uniform spectrum of 1 gives 1 in the most sensitive channel. Raises ValueError for unknown names, and in variants
+    without wavelengths.
+    """
+    curve = sensitivity(props["camera"], props["channel"])
+    if not mi.is_spectral:
+        raise ValueError(f"{SENSITIVITY} needs wavelengths: set `variant` to llvm_ad_spectral or cuda_ad_spectral")
+    return _regular(*curve)
+
+
+def _regular(wavelengths: np.ndarray, values: np.ndarray) -> mi.Texture:
+    """Return a spectrum that is linear between its values.
+
+    The spectrum does not have the id of the plugin that makes it, so that `export` replaces this plugin by a spectrum
+    with the recovered values.
+    """
+    made = mi.Properties("regular")
+    made["wavelength_min"], made["wavelength_max"] = float(wavelengths[0]), float(wavelengths[-1])
+    made["values"] = ", ".join(f"{value:.9g}" for value in values)
     return mi.PluginManager.instance().create_object(made)
 
 
@@ -87,8 +101,10 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
 
         The glass has the name `material` of the catalogue, or the numbers `nd` and `Vd`, or the coefficients
         `sellmeier` (B1, ..., C1, ..., with C in square micrometres). `nd` and `Vd` may also replace those of a
-        material. Its shape g of the dispersion stays the same. With `alpha`, the boundary is rough, and its normals
-        have the `distribution`.
+        material or of coefficients. The shape g of the dispersion stays the same. With `alpha`, the boundary is rough,
+        and its normals have the `distribution`.
+
+        Its parameters are the coefficients if the scene gives only `sellmeier`, otherwise `nd` and `Vd`.
         """
 
         def __init__(self, props: mi.Properties) -> None:
@@ -108,6 +124,10 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
             if self.distribution not in ("ggx", "beckmann"):
                 raise ValueError(f"distribution must be ggx or beckmann, not {self.distribution!r}")
             self.nd, self.Vd = mi.Float(nd), mi.Float(Vd)
+            #: The glass by its coefficients, if these are the parameters.
+            self.coefficients: Glass | None = None
+            if glass is not None and mi.is_spectral and "sellmeier" in props and not {"nd", "Vd"} & {*props.keys()}:
+                self.coefficients = Glass(tuple(map(mi.Float, glass.B)), tuple(map(mi.Float, glass.C)))
             sides, flags = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide, mi.BSDFFlags
             smooth = self.alpha is None
             reflection = flags.DeltaReflection if smooth else flags.GlossyReflection
@@ -117,9 +137,14 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
-            callback.put("nd", self.nd, flags)
-            if mi.is_spectral:  # it has no effect in other variants
-                callback.put("Vd", self.Vd, flags)
+            if self.coefficients is not None:
+                for letter, values in (("B", self.coefficients.B), ("C", self.coefficients.C)):
+                    for number, value in enumerate(values, 1):
+                        callback.put(f"{letter}{number}", value, flags)
+            else:
+                callback.put("nd", self.nd, flags)
+                if mi.is_spectral:  # it has no effect in other variants
+                    callback.put("Vd", self.Vd, flags)
             if self.alpha is not None:
                 callback.put("alpha", self.alpha, flags)
 
@@ -127,7 +152,11 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
             """Return the index inside, divided by that outside, for each wavelength of the ray."""
             if not mi.is_spectral:
                 return [self.nd / self.ext_ior]
-            n = index_of(self.nd, self.Vd, self.shape, dr.maximum(si.wavelengths, _SHORTEST))
+            wavelengths = dr.maximum(si.wavelengths, _SHORTEST)
+            if self.coefficients is not None:
+                n = self.coefficients.index(wavelengths)
+            else:
+                n = index_of(self.nd, self.Vd, self.shape, wavelengths)
             return [each / self.ext_ior for each in n]
 
         def sample(
@@ -239,13 +268,19 @@ def _glass_class(variant: str) -> type[mi.BSDF]:
 
         def to_string(self) -> str:
             rough = "" if self.alpha is None else f", alpha = {self.alpha[0]:g}"
-            return f"{GLASS_CLASS}[nd = {self.nd[0]:g}, Vd = {self.Vd[0]:g}{rough}]"
+            glass = self.coefficients
+            if glass is None:
+                return f"{GLASS_CLASS}[nd = {self.nd[0]:g}, Vd = {self.Vd[0]:g}{rough}]"
+            numbers = ", ".join(f"{value[0]:g}" for value in (*glass.B, *glass.C))
+            return f"{GLASS_CLASS}[sellmeier = {numbers}{rough}]"
 
     return DispersiveDielectric
 
 
 def _glass_of(props: mi.Properties) -> Glass | None:
-    """Return the glass of a plugin's `material` or `sellmeier`. Raises ValueError if it has both, or a wrong one."""
+    """Return the glass of a plugin's `material`, or of its `sellmeier`. `B1`, ..., `C1`, ... replace its coefficients.
+    Raises ValueError if there are both, or a wrong one.
+    """
     if "material" in props and "sellmeier" in props:
         raise ValueError(f"{GLASS} has both `material` and `sellmeier`; remove one")
     if "material" in props:
@@ -256,7 +291,19 @@ def _glass_of(props: mi.Properties) -> Glass | None:
     half = len(numbers) // 2
     if not numbers or len(numbers) % 2:
         raise ValueError("sellmeier needs as many coefficients B as C, such as `1.04, 0.23, 1.01, 0.006, 0.02, 103.6`")
-    return Glass(tuple(numbers[:half]), tuple(numbers[half:]))
+    names = [f"{letter}{number}" for letter in "BC" for number in range(1, half + 1)]
+    numbers = [float(props.get(name, value)) for name, value in zip(names, numbers, strict=True)]
+    B, C = tuple(numbers[:half]), tuple(numbers[half:])
+    ends = [(float(end) / 1000) ** 2 for end in visible()[[0, -1]]]
+    if any(ends[0] <= pole <= ends[1] for pole in C):
+        raise ValueError(f"sellmeier has a pole at a visible wavelength; C must be below {ends[0]:.3f} or above "
+                         f"{ends[1]:.3f}")  # fmt: skip
+    glass = Glass(B, C)
+    with np.errstate(invalid="ignore"):
+        least = glass.index(visible()).min()
+    if not least > 1:
+        raise ValueError("sellmeier gives an index that is not above 1 at all visible wavelengths")
+    return glass
 
 
 def _spectrum(values: list[Any]) -> mi.Spectrum:

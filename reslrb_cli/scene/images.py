@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,7 +132,8 @@ Image = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Photo:
-    """Image file as linear Rec. 709, (H, W, 3) float32. Booleans (H, W) mark the defects of the pixels.
+    """Image file as linear Rec. 709, (H, W, 3) float32, or with the channels that were asked for. Booleans (H, W) mark
+    the defects of the pixels.
 
     `clipped` pixels have a channel at the maximum value of an 8-bit or 16-bit file. `transparent` pixels have alpha 0.
     `nonfinite` pixels have a non-finite channel.
@@ -178,14 +179,18 @@ def read_photo(
     upright: bool = True,
     signed: bool = False,
     nonfinite: bool = False,
+    channels: Sequence[str] = (),
 ) -> Photo:
     """Read an image file like `read_image`, and mark unreliable pixels.
 
     `upright` rotates the image by its EXIF orientation. `size` then refers to the upright image. `signed` allows
-    negative values, and `nonfinite` allows non-finite values. Raises ConfigError, located in the file.
+    negative values, and `nonfinite` allows non-finite values. `channels` are the names of the channels to read, if the
+    image is not RGB. Raises ConfigError, located in the file.
     """
     bitmap = read_bitmap(path, size, upright)
-    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+    if channels:
+        bitmap = _choose(bitmap, channels, path)
+    elif bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; use an image with only R, G, B or Y")
     width, height = (int(n) for n in bitmap.size())
     raw = np.array(bitmap).reshape(height, width, -1)
@@ -193,8 +198,9 @@ def read_photo(
     colors = raw if alpha is None else raw[:, :, :-1]
     is_integer = raw.dtype.kind in "ui"
     bitmap.set_srgb_gamma(False)  # values as stored in the file; decoded below
-    bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
-    image = np.array(bitmap, dtype=np.float32).reshape(height, width, 3)
+    kind = bitmap.pixel_format() if channels else mi.Bitmap.PixelFormat.RGB
+    bitmap = bitmap.convert(kind, mi.Struct.Type.Float32, False)
+    image = np.array(bitmap, dtype=np.float32).reshape(height, width, -1)
     if color_space == "srgb" or (color_space == "auto" and is_integer):
         image = decode_srgb(image)
     finite, nothing = np.isfinite(image), np.zeros((height, width), dtype=bool)
@@ -202,7 +208,7 @@ def read_photo(
         if bad.any():
             y, x, channel = (int(n) for n in np.argwhere(bad)[0])
             value, count = f"{image[y, x, channel]:g}", int(bad.any(axis=2).sum())
-            where = f"pixel ({x}, {y}), channel {'RGB'[channel]}"
+            where = f"pixel ({x}, {y}), channel {(channels or 'RGB')[channel]}"
             raise ConfigError(path, "", f"{where}, is {value}: {what} ({count} pixels in all)")
     return Photo(
         image,
@@ -210,6 +216,16 @@ def read_photo(
         transparent=nothing if alpha is None else alpha == 0,
         nonfinite=np.logical_not(finite.all(axis=2)),
     )
+
+
+def _choose(bitmap: mi.Bitmap, channels: Sequence[str], path: Path) -> mi.Bitmap:
+    """Return the channels of a bitmap with these names, in this order. Raises ConfigError if one is missing."""
+    names = [field.name for field in bitmap.struct_()]
+    if missing := [name for name in channels if name not in names]:
+        reason = f"has the channels {', '.join(names)}; the film also needs {', '.join(missing)}"
+        raise ConfigError(path, "", reason)
+    pixels = np.array(bitmap).reshape(*bitmap.size()[::-1], -1)[:, :, [names.index(name) for name in channels]]
+    return mi.Bitmap(np.ascontiguousarray(pixels), mi.Bitmap.PixelFormat.MultiChannel)
 
 
 def decode_srgb(encoded: Image) -> Image:

@@ -18,6 +18,7 @@ import numpy as np
 from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters
+from reslrb_cli.scene.dispersion import COEFFICIENT
 from reslrb_cli.scene.export import LOBES
 from reslrb_cli.scene.graph import SceneGraph, grid, sensor_rays
 from reslrb_cli.scene.images import decode_srgb, read_bitmap
@@ -45,9 +46,9 @@ def open_photograph(path: Path) -> Photograph:
     return Photograph(path, (width, height), np.array(bitmap).dtype.kind in "ui", bitmap)
 
 
-def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
+def write_smaller(photo: Photograph, size: tuple[int, int], path: Path, is_raw: bool = False) -> None:
     """Write the photograph to `path` with fewer pixels. `size` is the new (width, height). Each new pixel is a mean of
-    linear values.
+    linear values. Integers are encoded in sRGB, or linear if the photograph `is_raw`.
 
     Integers become a PNG of 16 bits. A PNG pixel is clipped (at the maximum) if any photograph pixel within its area is
     clipped. A PNG pixel is transparent (alpha 0) if any photograph pixel within its area is transparent. Floats become
@@ -56,21 +57,26 @@ def write_smaller(photo: Photograph, size: tuple[int, int], path: Path) -> None:
     raw = np.array(photo.bitmap)
     raw = raw.reshape(*raw.shape[:2], -1)
     if not photo.is_integer:
-        write_bitmap(path, mi.Bitmap(np.ascontiguousarray(_means(raw, size))))
+        pixels = np.ascontiguousarray(_means(raw, size))
+        if (kind := photo.bitmap.pixel_format()) == mi.Bitmap.PixelFormat.MultiChannel:
+            write_bitmap(path, mi.Bitmap(pixels, kind, [field.name for field in photo.bitmap.struct_()]))
+        else:
+            write_bitmap(path, mi.Bitmap(pixels))
         return
     greatest = float(np.iinfo(raw.dtype).max)
     colours, alpha = (raw[:, :, :-1], raw[:, :, -1:]) if photo.bitmap.has_alpha() else (raw, None)
-    linear = _means(decode_srgb(colours.astype(np.float32) / np.float32(greatest)), size)
+    values = colours.astype(np.float32) / np.float32(greatest)
+    linear = _means(values if is_raw else decode_srgb(values), size)
     clipped = _means(colours == greatest, size) > 0
     encoded = mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32)).convert(
-        component_format=mi.Struct.Type.UInt16, srgb_gamma=True
+        component_format=mi.Struct.Type.UInt16, srgb_gamma=not is_raw
     )
     pixels = np.where(clipped, np.uint16(65535), np.array(encoded).reshape(linear.shape)).astype(np.uint16)
     if alpha is not None:
         opaque = (_means(alpha == 0, size) == 0) * np.uint16(65535)
         pixels = np.concatenate([pixels, opaque.astype(np.uint16)], axis=2)
     bitmap = mi.Bitmap(np.ascontiguousarray(pixels))
-    bitmap.set_srgb_gamma(True)
+    bitmap.set_srgb_gamma(not is_raw)
     write_bitmap(path, bitmap)
 
 
@@ -103,6 +109,9 @@ _BOUNDS = (
     (r"\bturbidity$", "[1, 10]"),
     (r"\.value$|\.data$|\.specular$", "[0, 1]"),
 )
+
+#: Bounds of a glass's coefficient C in µm² with a pole in the ultraviolet.
+_ULTRAVIOLET = "[0, 0.08]"
 
 #: Rays per axis of the film, for measuring shares.
 _RAYS = 64
@@ -232,6 +241,10 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
 
 def _bounds(info: ParameterInfo) -> str | None:
     text = next((bounds for pattern, bounds in _BOUNDS if re.search(pattern, info.key)), None)
+    if (name := COEFFICIENT.search(info.key)) and info.value is not None:
+        # The index stays above 1, and the poles stay outside of the visible wavelengths.
+        value = info.value.mean
+        text = _ULTRAVIOLET if name[1] == "C" and value < 0.1 else f"[{value / 2:.4g}, {2 * value:.4g}]"
     if text is None or info.value is None:
         return text
     low, high = (np.float32(word.strip(" []").replace(".inf", "inf")) for word in text.split(","))

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reslrb_cli.scene.dispersion import GLASS, ILLUMINANT
+from reslrb_cli.scene.dispersion import GLASS, ILLUMINANT, SENSITIVITY
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
 #: Kinds of plugins, and the headings of the page for them.
@@ -194,7 +194,7 @@ OWN = "a plugin of `reslrb`"
 OWN_INDEX = f"{OWN}; without wavelengths, its index is that at 587.6 nm"
 OWN_GLASS = f'<bsdf type="{GLASS}"><string name="material" value="N-BK7"/>{{}}</bsdf>'
 MENDED = "RGB variants have no spectrum `{}`: read as its colour"
-SPECTRAL = "needs wavelengths, which RGB variants lack"
+SPECTRAL = "needs wavelengths"
 
 ROWS: tuple[Row, ...] = (
     *(Row("bsdf", name, scene=thing(xml), note=SAID_OF.get(name, ""), without=SMOOTH.get(name, ""))
@@ -275,6 +275,8 @@ ROWS: tuple[Row, ...] = (
         painted('<spectrum type="d65" name="{}"><float name="scale" value="0.5"/></spectrum>')),
     Row("texture", ILLUMINANT, "on a lamp",
         lit('<spectrum type="illuminant" name="{}"><string name="name" value="A"/></spectrum>'), note=OWN),
+    Row("texture", SENSITIVITY, scene=painted('<spectrum type="sensitivity" name="{}"><string name="camera" '
+        'value="Nikon 5100"/><string name="channel" value="red"/></spectrum>'), loading=SPECTRAL),
     Row("texture", "uniform", scene=painted('<spectrum type="uniform" name="{}"><float name="value" '
         'value="0.4"/></spectrum>')),
     Row("texture", "srgb", scene=painted('<spectrum type="srgb" name="{}"><rgb name="color" '
@@ -417,7 +419,7 @@ REASONS = {
     "belongs to Mitsuba's own RayDataLoader": "it belongs to Mitsuba's own RayDataLoader",
     "irregular has 3 wavelengths and 2 values": "both lists must have the same length",
     "only emitters can have a blackbody; a bsdf can have <rgb>": "only emitters can have it; use `rgb` instead",
-    SPECTRAL: "it needs a spectral variant of Mitsuba; use `hdrfilm` instead",
+    SPECTRAL: "it needs a spectral variant of Mitsuba",
 }
 
 HEAD = """# Mitsuba's plugins

@@ -16,7 +16,7 @@ from cli.tiny import reslrb, settings
 from turns import a_few
 
 from reslrb_cli.backend.installation import package_folder, shipped_plugins
-from reslrb_cli.scene.dispersion import GLASS, ILLUMINANT
+from reslrb_cli.scene.dispersion import GLASS, ILLUMINANT, SENSITIVITY
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -110,7 +110,7 @@ def test_every_plugin_is_covered() -> None:
     }
     listed = {row.plugin for row in ROWS}
     assert registered >= {"prb", "flat_sensor"}
-    assert (shipped_plugins() | registered | {"blender", GLASS, ILLUMINANT}) - {"scene"} == listed
+    assert (shipped_plugins() | registered | {"blender", GLASS, ILLUMINANT, SENSITIVITY}) - {"scene"} == listed
     assert len({row.name for row in ROWS}) == len(ROWS)
 
 

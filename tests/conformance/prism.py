@@ -5,6 +5,7 @@ wavelength and each place in the slit. It shares no code with the package or Mit
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import colour
 import numpy as np
@@ -22,8 +23,8 @@ STEP, PLACES = 1.0, 41
 WAVELENGTHS = np.arange(380.0, 780.0, STEP)
 
 
-def sellmeier(nm: np.ndarray) -> np.ndarray:
-    """Return the index of F2."""
+def sellmeier(nm: np.ndarray, B: tuple[float, ...] = B, C: tuple[float, ...] = C) -> np.ndarray:
+    """Return the index of F2, or of a glass with other coefficients."""
     square = (nm / 1000) ** 2
     return np.sqrt(1 + sum(b * square / (square - c) for b, c in zip(B, C, strict=True)))
 
@@ -38,10 +39,15 @@ def index(nm: np.ndarray, nd: float | None = None, Vd: float | None = None) -> n
 @functools.cache
 def picture(nd: float | None = None, Vd: float | None = None) -> np.ndarray:
     """Return the sum of the picture over its rows, (width, 3), in linear sRGB."""
+    return picture_of(lambda nm: index(nm, nd, Vd))
+
+
+def picture_of(glass: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return the same for the index that `glass` returns at wavelengths in nm."""
     along, across = axes(90 - BEAM)[0], axes(90 - BEAM)[1]
     places = (np.arange(PLACES) + 0.5) / PLACES * 2 - 1
     nm, offset = (grid.ravel() for grid in np.meshgrid(WAVELENGTHS, HALF_WIDTH * places, indexing="ij"))
-    n = index(nm, nd, Vd)
+    n = glass(nm)
     o = SLIT[:, None] + across[:, None] * offset
     d, flux = np.repeat(along[:, None], len(n), 1), np.ones(len(n))
     for turn, relative in ((-60.0, n), (60.0, 1 / n)):

@@ -5,18 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import colour
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare, renders
+from cli.tiny import done, settings
 from click.testing import CliRunner
 from conformance.scenes import camera, lamp, rgb, stage
 
 import reslrb_cli as rl
 from reslrb_cli.cli import main
+from reslrb_cli.config.loader import loads
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import Case, integrator, seeds
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.scene.images import read_photo
+from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.upsampling import DARKEST, coefficients, colours_of
 
 #: Wavelengths in nm, and spectra with these nodes.
@@ -212,3 +221,67 @@ def test_a_run_recovers_spectra_and_exports_them(tmp_path: Path) -> None:
     made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
     for key in keys:
         np.testing.assert_allclose(np.ravel(made[key]), np.ravel(run.parameters[key]), rtol=1e-5)
+
+
+CHANNEL = """<spectrum type="sensitivity" name="{}"><string name="camera" value="Nikon 5100"/>
+    <string name="channel" value="{}"/></spectrum>"""
+CAMERA = f"""<scene version="3.0.0">
+    <sensor type="perspective"><film type="specfilm">
+        <integer name="width" value="8"/><integer name="height" value="8"/>
+        {CHANNEL.format("R", "red")}{CHANNEL.format("G", "green")}{CHANNEL.format("B", "blue")}</film></sensor>
+    <shape type="rectangle" id="plate"><transform name="to_world"><scale value="9"/><rotate y="1" angle="180"/>
+        <translate z="4"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.3, 0.2"/></bsdf></shape>
+    <emitter type="constant"><spectrum type="illuminant" name="radiance"><string name="name" value="A"/></spectrum>
+    </emitter>
+</scene>
+"""
+
+
+def take_raw_photograph(image: np.ndarray) -> None:
+    """Write the scene and a raw photograph into the working folder. A camera balances the image (8, 8, 3) for the
+    illuminant A, and writes 16 bits. White surfaces are grey, and the largest channel stays.
+    """
+    Path("plate.xml").write_text(CAMERA)
+    curves, light = colour.MSDS_CAMERA_SENSITIVITIES["Nikon 5100 (NPL)"], colour.SDS_ILLUMINANTS["A"]
+    white = np.interp(curves.wavelengths, light.wavelengths, light.values) @ curves.values
+    mi.Bitmap(np.uint16(np.clip(image * 0.8 * white.max() / white, 0, 1) * 65535 + 0.5)).write("raw.png")
+
+
+def test_a_raw_photograph_gets_the_colours_of_the_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    image = np.random.default_rng(1).uniform(0.1, 0.3, (8, 8, 3))
+    take_raw_photograph(image)
+    problem = assemble(loads(f"""
+        variant: {mi.variant()}
+        scene: {{file: plate.xml}}
+        target: {{file: raw.png, color_space: linear, white_balance: {{scene: A}}, mask: none}}
+        parameters: [{{key: plate.bsdf.reflectance.value}}]
+        integrator: {{type: prb}}
+    """, str(tmp_path / "plate.yaml")))  # fmt: skip
+    np.testing.assert_allclose(np.array(problem.views[0].target), 0.8 * image, rtol=1e-3)
+
+
+def test_a_colour_is_recovered_from_a_raw_photograph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mitsuba's `path` renders the image."""
+    monkeypatch.chdir(tmp_path)
+    Path("plate.xml").write_text(CAMERA)
+    scene, tracer = load_scene(Path("plate.xml")), mi.load_dict({"type": "path", "max_depth": 2})
+    take_raw_photograph(np.array(mi.render(scene, integrator=tracer, spp=16384)))
+    done("init", "plate.xml", "--target", "raw.png", "--set", f"variant={mi.variant()}")
+    assert "color_space: linear" in Path("plate.yaml").read_text()
+    done("optimize", "plate.yaml", *settings(
+        "target.white_balance={scene: A}", "target.exposure=0.8", "parameters[0].initial=0.5", "integrator.max_depth=2",
+        "integrator.paths=camera", "run.iterations=120", "run.spp=128", "optimizer.learning_rate=0.05", "run.name=it",
+    ))  # fmt: skip
+    found = read_value(Path("runs/it"), "plate.bsdf.reflectance.value")
+    np.testing.assert_allclose(found, [0.6, 0.3, 0.2], atol=0.01)
+    assert read_manifest(Path("runs/it"))["views"][0]["channels"] == ["R", "G", "B"]
+
+
+def test_a_photograph_lacks_a_channel_of_the_film(tmp_path: Path) -> None:
+    names, path = ["blue", "green", "red"], tmp_path / "seen.exr"
+    mi.Bitmap(np.ones((2, 2, 3), np.float32), mi.Bitmap.PixelFormat.MultiChannel, names).write(str(path))
+    assert read_photo(path, channels=["red", "blue"]).image.shape == (2, 2, 2)
+    with pytest.raises(ConfigError, match="the film also needs wide"):
+        read_photo(path, channels=["red", "wide"])

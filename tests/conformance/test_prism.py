@@ -4,6 +4,7 @@ glass.
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import drjit as dr
@@ -11,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli.tiny import done
-from conformance.prism import FILM, image, index, picture
+from conformance.prism import FILM, B, C, image, index, picture, picture_of, sellmeier
 
 from reslrb_cli.measure.gradients import smooth_weights
 from reslrb_cli.records.images import write_file
@@ -62,20 +63,48 @@ def test_the_rainbow_is_that_of_an_independent_tracer(kind: str, prism: mi.Scene
 
 @pytest.mark.parametrize("estimator", ["stack", pytest.param("reservoir", marks=pytest.mark.long)])
 def test_derivatives_by_the_glass_match_differences_of_the_tracer(estimator: str, prism: mi.Scene) -> None:
+    check_derivatives(prism, differences(), estimator)
+
+
+@pytest.mark.long
+def test_derivatives_by_coefficients_match_differences_of_the_tracer(prism: mi.Scene, tmp_path: Path) -> None:
+    wanted = {}
+    for letter, coefficients in (("B", B), ("C", C)):
+        for number, value in enumerate(coefficients[:2]):
+            ends = []
+            for factor in (1 + 1e-4, 1 - 1e-4):
+                changed = list(coefficients)
+                changed[number] *= factor
+                ends.append(picture_of(functools.partial(sellmeier, **{letter: tuple(changed)})))
+            wanted[f"glass.{letter}{number + 1}"] = (ends[0] - ends[1]) / (2e-4 * value)
+    check_derivatives(load_scene(coefficients_scene(tmp_path)), wanted, "stack")
+
+
+def coefficients_scene(folder: Path) -> Path:
+    """Write the shipped scene with the glass by its coefficients, and return its file."""
+    text = (ROOT / "scenes/prism/scene.xml").read_text()
+    numbers = ", ".join(map(str, (*B, *C)))
+    (folder / "scene.xml").write_text(text.replace('"material" value="F2"', f'"sellmeier" value="{numbers}"'))
+    return folder / "scene.xml"
+
+
+def check_derivatives(scene: mi.Scene, derivatives: dict[str, np.ndarray], estimator: str) -> None:
+    """Assert that derivatives of the picture equal `derivatives` (width, 3), for weights that vary over the film."""
     columns = np.stack([np.sin(np.arange(FILM[0]) / s) + 1 for s in (9.0, 14.0, 11.0)], -1).astype(np.float32)
-    wanted = [float((derivative * columns).sum()) for derivative in differences().values()]
-    params, weights = mi.traverse(prism), mi.TensorXf(np.broadcast_to(columns, (FILM[1], *columns.shape)).copy())
-    for key in STEPS:
+    wanted = [float((derivative * columns).sum()) for derivative in derivatives.values()]
+    params, weights = mi.traverse(scene), mi.TensorXf(np.broadcast_to(columns, (FILM[1], *columns.shape)).copy())
+    for key in derivatives:
         dr.enable_grad(params[key])
     params.update()
     integrator, found = mi.load_dict({"type": "reslrb", "estimator": estimator, "max_depth": 4}), []
     for seed in range(8):
-        seen = mi.render(prism, params, integrator=integrator, spp=64, seed=seed)
-        for key in STEPS:
+        seen = mi.render(scene, params, integrator=integrator, spp=64, seed=seed)
+        for key in derivatives:
             dr.set_grad(params[key], 0)
         dr.backward(dr.sum(seen * weights, axis=None))
-        found.append([float(dr.grad(params[key])[0]) for key in STEPS])
+        found.append([float(dr.grad(params[key])[0]) for key in derivatives])
     mean, error = np.mean(found, 0), np.std(found, 0, ddof=1) / np.sqrt(len(found))
+    print(mean, error, wanted)
     assert (error < 0.02 * np.abs(wanted)).all()
     assert (np.abs(mean - wanted) < 4 * error + 0.005 * np.abs(wanted)).all(), (mean, error, wanted)
 
@@ -93,12 +122,21 @@ def test_the_glass_is_recovered_from_the_picture_of_the_tracer(prism: mi.Scene, 
 
 
 @pytest.mark.long
-def test_derivatives_of_rough_glass_match_finite_differences(prism: mi.Scene, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "steps", [{"glass.nd": 5e-3, "glass.Vd": 2.0, "glass.alpha": 4e-3}, {"glass.B1": 0.015, "glass.C2": 0.002}]
+)
+def test_derivatives_of_rough_glass_match_finite_differences(
+    steps: dict[str, float], prism: mi.Scene, tmp_path: Path
+) -> None:
     """The weights vanish at the film's border, because derivatives lack the light that crosses it."""
-    text = (ROOT / "scenes/prism/scene.xml").read_text()
-    (tmp_path / "scene.xml").write_text(text.replace('value="F2"/>', 'value="F2"/><float name="alpha" value="0.1"/>'))
-    scene = load_scene(tmp_path / "scene.xml")
-    params, steps = mi.traverse(scene), {"glass.nd": 5e-3, "glass.Vd": 2.0, "glass.alpha": 4e-3}
+    path = ROOT / "scenes/prism/scene.xml" if "glass.nd" in steps else coefficients_scene(tmp_path)
+    text = path.read_text().replace(
+        '<bsdf type="dispersivedielectric" id="glass">',
+        '<bsdf type="dispersivedielectric" id="glass"><float name="alpha" value="0.1"/>',
+    )
+    (tmp_path / "rough.xml").write_text(text)
+    scene = load_scene(tmp_path / "rough.xml")
+    params = mi.traverse(scene)
     weights = mi.TensorXf((smooth_weights(*FILM[::-1]) * [1.0, 0.3, -0.8]).astype(np.float32))
     integrator = mi.load_dict({"type": "reslrb", "estimator": "stack", "max_depth": 4, "rr_depth": 100})
     start = {key: float(params[key][0]) for key in steps}

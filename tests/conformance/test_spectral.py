@@ -5,6 +5,7 @@ The default suite changes the variant of its process. `-m long` has a process fo
 
 from __future__ import annotations
 
+import inspect
 import os
 import subprocess
 import sys
@@ -19,13 +20,15 @@ from conformance.gradient_cases import CASES
 ROOT = Path(__file__).resolve().parents[2]
 OWN = "tests/conformance/spectral.py"
 ROULETTE = next(case for case in CASES if case.name == "roulette")
-QUICK: dict[str, Callable[[], None]] = {
+QUICK: dict[str, Callable[..., None]] = {
     "colours": own.test_coefficients_have_their_colour,
     "derivatives of colours": own.test_coefficients_have_derivatives,
     "condition of gradients by colours": own.test_the_condition_of_gradients_by_colours,
     "furnace": lambda: own.test_the_furnace_has_its_colour("both", "regular"),
     "derivatives by stack": lambda: own.test_the_furnace_has_its_derivatives("light", "stack", "regular"),
     "derivatives by reservoir": lambda: own.test_the_furnace_has_its_derivatives("light", "reservoir", "irregular"),
+    "raw photograph": own.test_a_raw_photograph_gets_the_colours_of_the_lamps,
+    "missing channel": own.test_a_photograph_lacks_a_channel_of_the_film,
     "naive AD": lambda: test_gradients.test_exact_estimators_equal_naive_ad(ROULETTE, "correlated"),
 }
 #: Files whose default tests do not assume that a path's values are the channels of the film.
@@ -43,8 +46,10 @@ def run(*arguments: str) -> None:
 
 
 @pytest.mark.parametrize("check", QUICK)
-def test_the_spectral_variant(check: str, spectral: None) -> None:
-    QUICK[check]()
+def test_the_spectral_variant(check: str, spectral: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = {"tmp_path": tmp_path, "monkeypatch": monkeypatch}
+    names = inspect.signature(QUICK[check]).parameters
+    QUICK[check](**{name: given[name] for name in names})
 
 
 @pytest.mark.long

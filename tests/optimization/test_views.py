@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colour
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,7 +16,9 @@ from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
+from reslrb_cli.report.perceptual import ciede2000
 
+CHART = "ColorChecker N Ohta"
 ALL = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
 
 
@@ -90,6 +93,8 @@ BAD = [
     ("views=[{sensor: 0, mask: auto}]", "views[0].mask", "must be `none` or the path of an image"),
     ("target.exposure=-1", "target.exposure", "must be a positive number, `auto` or `per_channel`"),
     ("target.mask=3", "target.mask", "must be `auto`, `none`"),
+    ("target.white_balance={scene: D64}", "target.white_balance.scene", "did you mean D65 or"),
+    ("target.white_balance={photograph: A}", "target.white_balance", "has no effect on a rendered target"),
 ]
 
 
@@ -99,6 +104,37 @@ def test_errors_are_located(folder, setting, key, words):
         make(folder, setting)
     assert words in str(error.value)
     assert key in str(error.value)
+
+
+def test_a_white_balance_adapts_the_colours_of_a_photograph(folder):
+    """The photograph shows a colour chart under the illuminant A. Adapted, it has almost the colours under D65."""
+    observer, nm = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"], np.arange(380.0, 781.0, 5.0)
+    matching = np.stack([np.interp(nm, observer.wavelengths, observer.values[:, i]) for i in range(3)], -1)
+    chart = [np.interp(nm, each.wavelengths, each.values) for each in colour.SDS_COLOURCHECKERS[CHART].values()]
+    space, xyz, whites = colour.RGB_COLOURSPACES["sRGB"], {}, {}
+    for name in ("A", "D65"):
+        light = np.interp(nm, colour.SDS_ILLUMINANTS[name].wavelengths, colour.SDS_ILLUMINANTS[name].values)
+        light /= matching[:, 1] @ light
+        xyz[name], whites[name] = np.array(chart) * light @ matching, light @ matching
+    linear = np.ones((64, 3), np.float32)
+    linear[:24] = xyz["A"] @ np.linalg.inv(space.matrix_RGB_to_XYZ).T
+    mi.Bitmap(np.maximum(linear, 0).reshape(8, 8, 3)).write(str(folder / "chart.exr"))
+
+    def seen(balance):
+        problem = make(folder, "target={file: chart.exr, mask: none}", f"target.white_balance={balance}")
+        return np.array(problem.views[0].target).reshape(64, 3)[:24]
+
+    wanted = colour.adaptation.chromatic_adaptation_VonKries(xyz["A"], whites["A"], whites["D65"], transform="Bradford")
+    inside = (wanted @ np.linalg.inv(space.matrix_RGB_to_XYZ).T > 0.01).all(1) & (linear[:24] > 0).all(1)
+    np.testing.assert_allclose(seen("{photograph: a}")[inside] @ space.matrix_RGB_to_XYZ.T, wanted[inside], atol=1e-3)
+    np.testing.assert_allclose(seen("{scene: A, photograph: A}"), np.maximum(linear[:24], 0), atol=1e-5)
+    factors = np.linalg.inv(space.matrix_RGB_to_XYZ) @ np.stack([whites["D65"], whites["A"]], -1)
+    under_d65 = xyz["D65"] @ np.linalg.inv(space.matrix_RGB_to_XYZ).T
+    differences = [
+        ciede2000(found[inside], under_d65[inside]).mean()
+        for found in (seen("{photograph: A}"), linear[:24] * factors[:, 0] / factors[:, 1])
+    ]
+    assert differences == pytest.approx([1.9, 3.1], abs=0.1)  # as `adaptation` says
 
 
 def test_separate_views_need_no_target_section(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colour
 import numpy as np
 import pytest
 from report.measured import make_run, texture
@@ -78,6 +79,32 @@ def test_grey_images_and_alpha():
     assert found["psnr_db"] == pytest.approx(tripled["psnr_db"])
     with_alpha = np.concatenate([texture(16, 16), np.zeros((16, 16, 1), np.float32)], axis=2)
     assert image_errors(with_alpha, texture(16, 16), 1.0)["psnr_db"] is None
+
+
+def test_colours_under_another_illuminant_are_adapted(tmp_path):
+    """Under the illuminant A, differences are those that colour-science finds after Bradford's adaptation to D65. A
+    film with the channels of a camera has no colours.
+    """
+    folder = make_run(tmp_path / "lamp")
+    images = [load_image(folder / "images" / f"{name}.exr") for name in ("final", "target")]
+    space, white = colour.RGB_COLOURSPACES["sRGB"], colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]
+    xyz = [image.astype(np.float64) @ space.matrix_RGB_to_XYZ.T for image in images]
+    whites = [colour.xy_to_XYZ(white[name]) for name in ("A", "D65")]
+    matrix = colour.adaptation.matrix_chromatic_adaptation_VonKries(*whites, transform="Bradford")
+    labs = [
+        colour.XYZ_to_Lab(
+            np.clip(each @ matrix.T @ np.linalg.inv(space.matrix_RGB_to_XYZ).T, 0, 1) @ space.matrix_RGB_to_XYZ.T,
+            white["D65"],
+        )
+        for each in xyz
+    ]
+    wanted = colour.delta_E(*labs, method="CIE 2000")
+    view = {"sensor": 0, "shown": 1.0}
+    found = seen_errors(folder, [view | {"white": "A"}])[""]["final"]["ciede2000"]
+    assert found == pytest.approx({"mean": wanted.mean(), "max": wanted.max()}, rel=0.005)
+    plain = seen_errors(folder, [view])[""]["final"]
+    assert abs(plain["ciede2000"]["mean"] / found["mean"] - 1) > 0.02
+    assert seen_errors(folder, [view | {"channels": ["R", "G", "B"]}])[""]["final"].keys() == {"psnr_db", "ssim"}
 
 
 def test_files_of_a_run_folder(tmp_path):

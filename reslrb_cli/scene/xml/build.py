@@ -94,7 +94,7 @@ REFUSED_PLUGINS = {
     ("texture", "curvature"): f"{_OLD}; use `mesh_attribute`",
     ("texture", "vertexcolors"): f"{_OLD}; use `mesh_attribute`",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
-    ("film", "specfilm"): "needs wavelengths, which RGB variants lack; use `hdrfilm`",
+    ("film", "specfilm"): "needs wavelengths: set `variant` to llvm_ad_spectral or cuda_ad_spectral, or use `hdrfilm`",
     ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; use a `perspective` one",
 }
 
@@ -146,6 +146,8 @@ _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
 #: "At string (line 3, col 7): " and the like, before the message proper.
 _PREAMBLE = re.compile(r"^(At|Error while loading|While loading) .*?\(line \d+, col \d+\):? ?")
 _PLACE = re.compile(r"\(line (\d+), col \d+\)")
+#: Traceback of a plugin in Python, before its message.
+_TRACEBACK = re.compile(r"Traceback \(most recent call last\):.*\n\w+: ", re.DOTALL)
 #: Mitsuba's message about a mesh without faces.
 _NO_FACES = re.compile(r"Storing new normals in a Mesh that didn't have normals.*")
 
@@ -217,7 +219,7 @@ class _Text:
         """
         place = _PLACE.search(message)
         element = self._elements[int(place[1]) - 1] if place else None
-        text = _ORIGIN.sub("", message).strip()
+        text = _TRACEBACK.sub("", _ORIGIN.sub("", message)).strip()
         while _PREAMBLE.match(text):
             text = _PREAMBLE.sub("", text).strip()
         text = _NO_FACES.sub("the mesh has no faces", text)
