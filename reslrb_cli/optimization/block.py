@@ -97,6 +97,8 @@ class Block:
         K = positive(np.where(np.outer(use, use), H / np.outer(root, root), 0.0))
         mean_g, mean_x, last_g, last_x, last_step = rows[:, :5].T
         y, x = np.where(use, now.gradient / root, 0.0), now.value * root
+        y *= min(1.0, np.linalg.norm((root * now.longest)[use]) / max(float(np.linalg.norm(y)), 1e-300))
+        gradient = np.where(use, y * root, 0.0)
         n, variances = rows[0, 6], rows[0, 7:FIELDS]
         before = K @ (x - last_x * root) if n > 0 else np.zeros_like(x)
         vectors = np.linalg.eigh(K[np.ix_(use, use)])[1]
@@ -105,7 +107,7 @@ class Block:
         new = np.array([np.mean(squares[:half]), np.mean(squares[-half:])])
         variances = np.where(variances > 0, variances**MEMORY * new ** (1 - MEMORY), new)
         n = n + 1 if now.gradient @ last_step > 0 else max(1.0, n - SHRINK)
-        mean_g = np.where(now.known, mean_g + (now.gradient - mean_g) / n, mean_g)
+        mean_g = np.where(now.known, mean_g + (gradient - mean_g) / n, mean_g)
         mean_x = mean_x + (now.value - mean_x) / n
         Y = np.where(use, mean_g / root, 0.0) - K @ (mean_x * root - x)
         free = use & ~((now.value <= now.low) & (Y > 0) | (now.value >= now.high) & (Y < 0))
@@ -118,7 +120,7 @@ class Block:
         step[free] = -(inverse @ A @ precision @ Y[free]) / root[free]
         error[free] = np.sqrt(np.diag(inverse) * noise / n) / root[free]
         distance = np.abs(step) + SURE * error
-        fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, *variances]
+        fields = [mean_g, mean_x, gradient, now.value, step, distance, n, *variances]
         rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
         change = np.clip(step, -now.longest, now.longest)
         if (tied := now.exposure >= 0).any():
