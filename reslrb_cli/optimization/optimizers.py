@@ -394,8 +394,8 @@ class Optimizer:
 
     @contextmanager
     def displaced(self, random: np.random.Generator) -> Iterator[None]:
-        """Displace all entries of large parameters by equal amounts in the directions in which they move, and measure the
-        curvature for `auto`. Entries that do not move have random directions.
+        """Displace all entries of large parameters in the directions of their next steps, by equal amounts, and measure
+        the curvature for `auto`. Entries that do not move have random directions.
 
         Accumulate the gradient before, and within the block the gradient at the displaced values, with the same
         samples. Afterwards, values and gradients are as before.

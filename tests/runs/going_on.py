@@ -78,7 +78,8 @@ def work_alone(patch: pytest.MonkeyPatch) -> None:
         return call
 
     places = [(loop, "gradient"), (sensitivity, "sample_gradient"), (sensitivity, "see_images"),
-              (curvature, "see_images"), (measuring, "sample_gradient"), (problem, "render_in_passes"), (targets, "render_in_passes")]  # fmt: skip
+              (curvature, "see_images"), (measuring, "sample_gradient"), (problem, "render_in_passes"),
+              (targets, "render_in_passes")]  # fmt: skip
     for module, name in places:
         patch.setattr(module, name, alone(getattr(module, name)))
     patch.setattr(optimizers.Optimizer, "step", alone(optimizers.Optimizer.step))
