@@ -7,7 +7,7 @@ iteration, the entries i move as follows.
     m_i  <-  0.5 m_i + g_i                                    momentum
     s_i  <-  0.9 s_i + 0.1 |g_i|                              size of the gradients of entry i
     h_i   =  c s_i,   c = sum_j H_j s_j / sum_j s_j²          curvature
-    x_i  <-  x_i - clip(0.2 m_i / h_i, ±L) / (1 + q n_i)      step
+    x_i  <-  x_i - clip(0.4 m_i / h_i, ±L) / (1 + q n_i)      step
 
 H is the second derivative of the loss, measured at common random numbers: H_i = z_i (g_i(x + d z) - g_i(x)) / d. The
 signs z are those of the next step. Random signs would give the diagonal (Hutchinson 1989). However, a pixel shows
@@ -45,7 +45,7 @@ from reslrb_cli.optimization.nonfinite import flat
 
 #: Step as a share of Newton's, decay of the momentum, and decay of the gradients' size. docs/optimizers.md has
 #: measurements.
-GAIN, MOMENTUM, MEMORY = 0.2, 0.5, 0.9
+GAIN, MOMENTUM, MEMORY = 0.4, 0.5, 0.9
 #: Displacement d of a measurement as a share of the extent, and the weight of the newest measurement.
 DISPLACEMENT, NEWEST = 0.05, 0.75
 #: L as a share of the extent, and q.
