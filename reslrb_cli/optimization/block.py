@@ -4,13 +4,16 @@ Colours that light each other, a lamp and the surfaces that it lights, and an ex
 curvature H is therefore measured as a whole, by differences of images (`loop.measure_block`). Near the optimum x*, a
 gradient is g = H (x - x*) + noise. With the means of the last n gradients and of their values, a step is
 
-    y = mean g - H (mean x - x),   x <- x - (n H V^-1 H + s C^-1)^-1 n H V^-1 y
+    y = mean g - H (mean x - x),   x <- x - (n H² + s v C^-1)^-1 n H y
 
-in units in which the diagonal of H is 1. C is diagonal, with the squares of twice the longest steps. V is the
-covariance of the noise of a gradient, so noise limits the steps in directions that the images hardly determine. V has
-the eigenvectors of H, and two variances: one for the half of the eigenvectors with the larger curvature, and one for
-the others, along which noise is smaller as well. Consecutive gradients give both variances, because
-g - g' - H (x - x') has the covariance 2 V. Where the loss is not quadratic, V is larger, and the steps are shorter.
+in units in which the diagonal of H is 1. C is diagonal, with the squares of twice the longest steps L. v is the
+variance of the noise of a gradient, so noise limits the steps in directions that the images hardly determine.
+Consecutive gradients give v, because g - g' - H (x - x') has the variance 2 v. Where the loss is not quadratic, v is
+larger, and the steps are shorter.
+
+A rare bright sample makes a gradient many times as large, and would lead all values astray until the mean forgets it. A
+gradient that is longer than L is therefore shortened to this length, in the same units. Near the optimum, most
+gradients are shorter, and are not changed.
 
 n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.
@@ -30,15 +33,12 @@ import numpy as np
 from reslrb_cli.optimization.uncertainty.posterior import positive
 from reslrb_cli.statistics import Array
 
-#: s, decay of V, and decrease of n.
+#: s, decay of v, and decrease of n.
 NOISE, MEMORY, SHRINK = 0.3, 0.8, 0.25
-#: Smallest variance of V as a share of the largest.
-LEAST_NOISE = 1e-4
 #: Standard errors from the estimate to a limit that holds with a probability of 85 %.
 SURE = 1.04
-#: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, and
-#: the variances along the smaller and the larger curvatures.
-FIELDS = 9
+#: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, and v.
+FIELDS = 8
 
 
 @dataclass(frozen=True)
@@ -97,28 +97,24 @@ class Block:
         K = positive(np.where(np.outer(use, use), H / np.outer(root, root), 0.0))
         mean_g, mean_x, last_g, last_x, last_step = rows[:, :5].T
         y, x = np.where(use, now.gradient / root, 0.0), now.value * root
-        n, variances = rows[0, 6], rows[0, 7:FIELDS]
+        y *= min(1.0, np.linalg.norm((root * now.longest)[use]) / max(float(np.linalg.norm(y)), 1e-300))
+        gradient = np.where(use, y * root, 0.0)
+        n, variance = rows[0, 6:FIELDS]
         before = K @ (x - last_x * root) if n > 0 else np.zeros_like(x)
-        vectors = np.linalg.eigh(K[np.ix_(use, use)])[1]
-        squares = np.square(vectors.T @ (y - last_g / root - before)[use]) / 2
-        half = (len(squares) + 1) // 2
-        new = np.array([np.mean(squares[:half]), np.mean(squares[-half:])])
-        variances = np.where(variances > 0, variances**MEMORY * new ** (1 - MEMORY), new)
+        new = max(float(np.mean(np.square(y - last_g / root - before)[use])) / 2, 1e-300)
+        variance = variance**MEMORY * new ** (1 - MEMORY) if variance > 0 else new
         n = n + 1 if now.gradient @ last_step > 0 else max(1.0, n - SHRINK)
-        mean_g = np.where(now.known, mean_g + (now.gradient - mean_g) / n, mean_g)
+        mean_g = np.where(now.known, mean_g + (gradient - mean_g) / n, mean_g)
         mean_x = mean_x + (now.value - mean_x) / n
         Y = np.where(use, mean_g / root, 0.0) - K @ (mean_x * root - x)
         free = use & ~((now.value <= now.low) & (Y > 0) | (now.value >= now.high) & (Y < 0))
         A, C = K[np.ix_(free, free)], np.square(2 * now.longest * root)[free]
-        vectors, noise = np.linalg.eigh(A)[1], max(float(variances.max()), 1e-300)
-        places = (np.arange(len(A)) >= len(A) // 2).astype(int)
-        precision = (vectors * (noise / np.maximum(variances[places], LEAST_NOISE * noise))) @ vectors.T
-        inverse = np.linalg.inv(A @ precision @ A + np.diag(NOISE * noise / n / C + 1e-8))
+        inverse = np.linalg.inv(A @ A + np.diag(NOISE * variance / n / C + 1e-8))
         step, error = np.zeros_like(x), np.zeros_like(x)
-        step[free] = -(inverse @ A @ precision @ Y[free]) / root[free]
-        error[free] = np.sqrt(np.diag(inverse) * noise / n) / root[free]
+        step[free] = -(inverse @ A @ Y[free]) / root[free]
+        error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
         distance = np.abs(step) + SURE * error
-        fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, *variances]
+        fields = [mean_g, mean_x, gradient, now.value, step, distance, n, variance]
         rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
         change = np.clip(step, -now.longest, now.longest)
         if (tied := now.exposure >= 0).any():

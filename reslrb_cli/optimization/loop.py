@@ -110,22 +110,20 @@ def close_enough(problem: Problem, iteration: int) -> str:
     return f"every parameter is within {100 * CLOSE:g} % of the optimum"
 
 
-#: Displacement of small parameters as a share of half their extent, and the divisor of a step's samples for each of the
-#: two sets that measure their curvature.
-DISPLACEMENT, PART = 0.05, 4
+#: Displacement of small parameters as a share of half their extent, the divisor of a step's samples for each of the two
+#: sets that measure their curvature, and the largest ratio of the samples of these sets to those of the steps.
+DISPLACEMENT, PART, MOST = 0.05, 4, 1.0
 
 
 def measure_curvature(problem: Problem, iteration: int) -> None:
     """Measure the curvature for `auto`, if it is due. The gradient of `iteration` must be accumulated.
 
     The curvature of large parameters is measured in the iterations 0, 2, 6, 14, 30 and so on, with the samples of the
-    iteration. The joint curvature of small parameters is measured in the iterations 0, 1, 2, 4, 7, 11 and so on.
+    iteration. The joint curvature of small parameters is measured if `is_due`.
     """
-    optimizer, due = problem.optimizer, 0
-    while due < iteration:
-        due += due // 2 + 1
-    if optimizer.block.at and due == iteration:
-        measure_block(problem)
+    optimizer = problem.optimizer
+    if optimizer.block.at:
+        measure_block(problem, iteration)
     if len(optimizer.block.at) < len(optimizer.keys()) and (iteration + 2) & (iteration + 1) == 0:
         random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
         with optimizer.displaced(random):
@@ -134,13 +132,32 @@ def measure_curvature(problem: Problem, iteration: int) -> None:
         problem.apply()
 
 
-def measure_block(problem: Problem) -> None:
-    """Measure the joint curvature of all small parameters for `auto`, by differences of images."""
+def is_due(iteration: int, cost: float) -> bool:
+    """Return True if the joint curvature is measured in `iteration`. A measurement has `cost` times the samples of a
+    step.
+
+    The candidates are the iterations 0, 1, 2, 4, 7, 11 and so on. A candidate is left out if measuring would take more
+    than its share of the samples. The first `LEAST_ITERATIONS` steps count from the start.
+    """
+    due, made, fits = 0, 0, True
+    while due < iteration:
+        made, due = made + fits, due + due // 2 + 1
+        fits = (made + 1) * cost <= MOST * (due + LEAST_ITERATIONS)
+    return due == iteration and fits
+
+
+def measure_block(problem: Problem, iteration: int) -> None:
+    """Measure the joint curvature of all small parameters for `auto` by differences of images, if it is due."""
     optimizer, block, unit = problem.optimizer, problem.optimizer.block, problem.samples_per_pass or 1
     scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
               else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
-    curvature = LossCurvature(problem, max(problem.config.run.spp // PART // unit, 1) * unit, of_target=False)
-    directions, H, _ = curvature.along(plan_changes(problem, scales, DISPLACEMENT), lambda: True)
+    changes, spp = plan_changes(problem, scales, DISPLACEMENT), problem.config.run.spp
+    part = max(spp // PART // unit, 1) * unit
+    views = len(problem.trained) / len(problem.drawn(iteration))
+    if not is_due(iteration, views * 2 * (len(changes) + 1) * part / spp):
+        return
+    curvature = LossCurvature(problem, part, of_target=False)
+    directions, H, _ = curvature.along(changes, lambda: True)
     at = np.array([block.at[each.key].start + (each.entry or 0) for each in directions])
     slopes = np.concatenate([optimizer.slopes(key) for key in block.at])
     whole = np.zeros((len(slopes), len(slopes)))

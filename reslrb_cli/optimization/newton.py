@@ -9,11 +9,13 @@ iteration, the entries i move as follows.
     h_i   =  c s_i,   c = sum_j H_j s_j / sum_j s_j²          curvature
     x_i  <-  x_i - clip(0.4 m_i / h_i, ±L) / (1 + q n_i)      step
 
-H is the diagonal of the loss's second derivative, measured with random signs z (Hutchinson 1989) at common random
-numbers: H_i = z_i (g_i(x + d z) - g_i(x)) / d. A measurement costs one gradient. It takes place in the iterations 0, 2,
-6, 14, 30, and so on, because H changes as the parameters move. A single H_i is mostly noise. The least-squares factor c
-uses all entries, and s gives the differences between entries, as in Adam. Where the loss is not convex, the
-absolute value of the curvature counts.
+H is the second derivative of the loss, measured at common random numbers: H_i = z_i (g_i(x + d z) - g_i(x)) / d. The
+signs z are those of the next step. Random signs would give the diagonal (Hutchinson 1989). However, a pixel shows
+several texels, so neighbours that move together change the gradient more than one alone. Neighbours that move in
+opposite directions change it less. A measurement costs one gradient. It takes place in the iterations 0, 2, 6, 14, 30,
+and so on, because H changes as the parameters move. A single H_i is mostly noise. The least-squares factor c uses all
+entries, and s gives the differences between entries, as in Adam. Where the loss is not convex, the absolute value of
+the curvature counts.
 
 L is a share of the parameter's extent, so one bright path cannot move a texel far. n_i counts the iterations in which
 g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length.
@@ -144,6 +146,11 @@ class Newton(Rule, dropt.Optimizer[Any]):
 
     def forget(self) -> None:
         pass  # no long memory, and the measured curvature stays
+
+    def toward(self, key: str, gradient: Any) -> np.ndarray[Any, Any]:
+        """Return the direction of the next step, in the shape of the parameter. The next gradient is `gradient`."""
+        newest = np.array(gradient, dtype=np.float64)
+        return -newest - MOMENTUM * np.array(self.state[key][3][0], dtype=np.float64).reshape(newest.shape)
 
     def bend(self, key: str, curvature: Any) -> None:
         """Take a measurement of H, in the shape of the parameter. Entries that are not finite keep their curvature."""

@@ -364,8 +364,10 @@ class Optimizer:
         """Set the optimiser's variable of a small parameter to `row`, within its bounds."""
         own, variable = self._own[key], self.variable(key)
         old = dr.detach(own[key])
-        new = type(old)(row.reshape(np.array(old).shape).astype(np.float32)) + _opaque(old, 0)  # in Dr.Jit's own memory
-        dr.eval(new)
+        # A list is copied, but NumPy's memory is not, and kernels depend on its alignment.
+        entries = type(flat(old))(row.tolist())
+        new = type(old)(entries, dr.shape(old)) if dr.is_tensor_v(old) else dr.unravel(type(old), entries)
+        dr.make_opaque(new)
         own[key] = variable.clamp(new)
         if key in self._variables:
             self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
@@ -392,7 +394,8 @@ class Optimizer:
 
     @contextmanager
     def displaced(self, random: np.random.Generator) -> Iterator[None]:
-        """Displace all entries of large parameters by random signs, and measure the curvature for `auto`.
+        """Displace all entries of large parameters in the directions of their next steps, by equal amounts, and measure
+        the curvature for `auto`. Entries that do not move have random directions.
 
         Accumulate the gradient before, and within the block the gradient at the displaced values, with the same
         samples. Afterwards, values and gradients are as before.
@@ -402,7 +405,9 @@ class Optimizer:
         before, steps = self._descents(), {}
         for key, own in large.items():
             v, variable = dr.detach(own[key]), self.variable(key)
-            signs = random.choice([-1.0, 1.0], size=np.array(v).shape) * DISPLACEMENT * self.extent(key)
+            toward = own.toward(key, before[key])
+            signs = random.choice([-1.0, 1.0], size=toward.shape)
+            signs = np.where(toward != 0, np.sign(toward), signs) * DISPLACEMENT * self.extent(key)
             ahead = v + type(v)(signs.astype(np.float32))
             ahead = variable.clamp(dr.select(variable.clamp(ahead) == ahead, ahead, 2 * v - ahead))
             steps[key] = ahead - v

@@ -98,16 +98,32 @@ def test_where_the_loss_is_not_convex_a_step_goes_downhill():
     assert float(np.array(optimizer["p"])[0]) > 0.51
 
 
-def in_the_valley(start, noise=0.0, bounds=(-2.0, 2.0), size=1.0, iterations=30):
-    """Move two parameters along `VALLEY`. The measured curvature is `size` times the true one. Returns the values and
-    the limits of the distance by iteration.
+def test_the_curvature_of_texels_that_share_a_pixel_is_that_of_moving_together():
+    """Each texel has a curvature of 6. Forty texels of one pixel that move together have 201, and need short steps."""
+    optimizer, shared = make({"p": np.full(40, 0.2)}), np.full((40, 40), 5.0) + np.eye(40)
+
+    def pull_all():
+        optimizer.clear_gradient("p")
+        gradient = shared @ (np.array(optimizer["p"], dtype=np.float64) - 0.6)
+        dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(gradient.astype(np.float32)), axis=None))
+
+    pull_all()
+    with optimizer.displaced(np.random.default_rng(0)):
+        pull_all()
+    np.testing.assert_allclose(np.array(optimizer.moments()["p"]["3"]).ravel(), 201, rtol=1e-3)
+
+
+def in_the_valley(start, noise=0.0, bounds=(-2.0, 2.0), size=1.0, iterations=30, bright=()):
+    """Move two parameters along `VALLEY`. The measured curvature is `size` times the true one. The gradients of the
+    iterations `bright` are 1,000 times as large. Returns the values and the limits of the distance by iteration.
     """
     optimizer, random = make({"p": start[:1], "q": start[1:]}, bounds), np.random.default_rng(5)
     optimizer.block.bend(size * VALLEY)
     values, limits = [], []
-    for _ in range(iterations):
+    for iteration in range(iterations):
         x = np.array([float(np.array(optimizer[key])[0]) for key in ("p", "q")])
         gradients = VALLEY @ (x - BEST) + noise * random.normal(size=2)
+        gradients *= 1000.0 if iteration in bright else 1.0
         for key, gradient in zip(("p", "q"), gradients, strict=True):
             optimizer.clear_gradient(key)
             dr.backward(dr.sum(optimizer[key] * float(gradient), axis=None))
@@ -122,6 +138,12 @@ def test_small_parameters_that_compensate_for_each_other_move_together():
     np.testing.assert_allclose(values[7], BEST, atol=0.02)
     np.testing.assert_allclose(values[-1], BEST, atol=1e-3)
     assert limits[-1].max() < 0.01
+
+
+def test_a_rare_bright_sample_does_not_move_the_values_far():
+    values, _ = in_the_valley(np.array([0.9, 0.9]), noise=0.1, bright=(12, 24), iterations=60)
+    assert np.abs(values[12:] - BEST).max() < 0.6
+    np.testing.assert_allclose(values[-1], BEST, atol=0.05)
 
 
 @pytest.mark.parametrize("size", [0.6, 1.7])
@@ -203,6 +225,18 @@ def test_a_measurement_has_the_samples_of_its_step(tmp_path, steps):
     assert [a == b for a, b in itertools.pairwise(seeds)].count(True) == 3
 
 
+@pytest.mark.parametrize("cost", [0.5, 4.5, 15.5, 40.0])
+def test_measuring_takes_at_most_its_share_of_the_samples(cost):
+    measured = [iteration for iteration in range(300) if loop.is_due(iteration, cost)]
+    assert measured[0] == 0
+    for number, iteration in enumerate(measured[1:], start=2):
+        assert number * cost <= loop.MOST * (iteration + loop.LEAST_ITERATIONS)
+    if cost < 5:
+        assert measured[:7] == [0, 1, 2, 4, 7, 11, 17]
+    else:
+        assert len(measured) >= 0.5 * loop.MOST * 200 / cost
+
+
 def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
     begin_alone(tmp_path, monkeypatch)
     for sets, where in (
@@ -221,7 +255,7 @@ def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
 
 def test_a_finished_run_says_why_it_ended(llvm, tmp_path, monkeypatch, capsys):
     begin_alone(tmp_path, monkeypatch)
-    monkeypatch.setattr(loop, "CLOSE", 10.0)
+    monkeypatch.setattr(loop, "CLOSE", 100.0)
     sets = ("--set", AUTO, "--set", "run.iterations=40", "--set", "run.certainty=false", "--set", "run.measuring=0")
     assert optimize("tiny.yaml", *sets) == 0
     assert "stopped after 21 iterations: every parameter is within" in "".join(capsys.readouterr())

@@ -177,13 +177,13 @@ def test_a_changing_rate_compiles_nothing(type, kind):
     value = KINDS[kind]()
     optimizer, clock = Optimizer(type, RATE, {}, {"p": value}, {"p": None}, {"p": (0.0, 1.0)}), StepClock()
     compiled = []
-    for step in range(4):
+    for step in range(12):
         with clock.step() as times:
             dr.backward(dr.sum(dr.square(optimizer["p"] - 0.9), axis=None))
             dr.eval(optimizer.gradient("p"))
             optimizer.step(0.9**step)
         compiled.append(times.new_kernels)
-    assert compiled[2:] == [0, 0]
+    assert not any(compiled[2:])
 
 
 def test_the_state_holds_the_moments():

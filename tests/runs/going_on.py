@@ -20,7 +20,7 @@ from kit import work_in
 from reslrb_cli.cli import main
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.optimization import loop, optimizers, problem, sensitivity, targets
-from reslrb_cli.optimization.uncertainty import measuring
+from reslrb_cli.optimization.uncertainty import curvature, measuring
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.runs import recorder as recording
 
@@ -78,7 +78,8 @@ def work_alone(patch: pytest.MonkeyPatch) -> None:
         return call
 
     places = [(loop, "gradient"), (sensitivity, "sample_gradient"), (sensitivity, "see_images"),
-              (measuring, "sample_gradient"), (problem, "render_in_passes"), (targets, "render_in_passes")]  # fmt: skip
+              (curvature, "see_images"), (measuring, "sample_gradient"), (problem, "render_in_passes"),
+              (targets, "render_in_passes")]  # fmt: skip
     for module, name in places:
         patch.setattr(module, name, alone(getattr(module, name)))
     patch.setattr(optimizers.Optimizer, "step", alone(optimizers.Optimizer.step))
