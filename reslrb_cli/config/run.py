@@ -85,6 +85,13 @@ _Shards = Annotated[
 ]
 
 
+_Blur = Annotated[
+    Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False), mark("number")]
+    | Annotated[Literal["auto"], mark("text")],
+    by_kind("a number of pixels, or `auto`", "auto"),
+]
+
+
 class RunConfig(Section):
     """Length, samples and output of a run."""
 
@@ -128,10 +135,11 @@ class RunConfig(Section):
     the parameter, or all parameters, unchanged in this iteration. `zero`: replace such entries of a gradient or of the
     loss's derivative by 0 and continue. Values that are not finite never reach a parameter. A run without progress for
     10 iterations ends."""
-    blur: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 0.0
+    blur: _Blur = "auto"
     """Standard deviation, in pixels, of a Gaussian blur of image and target in the first iteration. The derivative of
     the loss is that of the blurred images, so that shapes and caustics also attract each other from a distance. The
-    blur falls linearly to 0 at half of the run. The recorded loss is that of images without blur. 0: no blur."""
+    blur falls linearly to 0 at half of the run. The recorded loss is that of images without blur. `auto`: a sixteenth
+    of the shorter side of the image if the run recovers a `motion`, otherwise 0. 0: no blur."""
     final_spp: Count = 256
     """Samples per pixel of the initial and the final image, rounded up to whole passes of `samples_per_pass`."""
     views_per_iteration: Count | None = None

@@ -59,8 +59,8 @@ def learning_rate_factor(
     return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
 
 
-#: The part of a run after which images are no longer blurred.
-BLURRED = 0.5
+#: The part of a run after which images are no longer blurred, and the blur of a motion relative to the image.
+BLURRED, MOTION_BLUR = 0.5, 1 / 16
 
 
 def blur_factor(iteration: int, iterations: int, least: float = 0.0) -> float:
@@ -212,8 +212,10 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     errors = problem.meter.errors(problem.selection.array)
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
     elapsed = time_share(problem.limit_s, state)
+    blur, moves = config.run.blur, any(each.motion is not None for each in config.parameters)
     for view in problem.trained:
-        view.blur = config.run.blur * blur_factor(iteration, config.run.iterations, elapsed)
+        sigma = blur if blur != "auto" else moves * MOTION_BLUR * min(view.target.shape[:2])
+        view.blur = sigma * blur_factor(iteration, config.run.iterations, elapsed)
     with clock.step() as times:
         loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)

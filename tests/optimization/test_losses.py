@@ -128,8 +128,16 @@ def test_a_blur_does_not_spread_a_nan():
     assert (derivative != 0).sum() == derivative.size - 1
 
 
-def test_the_blur_falls_to_zero_at_half_of_a_run_and_reaches_shards(tmp_path, monkeypatch):
-    problem, seen = make_problem(tmp_path, sets=["run.blur=2", "run.iterations=9", "run.shards=1"]), []
+@pytest.mark.parametrize(
+    ("settings", "first"),
+    [
+        (["run.blur=2"], 2),
+        ([], 0),
+        (["parameters=[{motion: {of: box, free: [translation]}}]"], 2 / 16),  # of a target of 2x2 pixels
+    ],
+)
+def test_the_blur_falls_to_zero_at_half_of_a_run_and_reaches_shards(tmp_path, monkeypatch, settings, first):
+    problem, seen = make_problem(tmp_path, sets=["run.iterations=9", *settings]), []
     monkeypatch.setattr(
         "reslrb_cli.optimization.loop.gradient",
         lambda problem, iteration: (
@@ -140,7 +148,7 @@ def test_the_blur_falls_to_zero_at_half_of_a_run_and_reaches_shards(tmp_path, mo
     state = standing(problem)
     for _ in range(9):
         state, _ = step(problem, state)
-    assert np.ravel(seen) == pytest.approx([2, 1.5, 1, 0.5, 0, 0, 0, 0, 0])
+    assert np.ravel(seen) == pytest.approx(np.multiply(first, [1, 0.75, 0.5, 0.25, 0, 0, 0, 0, 0]))
 
 
 # SSIM, and sums of losses.
