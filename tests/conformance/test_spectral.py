@@ -15,6 +15,7 @@ QUICK = [
     f"{OWN}::test_coefficients_have_their_colour",
     f"{OWN}::test_coefficients_have_derivatives",
     f"{OWN}::test_the_condition_of_gradients_by_colours",
+    f"{OWN}::test_the_coefficients_of_an_environment_map_are_no_zeros",
     f"{OWN}::test_the_furnace_has_its_colour[both-regular]",
     f"{OWN}::test_the_furnace_has_its_derivatives[light-stack-regular]",
     f"{OWN}::test_the_furnace_has_its_derivatives[light-reservoir-irregular]",
@@ -23,7 +24,7 @@ QUICK = [
 #: Files whose default tests do not assume that a path's values are the channels of the film.
 FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "freezing", "gradients", "guiding",
          "guiding_tables", "image_paths", "image_plugins", "kernels", "memory", "moving_emitters", "plan", "plugin",
-         "replay", "sequences", "shuffled", "small_lamps", "survival"]  # fmt: skip
+         "replay", "sequences", "shuffled", "small_lamps", "survival", "weights"]  # fmt: skip
 
 
 def run(*arguments: str) -> None:
