@@ -22,9 +22,9 @@ QUICK = [
     "tests/conformance/test_gradients.py::test_exact_estimators_equal_naive_ad[roulette-correlated]",
 ]
 #: Files whose default tests do not assume that a path's values are the channels of the film.
-FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "freezing", "gradients", "guiding",
-         "guiding_tables", "image_paths", "image_plugins", "kernels", "memory", "moving_emitters", "plan", "plugin",
-         "replay", "sequences", "shuffled", "small_lamps", "survival", "weights"]  # fmt: skip
+FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "camera_paths", "edges", "freezing", "gradients",
+         "guiding", "guiding_tables", "image_paths", "image_plugins", "kernels", "memory", "moving_emitters",
+         "plan", "plugin", "replay", "sequences", "shuffled", "small_lamps", "survival", "weights"]  # fmt: skip
 
 
 def run(*arguments: str) -> None:
