@@ -21,6 +21,9 @@ powerful. z is the normal deviate with the same probability as t.
 
     t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)
 
+A deviation must be significant with and without the rounding error `floor`: z is the smaller of both scores. Few
+samples can have a variance that is too small by chance. Rounding must not then count as noise of a known size.
+
 Two criteria must hold. First, the largest |z| must be below Sidak's threshold for all entries of all rows of a table.
 Second, the root mean square of a row's z must be below a limit for nu normal deviates. nu is the row's effective number
 of independent entries (Satterthwaite). r^2 is the mean squared correlation between the samples of different entries,
@@ -53,14 +56,9 @@ def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray
     """
     mean_a, mean_b = a.mean(0), b.mean(0)
     var_a, var_b = a.var(0, ddof=1) / len(a), b.var(0, ddof=1) / len(b)
-    floor = (rounding * np.maximum(np.abs(mean_a), np.abs(mean_b))) ** 2
-    error = np.sqrt(var_a + var_b + floor)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(mean_a == mean_b, 0.0, (mean_a - mean_b) / error)
-        # The rounding floor has no uncertainty.
-        spread = var_a**2 / (len(a) - 1) + var_b**2 / (len(b) - 1)
-        freedom = np.where(spread > 0, (var_a + var_b + floor) ** 2 / spread, np.inf)
-    return _normal_scores(t, freedom)
+    floor = rounding * np.maximum(np.abs(mean_a), np.abs(mean_b))
+    spread = var_a**2 / (len(a) - 1) + var_b**2 / (len(b) - 1)
+    return _smaller_scores(mean_a - mean_b, var_a + var_b, spread, floor)
 
 
 def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -> np.ndarray:
@@ -70,12 +68,24 @@ def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -
     error, and is added to the standard error in quadrature. `bias` bounds a known error such as truncation. The
     function subtracts `bias` from the absolute value of the mean difference, and clips the result at 0.
     """
-    mean, var, floor = difference.mean(0), difference.var(0, ddof=1) / len(difference), np.square(floor)
+    mean, var = difference.mean(0), difference.var(0, ddof=1) / len(difference)
     mean = np.sign(mean) * np.maximum(np.abs(mean) - bias, 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(mean == 0, 0.0, mean / np.sqrt(var + floor))
-        freedom = np.where(var > 0, (1 + floor / var) ** 2 * (len(difference) - 1), np.inf)
-    return _normal_scores(t, freedom)
+    return _smaller_scores(mean, var, var**2 / (len(difference) - 1), floor)
+
+
+def _smaller_scores(mean: np.ndarray, var: np.ndarray, spread: np.ndarray, floor: Any) -> np.ndarray:
+    """Return the scores of `mean` with and without the rounding error `floor`: for each entry, the one nearer to 0.
+
+    `var` is the variance of the mean, and 2 `spread` is the variance of `var`. The rounding error has no uncertainty.
+    """
+    scores = []
+    for total in (var, var + np.square(floor)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.where(mean == 0, 0.0, mean / np.sqrt(total))
+            freedom = np.where(spread > 0, total**2 / spread, np.inf)
+        scores.append(_normal_scores(t, freedom))
+    plain, rounded = scores
+    return np.where(np.abs(plain) < np.abs(rounded), plain, rounded)
 
 
 def _normal_scores(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:

@@ -49,11 +49,11 @@ DIRECTIONS = 2
 MOVING_DIRECTIONS = 3
 
 #: Settings of attached derivatives for each reference that differ from the user's. Naive AD follows everywhere;
-#: `ptracer` does not differentiate the filter's normalisation, but differences do.
+#: `ptracer` does not differentiate the filter's normalisation, but differences do, and they alone include edges.
 ALIKE: dict[Reference, dict[str, str]] = {
     Reference.WALK_AD: {"attached_sampling": "follow"},
     Reference.PTRACER: {"attached_sampling": "follow", "filter_normalization": "detached"},
-    Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached"},
+    Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached", "edges": "on"},
 }
 
 #: Integrator of the differenced images: ours, without roulette if paths have a maximum length.
@@ -123,7 +123,7 @@ class CheckSettings:
 
 
 def without_edges(config: Config) -> Config:
-    """Return the experiment without the derivatives of edges, which no reference has."""
+    """Return the experiment without the derivatives of edges, which only differences have."""
     integrator = config.integrator
     if integrator.options().get("edges") != "on":
         return config
@@ -222,7 +222,10 @@ class Participants:
             for case in self.listed
         }
         self.each_way = list(dict.fromkeys(self.ways.values()))
-        asked = config.integrator.options().get("guiding", "off")
+        chosen = config.integrator.options()
+        #: Labels of the estimators whose edges the user has turned off.
+        self._edgeless = {case.label for case in self.listed if (chosen | case.options).get("edges") == "off"}
+        asked = chosen.get("guiding", "off")
         #: The integrator of the unguided steps, by the label of each estimator that a run would guide or may guide.
         self.unguided = {
             label: label if configs[label].integrator.options()["guiding"] == "off" else f"{label}, unguided"
@@ -316,6 +319,7 @@ class Participants:
                 made[_alike(label, Reference.UNGUIDED)] = make_integrator(kind, **options | {"guiding": "on"})
                 made.setdefault(self.unguided[label], make_integrator(kind, **options | {"guiding": "off"}))
             for reference, alike in ALIKE.items() if self.attached else ():
+                alike = alike | {"edges": "off"} if label in self._edgeless else alike
                 if options | alike != options:
                     made[_alike(label, reference)] = make_integrator(kind, **options | alike)
         return made

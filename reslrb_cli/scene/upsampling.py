@@ -162,19 +162,26 @@ def _from_table(rgb: mi.Color3f) -> mi.Color3f:
 
 def values_of(params: mi.SceneParameters, key: str) -> Any:
     """Return the value of a parameter. In place of the coefficients of colours, return the values of their spectra at a
-    few visible wavelengths, one after the other.
+    few visible wavelengths, one after the other. Texels of environment maps have a fourth number, a scale.
     """
     value = params[key]
-    if not is_upsampled(params, key):
+    scaled = (
+        mi.is_spectral and params.properties[key][2].class_name() == "EnvironmentMapEmitter" and key.endswith("data")
+    )
+    if not (scaled or is_upsampled(params, key)):
         return value
-    c = dr.detach(value)
+    c, scale = dr.detach(value), mi.Float(1)
     dr.eval()  # scheduled variables, which would change this kernel in the first step
-    count = value.shape[0] * value.shape[1] if dr.is_tensor_v(value) else 1
-    c = dr.gather(mi.Color3f, value.array, dr.arange(mi.UInt32, count)) if dr.is_tensor_v(value) else mi.Color3f(c)
+    if dr.is_tensor_v(value):
+        texel = dr.arange(mi.UInt32, value.shape[0] * value.shape[1]) * value.shape[2]
+        c = mi.Color3f(*(dr.gather(mi.Float, value.array, texel + channel) for channel in range(3)))
+        scale = dr.gather(mi.Float, value.array, texel + 3) if scaled else scale
+    else:
+        c = mi.Color3f(c)
     found = []
     for wavelength in (420.0, 500.0, 580.0, 660.0):
         v = (c.x * wavelength + c.y) * wavelength + c.z
-        found.append(0.5 + 0.5 * v * dr.rsqrt(dr.square(v) + 1))
+        found.append(scale * (0.5 + 0.5 * v * dr.rsqrt(dr.square(v) + 1)))
     return dr.ravel(mi.Vector4f(*found))
 
 

@@ -141,11 +141,15 @@ class LightNotes(Hooks, Notes):
         return lane
 
 
+#: Wavelengths between which their density is interpolated. More would be too close to each other for single precision.
+NODES = 2000
+
+
 @dataclass
 class Emission:
     """Rays that left emitters, with shape (lanes,) or (lanes, n). Each ray has its emitter's number, its origin with
     normal and texture coordinates, its direction, and its weight. `light` is the light of one channel along each
-    ray, without the cosine at a lamp.
+    ray, without the cosine at a lamp. In spectral variants, it is divided by the density of the ray's wavelength.
     """
 
     id: np.ndarray
@@ -167,15 +171,33 @@ class Emission:
         on_lamp = si.is_valid() & (si.t < 0.02) & (si.emitter(scene) == emitter)
         z, nz, uv = (dr.select(on_lamp, a, b) for a, b in ((si.p, ray.o), (si.n, 0), (si.uv, 0)))
         si.wi = dr.select(emitter.is_environment(), ray.d, si.to_local(ray.d))
+        si.wavelengths = ray.wavelengths
         light = emitter.eval(si, on_lamp | emitter.is_environment())
         before = dr.zeros(mi.SurfaceInteraction3f, samples.width)
-        before.p = ray.o + ray.d
+        before.p, before.wavelengths = ray.o + ray.d, ray.wavelengths
         delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
         light += emitter.sample_direction(before, mi.Point2f(0.5), delta)[1]
         which, d = number(emitter) + dr.zeros(mi.UInt32, samples.width), dr.normalize(ray.d)
         values = which, z, nz, uv, d, e.E[0], light[0]
         dr.eval(values)
-        return Emission(*(np.array(value, np.float64).T for value in values))
+        result = Emission(*(np.array(value, np.float64).T for value in values))
+        for each in scene.emitters() if mi.is_spectral else ():
+            here = result.id == emitter_number(each)
+            result.light[here] /= density_of_wavelengths(each, np.array(ray.wavelengths[0], np.float64)[here])
+        return result
+
+
+def density_of_wavelengths(emitter: Any, wavelengths: np.ndarray) -> np.ndarray:
+    """Return the density with which the emitter's rays have these wavelengths: the inverse of the wavelength's
+    derivative by the random number. Maps of the environment have the density of a white lamp.
+    """
+    if emitter.class_name() == "EnvironmentMapEmitter":
+        return np.array(mi.pdf_rgb_spectrum(mi.Spectrum(mi.Float(wavelengths.astype(np.float32))))[0], np.float64)
+    u = (np.arange(NODES) + 0.5) / NODES
+    drawn, _ = emitter.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f, NODES), mi.Float(u.astype(np.float32)))
+    drawn = np.array(drawn[0], np.float64)
+    order = np.argsort(drawn)
+    return np.interp(wavelengths, drawn[order], np.abs(np.gradient(u, drawn))[order])
 
 
 # Paths, in order from the sensor to the light, and their densities.

@@ -285,3 +285,16 @@ def test_a_photograph_lacks_a_channel_of_the_film(tmp_path: Path) -> None:
     assert read_photo(path, channels=["red", "blue"]).image.shape == (2, 2, 2)
     with pytest.raises(ConfigError, match="the film also needs wide"):
         read_photo(path, channels=["red", "wide"])
+
+
+def test_the_coefficients_of_an_environment_map_are_no_zeros() -> None:
+    """Coefficients may be negative. Only the radiance of a texel can be a zero factor."""
+    for darkest, zeros in ((0.01, False), (0.0, True)):
+        texels = np.random.default_rng(4).uniform(0.1, 1, (4, 8, 3)).astype(np.float32)
+        texels[1, 2] = darkest
+        case = Case(stage({"light": {"type": "envmap", "bitmap": mi.Bitmap(texels)}}), ["light.data"])
+        ours, leaves = integrator("reslrb", estimator="stack"), case.leaves()
+        plan = ours.plan(case.scene, case.scene.sensors()[0], case.params)
+        case.release(leaves)
+        assert plan.differentiate_emission
+        assert plan.track_zeros == zeros

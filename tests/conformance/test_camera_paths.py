@@ -159,7 +159,8 @@ def test_gradients_are_independent_of_the_distribution_of_paths(paths: str):
 
 def test_the_pilot_finds_pixels_that_only_a_mirror_shows():
     """A camera sees a red wall behind it only in a mirror. The mirror's pixels alone depend on the wall's colour, and
-    the other pixels get few paths. A second recording gives the same result.
+    the other pixels get few paths. They show a dark wall: in spectral variants, a path's wavelengths give a bright wall
+    noise, which attracts paths. A second recording gives the same result.
     """
     size = {"width": 48, "height": 48, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     at = transform().look_at(origin=[0, 0, 0], target=[0, 0, -1], up=[0, 1, 0])
@@ -167,7 +168,7 @@ def test_the_pilot_finds_pixels_that_only_a_mirror_shows():
     scene = mi.load_dict({
         "type": "scene",
         "sensor": {"type": "perspective", "fov": 60.0, "to_world": at, "film": {"type": "hdrfilm", **size}},
-        "wall": rectangle({"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.5)}, back),
+        "wall": rectangle({"type": "diffuse", "reflectance": rgb(0.2, 0.2, 0.2)}, back),
         "glass": rectangle({"type": "conductor"}, transform().translate([0.6, 0, -2.9]).scale(0.5)),
         "red": rectangle(RED, transform().translate([0, 0, 2]).rotate([0, 1, 0], 180).scale(3)),
         "lamp": rectangle(RED, transform().translate([0, 2.5, -1]).rotate([1, 0, 0], 90).scale(0.3))
@@ -186,7 +187,7 @@ def test_the_pilot_finds_pixels_that_only_a_mirror_shows():
     mirror = np.array(mi.has_flag(scene.ray_intersect(ray).bsdf().flags(), mi.BSDFFlags.Delta)).reshape(48, 48)
     assert density.mean() == pytest.approx(1)
     assert density.max() <= MOST * (1 + 1e-5)
-    assert density[mirror].mean() > 6 * density[~mirror].mean()
+    assert density[mirror].mean() > 10 * density[~mirror].mean()
     assert show[mirror].mean() > 0.5
     # The first gradient records the pixel shares. Images before this gradient have even shares.
     assert tracer.passes(Job(scene, scene.sensors()[0], mi.UInt32(0), 32))[0].shares is None

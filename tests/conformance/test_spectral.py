@@ -29,12 +29,13 @@ QUICK: dict[str, Callable[..., None]] = {
     "derivatives by reservoir": lambda: own.test_the_furnace_has_its_derivatives("light", "reservoir", "irregular"),
     "raw photograph": own.test_a_raw_photograph_gets_the_colours_of_the_lamps,
     "missing channel": own.test_a_photograph_lacks_a_channel_of_the_film,
+    "coefficients are no zeros": own.test_the_coefficients_of_an_environment_map_are_no_zeros,
     "naive AD": lambda: test_gradients.test_exact_estimators_equal_naive_ad(ROULETTE, "correlated"),
 }
 #: Files whose default tests do not assume that a path's values are the channels of the film.
-FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "edges", "freezing", "gradients", "guiding",
-         "guiding_tables", "image_paths", "image_plugins", "kernels", "memory", "moving_emitters", "plan", "plugin",
-         "replay", "sequences", "shuffled", "small_lamps", "survival"]  # fmt: skip
+FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "camera_paths", "edges", "freezing", "gradients",
+         "guiding", "guiding_tables", "image_paths", "image_plugins", "kernels", "memory", "moving_emitters",
+         "plan", "plugin", "replay", "sequences", "shuffled", "small_lamps", "survival", "weights"]  # fmt: skip
 
 
 def run(*arguments: str) -> None:

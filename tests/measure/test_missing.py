@@ -17,10 +17,11 @@ import pytest
 from cli.tiny import ended
 from measure.analytic_motion import centre_of_gravity, parallel
 from measure.differenced import AttachedScene, Differenced, compare_with_differences
-from measure.faults import room
+from measure.faults import checked, room
 from measure.moving_light import ROOMS_SCENES as ROOMS
 from measure.moving_light import SCENES, setting
 
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure import missing as missing_check
@@ -30,13 +31,14 @@ from reslrb_cli.measure.scenes.analytic import fresnel
 from reslrb_cli.measure.scenes.moving import Displacement, Move, Pose, smooth_fields, vertices
 from reslrb_cli.measure.scenes.small import transform
 from reslrb_cli.optimization import targets
-from reslrb_cli.records.measurements import LEAST, NOTHING, MissingRecord
+from reslrb_cli.records.measurements import LEAST, NOTHING, MissingRecord, Reference, Verdict
 from reslrb_cli.transport import bsdf, connection
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.walk import Segment
 
 # The share of a derivative that attached gradients lack, in scenes where this share is known.
 
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 HALF, EDGE, HEIGHT, TILT, IOR, SLAB = 0.6, 0.2, 1.4, 0.5, 1.5, 0.3
 SPP, SEEDS = 64, 24
 
@@ -301,3 +303,15 @@ def test_a_ray_that_does_not_follow_its_surface(monkeypatch: pytest.MonkeyPatch)
     right = Segment.next_ray
     monkeypatch.setattr(Segment, "next_ray", lambda self, attached=False: dr.detach(right(self, attached)))
     assert beam((0, 1, 0)).error > 10 * ERROR
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("edges", ["auto", "off"])
+def test_gradcheck_compares_differences_with_edges(edges: str) -> None:
+    """Silhouette and shadow of a box make the derivative of its place. Without them, it has the opposite sign."""
+    config = load(CONFIGS / "moved_box.yaml", [f"integrator.edges={edges}"])
+    of = {(row.parameter, row.reference): row for row in checked(config, "stack", 8)}
+    place = of["box.translation", Reference.FINITE_DIFFERENCE]
+    print(place)
+    assert place.verdict is (Verdict.HOLDS if edges == "auto" else Verdict.FAILS)
+    assert of["box.translation", Reference.WALK_AD].verdict is Verdict.HOLDS

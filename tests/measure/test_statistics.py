@@ -18,6 +18,7 @@ from reslrb_cli.measure.comparison import (
     effective_entries,
     entry_count,
     overall,
+    paired_z_scores,
     parts,
     sidak,
     tail_weight,
@@ -39,6 +40,19 @@ def test_z_is_standard_normal_even_for_few_renders():
     assert z.mean() == pytest.approx(0, abs=0.03)
     assert z.std() == pytest.approx(1, abs=0.03)
     assert (np.abs(z) > 3).mean() < 0.005
+
+
+@pytest.mark.parametrize("paired", [True, False])
+@pytest.mark.parametrize("rounding", [0.03, 0.1])
+def test_rounding_does_not_make_the_variance_of_three_samples_certain(rounding, paired):
+    """The floor's size is certain, but the noise's is not: the smallest variance of many entries is far too small."""
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(size=(2, 3, 200_000))
+    a = a + 1
+    b = b + 1 if not paired else np.zeros_like(b)
+    z = paired_z_scores(a - 1, rounding) if paired else z_scores(a, b, rounding)
+    assert (np.abs(z) > 4).sum() <= 30  # 13 are expected of normal deviates
+    assert np.abs(z).max() < 5.5
 
 
 def test_equal_expectations_agree():

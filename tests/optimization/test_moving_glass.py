@@ -99,12 +99,12 @@ STARTS = [
 @pytest.mark.long
 def test_a_glass_ball_is_found_by_its_caustic(llvm: str, tmp_path: Path) -> None:
     """From at least seven of eight starts, the ball ends within 1 % of its size, which is 1. The target is an image by
-    `path`.
+    `prb`.
 
     Without the blur, the ball ends in local minima up to its own size away.
     """
     sets = ["run.iterations=120", "run.spp=32", "optimizer.schedule=cosine", "scene.options.size=64"]
-    sets += ["target.render.integrator={type: path, max_depth: 6}", "integrator={max_depth: 6}"]
+    sets += ["target.render.integrator.max_depth=6", "integrator={max_depth: 6, edges: on}"]
     distances = []
     for start in STARTS:
         first = "[" + ", ".join(f"{value:.4f}" for value in start) + "]"
