@@ -103,7 +103,7 @@ def test_a_glass_ball_is_found_by_its_caustic(llvm: str, tmp_path: Path) -> None
 
     Without the blur, the ball ends in local minima up to its own size away.
     """
-    sets = ["run.iterations=120", "run.spp=32", "optimizer.schedule=cosine", "scene.options.size=64"]
+    sets = ["run.iterations=200", "run.spp=32", "optimizer.schedule=cosine", "scene.options.size=64"]
     sets += ["target.render.integrator.max_depth=6", "integrator={max_depth: 6, edges: on}"]
     distances = []
     for start in STARTS:
