@@ -56,19 +56,28 @@ def learning_rate_factor(
 
     `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
-    return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
+    return SCHEDULES[schedule](_progress(iteration, iterations, least), final_fraction)
+
+
+def _progress(iteration: int, iterations: int, least: float) -> float:
+    """Return the progress of a run, from 0 in its first iteration to 1 in its last."""
+    return max(iteration / max(iterations - 1, 1), least)
 
 
 #: The part of a run after which images are no longer blurred, and the blur of a motion relative to the image.
 BLURRED, MOTION_BLUR = 0.5, 1 / 16
 
 
-def blur_factor(iteration: int, iterations: int, least: float = 0.0) -> float:
-    """Return the factor on `run.blur` in `iteration` (0-based) of `iterations`. It falls linearly from 1 to 0.
+def set_blur(problem: Problem, iteration: int, least: float) -> None:
+    """Set the blur of all training views for `iteration` (0-based). It falls linearly to 0.
 
     `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
-    return max(1.0 - max(iteration / max(iterations - 1, 1), least) / BLURRED, 0.0)
+    run, moves = problem.config.run, any(spec.motion is not None for spec in problem.config.parameters)
+    factor = max(1.0 - _progress(iteration, run.iterations, least) / BLURRED, 0.0)
+    for view in problem.trained:
+        automatic = MOTION_BLUR * min(view.target.shape[:2]) if moves else 0.0
+        view.blur = factor * (automatic if run.blur == "auto" else run.blur)
 
 
 def time_share(limit_s: float | None, state: State) -> float:
@@ -119,10 +128,10 @@ def measure_curvature(problem: Problem, iteration: int) -> None:
     """Measure the curvature for `auto`, if it is due. The gradient of `iteration` must be accumulated.
 
     The curvature of large parameters is measured in the iterations 0, 2, 6, 14, 30 and so on, with the samples of the
-    iteration. The joint curvature of small parameters is measured if `is_due`.
+    iteration. The joint curvature of small parameters is measured when `is_due` is true.
     """
     optimizer = problem.optimizer
-    if optimizer.block.at:
+    if optimizer.block.at and is_due(iteration):
         measure_block(problem, iteration)
     if len(optimizer.block.at) < len(optimizer.keys()) and (iteration + 2) & (iteration + 1) == 0:
         random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
@@ -132,9 +141,9 @@ def measure_curvature(problem: Problem, iteration: int) -> None:
         problem.apply()
 
 
-def is_due(iteration: int, cost: float) -> bool:
+def is_due(iteration: int, cost: float = 0.0) -> bool:
     """Return True if the joint curvature is measured in `iteration`. A measurement has `cost` times the samples of a
-    step.
+    step. Without a cost, all candidates are measured.
 
     The candidates are the iterations 0, 1, 2, 4, 7, 11 and so on. A candidate is left out if measuring would take more
     than its share of the samples. The first `LEAST_ITERATIONS` steps count from the start.
@@ -147,7 +156,7 @@ def is_due(iteration: int, cost: float) -> bool:
 
 
 def measure_block(problem: Problem, iteration: int) -> None:
-    """Measure the joint curvature of all small parameters for `auto` by differences of images, if it is due."""
+    """Measure the joint curvature of all small parameters for `auto` by differences of images, if its samples fit."""
     optimizer, block, unit = problem.optimizer, problem.optimizer.block, problem.samples_per_pass or 1
     scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
               else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
@@ -212,10 +221,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     errors = problem.meter.errors(problem.selection.array)
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
     elapsed = time_share(problem.limit_s, state)
-    blur, moves = config.run.blur, any(each.motion is not None for each in config.parameters)
-    for view in problem.trained:
-        sigma = blur if blur != "auto" else moves * MOTION_BLUR * min(view.target.shape[:2])
-        view.blur = sigma * blur_factor(iteration, config.run.iterations, elapsed)
+    set_blur(problem, iteration, elapsed)
     with clock.step() as times:
         loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)

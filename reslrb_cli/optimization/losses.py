@@ -132,9 +132,6 @@ class _Blur(dr.CustomOp):
         series = dctn(np.array(image), axes=(0, 1), norm="ortho") * factors
         return mi.TensorXf(np.ascontiguousarray(idctn(series, axes=(0, 1), norm="ortho")))
 
-    def forward(self) -> None:
-        self.set_grad_out(self._blurred(self.grad_in("image")))
-
     def backward(self) -> None:
         self.set_grad_in("image", self._blurred(self.grad_out()))
 

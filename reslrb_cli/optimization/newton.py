@@ -40,8 +40,8 @@ import drjit as dr
 import drjit.opt as dropt
 import numpy as np
 
+from reslrb_cli.backend.memory import flat
 from reslrb_cli.optimization.block import Block
-from reslrb_cli.optimization.nonfinite import flat
 
 #: Step as a share of Newton's, decay of the momentum, and decay of the gradients' size. docs/optimizers.md has
 #: measurements.

@@ -16,6 +16,8 @@ from typing import Any, Literal
 
 import drjit as dr
 
+from reslrb_cli.backend.memory import flat
+
 OnNonFinite = Literal["stop", "skip", "zero"]
 
 #: Consecutive iterations with skipped updates after which a run ends.
@@ -100,11 +102,6 @@ def zero_nonfinite(parameter: Any) -> None:
     """Set the entries of a parameter's gradient that are not finite to 0."""
     gradient = dr.grad(parameter)
     dr.set_grad(parameter, dr.select(dr.isfinite(gradient), gradient, 0))
-
-
-def flat(value: Any) -> Any:
-    """Return all entries of a tensor or a (nested) array as a flat array."""
-    return value.array if dr.is_tensor_v(value) else dr.ravel(value)
 
 
 def count_nonfinite(value: Any) -> Any:

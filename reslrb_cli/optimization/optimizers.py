@@ -46,9 +46,10 @@ import drjit as dr
 import numpy as np
 import scipy.fft
 
+from reslrb_cli.backend.memory import flat
 from reslrb_cli.optimization.block import Block, JointState
 from reslrb_cli.optimization.newton import DISPLACEMENT, AdamRule, Descent, Joint, Newton
-from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
+from reslrb_cli.optimization.nonfinite import count_nonfinite
 from reslrb_cli.statistics import Array, rms
 
 Bounds = tuple[float, float] | None

@@ -100,20 +100,20 @@ def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[T
     else:
         ends = [len(drawn) * place // count for place in range(count + 1)]
         sets = [drawn[first:end] for first, end in pairwise(ends)]
+    purposes = [f"image, shard {shard}" for shard in range(len(sets))]
     return [
         Task(
             iteration,
             shard,
             tuple(
-                Part(view.sensor, scale, seed(config.run.seed, iteration, view.sensor, name), view.blur)
+                Part(view.sensor, scale, seed(config.run.seed, iteration, view.sensor, purpose), view.blur)
                 for view, scale in own
             ),
             config.share_spp,
             1 / shares,
             images or shares > 1,
         )
-        for shard, own in enumerate(sets)
-        for name in [f"image, shard {shard}"]
+        for shard, (own, purpose) in enumerate(zip(sets, purposes, strict=True))
     ]
 
 

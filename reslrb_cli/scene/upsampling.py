@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.installation import package_folder
-from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.backend.memory import flat, own_memory
 from reslrb_cli.scene.deformation import Leaf, collect, push
 from reslrb_cli.scene.graph import visible
 
@@ -49,10 +49,6 @@ def is_upsampled(params: mi.SceneParameters, key: str) -> bool:
     if not node.class_name().startswith("BitmapTexture") or name != "data":
         return False
     return params[key].shape[2] == 3 and not re.search(r"^ *raw = 1,$", str(node), re.MULTILINE)
-
-
-def _flat(value: Any) -> mi.Float:
-    return value.array if dr.is_tensor_v(value) else dr.ravel(value)
 
 
 def emitted(key: str) -> str:
@@ -306,13 +302,13 @@ class Upsampling:
             for own, name in ((key, name) for key in found.keys for name in (key, emitted(key))):
                 if name not in found.leaves:
                     continue
-                gradient = _flat(dr.grad(found.leaves[name].leaf))
+                gradient = flat(dr.grad(found.leaves[name].leaf))
                 parts = 3 if name == own else 1  # coefficients, or the values of D65 times a scale
                 for part in range(parts):
                     here = dr.select(dr.arange(mi.UInt32, dr.width(gradient)) % parts == part, gradient, 0)
                     colour = type(found.value)(dr.detach(found.value))
                     dr.enable_grad(colour)
-                    dr.backward(_flat(self._spectra(own, colour)[name]) * here)
+                    dr.backward(flat(self._spectra(own, colour)[name]) * here)
                     term = np.array(dr.grad(colour), np.float64)
                     total, magnitude = total + term, magnitude + np.abs(term)
             size = np.linalg.norm(total)
