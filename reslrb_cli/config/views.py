@@ -112,8 +112,8 @@ Illuminant = Annotated[str, AfterValidator(_illuminant)]
 
 
 class WhiteBalance(Section):
-    """Chromatic adaptation of photographs to the lamps of the scene. A surface that has the colour of the illuminant
-    `photograph` in the photographs gets the colour of the illuminant `scene`.
+    """Chromatic adaptation of photographs to the lamps of the scene. Surfaces with the colour of the illuminant
+    `photograph` get the colour of the illuminant `scene`.
     """
 
     scene: Illuminant = "D65"
