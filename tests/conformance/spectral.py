@@ -151,6 +151,8 @@ def test_the_condition_of_gradients_by_colours() -> None:
     case = Case(scene, [key])
     leaves = case.leaves()
     [found] = case.values.colours._found.values()
+    dr.set_grad(found.leaves[key].leaf, dr.zeros(mi.Color3f))
+    assert case.values.colours.cancellation() == {key: 1}
     gradient = np.array([3.5e5, 550.0, 1.0])
     dr.set_grad(found.leaves[key].leaf, mi.Color3f(*gradient.tolist()))
     jacobian = []
