@@ -151,8 +151,6 @@ def test_the_condition_of_gradients_by_colours() -> None:
     case = Case(scene, [key])
     leaves = case.leaves()
     [found] = case.values.colours._found.values()
-    dr.set_grad(found.leaves[key].leaf, dr.zeros(mi.Color3f))
-    assert case.values.colours.cancellation() == {key: 1}
     gradient = np.array([3.5e5, 550.0, 1.0])
     dr.set_grad(found.leaves[key].leaf, mi.Color3f(*gradient.tolist()))
     jacobian = []
@@ -167,6 +165,16 @@ def test_the_condition_of_gradients_by_colours() -> None:
     assert case.values.colours.cancellation() == {key: pytest.approx(expected, rel=1e-3)}
     case.values.collect()
     np.testing.assert_allclose(np.ravel(dr.grad(leaves[key])), terms.sum(0), rtol=1e-3)
+
+
+def test_the_condition_of_gradients_that_are_zero() -> None:
+    """The condition number is 1 if no path connects, as in the extreme case `no_connection`."""
+    scene = furnace()
+    scene["wall"]["emitter"]["radiance"] = rgb(8, 7, 6)
+    key = "wall.emitter.radiance.value"
+    case = Case(scene, [key])
+    case.leaves()
+    assert case.values.colours.cancellation() == {key: 1}
 
 
 SPECFILM = {

@@ -24,6 +24,7 @@ QUICK: dict[str, Callable[..., None]] = {
     "colours": own.test_coefficients_have_their_colour,
     "derivatives of colours": own.test_coefficients_have_derivatives,
     "condition of gradients by colours": own.test_the_condition_of_gradients_by_colours,
+    "condition of zero gradients": own.test_the_condition_of_gradients_that_are_zero,
     "furnace": lambda: own.test_the_furnace_has_its_colour("both", "regular"),
     "derivatives by stack": lambda: own.test_the_furnace_has_its_derivatives("light", "stack", "regular"),
     "derivatives by reservoir": lambda: own.test_the_furnace_has_its_derivatives("light", "reservoir", "irregular"),
