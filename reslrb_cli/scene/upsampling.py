@@ -308,8 +308,9 @@ class Upsampling:
                     here = dr.select(dr.arange(mi.UInt32, dr.width(gradient)) % parts == part, gradient, 0)
                     colour = type(found.value)(dr.detach(found.value))
                     dr.enable_grad(colour)
-                    # A gradient of 0 leaves no dependence on the colour.
-                    dr.backward(flat(self._spectra(own, colour)[name]) * here, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+                    product = flat(self._spectra(own, colour)[name]) * here
+                    # A product with 0 does not depend on the colour.
+                    dr.backward(product, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
                     term = np.array(dr.grad(colour), np.float64)
                     total, magnitude = total + term, magnitude + np.abs(term)
             size = np.linalg.norm(total)
