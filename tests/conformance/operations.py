@@ -79,7 +79,9 @@ def nothing_is_compiled_without(feature: str, scene: Any, ours: Any, plain: Any)
     `feature` is a member of the plan. It is None in the plan of `plain`, but not in the plan of `ours`.
     """
     sensor = scene.scene.sensors()[0]
-    with tracking(scene.params, scene.keys):
+    # In the spectral variant, Dr.Jit's history lacks kernels with derivatives of an environment map.
+    keys = [key for key in scene.keys if key != "sky.data"]
+    with tracking(scene.params, keys):
         plans = [each.plan(scene.scene, sensor, scene.params) for each in (ours, plain)]
         values = [getattr(plan, feature) for plan in plans]
         assert [value is None for value in values] == [False, True]
