@@ -115,10 +115,11 @@ def recorded(case: EdgeCase) -> np.ndarray:
 # ---- Moving shapes ----
 
 
-def mesh(positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any] = OWN) -> mi.Mesh:
-    """Return a mesh with flat faces."""
+def mesh(positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any] = OWN, **things: Any) -> mi.Mesh:
+    """Return a mesh with flat faces. `things` are added to its dictionary, for example an emitter."""
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
+    for key, thing in {"bsdf": bsdf, **things}.items():
+        properties[key] = mi.load_dict(thing)
     made = mi.Mesh("shape", len(positions), len(faces), properties)
     params = mi.traverse(made)
     params["vertex_positions"] = np.asarray(positions, np.float32).ravel()

@@ -34,9 +34,10 @@ QUICK: dict[str, Callable[..., None]] = {
     "naive AD": lambda: test_gradients.test_exact_estimators_equal_naive_ad(ROULETTE, "correlated"),
 }
 #: Files whose default tests do not assume that a path's values are the channels of the film.
-FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "camera_paths", "drawing", "edges", "freezing", "gradients",
-         "guiding", "guiding_tables", "image_paths", "image_plugins", "kernels", "memory", "moving_emitters",
-         "plan", "plugin", "replay", "sequences", "shuffled", "small_lamps", "survival", "weights"]  # fmt: skip
+FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "camera_paths", "drawing", "edges", "freezing",
+         "gradients", "guiding", "guiding_tables", "image_paths", "image_plugins", "kernels", "memory",
+         "moving_emitters", "plan", "plugin", "replay", "sequences", "shuffled", "small_lamps", "survival",
+         "weights"]  # fmt: skip
 
 
 def run(*arguments: str) -> None:

@@ -126,7 +126,8 @@ def in_the_valley(start, noise=0.0, bounds=(-2.0, 2.0), size=1.0, iterations=30,
         gradients *= 1000.0 if iteration in bright else 1.0
         for key, gradient in zip(("p", "q"), gradients, strict=True):
             optimizer.clear_gradient(key)
-            dr.backward(dr.sum(optimizer[key] * float(gradient), axis=None))
+            # As a literal, each gradient would compile a kernel.
+            dr.backward(dr.sum(optimizer[key] * dr.opaque(mi.Float, float(gradient)), axis=None))
         optimizer.step(1.0)
         values.append([float(np.array(optimizer[key])[0]) for key in ("p", "q")])
         limits.append([optimizer.to_go(key) * optimizer.extent(key) for key in ("p", "q")])

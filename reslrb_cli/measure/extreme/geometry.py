@@ -301,7 +301,7 @@ PLACES_CASES = [
                 lambda: room(camera=pinhole([0.9, -0.95, 0.9], [-0.9, -0.96, -0.2], [0, 1, 0], 25)),
                 (FLOOR, WALL, LAMP), Stock("ptracer"), spp=512),
     ExtremeCase("grazing_lamp", "a lamp at the edge of the floor, at a right angle to the floor", vertical_light,
-                (FLOOR, WALL, LAMP), Stock("ptracer"), spp=128),
+                (FLOOR, WALL, LAMP), Stock("ptracer"), spp=128, seeds=32),  # the image has skewed noise beside the lamp
     ExtremeCase("back_facing", "one-sided sheets that face away from the camera and the lamp", turned_panes,
                 ("first.bsdf.reflectance.value", "second.bsdf.reflectance.value", FLOOR), Stock("ptracer"), spp=256),
     ExtremeCase("shading_normals", "eight flat faces with the shading normals of a sphere",
