@@ -64,8 +64,8 @@ def _progress(iteration: int, iterations: int, least: float) -> float:
     return max(iteration / max(iterations - 1, 1), least)
 
 
-#: The part of a run after which images are no longer blurred, and the blur of a motion relative to the image.
-BLURRED, MOTION_BLUR = 0.5, 1 / 16
+#: The part of a run after which images are no longer blurred.
+BLURRED = 0.5
 
 
 def set_blur(problem: Problem, iteration: int, least: float) -> None:
@@ -73,11 +73,9 @@ def set_blur(problem: Problem, iteration: int, least: float) -> None:
 
     `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
-    run, moves = problem.config.run, any(spec.motion is not None for spec in problem.config.parameters)
-    factor = max(1.0 - _progress(iteration, run.iterations, least) / BLURRED, 0.0)
+    factor = max(1.0 - _progress(iteration, problem.config.run.iterations, least) / BLURRED, 0.0)
     for view in problem.trained:
-        automatic = MOTION_BLUR * min(view.target.shape[:2]) if moves else 0.0
-        view.blur = factor * (automatic if run.blur == "auto" else run.blur)
+        view.blur = factor * problem.first_blur(view)
 
 
 def time_share(limit_s: float | None, state: State) -> float:

@@ -26,6 +26,9 @@ from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms
 
+#: Blur of a motion in the first iteration, relative to the shorter side of the image.
+MOTION_BLUR = 1 / 16
+
 
 def saved_spp(problem: Problem) -> int:
     """Return the samples per pixel of the initial and the final image: `run.final_spp`, or the next larger multiple of
@@ -256,6 +259,13 @@ class Problem:
     def values(self) -> dict[str, Array]:
         """Return the parameters' current values."""
         return {key: self.selection.array(key) for key in self.selection.keys}
+
+    def first_blur(self, view: View) -> float:
+        """Return the blur of a view in the first iteration, in pixels (`run.blur`)."""
+        if self.config.run.blur != "auto":
+            return self.config.run.blur
+        moves = any(spec.motion is not None for spec in self.config.parameters)
+        return MOTION_BLUR * min(view.target.shape[:2]) if moves else 0.0
 
     def render(self, sensor: int, spp: int, iteration: int, purpose: str) -> Array:
         """Render the current scene with the experiment's integrator. Returns (H, W, C) float32."""

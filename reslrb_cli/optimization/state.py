@@ -21,7 +21,7 @@ import drjit as dr
 
 from reslrb_cli.guiding.tables import KNOWN, Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.optimization.autotune.sampling import as_decided, decided
+from reslrb_cli.optimization.autotune.sampling import as_decided, blur_decision, decided
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.checkpoint import entries_below
 from reslrb_cli.records.decisions import Decision, Scaled
@@ -210,7 +210,7 @@ def decide_as(problem: Problem, stored: Stored) -> Problem:
     integrator = as_decided(problem.integrator, decisions)
     if shares := entries_below(stored.arrays, "pixels/"):
         integrator = integrator.shared_out(shares)
-    return replace(problem, decisions=decisions, integrator=integrator)
+    return replace(problem, decisions=[*decisions, *blur_decision(problem)], integrator=integrator)
 
 
 def reach_as(problem: Problem, stored: Stored) -> Problem:

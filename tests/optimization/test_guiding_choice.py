@@ -148,7 +148,7 @@ def test_runs_that_move_light_are_not_guided(monkeypatch: pytest.MonkeyPatch) ->
     settings = ["target.render.spp=4", "scene.size=[16, 16]", "run.measuring=1000"]
     problem = assemble(load(Path(__file__).parents[2] / "configs" / "lens_pose.yaml", settings))
     values = {each.setting: each.value for each in problem.decisions}
-    assert values == {"sequence": "low_discrepancy", "guiding": "off"}
+    assert values == {"sequence": "low_discrepancy", "guiding": "off", "blur": "1 px"}
 
 
 def seeds_of_parts(monkeypatch: pytest.MonkeyPatch, experiment: Path) -> tuple[set[int], set[int]]:

@@ -12,9 +12,10 @@ from kit import area, diffuse, scene, sensor, shape
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.identifiability import find_reached
-from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.loop import optimize, set_blur
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import set_targets, target_arrays, to_tensor
+from reslrb_cli.runs.prepare import plan_record
 from reslrb_cli.scene.visibility import interior, sees_specular
 
 SCENE = scene(
@@ -123,3 +124,19 @@ def test_light_paths_that_only_carry_bundled_light_are_guided(llvm: str, tmp_pat
     assert decided["guiding"] == "on"
     assert decided["sequence"] == "independent"
     assert problem.integrator.preparation.guiding is not None
+
+
+@pytest.mark.parametrize("blur", ["auto", "0", "3"])
+def test_the_run_says_how_it_blurs(blur: str, llvm: str, tmp_path: Path) -> None:
+    """A blur that the run chooses is a decision, with a row in the plan. A blur that the user chooses is not."""
+    problem = make(tmp_path, "integrator={max_depth: 6}", "run.measuring=0", "target.render.spp=16", f"run.blur={blur}")
+    decided = {each.setting: each for each in problem.decisions}
+    assert ("blur" in decided) is (blur == "auto")
+    set_blur(problem, 0, 0.0)
+    assert problem.views[0].blur == (2 if blur == "auto" else float(blur))
+    rows = [row["reason"] for row in plan_record(problem)["rows"] if row["feature"] == "blurred images"]
+    if blur == "auto":
+        assert decided["blur"].value == "2 px"
+        assert rows == [f"2 px; blur: auto, {decided['blur'].why}"]
+    else:
+        assert rows == []

@@ -21,6 +21,8 @@ ways (`race.py`), with dL/dI fixed at one image.
     of paths, the weights ignore guiding and take away most of its benefit. If a parameter moves light and all paths are
     light paths, guiding is off (rule), because low-discrepancy numbers help most there. If a shape moves and there are
     both kinds, guiding is on (rule), because light paths then have only the light that mirrors and glass bundle.
+- `blur` (rule): images are blurred at first if the run recovers a motion. This is a setting of the run, which the
+    integrator does not know, so it has no entry in `AUTOMATIC`.
 - `edges` (measured after all others, by `measure/missing.py`): on if the derivative lacks a significant share without
     them.
 """
@@ -62,6 +64,8 @@ PATHS_PLANNED = 1.2
 #: A race needs time for this many iterations of the run, and to compile the kernels of this many steps. The run needs
 #: the kernels of camera paths and of both kinds, whichever wins.
 LEAST_ITERATIONS, GUIDING_KERNELS, PATHS_KERNELS = 3.0, 2.5, 0.0
+#: The setting of the run, not of the integrator, that a rule decides.
+BLUR = "blur"
 Say = Callable[[str], None]
 logger = logging.getLogger(__name__)
 
@@ -376,9 +380,16 @@ def decide(problem: Problem, say: Say, cache: DecisionCache | None = None) -> Pr
     # The chosen paths may leave a setting without effect.
     unused = {"camera": "sequence", "light": "pixels"}.get(getattr(tuner.problem.integrator, "paths", ""))
     decisions = [each for each in tuner.problem.decisions if each.setting != unused]
-    tuner.problem = replace(tuner.problem, decisions=decisions)
+    tuner.problem = replace(tuner.problem, decisions=[*decisions, *blur_decision(problem)])
     tuner.tell()
     return tuner.problem
+
+
+def blur_decision(problem: Problem) -> list[Decision]:
+    """Return the decision on `run.blur: auto`, or nothing if images stay sharp."""
+    widest = max(problem.first_blur(view) for view in problem.trained) if problem.config.run.blur == "auto" else 0.0
+    why = "shapes that move also attract each other from a distance in blurred images"
+    return [Decision(setting=BLUR, value=f"{widest:.3g} px", why=why)] if widest else []
 
 
 def open_settings(config: Config, paths: str) -> list[str]:
@@ -407,6 +418,7 @@ def plan_rows(plan: Plan, decisions: Iterable[Decision]) -> list[PlanRow]:
     """Return all features of a plan, including those that it leaves out, with the reasons of decisions."""
     rows = {setting: automatic.row(plan) for setting, automatic in AUTOMATIC.items()}
     for each in decisions:
-        row, why = rows[each.setting], f"{each.setting}: auto, {each.why}"
+        row = rows.get(each.setting) or PlanRow("blurred images", True, each.value)
+        why = f"{each.setting}: auto, {each.why}"
         rows[each.setting] = replace(row, reason=f"{row.reason}; {why}" if row.needed else why)
     return [*scene_rows(plan), *rows.values()]
