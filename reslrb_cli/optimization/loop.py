@@ -97,16 +97,18 @@ def out_of_time(limit_s: float | None, state: State) -> str:
     return f"the time is up, after {state.elapsed_s:.3g} s of iterations"
 
 
-#: Fewest iterations, and the distance to the optimum at which a run with `auto` ends: a share of a value's root mean
-#: square, or of this share of its extent if that is larger. It is a quarter of the tolerance of a verdict.
-LEAST_ITERATIONS, CLOSE, LEAST_SHARE = 20, 0.025, 0.2
+#: Fewest iterations of a run with `auto`, and fewest with textures, whose noise falls for longer. Distance to the
+#: optimum at which such a run ends: a share of a value's root mean square, or of this share of its extent if that is
+#: larger. It is a quarter of the tolerance of a verdict.
+LEAST_ITERATIONS, LEAST_OF_LARGE, CLOSE, LEAST_SHARE = 20, 45, 0.025, 0.2
 
 
 def close_enough(problem: Problem, iteration: int) -> str:
     """Return a message if more iterations would not help, otherwise "". `iteration` is the number of iterations."""
     optimizer = problem.optimizer
     measured = 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last measurement of large parameters
-    is_long = iteration >= max(LEAST_ITERATIONS, 1.5 * measured)
+    least = LEAST_ITERATIONS if len(optimizer.block.at) == len(optimizer.keys()) else LEAST_OF_LARGE
+    is_long = iteration >= max(least, 1.5 * measured)
     if not optimizer.measures_curvature or not is_long:
         return ""
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)

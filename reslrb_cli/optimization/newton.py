@@ -4,10 +4,10 @@ Steps that know their scale (`Newton`, of `optimizer: auto`) have a measured cur
 They are for textures and other large parameters. `block.py` moves the small ones together. With the gradient g of an
 iteration, the entries i move as follows.
 
-    m_i  <-  0.5 m_i + g_i                                    momentum
     s_i  <-  0.9 s_i + 0.1 |g_i|                              size of the gradients of entry i
     h_i   =  c s_i,   c = sum_j H_j s_j / sum_j s_j²          curvature
-    x_i  <-  x_i - clip(0.4 m_i / h_i, ±L) / (1 + q n_i)      step
+    m_i  <-  0.5 m_i + clip(g_i, ±0.5 L h_i / 0.3)            momentum
+    x_i  <-  x_i - clip(0.3 m_i / h_i, ±L) / (1 + q n_i)      step
 
 H is the second derivative of the loss, measured at common random numbers: H_i = z_i (g_i(x + d z) - g_i(x)) / d. The
 signs z are those of the next step. Random signs would give the diagonal (Hutchinson 1989). However, a pixel shows
@@ -17,7 +17,10 @@ and so on, because H changes as the parameters move. A single H_i is mostly nois
 entries, and s gives the differences between entries, as in Adam. Where the loss is not convex, the absolute value of
 the curvature counts.
 
-L is a share of the parameter's extent, so one bright path cannot move a texel far. n_i counts the iterations in which
+L is a share of the parameter's extent. One gradient moves an entry by about L in all later steps together, because the
+clipped gradients add up to L. Otherwise, a texel that few paths reach would move by 3 L after each path. Steps of 0.3
+are a compromise: with 0.4, more noise of the first, large gradients remains in directions that the images do not
+determine, for example differences of texels in one pixel. n_i counts the iterations in which
 g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length.
 When it oscillates, or when noise dominates, its steps become shorter, as 1/n.
 
@@ -45,11 +48,11 @@ from reslrb_cli.optimization.block import Block
 
 #: Step as a share of Newton's, decay of the momentum, and decay of the gradients' size. docs/optimizers.md has
 #: measurements.
-GAIN, MOMENTUM, MEMORY = 0.4, 0.5, 0.9
+GAIN, MOMENTUM, MEMORY = 0.3, 0.5, 0.9
 #: Displacement d of a measurement as a share of the extent, and the weight of the newest measurement.
 DISPLACEMENT, NEWEST = 0.05, 0.75
 #: L as a share of the extent, and q.
-LONGEST, SHORTER = 0.08, 0.5
+LONGEST, SHORTER = 0.08, 0.3
 #: The limit of the distance uses this many iterations, and exceeds the largest of them by this factor.
 RECENT, SURE = 4, 1.5
 #: A mean square distance that is not known. A state on file has only finite numbers.
@@ -133,8 +136,9 @@ class Newton(Rule, dropt.Optimizer[Any]):
         offsets = dr.select(known, grad * ((1 - MOMENTUM) * velocity / steepness), 0)
         square = dr.select(weight > 0, total(offsets) / weight, UNKNOWN)
         turns = turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
-        velocity = MOMENTUM * velocity + grad
         longest = dr.opaque(dr.leaf_t(grad), lr)
+        reach = longest * ((1 - MOMENTUM) / GAIN) * steepness
+        velocity = MOMENTUM * velocity + dr.clip(grad, -reach, reach)
         step = dr.clip(GAIN * velocity / steepness, -longest, longest) / (1 + SHORTER * turns)
         return value - dr.select(known, step, 0), (velocity, size, turns, bent, earlier, square, *squares[:-1])
 

@@ -61,8 +61,9 @@ def test_updates_follow_the_formula():
         s = 0.9 * s + 0.1 * np.abs(g)
         h = np.sum(curvature * s) / np.sum(s * s) * s
         n = n + (g * m < 0)
-        m = 0.5 * m + g
-        x = np.clip(x - np.clip(0.4 * m / h, -LONGEST, LONGEST) / (1 + SHORTER * n), 0, 1)
+        reach = 0.5 * LONGEST * h / 0.3
+        m = 0.5 * m + np.clip(g, -reach, reach)
+        x = np.clip(x - np.clip(0.3 * m / h, -LONGEST, LONGEST) / (1 + SHORTER * n), 0, 1)
         np.testing.assert_allclose(np.array(optimizer["p"]), x, atol=1e-4)
     assert n.max() > 0
 
@@ -187,10 +188,27 @@ def test_noise_shortens_the_steps_and_a_steady_pull_does_not():
     assert last[3:].min() > 0.9 * first[3:].max()
 
 
+def test_one_gradient_of_a_texel_that_few_paths_reach_moves_it_by_the_longest_step():
+    """The last entry has a gradient in iteration 8 alone. Its mean gradient is small, and its curvature as well."""
+    optimizer, values = make({"p": np.full(6, 0.5)}), []
+    curvature = np.array([4.0, 4.0, 4.0, 4.0, 4.0, 0.0])
+    for iteration in range(20):
+        pull(optimizer, {"p": (curvature, np.full(6, 0.3))})
+        if iteration == 0:
+            measure(optimizer, {"p": (curvature, np.full(6, 0.3))})
+        if iteration == 8:
+            dr.backward(optimizer["p"].array[5] * 0.5)
+        optimizer.step(1.0)
+        values.append(np.array(optimizer["p"]))
+    assert values[7][5] == 0.5
+    assert 0.5 * LONGEST < 0.5 - values[-1][5] < 1.3 * LONGEST
+    np.testing.assert_allclose(values[-1][:5], 0.3, atol=0.02)
+
+
 def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):
     problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=500"])
     *_, (state, record) = loop.iterate(problem, standing(problem))
-    assert loop.LEAST_ITERATIONS <= state.iteration < 40
+    assert loop.LEAST_OF_LARGE <= state.iteration < 60
     assert state.stopped == "every parameter is within 2.5 % of the optimum"
     assert np.abs(np.array(problem.optimizer["albedo"]) - 0.8).max() < 0.02
     assert record.lr == 1
@@ -257,9 +275,9 @@ def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
 def test_a_finished_run_says_why_it_ended(llvm, tmp_path, monkeypatch, capsys):
     begin_alone(tmp_path, monkeypatch)
     monkeypatch.setattr(loop, "CLOSE", 100.0)
-    sets = ("--set", AUTO, "--set", "run.iterations=40", "--set", "run.certainty=false", "--set", "run.measuring=0")
+    sets = ("--set", AUTO, "--set", "run.iterations=50", "--set", "run.certainty=false", "--set", "run.measuring=0")
     assert optimize("tiny.yaml", *sets) == 0
-    assert "stopped after 21 iterations: every parameter is within" in "".join(capsys.readouterr())
+    assert "stopped after 45 iterations: every parameter is within" in "".join(capsys.readouterr())
     assert manifest("runs/tiny")["results"]["stopped"].startswith("every parameter is within")
     assert optimize("--resume", "runs/tiny", "--set", "run.iterations=50") == 0
-    assert "is finished, after 21 of 50 iterations: every parameter is within" in "".join(capsys.readouterr())
+    assert "is finished, after 45 of 50 iterations: every parameter is within" in "".join(capsys.readouterr())
