@@ -26,7 +26,7 @@ from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.run_folder import read_value
 from reslrb_cli.scene.images import read_photo
 from reslrb_cli.scene.load import load_scene
-from reslrb_cli.scene.upsampling import DARKEST, coefficients, colours_of
+from reslrb_cli.scene.upsampling import DARKEST, coefficients, colour_in_scene, colours_of
 
 #: Wavelengths in nm, and spectra with these nodes.
 NODES = np.linspace(400, 700, 7)
@@ -231,6 +231,29 @@ def test_a_run_recovers_spectra_and_exports_them(tmp_path: Path) -> None:
     made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
     for key in keys:
         np.testing.assert_allclose(np.ravel(made[key]), np.ravel(run.parameters[key]), rtol=1e-5)
+
+
+def test_a_recovered_colour_of_a_lamp_is_exported(tmp_path: Path) -> None:
+    """The colour determines the lamp's spectrum of D65, which has no element of its own."""
+    start = SCENE.index('<spectrum type="regular" name="radiance">')
+    end = SCENE.index("</spectrum></emitter>")
+    lit = f'{SCENE[:start]}<rgb name="radiance" value="1, 2, 1"/>{SCENE[end + len("</spectrum>") :]}'
+    (tmp_path / "scene.xml").write_text(lit)
+    key = "wall.emitter.radiance.value"
+    config = {
+        "variant": mi.variant(),
+        "scene": {"file": str(tmp_path / "scene.xml")},
+        "target": {"render": {"spp": 16}},
+        "parameters": [{"key": key, "initial": [3.0, 1.0, 0.5]}],
+        "integrator": {"type": "reslrb", "max_depth": 3, "paths": "light"},
+        "run": {"iterations": 1, "spp": 16, "output": str(tmp_path), "measuring": 0},
+    }
+    run = rl.optimize(rl.load(config), folder=str(tmp_path / "run"))
+    list(run)
+    result = CliRunner().invoke(main, ["export", str(tmp_path / "run"), "-o", str(tmp_path / "made")])
+    assert result.exit_code == 0, result.output
+    made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
+    np.testing.assert_allclose(colour_in_scene(made, key), np.ravel(run.parameters[key]), rtol=0.01)
 
 
 CHANNEL = """<spectrum type="sensitivity" name="{}"><string name="camera" value="Nikon 5100"/>

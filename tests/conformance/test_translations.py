@@ -37,7 +37,8 @@ SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 class Translation:
     """Scene in which the objects `moved` move by theta along `along`, or grow by theta if `along` is None.
 
-    `paths` are the kinds of paths of `reslrb`. `edges` is `off` if the image has no edges that move. The camera has a field of view of `fov` degrees and stands at `eye`.
+    `paths` are the kinds of paths of `reslrb`. `edges` is `off` if the image has no edges that move. The camera has a
+    field of view of `fov` degrees and stands at `eye`.
     """
 
     name: str
