@@ -18,7 +18,7 @@ entries, and s gives the differences between entries, as in Adam. Where the loss
 the curvature counts.
 
 L is a share of the parameter's extent. One gradient moves an entry by about L in all later steps together, because the
-clipped gradients add up to L. Otherwise, a texel that few paths reach would move by 3 L after each path. Steps of 0.3
+clipped gradients add up to L. Otherwise, a texel that few paths reach would move by 2.5 L after a path. Steps of 0.3
 are a compromise: with 0.4, more noise of the first, large gradients remains in directions that the images do not
 determine, for example differences of texels in one pixel. n_i counts the iterations in which
 g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length.
