@@ -53,14 +53,15 @@ def run(script: str, folder: Path) -> list[str]:
 @pytest.fixture
 def quick_checkout(llvm: str, tmp_path: Path) -> Path:
     """Folder with the repository's scenes and a small version of the page's only experiment. The experiment measures
-    nothing, and its target has few samples.
+    nothing and chooses no paths, and its target has few samples.
     """
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     (tmp_path / "configs").mkdir()
     text = (ROOT / "configs/cornell_floor.yaml").read_text(encoding="utf-8")
     assert text.count("\nrun:\n") == text.count("{spp: 1024}") == 1
     text = text.replace("\nrun:\n", "\nrun:\n  measuring: 0\n").replace("{spp: 1024}", "{spp: 16}")
-    text = text.replace("{resx: 256, resy: 256}", "{resx: 16, resy: 16}").replace("max_depth: 6", "max_depth: 3")
+    text = text.replace("{resx: 256, resy: 256}", "{resx: 16, resy: 16}")
+    text = text.replace("max_depth: 6", "max_depth: 3\n  paths: light")
     (tmp_path / "configs/cornell_floor.yaml").write_text(text, encoding="utf-8")
     return tmp_path
 
