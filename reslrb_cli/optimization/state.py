@@ -210,7 +210,7 @@ def decide_as(problem: Problem, stored: Stored) -> Problem:
     integrator = as_decided(problem.integrator, decisions)
     if shares := entries_below(stored.arrays, "pixels/"):
         integrator = integrator.shared_out(shares)
-    return replace(problem, decisions=[*decisions, *blur_decision(problem)], integrator=integrator)
+    return replace(problem, decisions=[*blur_decision(problem), *decisions], integrator=integrator)
 
 
 def reach_as(problem: Problem, stored: Stored) -> Problem:

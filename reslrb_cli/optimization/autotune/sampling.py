@@ -380,7 +380,7 @@ def decide(problem: Problem, say: Say, cache: DecisionCache | None = None) -> Pr
     # The chosen paths may leave a setting without effect.
     unused = {"camera": "sequence", "light": "pixels"}.get(getattr(tuner.problem.integrator, "paths", ""))
     decisions = [each for each in tuner.problem.decisions if each.setting != unused]
-    tuner.problem = replace(tuner.problem, decisions=[*decisions, *blur_decision(problem)])
+    tuner.problem = replace(tuner.problem, decisions=[*blur_decision(problem), *decisions])
     tuner.tell()
     return tuner.problem
 
