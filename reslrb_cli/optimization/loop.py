@@ -106,10 +106,11 @@ LEAST_ITERATIONS, LEAST_OF_LARGE, CLOSE, LEAST_SHARE = 20, 45, 0.025, 0.2
 def close_enough(problem: Problem, iteration: int) -> str:
     """Return a message if more iterations would not help, otherwise "". `iteration` is the number of iterations."""
     optimizer = problem.optimizer
+    if not optimizer.measures_curvature:
+        return ""
     measured = 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last measurement of large parameters
     least = LEAST_ITERATIONS if len(optimizer.block.at) == len(optimizer.keys()) else LEAST_OF_LARGE
-    is_long = iteration >= max(least, 1.5 * measured)
-    if not optimizer.measures_curvature or not is_long:
+    if iteration < max(least, 1.5 * measured):
         return ""
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
         extent = optimizer.extent(key)

@@ -18,10 +18,10 @@ entries, and s gives the differences between entries, as in Adam. Where the loss
 the curvature counts.
 
 L is a share of the parameter's extent. One gradient moves an entry by about L in all later steps together, because the
-clipped gradients add up to L. Otherwise, a texel that few paths reach would move by 2.5 L after a path. Steps of 0.3
-are a compromise: with 0.4, more noise of the first, large gradients remains in directions that the images do not
-determine, for example differences of texels in one pixel. n_i counts the iterations in which
-g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length.
+clipped gradients add up to L. Otherwise, a texel that few paths reach would move by 2.5 L after one path. Steps of 0.3
+are a compromise. Larger steps keep more noise of the first, large gradients in directions that the images do not
+determine, such as differences of texels in one pixel. n_i counts the iterations in which g_i and m_i have opposite
+signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length.
 When it oscillates, or when noise dominates, its steps become shorter, as 1/n.
 
 `to_go` is a limit of the distance to the optimum. m_i contains only earlier samples, so the product g_i m_i has no bias

@@ -64,8 +64,6 @@ PATHS_PLANNED = 1.2
 #: A race needs time for this many iterations of the run, and to compile the kernels of this many steps. The run needs
 #: the kernels of camera paths and of both kinds, whichever wins.
 LEAST_ITERATIONS, GUIDING_KERNELS, PATHS_KERNELS = 3.0, 2.5, 0.0
-#: The setting of the run, not of the integrator, that a rule decides.
-BLUR = "blur"
 Say = Callable[[str], None]
 logger = logging.getLogger(__name__)
 
@@ -389,7 +387,7 @@ def blur_decision(problem: Problem) -> list[Decision]:
     """Return the decision on `run.blur: auto`, or nothing if images stay sharp."""
     widest = max(problem.first_blur(view) for view in problem.trained) if problem.config.run.blur == "auto" else 0.0
     why = "shapes that move also attract each other from a distance in blurred images"
-    return [Decision(setting=BLUR, value=f"{widest:.3g} px", why=why)] if widest else []
+    return [Decision(setting="blur", value=f"{widest:.3g} px", why=why)] if widest else []
 
 
 def open_settings(config: Config, paths: str) -> list[str]:
