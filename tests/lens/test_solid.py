@@ -21,14 +21,12 @@ import numpy as np
 import pytest
 import trimesh
 from cli.tiny import done, reslrb
-from lens.test_experiment import picture
 from turns import a_few
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.lens import solid as solids
 from reslrb_cli.lens.solid import Sheet, as_sheet, make_solid, measured
-from reslrb_cli.records.images import write_file
 from reslrb_cli.runs import export
 from reslrb_cli.scene.images import read_image
 
@@ -201,17 +199,10 @@ def test_invalid_solids_are_refused() -> None:
 # ---- by the command
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
+@pytest.fixture
+def run(lens: Path) -> Path:
     """Folder of a lens run with one iteration from its start."""
-    folder = tmp_path_factory.mktemp("solid")
-    image = np.repeat(picture(16, 12)[:, :, None], 3, 2).astype(np.float32)
-    write_file(folder / "p.exr", image, linear=True)
-    done("lens", folder / "p.exr", "-o", folder / "lens", "--pixels", "16")
-    sets = [f"run.output={folder}/runs", "run.iterations=1", "run.spp=4", "run.final_spp=4", "run.certainty=false"]
-    said = done("optimize", folder / "lens/lens.yaml", *(word for line in sets for word in ("--set", line))).output
-    assert "runs/lens -o FOLDER` writes the solid" in said  # the next command
-    return folder / "runs/lens"
+    return lens / "runs/lens"
 
 
 @pytest.mark.long
@@ -231,14 +222,14 @@ def test_the_folder_of_a_run_holds_the_solid_of_its_scene(run: Path, tmp_path: P
     assert "lens.stl: 75 x 100 x" in said
     # Heights as seen from the receiver's side, with y up.
     map = told["faces"]["face"]["heights"]
-    wanted = points[:, 2].reshape(48, 36)[::-1]  # three vertices per pixel
+    wanted = points[:, 2].reshape(96, 72)[::-1]  # three vertices per pixel
     numbers = np.array(mi.Bitmap(str(out / "heights.png")))
     assert numbers.dtype == np.uint16
     step = map["png"]["step"]
-    assert np.abs(map["png"]["offset"] + step * numbers.reshape(48, 36) - wanted).max() <= 0.51 * step
+    assert np.abs(map["png"]["offset"] + step * numbers.reshape(96, 72) - wanted).max() <= 0.51 * step
     exact = read_image(out / "heights.exr", "linear", signed=True)[:, :, 0]
     assert np.array_equal(exact, wanted)
-    assert map["pitch"] == pytest.approx([75 / 35, 100 / 47])
+    assert map["pitch"] == pytest.approx([75 / 71, 100 / 95])
 
 
 def read_back(path: Path) -> trimesh.Trimesh:

@@ -83,7 +83,7 @@ def test_resizing_preserves_the_light() -> None:
         assert resized(picture, shape).mean() == pytest.approx(picture.mean(), rel=1e-12)
 
 
-@pytest.mark.parametrize("side", [16, 63, 400])
+@pytest.mark.parametrize("side", [16, 63, pytest.param(400, marks=pytest.mark.long)])
 def test_a_resized_black_and_white_picture_stays_within_black_and_white(side: int) -> None:
     at = np.arange(side)
     disc = np.hypot(*np.meshgrid(at - side / 2, at - side / 2)) < 0.4 * side
