@@ -13,15 +13,17 @@ from reslrb_cli.backend import llvm, shared_library
 # gets the same kernels. The documented option `-opt-bisect-limit=0` leaves out its optional passes,
 # `-optimize-regalloc=false` allocates registers quickly, and `-combiner-disabled` leaves out the combination of
 # operations, which took 29 % of the time. No pass may reassociate or approximate, so the values are the same. The
-# kernels run slower, which is negligible for small kernels. Without combination, LLVM ends the process (`Cannot
-# select`) at a comparison of two masks on CPUs with AVX-512. Mitsuba's `checkerboard` has one. Tests that compile such
-# kernels use the fixture `combined`.
+# kernels run slower, which is negligible for small kernels. Tests whose kernels run for seconds use the fixture
+# `registers`, which saves about 10 % of their time. Without combination, LLVM ends the process (`Cannot select`) at a
+# comparison of two masks on CPUs with AVX-512. Mitsuba's `checkerboard` has one. Tests that compile such kernels use
+# the fixture `combined`.
 # `-m long` has kernels that run for minutes, so it uses LLVM as users do.
 
 #: Dr.Jit identifies a cached kernel by its computation, so the kernels of the tests need a folder apart from those of
 #: users.
 CACHE = Path("~/.drjit-tests")
-OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0", "-optimize-regalloc=false")
+REGISTERS = "-optimize-regalloc"
+OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0", f"{REGISTERS}=false")
 #: Folder with the code that Python runs first in each process that a test starts.
 STARTED = Path(__file__).parent / "started"
 #: First LLVM version that does not print the name of each pass that it leaves out.
@@ -54,6 +56,13 @@ def combine(on: bool) -> None:
     library = shared_library.load(Path(os.environ[llvm.VARIABLE]))
     if version_of(library) >= HAS_COMBINER_SINCE and platform.machine() == "x86_64":
         set_options(library, f"{COMBINER}={'false' if on else 'true'}")
+
+
+def allocate_registers(well: bool) -> None:
+    """Let LLVM allocate registers well, or quickly as in OPTIONS."""
+    library = shared_library.load(Path(os.environ[llvm.VARIABLE]))
+    if version_of(library) >= SILENT_SINCE:
+        set_options(library, f"{REGISTERS}={'true' if well else 'false'}")
 
 
 def leave_out_optimisations() -> bool:

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from compilation import combine, compute_alone, leave_out_optimisations, show_fatal_errors
+from compilation import allocate_registers, combine, compute_alone, leave_out_optimisations, show_fatal_errors
 from kit import with_wavelengths, work_in
 from report.chromium import Chromium, find_chromium
 
@@ -135,6 +135,16 @@ def combined(llvm: str, pytestconfig: pytest.Config) -> Iterator[None]:
     yield
     if is_quick(pytestconfig):
         combine(False)
+
+
+@pytest.fixture
+def registers(llvm: str, pytestconfig: pytest.Config) -> Iterator[None]:
+    """Compile the kernels of a test with LLVM's allocation of registers, for kernels that run for seconds."""
+    if is_quick(pytestconfig):
+        allocate_registers(True)
+    yield
+    if is_quick(pytestconfig):
+        allocate_registers(False)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -27,7 +27,7 @@ from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import integrator, relative, seeds, smooth_weights
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, lit_square, look_at, rectangle, rgb, transform
 
-pytestmark = pytest.mark.usefixtures("llvm")
+pytestmark = pytest.mark.usefixtures("registers")
 
 #: Translation along z, and rotation by units of `TURN` degrees about an axis through the origin.
 MOTION, TURN, STEP = ("z", "turn"), 30.0, 0.02
