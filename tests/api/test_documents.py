@@ -74,6 +74,7 @@ def run_here(script: str, folder: Path) -> list[str]:
     return said.getvalue().splitlines()
 
 
+@pytest.mark.long
 def test_scripts_of_the_docs_run(quick_checkout: Path) -> None:
     folder = quick_checkout
     lines = run_here(script_of(PAGE.read_text(encoding="utf-8")), folder)

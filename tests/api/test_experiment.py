@@ -188,6 +188,7 @@ def test_given_values_replace_initial_ones(folder: Path) -> None:
     assert np.array_equal(rl.render("tiny.yaml", values={KEY: 0.25, LAMP: 6})[0], expected[0])
 
 
+@pytest.mark.long
 def test_the_gradient_equals_that_of_the_first_iteration(folder: Path) -> None:
     run = rl.optimize("tiny.yaml", overrides=FAST)
     first = next(iter(run))
@@ -247,6 +248,7 @@ def test_arguments_are_named_in_errors(folder: Path, call: Callable[[], Any], li
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
     done("gradcheck", "tiny.yaml", "--integrators", "reslrb:stack", "--seeds", "3", "--spp", "4", "--json", "g.jsonl")
     records = rl.gradcheck("tiny.yaml", "reslrb:stack", seeds=3, spp=4)

@@ -115,6 +115,7 @@ def test_everything_can_be_inspected_between_iterations(experiment: Path) -> Non
     assert repr(run) == "<Run tiny.yaml: 6 of 6, finished>"
 
 
+@pytest.mark.long
 def test_two_experiments_alternate(experiment: Path) -> None:
     """Each run gives the same records as alone, bit by bit."""
     other = SET | {"run.iterations": 4, "run.seed": 7, "optimizer.type": "sgd"}

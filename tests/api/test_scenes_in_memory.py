@@ -166,7 +166,7 @@ def test_a_file_a_dictionary_and_a_scene_give_equal_results(folder: Path) -> Non
 def test_moving_parameters_of_a_scene_in_memory(folder: Path) -> None:
     """The check of the missing share moves the object before the run, and so does the rendering of the target."""
     box = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0.4, 0.3, 0.3]).scale(0.2)}
-    moving = experiment(iterations=30, measuring=1.0, spp=16) | {"parameters": [BOX | MOVED]}
+    moving = experiment(iterations=8, measuring=1.0, spp=16) | {"parameters": [BOX | MOVED]}
     runs = [rl.optimize(moving, scene=each) for each in (room(box=box), rl.load_scene(room(box=box)))]
     expected, found = (losses(run) for run in runs)
     assert found == expected

@@ -22,6 +22,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_scene_end_to_end(folder: Path) -> None:
     """The bias of each method stays below its limit, and the error of averages falls at the expected rate. `ptracer` is
     also the independent reference, so three processes are enough.

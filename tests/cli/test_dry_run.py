@@ -63,6 +63,7 @@ def test_few_long_steps_suffice(experiment: Path, monkeypatch: pytest.MonkeyPatc
     assert taken == [0, 1, 2]
 
 
+@pytest.mark.long
 def test_work_before_the_iterations_is_measured_once(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A dry run measures the decisions and stores them for the run that follows."""
     monkeypatch.setenv("RESLRB_CACHE", str(experiment / "cache"))

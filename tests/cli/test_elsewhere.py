@@ -87,6 +87,7 @@ def test_keys_are_the_same_from_inspect_to_the_page(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "runs/corner/parameters/true/parameters.json").read_text()).keys() == set(WALLS)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("llvm")
 def test_invisible_texels_are_told_from_settled_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No true value is known. Invisible texels light the lamp's face, and so the visible texels. They have a gradient,

@@ -124,8 +124,7 @@ def test_unknown_plugins_are_refused_by_every_command_and_integrator(folder: Pat
     (folder / "c.yaml").write_text(BY_HAND)
     for type in TYPES:
         assert row.light in said("optimize", "c.yaml", *settings(f"integrator.type={type}"), code=2)
-    one_case = ("--integrators", "reslrb:stack", "--max-depth", "2")  # each case has a process of its own
-    for command, *words in (("render", "-o", "image.exr"), ("render", "--scene", "-o", "image.exr"), ("gradcheck",),
-                            ("bench", *one_case)):  # fmt: skip
+    # Cases of `bench` are refused in processes of their own (test_wrong_calls_are_one_located_line).
+    for command, *words in (("render", "-o", "image.exr"), ("render", "--scene", "-o", "image.exr"), ("gradcheck",)):
         assert row.light in said(command, "c.yaml", *words, code=2)
     assert not (folder / "image.exr").exists()

@@ -151,7 +151,12 @@ def test_an_unfinished_run_is_marked_everywhere():
     assert f"not converged, still moving: {KEY}" in page.partition("<section>")[0]
     assert '<th scope="col">verdict</th>' in page
     assert '<span class="worse">still moving' in page
-    # A run without certainty ends with the same values.
+
+
+@pytest.mark.long
+def test_a_run_without_certainty_ends_with_the_same_values():
+    sets = ["run.adjoint=independent", "run.spp=128", "optimizer.learning_rate=0.002"]
+    optimize(*sets)
     values = np.load("runs/box/parameters/parameters.npz")[KEY]
     optimize(*sets, "run.certainty=false")
     np.testing.assert_allclose(np.load("runs/box/parameters/parameters.npz")[KEY], values, rtol=1e-5)

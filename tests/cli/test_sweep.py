@@ -500,6 +500,7 @@ def test_curves_are_medians_with_minimum_and_maximum():
     assert [end.tolist() for end in curve.band] == [[1.0, 1.0, 2.0, 3.0], [9.0] * 4]
 
 
+@pytest.mark.long
 def test_the_page_has_a_table_curves_and_pictures(folder):
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "target.render.spp=[8, 16]", "--seeds", "2"]
     tiny.done(*words, "-o", "s")

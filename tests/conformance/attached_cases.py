@@ -148,7 +148,7 @@ CASES = [
                  {"mirror.vertex_positions": None}),
     AttachedCase("rough_mirror", lambda: mirrored({"type": "roughconductor", "alpha": 0.15, "material": "Al"}),
                  {"mirror.vertex_positions": None}, limit=ROUGH),
-    AttachedCase("rough_slab", lambda: enclosed(rough()), SLAB, depth=5, limit=ROUGH, quick=True),
+    AttachedCase("rough_slab", lambda: enclosed(rough()), SLAB, depth=5, limit=ROUGH),
     AttachedCase("roughness_and_index", lambda: enclosed(rough(0.2)),
                  SLAB | {"slab.bsdf.alpha.value": None, "slab.bsdf.eta": None}, limit=ROUGH, depth=6),
     AttachedCase("roughness_alone", lambda: under_glass(rough(0.2)),

@@ -80,6 +80,7 @@ TEXTURES = {
 }
 
 
+@pytest.mark.long
 @taking_turns("name", list(TEXTURES), "paths", ["both", "light"])
 def test_recordings_of_scenes_with_textures(name: str, paths: str) -> None:
     case = TEXTURES[name]

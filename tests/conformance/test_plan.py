@@ -272,6 +272,7 @@ def test_vertices_after_the_last_differentiable_one_are_not_revisited(
     assert 0 < means[0] < 0.7 * means[1]
 
 
+@pytest.mark.long
 def test_connections_without_differentiable_vertices_are_no_candidates(
     scene: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -92,6 +92,7 @@ def test_unsupported_variants_are_refused_with_the_supported_ones():
     assert others == ["BackendError", "BackendError", "RuntimeError"] * 3 + ["3"]
 
 
+@pytest.mark.long
 def test_the_script_of_the_docs_runs():
     """The Python blocks of docs/integrator.md run one after the other, and reduce the loss."""
     text = (ROOT / "docs" / "integrator.md").read_text(encoding="utf-8")
@@ -238,6 +239,7 @@ def test_mi_render_adds_to_existing_gradients(case: Case):
     assert (sums[1] > sums[0]).mean() > 0.9
 
 
+@pytest.mark.long
 def test_one_latent_for_several_sensors(llvm: str):
     """Propagation for one view must not remove the edges above the parameters. The next view needs these edges."""
     scene = Case(_textured(other=camera()), (FLOOR,))

@@ -61,7 +61,8 @@ def test_the_rainbow_is_that_of_an_independent_tracer(kind: str, prism: mi.Scene
     assert abs(errors["glass.Vd"]) < 0.005 * TRUE["glass.Vd"]
 
 
-@pytest.mark.parametrize("estimator", ["stack", pytest.param("reservoir", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("estimator", ["stack", "reservoir"])
 def test_derivatives_by_the_glass_match_differences_of_the_tracer(estimator: str, prism: mi.Scene) -> None:
     check_derivatives(prism, differences(), estimator)
 

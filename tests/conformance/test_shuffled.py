@@ -134,6 +134,7 @@ def differing(way: str, names: tuple[str, ...], orders: Iterator[np.random.Gener
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", ["both"])
 def test_results_do_not_depend_on_earlier_work(way: str) -> None:
     with one_thread():

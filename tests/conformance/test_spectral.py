@@ -27,7 +27,6 @@ QUICK: dict[str, Callable[..., None]] = {
     "condition of zero gradients": own.test_the_condition_of_gradients_that_are_zero,
     "furnace": lambda: own.test_the_furnace_has_its_colour("both", "regular"),
     "derivatives by stack": lambda: own.test_the_furnace_has_its_derivatives("light", "stack", "regular"),
-    "derivatives by reservoir": lambda: own.test_the_furnace_has_its_derivatives("light", "reservoir", "irregular"),
     "export of a lamp": own.test_a_recovered_colour_of_a_lamp_is_exported,
     "raw photograph": own.test_a_raw_photograph_gets_the_colours_of_the_lamps,
     "missing channel": own.test_a_photograph_lacks_a_channel_of_the_film,

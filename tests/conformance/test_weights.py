@@ -306,7 +306,7 @@ def as_it_stands(name: str) -> dict[str, Comparison]:
 
 POINTS = ("PointLight", "SpotLight", "Projector", "DirectionalEmitter")
 #: Cases that need `-m long`: each resembles another case. Plans for single emitters differ, and one of them runs.
-SIMILAR = ("rough", *(name for name in CASES if name.startswith("only") and name != "only_directional"))
+SIMILAR = ("rough", "smooth", *(name for name in CASES if name.startswith("only") and name != "only_directional"))
 
 
 @pytest.mark.parametrize("name", a_few(CASES, [name for name in CASES if name not in SIMILAR]))

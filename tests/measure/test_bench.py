@@ -61,6 +61,7 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [line.split()[:2] for line in lines[3:5]] == [[str(depth), "reslrb:stack"] for depth in (2, 4)]
 
 
+@pytest.mark.long
 def test_a_failing_case_gives_its_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

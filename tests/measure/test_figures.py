@@ -133,6 +133,7 @@ def test_compared_methods_have_one_expectation(config: Config) -> None:
     assert figures.verdict is Verdict.HOLDS, figures
 
 
+@pytest.mark.long
 def test_a_process_ends_at_its_limit() -> None:
     """The process loads the scene, but its memory limit is too small for the paths that naive AD stores at this sample
     count.

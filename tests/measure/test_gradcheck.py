@@ -286,6 +286,7 @@ def test_images_are_compared_without_the_border(dark):
     np.testing.assert_allclose(image[inside], case.image(integrators["walk_ad"], 1, 16)[inside], rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.long
 def test_a_step_has_the_stated_truncation_error():
     """The image is cubic in the albedo, so that differences have an error of h^2 times the third derivative."""
     key = "side.brdf_0.reflectance.value"

@@ -111,6 +111,7 @@ def test_a_configuration_names_the_file(experiment: Path) -> None:
     assert "Twice lacks kept" in err
 
 
+@pytest.mark.long
 def test_gradcheck_names_the_file(experiment: Path) -> None:
     words = ("gradcheck", "tiny.yaml", "--integrators", "reslrb:mine.py:Twice", "--seeds", 3, "--spp", 4)
     code, _, err = outcome(*words)

@@ -120,6 +120,7 @@ def test_a_value_at_its_bound_without_a_gradient_is_at_its_bound(folder, monkeyp
     assert verdicts(toy, found) == toy.right, told(toy, found)
 
 
+@pytest.mark.long
 def test_a_lamp_that_moves_through_a_wall_has_lost_its_effect(folder):
     """The target has the lamp nearer to the wall. The first step moves the lamp behind the wall."""
     motion = "motion: {of: left, free: [z]}, initial: -2.4, learning_rate: 2"
@@ -363,6 +364,7 @@ def test_a_known_visible_poster_separates_exposure_from_colour(folder_of_views: 
         assert np.all(np.abs(np.ravel(found.errors[key])) < 4 * spread), key
 
 
+@pytest.mark.long
 def test_with_a_mask_colour_and_exposure_compensate_for_each_other(folder_of_views: Path) -> None:
     found = run(folder_of_views, Toy("masked", COLOR_OF_BACK, {}, (*SETTINGS, "target.mask=mask.exr")))
     wall, exposure = (found.certainty.parameters[key] for key in (WALL, EXPOSURE))

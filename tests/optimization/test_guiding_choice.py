@@ -323,6 +323,7 @@ def test_it_is_on_if_it_pays(world: World, on: bool) -> None:
     assert ("the image, of the same samples" in found.why()) == (not on and low > 1)
 
 
+@pytest.mark.long
 @taking_turns("entries", [3, 200], "sparse", [False, True])
 def test_the_interval_of_the_gain_has_its_coverage(entries: int, sparse: bool) -> None:
     """Without the allowance for timing errors, the interval has its nominal level. The gain includes the cost of
@@ -345,6 +346,7 @@ def on_by_accident(**world: Any) -> int:
     return sum(World(**world, seed=seed).race().other for seed in range(100))
 
 
+@pytest.mark.long
 def test_it_is_rarely_on_if_it_does_not_pay() -> None:
     # Learning costs as much as guiding gains: 0.8 * (1 + 0.1 + 0.15).
     world = {"variance": 0.8, "walk": 0.7, "python": 16.8}

@@ -374,6 +374,7 @@ def test_indistinguishable_parameters_are_refused(folder, exposure):
     check_exposures(known)
 
 
+@pytest.mark.long
 def test_a_colour_beside_a_known_one_is_recovered_with_the_exposure(folder):
     scene = folder / "scene.xml"
     scene.write_text(scene.read_text().replace("</scene>", """

@@ -120,7 +120,7 @@ def norm_of_all_samples(llvm, tmp_path_factory) -> float:
     "options",
     a_few(
         ["run.adjoint=independent", "run.adjoint=batched", "integrator.samples_per_pass=4"],
-        ["integrator.samples_per_pass=4"],
+        (),  # test_passes_have_the_gradient_of_all_samples
     ),
 )
 def test_steps_of_several_backward_passes_add_up(tmp_path, options, norm_of_all_samples):
@@ -140,6 +140,7 @@ def test_passes_have_the_gradient_of_all_samples(tmp_path):
         assert np.linalg.norm(parts[key] - value) < 0.3 * np.linalg.norm(value), key
 
 
+@pytest.mark.long
 def test_a_lamp_is_found(tmp_path):
     config = load(glass.write_experiment(tmp_path), ["run.iterations=25", "run.spp=32", "integrator.estimator=auto"])
     problem = assemble(config)

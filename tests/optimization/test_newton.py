@@ -154,6 +154,7 @@ def test_a_measured_curvature_that_is_wrong_does_not_stop_the_run(size):
     np.testing.assert_allclose(values[-1], BEST, atol=0.02)
 
 
+@pytest.mark.long
 def test_the_limit_of_the_distance_along_a_valley_holds_under_noise():
     """Most of the noise moves the values along the valley. The limit has a confidence of 85 %."""
     values, limits = in_the_valley(np.array([0.9, 0.9]), noise=1.0, iterations=300)

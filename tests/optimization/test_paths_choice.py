@@ -283,6 +283,7 @@ def test_naive_differentiation_of_moving_shapes_uses_light_paths():
     assert (naive.paths, naive.integrator.paths) == ("light", "light")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "settings", [pytest.param(AUTO, id="measured at length"), pytest.param(SHORT, id="short", marks=pytest.mark.long)]
 )

@@ -85,7 +85,7 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", a_few(WAYS, ["2 in rounds", "guided"]))
+@pytest.mark.parametrize("way", a_few(WAYS, ["2 in rounds"]))
 def test_gradients_are_unbiased(folder, way):
     """The reference consists of steps of 256 samples with a second set for dL/dI. Each shard has one or two samples per
     pixel.
@@ -105,6 +105,7 @@ def test_a_single_set_of_samples_would_be_found(folder):
     assert not found, found
 
 
+@pytest.mark.long
 def test_views_and_exposures_are_unbiased(folder):
     """Two views with different weights have two shards each. The second view's exposure is recovered."""
     reference = independent(make(folder, TWO_VIEWS, "run.adjoint=independent"))
@@ -130,7 +131,10 @@ def shuffled(problem: Problem, function: Callable[..., Any], work: Any) -> Itera
     [
         pytest.param(["run.spp=8", "run.shards=4", ROUNDS, "target.exposure=1.5"], marks=pytest.mark.long),
         ["run.spp=16", "run.shards=4", "run.adjoint=batched", "integrator.guiding=on"],
-        ["run.spp=4", "run.shards=2", "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]", "integrator.guiding=on"],
+        pytest.param(
+            ["run.spp=4", "run.shards=2", "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]", "integrator.guiding=on"],
+            marks=pytest.mark.long,
+        ),
         pytest.param(["run.spp=8", "run.shards=4", ROUNDS, TWO_VIEWS.replace("auto", "2")], marks=pytest.mark.long),
     ],
 )

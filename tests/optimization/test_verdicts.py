@@ -447,6 +447,7 @@ def test_a_slow_rise_is_found():
     assert found[Change.ROSE] > 0.95
 
 
+@pytest.mark.long
 def test_a_slow_fall_is_rarely_missed():
     """The loss falls by a fifth over the run. A single iteration has noise of a tenth."""
     for iterations in (50, 100, 200):

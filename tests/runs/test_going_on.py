@@ -86,7 +86,7 @@ CASES: dict[str, list[str]] = {
     "a list of losses": ["loss=[{type: l1}, {type: l2, weight: 0.5}]"],
     "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
 }
-FEW = ("auto", "auto, exposure", "pixels", "scale auto, sigmoid", "shards")
+FEW = ("auto, exposure", "pixels", "shards")
 #: The number of iterations after which a run is killed, and the number in its newest state at that time. Certainty
 #: makes its notes at four fifths of the iterations, which must come before this state.
 KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20)}

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from kit import with_wavelengths
+from turns import taking_turns
 
 from reslrb_cli.glasses import C_LINE, D_LINE, F_LINE, GLASSES, find_glass
 from reslrb_cli.scene.dispersion import register
@@ -130,8 +131,7 @@ def rays(count: int) -> tuple[mi.SurfaceInteraction3f, mi.Float, mi.Point2f]:
 GLASS = {"type": "dispersivedielectric", "material": "N-SF11"}
 
 
-@pytest.mark.parametrize("rough", [None, 0.3])
-@pytest.mark.parametrize("mode", ["Radiance", "Importance"])
+@taking_turns("mode", ["Radiance", "Importance"], "rough", [None, 0.3])
 def test_each_wavelength_scatters_as_in_mitsubas_dielectric(rough: float | None, mode: str, spectral: None) -> None:
     """With one wavelength, samples, values and densities are equal to those of Mitsuba's plugins. With four, the mean
     of each weighted by a function of the direction is that of the wavelength alone.

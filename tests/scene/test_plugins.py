@@ -145,16 +145,16 @@ CONFIG_FILE = "../c.yaml"
     [
         pytest.param(
             [
-                ["inspect", "../scene/scene.xml"],
                 ["inspect", CONFIG_FILE],
                 ["render", CONFIG_FILE, "-o", "image.exr", "--set", "integrator={type: ptracer, max_depth: 2}"],
-                ["optimize", CONFIG_FILE, "--set", "integrator={type: prb, max_depth: 2}"],
             ],
             id="short",
         ),
         pytest.param(
             [
+                ["inspect", "../scene/scene.xml"],
                 ["optimize", CONFIG_FILE],
+                ["optimize", CONFIG_FILE, "--set", "integrator={type: prb, max_depth: 2}"],
                 ["gradcheck", CONFIG_FILE, "--seeds", "3"],
                 ["bench", CONFIG_FILE, "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack,ptracer"],
                 ["doctor"],
