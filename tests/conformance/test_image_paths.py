@@ -199,7 +199,7 @@ SIMILAR = (
     "mask_between_1", "shapes", "format_luminance", "format_xyza", "thin_lens_through_a_mask", "near_clip",
     "near_clip_of_a_pinhole", "far_clip_of_a_lens", "focus_0.9", "focus_30.0", "focus_2.0",
     "principal_point_of_a_whole_film", "thin_lens", "masks_before_a_hidden_sky", "filter_lanczos",
-    "opaque_and_absent_masks", "moving_shutter",
+    "opaque_and_absent_masks", "moving_shutter", "closed_room",
 )  # fmt: skip
 
 

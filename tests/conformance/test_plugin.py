@@ -400,6 +400,7 @@ def test_hide_emitters(shown: Case):
     assert 0.02 < lit.mean() < 0.5
 
 
+@pytest.mark.long
 def test_rr_depth_ends_paths(case: Case):
     early, late = (case.gradients(integrator("reslrb", 8, rr), seeds(8), 16) for rr in (1, 1000))
     assert relative(early, late) > 0.01

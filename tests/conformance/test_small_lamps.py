@@ -92,6 +92,7 @@ def test_forward_mode():
     assert case.tangent(tracer, direction, 3, 64) == pytest.approx(known.gradient(case.weights) @ direction, rel=0.01)
 
 
+@pytest.mark.long
 def test_a_recorded_step_equals_the_step_and_later_ones_compile_nothing():
     case, kernels = Case(two(), SPECKS), Kernels()
     plain, frozen = (integrator("reslrb", 3, estimator="stack", freeze=freeze) for freeze in (False, True))

@@ -55,7 +55,7 @@ SETUPS = {
 }
 
 
-@pytest.mark.parametrize("name", a_few(SETUPS, ["lens", "mirror"]))
+@pytest.mark.parametrize("name", a_few(SETUPS, ["lens"]))
 def test_a_set_up_matches_the_options_of_the_command(name: str, tmp_path: Path, llvm: str) -> None:
     options, side, light, through, words = SETUPS[name]
     write_file(tmp_path / "p.exr", np.repeat(picture(24, 16)[:, :, None], 3, 2).astype(np.float32), linear=True)

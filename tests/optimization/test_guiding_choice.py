@@ -91,7 +91,7 @@ def test_on_enables_guiding_and_off_removes_it(adjoint: str, experiment: Path, m
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("sequence", a_few(["low_discrepancy", "auto"], ["auto"]))
+@pytest.mark.parametrize("sequence", a_few(["low_discrepancy", "auto"], ()))
 def test_a_named_sequence_stays_and_auto_depends_on_guiding(
     sequence: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
