@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from conformance.moving import Latents, Moving, turned
+from conformance.moving import Latents, Moving, mesh, turned
 
 from reslrb_cli.measure.gradients import integrator, seeds, smooth_weights
 from reslrb_cli.measure.scenes.small import diffuse, lit_square, look_at, rectangle, rgb, transform
@@ -115,19 +115,6 @@ def recorded(case: EdgeCase) -> np.ndarray:
 # ---- Moving shapes ----
 
 
-def mesh(positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any] = OWN, **things: Any) -> mi.Mesh:
-    """Return a mesh with flat faces. `things` are added to its dictionary, for example an emitter."""
-    properties = mi.Properties()
-    for key, thing in {"bsdf": bsdf, **things}.items():
-        properties[key] = mi.load_dict(thing)
-    made = mi.Mesh("shape", len(positions), len(faces), properties)
-    params = mi.traverse(made)
-    params["vertex_positions"] = np.asarray(positions, np.float32).ravel()
-    params["faces"] = np.asarray(faces, np.uint32).ravel()
-    params.update()
-    return made
-
-
 def split_box(center: tuple[float, float, float], half: tuple[float, float, float], degrees: float = 23.0
               ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the vertices (24, 3) and faces (12, 3) of a box turned about z. Each side has its own four vertices."""
@@ -166,7 +153,7 @@ def ball(center: tuple[float, float, float], radius: float, rows: int = 6, colum
 
 
 def _box(x: float, y: float, z: float, size: float = 1.0) -> Any:
-    return mesh(*split_box((x, y, z), (0.3 * size, 0.25 * size, 0.3 * size)))
+    return mesh(*split_box((x, y, z), (0.3 * size, 0.25 * size, 0.3 * size)), OWN)
 
 
 def _sphere(x: float, y: float, z: float, size: float = 1.0) -> Any:
@@ -189,7 +176,7 @@ def _cylinder(x: float, y: float, z: float, size: float = 1.0) -> Any:
 
 
 def _ball(x: float, y: float, z: float, size: float = 1.0) -> Any:
-    return mesh(*ball((x, y, z), 0.4 * size))
+    return mesh(*ball((x, y, z), 0.4 * size), OWN)
 
 
 SHAPES: dict[str, Callable[..., Any]] = {

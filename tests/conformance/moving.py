@@ -133,6 +133,32 @@ def rippled(y: float, cells: int, ripples: float = 1.0, side: float = 1.0) -> np
     return np.stack([side * x, y + ripples * height(x, z), side * z], -1).reshape(-1, 3)
 
 
+def mesh(
+    positions: np.ndarray,
+    faces: np.ndarray,
+    bsdf: dict[str, Any],
+    name: str = "shape",
+    normals: np.ndarray | bool = False,
+    texcoords: np.ndarray | None = None,
+    **things: Any,
+) -> mi.Mesh:
+    """Return a mesh with flat faces, or with the given `normals`. If `normals` is true, Mitsuba interpolates them.
+    `things` are added to the mesh's dictionary, for example an emitter.
+    """
+    properties = mi.Properties()
+    for key, thing in {"bsdf": bsdf, **things}.items():
+        properties[key] = mi.load_dict(thing)
+    made = mi.Mesh(name, len(positions), len(faces), properties, has_vertex_normals=normals is not False,
+                   has_vertex_texcoords=texcoords is not None)  # fmt: skip
+    params = mi.traverse(made)
+    for part, value in (("positions", positions), ("normals", normals), ("texcoords", texcoords)):
+        if isinstance(value, np.ndarray):
+            params[f"vertex_{part}"] = value.astype(np.float32).ravel()
+    params["faces"] = np.asarray(faces, np.uint32).ravel()
+    params.update()
+    return made
+
+
 def sheet(name: str, bsdf: dict[str, Any], y: float, cells: int = 12, ripples: float = 1.0, side: float = 1.0,
           **things: Any) -> mi.Mesh:  # fmt: skip
     """Return a horizontal mesh that faces up. The mesh is a rippled square of `cells` x `cells`, with interpolated
@@ -144,16 +170,7 @@ def sheet(name: str, bsdf: dict[str, Any], y: float, cells: int = 12, ripples: f
     at = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]
     faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
-    properties = mi.Properties()
-    for key, thing in {"bsdf": bsdf, **things}.items():
-        properties[key] = mi.load_dict(thing)
-    mesh = mi.Mesh(name, len(positions), len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=True)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = positions.astype(np.float32).ravel()
-    params["vertex_texcoords"] = np.stack([(x + 1) / 2, (z + 1) / 2], -1).astype(np.float32).ravel()
-    params["faces"] = faces.astype(np.uint32).ravel()
-    params.update()
-    return mesh
+    return mesh(positions, faces, bsdf, name, True, np.stack([(x + 1) / 2, (z + 1) / 2], -1), **things)
 
 
 def camera(rfilter: str = "gaussian", size: int = SIZE, sensor: str = "perspective", **film: Any) -> dict[str, Any]:

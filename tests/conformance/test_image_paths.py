@@ -7,6 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from conformance.moving import mesh
 from conformance.scenes import (
     RED,
     SAME,
@@ -56,17 +57,7 @@ def facets(bsdf: dict[str, Any], smooth: bool = True, **things: Any) -> mi.Mesh:
     quads = [(i * m + j, i * m + (j + 1) % m, (i + 1) * m + j, (i + 1) * m + (j + 1) % m)
              for i in range(n) for j in range(m)]  # fmt: skip
     faces = [(a, b, c) for a, b, c, _ in quads[m:]] + [(b, d, c) for _, b, c, d in quads[:-m]]
-    properties = mi.Properties()
-    for name, thing in {"bsdf": bsdf, **things}.items():
-        properties[name] = mi.load_dict(thing)
-    mesh = mi.Mesh("ball", len(normals), len(faces), properties, has_vertex_normals=smooth)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = (0.5 * normals + [0, 0.7, 0]).ravel().astype(np.float32)
-    if smooth:
-        params["vertex_normals"] = normals.ravel().astype(np.float32)
-    params["faces"] = np.array(faces).ravel().astype(np.uint32)
-    params.update()
-    return mesh
+    return mesh(0.5 * normals + [0, 0.7, 0], np.array(faces), bsdf, "ball", normals if smooth else False, **things)
 
 
 def shapes() -> dict[str, Any]:

@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.edge_cases import ball, mesh, split_box
-from conformance.moving import Latents, Moving
+from conformance.edge_cases import ball, split_box
+from conformance.moving import Latents, Moving, mesh
 from scipy import stats
 
 from reslrb_cli.measure.comparison import z_scores
@@ -87,17 +87,9 @@ class Translation:
 
 def _square(to_world: Any, bsdf: dict[str, Any] = GREY, **things: Any) -> mi.Mesh:
     """Return a square of two triangles, of side 2 before `to_world`, with texture coordinates."""
-    properties = mi.Properties()
-    for key, thing in {"bsdf": bsdf, **things}.items():
-        properties[key] = mi.load_dict(thing)
-    made = mi.Mesh("square", 4, 2, properties, has_vertex_texcoords=True)
-    matrix = np.array(to_world.matrix)
-    params = mi.traverse(made)
-    params["vertex_positions"] = (SQUARE @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32).ravel()
-    params["vertex_texcoords"] = np.array([0, 0, 1, 0, 1, 1, 0, 1], np.float32)
-    params["faces"] = np.array([0, 1, 2, 0, 2, 3], np.uint32)
-    params.update()
-    return made
+    matrix, texcoords = np.array(to_world.matrix), np.array([0, 0, 1, 0, 1, 1, 0, 1])
+    positions = SQUARE @ matrix[:3, :3].T + matrix[:3, 3]
+    return mesh(positions, np.array([[0, 1, 2], [0, 2, 3]]), bsdf, "square", texcoords=texcoords, **things)
 
 
 def _ball(x: float, y: float, z: float, radius: float, bsdf: dict[str, Any] = GREY, **things: Any) -> mi.Mesh:

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from conformance.moving import mesh
 from conformance.path_densities import CameraNotes, Densities, Emission, LightNotes, cosine, emitter_number, paths_of
 from measure.faults import Fault, plant, planted
 from turns import a_few
@@ -84,20 +85,12 @@ def sheet(at: Any, bsdf: Any = WHITE, emitter: Any = None, leaning: float = 0, s
     """Return a mesh of two faces that faces down. If `leaning` is above 0, the vertex normals lean outwards by
     `leaning`.
     """
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
-    if emitter is not None:
-        properties["emitter"] = mi.load_dict(emitter)
-    mesh = mi.Mesh("sheet", 4, 2, has_vertex_normals=leaning > 0, has_vertex_texcoords=True, props=properties)
-    params, corner = mi.traverse(mesh), np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-    own = np.insert(corner * size, 1, 0, axis=1)
-    params["vertex_positions"] = (own + np.array(at)).astype(np.float32).ravel()
-    if leaning > 0:
-        normals = np.insert((corner - 0.5) * leaning, 1, -1, axis=1)
-        params["vertex_normals"] = (normals / np.linalg.norm(normals, axis=1)[:, None]).astype(np.float32).ravel()
-    params["vertex_texcoords"], params["faces"] = corner.ravel(), np.array([0, 1, 2, 0, 2, 3], np.uint32)
-    params.update()
-    return mesh
+    corner, faces = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32), np.array([[0, 1, 2], [0, 2, 3]])
+    positions = np.insert(corner * size, 1, 0, axis=1) + np.array(at)
+    normals = np.insert((corner - 0.5) * leaning, 1, -1, axis=1)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    things = {} if emitter is None else {"emitter": emitter}
+    return mesh(positions, faces, bsdf, "sheet", normals if leaning > 0 else False, corner, **things)
 
 
 def room(lights: dict[str, Any], sensor: Any = None, film: Any = None, walls: Any = WHITE, **things: Any) -> Any:
