@@ -35,6 +35,7 @@ def call(*words: str) -> str:
     return done("optimize", "tiny.yaml", *settings(*SETS), *words).stdout
 
 
+@pytest.mark.long
 def test_memory_matches_the_run(experiment: Path) -> None:
     before = sorted(os.listdir(experiment))
     printed = call("--dry-run")

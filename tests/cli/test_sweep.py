@@ -253,6 +253,7 @@ def test_a_killed_sweep_ends_with_the_same_table(folder, monkeypatch):
     assert len(calls) == 10  # nothing is done twice
 
 
+@pytest.mark.long
 def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
     ends = {"learning_rate=0.02-seed=1": (5, "the loss is not finite"), "learning_rate=0.2-seed=0": (-9, "killed")}
     called = []

@@ -92,6 +92,7 @@ def test_random_estimators_agree(case: GradientCase):
     agree(case, count, BY_ADJOINT, "independent")
 
 
+@pytest.mark.long
 def test_event_agrees_without_connected_lobes():
     [case] = [case for case in CASES if case.name == "glass"]
     agree(case, 16, {"event": {}}, "correlated")

@@ -43,6 +43,7 @@ def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **
     return dr.detail.malloc_watermark(backend) - before
 
 
+@pytest.mark.long
 def test_reservoir_is_flat(case: Case):
     peaks = {depth: peak(case, "reslrb", depth) for depth in (2, 40)}
     print(peaks)

@@ -382,6 +382,7 @@ def test_step_returns_image_and_loss(case: Case):
         assert np.allclose(image, np.array(render_image(integrator("reslrb"), case.scene, 0, 9, 16)), rtol=1e-4)
 
 
+@pytest.mark.long
 def test_max_depth(case: Case):
     """Depths 0 and 1 give no light, because no emitter is in view, and no derivatives. Larger depths give more
     light.
