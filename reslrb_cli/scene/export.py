@@ -21,7 +21,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.images import file_stem, write_file
 from reslrb_cli.scene.catalog import as_numbers, parameter_kind
-from reslrb_cli.scene.upsampling import colour_in_scene, emitted, is_upsampled
+from reslrb_cli.scene.upsampling import colour_in_scene, is_upsampled
 from reslrb_cli.scene.values import ParameterValue
 from reslrb_cli.scene.xml.build import Owners
 from reslrb_cli.scene.xml.read import Description, Element, tag_lines
@@ -279,12 +279,8 @@ def export_scene(
     names `source` and the key if a value cannot be expressed. Raises OSError.
     """
     replacing, root = Replacing(description, params, source), description.root
-    # The colour of a lamp determines its spectrum of D65.
-    keys = list(keys)
-    factors = {emitted(key) for key in keys if is_upsampled(params, key)}
     for key in keys:
-        if key not in factors:
-            replacing.put(key)
+        replacing.put(key)
     replacing.writers |= beside or {}  # before assets, which then get other names
     replacing.copy_assets()
     options = [

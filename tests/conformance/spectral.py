@@ -26,6 +26,7 @@ from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.run_folder import read_value
 from reslrb_cli.scene.images import read_photo
 from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.proposal import propose
 from reslrb_cli.scene.upsampling import DARKEST, coefficients, colour_in_scene, colours_of
 
 #: Wavelengths in nm, and spectra with these nodes.
@@ -231,6 +232,29 @@ def test_a_run_recovers_spectra_and_exports_them(tmp_path: Path) -> None:
     made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
     for key in keys:
         np.testing.assert_allclose(np.ravel(made[key]), np.ravel(run.parameters[key]), rtol=1e-5)
+
+
+def test_spectra_get_bounds_and_black_lamps_are_not_proposed() -> None:
+    """Mitsuba's coefficients of black belong to a reflectance of 4e-9."""
+    black = {"type": "diffuse", "reflectance": rgb(0, 0, 0)}
+    before = mi.ScalarTransform4f().translate([0, 0, 0.8]).scale(0.2)
+    panel = {"type": "rectangle", "to_world": before, "bsdf": black,
+             "emitter": {"type": "area", "radiance": rgb(2, 2, 2)}}  # fmt: skip
+    metal = {"type": "sphere", "radius": 0.2, "center": [1, 0, 0],
+             "bsdf": {"type": "roughconductor", "material": "Cu"}}  # fmt: skip
+    scene = Case(furnace() | {"panel": panel, "metal": metal}, []).scene
+    found = {each.info.key: each for each in propose(scene, 0, lamps=True)}
+    assert {key: each.bounds for key, each in found.items() if key.endswith("values")} == {
+        "wall.bsdf.reflectance.values": "[0, 1]",
+        "wall.emitter.radiance.values": "[0, .inf]",
+        "metal.bsdf.eta.values": "[0, 10]",
+        "metal.bsdf.k.values": "[0, 10]",
+    }
+    own = found["panel.bsdf.reflectance.value"]
+    assert own.share > 0.02
+    assert own.info.value is not None
+    assert own.info.value.high == 0
+    assert not own.first
 
 
 def test_a_recovered_colour_of_a_lamp_is_exported(tmp_path: Path) -> None:
