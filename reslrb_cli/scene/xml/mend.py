@@ -9,6 +9,9 @@ The plugins `regular`, `irregular` and `blackbody` need wavelengths, which only 
 variants, `convert_spectra` replaces these plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba
 converts a `<spectrum>` element to a colour with the CIE matching functions. For emitters, the result is the colour of
 light. Otherwise, the result is the colour of a surface under D65.
+
+In spectral variants, `convert_spectra` replaces only `blackbody`: Mitsuba cannot sample its wavelengths in light paths,
+and ends with an error of Dr.Jit.
 """
 
 from __future__ import annotations
@@ -198,7 +201,9 @@ def mend(description: Description) -> list[Note]:
     mender.mend_below(root)
     if mi.is_spectral:
         upsample_bitmaps(description)
-    for spectrum in convert_spectra(root) if not mi.is_spectral else ():
+    for spectrum in convert_spectra(root):
+        if mi.is_spectral:
+            continue
         wrong = f"RGB variants have no spectrum `{spectrum.type}`"
         mender.notes.append(Note(spectrum, wrong, done="read as its colour"))
     root.attributes["version"] = "3.0.0"
@@ -343,7 +348,8 @@ def convert_spectra(root: Element) -> list[Element]:
 
     Raises ConfigError if a plugin is not a valid spectrum, or if it is not the parameter of an object.
     """
-    named = {id: item for id, item in root.by_id().items() if item.type in _SPECTRA}
+    types = ("blackbody",) if mi.is_spectral else _SPECTRA
+    named = {id: item for id, item in root.by_id().items() if item.type in types}
     used = []
     for owner in root.objects():
         kept = []
