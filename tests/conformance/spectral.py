@@ -235,23 +235,26 @@ def test_a_run_recovers_spectra_and_exports_them(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.ravel(made[key]), np.ravel(run.parameters[key]), rtol=1e-5)
 
 
+def camera_sees_a_black_body(scene: dict[str, Any]) -> np.ndarray:
+    """Return the colour that camera paths see if Mitsuba loads the scene. Assert that light paths are refused."""
+    stock = mi.load_dict(scene, optimize=False)
+    with pytest.raises(UnsupportedScene, match="of emitter emitter, a `blackbody`; load the scene with"):
+        render_image(integrator("reslrb", 2), stock, 0, 0, 1)
+    return renders(lambda seed: render_image(integrator("path", 2), stock, 0, seed, 1024), range(4)).mean((0, 1, 2))
+
+
 def test_a_black_body_becomes_a_regular_spectrum() -> None:
     """Mitsuba cannot sample its wavelengths along light paths, but camera paths evaluate it."""
     glow = {"type": "sphere", "radius": 0.3, "center": [0, 1.5, 3],
             "emitter": {"type": "area", "radiance": {"type": "blackbody", "temperature": 3000.0}}}  # fmt: skip
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 4]).scale(3)}
     own = {"type": "scene", "wall": wall, "glow": glow, "sensor": furnace()["sensor"]}
+    seen = camera_sees_a_black_body(own)
+    gc.collect()  # light paths ask the emitters of all scenes in memory
     scene = rl.load_scene(own)
     assert np.shape(mi.traverse(scene)["glow.emitter.radiance.values"]) == (95,)
     found = renders(lambda seed: render_image(integrator("reslrb", 2), scene, 0, seed, 1024), range(4)).mean((0, 1, 2))
-    # From here on: Mitsuba's calls ask the emitters of all scenes in memory.
-    stock = mi.load_dict(own, optimize=False)
-    seen = renders(lambda seed: render_image(integrator("path", 2), stock, 0, seed, 1024), range(4)).mean((0, 1, 2))
     np.testing.assert_allclose(found, seen, rtol=0.02)
-    with pytest.raises(UnsupportedScene, match="of emitter emitter, a `blackbody`; load the scene with"):
-        render_image(integrator("reslrb", 2), stock, 0, 0, 1)
-    del stock
-    gc.collect()
 
 
 def test_spectra_get_bounds_and_black_lamps_are_not_proposed() -> None:
