@@ -23,6 +23,7 @@ from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.records.images import write_file
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.run_folder import read_value
 from reslrb_cli.scene.images import read_photo
@@ -233,6 +234,20 @@ def test_a_run_recovers_spectra_and_exports_them(tmp_path: Path) -> None:
     made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
     for key in keys:
         np.testing.assert_allclose(np.ravel(made[key]), np.ravel(run.parameters[key]), rtol=1e-5)
+
+
+def test_a_bump_map_is_no_colour(tmp_path: Path) -> None:
+    """Its bitmap stays raw, although it may have the name of a spot's colour. The bitmap of a reflectance does not."""
+    write_file(tmp_path / "a.exr", np.full((4, 4, 3), 0.5, np.float32), linear=True)
+    file = '<string name="filename" value="a.exr"/><boolean name="raw" value="true"/>'
+    paint = f'<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{file}</texture></bsdf>'
+    bumps = f'<bsdf type="bumpmap"><texture type="bitmap" name="texture">{file}</texture>{paint}</bsdf>'
+    first, last = SCENE.index("<bsdf"), SCENE.index("</bsdf>") + len("</bsdf>")
+    (tmp_path / "scene.xml").write_text(SCENE[:first] + bumps + SCENE[last:])
+    scene = load_scene(tmp_path / "scene.xml")
+    assert np.isfinite(np.array(render_image(integrator("reslrb", 2), scene, 0, 0, 4))).all()
+    [key] = [key for key in mi.traverse(scene).properties if key.endswith("reflectance.data")]
+    np.testing.assert_allclose(colour_in_scene(mi.traverse(scene), key), 0.5, rtol=0.01)
 
 
 def camera_sees_a_black_body(scene: dict[str, Any]) -> np.ndarray:

@@ -28,6 +28,7 @@ QUICK: dict[str, Callable[..., None]] = {
     "furnace": lambda: own.test_the_furnace_has_its_colour("both", "regular"),
     "derivatives by stack": lambda: own.test_the_furnace_has_its_derivatives("light", "stack", "regular"),
     "derivatives by reservoir": lambda: own.test_the_furnace_has_its_derivatives("light", "reservoir", "irregular"),
+    "bump map": own.test_a_bump_map_is_no_colour,
     "black body": own.test_a_black_body_becomes_a_regular_spectrum,
     "proposals": own.test_spectra_get_bounds_and_black_lamps_are_not_proposed,
     "export of a lamp": own.test_a_recovered_colour_of_a_lamp_is_exported,

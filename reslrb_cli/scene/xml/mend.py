@@ -314,10 +314,12 @@ _LINEAR = (".exr", ".hdr", ".pfm", ".rgbe")
 def upsample_bitmaps(description: Description) -> None:
     """Remove `raw` from the scene's bitmaps that are colours. In a spectral variant, Mitsuba would not convert raw
     colours to spectra. Raises ConfigError if the file of a colour is not linear. Bitmaps with one channel stay.
+
+    Bump maps are no colours. Their bitmap may have the same name as the texture of a spot.
     """
     root = description.root
     named = root.by_id()
-    for owner in root.objects():
+    for owner in (item for item in root.objects() if item.type != "bumpmap"):
         for child in owner.children:
             bitmap = named.get(child.id, child) if child.tag == "ref" else child
             raw = bitmap.find("raw") if bitmap.type == "bitmap" else None
