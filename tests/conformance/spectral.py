@@ -19,6 +19,7 @@ from conformance.scenes import camera, lamp, rgb, stage
 import reslrb_cli as rl
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import loads
+from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import Case, integrator, seeds
@@ -26,10 +27,13 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.records.images import write_file
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.images import read_photo
 from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.proposal import propose
 from reslrb_cli.scene.upsampling import DARKEST, coefficients, colour_in_scene, colours_of
+from reslrb_cli.scene.xml.read import Description
 
 #: Wavelengths in nm, and spectra with these nodes.
 NODES = np.linspace(400, 700, 7)
@@ -316,6 +320,31 @@ def test_a_recovered_colour_of_a_lamp_is_exported(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
     np.testing.assert_allclose(colour_in_scene(made, key), np.ravel(run.parameters[key]), rtol=0.01)
+
+
+#: Forms of spectra that the exported scene must give in another way.
+FORMS = """<scene version="3.0.0"><sensor type="perspective"/>
+<emitter type="point" id="bulb"><spectrum name="intensity" value="12"/></emitter>
+<emitter type="point" id="tinted"><spectrum type="d65" name="intensity"><rgb name="color" value="1, 0.5, 0.2"/>
+    </spectrum></emitter>
+<emitter type="point" id="tube"><spectrum type="illuminant" name="intensity"><string name="name" value="FL2"/>
+    </spectrum></emitter>
+<shape type="sphere" id="ball"><bsdf type="conductor"><string name="material" value="Cu"/></bsdf></shape></scene>"""
+
+
+def test_every_form_of_a_spectrum_is_exported(tmp_path: Path) -> None:
+    """A number of an emitter is uniform, and not D65. A material's name gives eta and k, so both are written."""
+    (tmp_path / "scene.xml").write_text(FORMS)
+    found: list[Description] = []
+    scene = load_scene(tmp_path / "scene.xml", look=found.append)
+    keys = ["bulb.intensity.value", "tinted.intensity.value", "tube.intensity.values", "ball.bsdf.k.values"]
+    selection = select_parameters(scene, [ParameterSpec(key=key) for key in keys], "c.yaml")
+    selection.set_arrays({key: 2.0 * selection.array(key) for key in keys})
+    export_scene(found[0], selection.params, selection.scene_keys, {"type": "path"}, tmp_path / "made", "RUN")
+    made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
+    for key in keys:
+        own = colour_in_scene(made, key) if key.startswith("tinted") else np.ravel(made[key])
+        np.testing.assert_allclose(own, selection.array(key).ravel(), rtol=0.01, err_msg=key)
 
 
 CHANNEL = """<spectrum type="sensitivity" name="{}"><string name="camera" value="Nikon 5100"/>

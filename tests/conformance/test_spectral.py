@@ -32,6 +32,7 @@ QUICK: dict[str, Callable[..., None]] = {
     "black body": own.test_a_black_body_becomes_a_regular_spectrum,
     "proposals": own.test_spectra_get_bounds_and_black_lamps_are_not_proposed,
     "export of a lamp": own.test_a_recovered_colour_of_a_lamp_is_exported,
+    "export of every form": own.test_every_form_of_a_spectrum_is_exported,
     "raw photograph": own.test_a_raw_photograph_gets_the_colours_of_the_lamps,
     "missing channel": own.test_a_photograph_lacks_a_channel_of_the_film,
     "coefficients are no zeros": own.test_the_coefficients_of_an_environment_map_are_no_zeros,
