@@ -201,9 +201,8 @@ def mend(description: Description) -> list[Note]:
     mender.mend_below(root)
     if mi.is_spectral:
         upsample_bitmaps(description)
-    for spectrum in convert_spectra(root):
-        if mi.is_spectral:
-            continue
+    replaced = convert_spectra(root)
+    for spectrum in () if mi.is_spectral else replaced:
         wrong = f"RGB variants have no spectrum `{spectrum.type}`"
         mender.notes.append(Note(spectrum, wrong, done="read as its colour"))
     root.attributes["version"] = "3.0.0"
