@@ -38,6 +38,7 @@ from reslrb_cli.optimization.views import expose, make_views
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import select_parameters
 
 #: Parameters of emission; parameters of the same quantity have the same unit.
@@ -57,10 +58,14 @@ def quantity(params: Any, key: str) -> str:
     """Return the quantity of a `mi.traverse` entry: `radiance`, `irradiance`, `intensity`, `length`, or "" without a
     unit.
 
-    Parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`) have no unit.
+    Parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`) have no unit. A glass with
+    dispersion has the quantities `nd`, `Vd`, `B` and `C`: V_d is far larger than n_d, so their errors cannot be
+    combined.
     """
     if key.endswith((".vertex_positions", ".position")):
         return "length"
+    if bends_light(params, key):
+        return key.rpartition(".")[2].rstrip("123456789")
     node = own = params.properties[key][2]
     while node is not None and not isinstance(node, mi.Emitter):
         node = params.hierarchy[node][0]

@@ -209,7 +209,7 @@ def _spectral_obstacle(node: Any, key: str) -> str | None:
     """Return the reason why a parameter cannot be recovered in a spectral variant, or None."""
     kind, name = node.class_name(), key.rpartition(".")[2]
     if key.endswith(".d65.values"):
-        return f"belongs to the colour `{key.removesuffix('.d65.values')}.value`"
+        return f"belongs to the colour `{key.removesuffix('.d65.values')}.value`, if the scene gives one, such as <rgb>"
     if kind == "IrregularSpectrum" and name == "wavelengths":
         return "has the wavelengths of a spectrum; its `values` have derivatives"
     if kind == "BlackBodySpectrum":

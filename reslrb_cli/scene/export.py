@@ -21,7 +21,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.images import file_stem, write_file
 from reslrb_cli.scene.catalog import as_numbers, parameter_kind
-from reslrb_cli.scene.upsampling import colour_in_scene, emitted, is_upsampled
+from reslrb_cli.scene.upsampling import colour_in_scene, is_upsampled
 from reslrb_cli.scene.values import ParameterValue
 from reslrb_cli.scene.xml.build import Owners
 from reslrb_cli.scene.xml.read import Description, Element, tag_lines
@@ -82,6 +82,8 @@ LOBES = (
 )
 
 _CONDUCTORS = ("conductor", "roughconductor")
+#: Spectra that Mitsuba reads as values by wavelength.
+_SPECTRA = ("regular", "irregular", "d65", "illuminant")
 
 
 class Replacing:
@@ -119,10 +121,14 @@ class Replacing:
             replace(owner, triple(owner, "point", name, self._array(key)), "to_world")
         elif name == "data":
             self._put_image(owner, key)
-        elif name == "values" and owner.type in ("regular", "irregular"):
-            replace(owner, owner.new("string", name=name, value=numbers(self._array(key))))
+        elif name == "values" and owner.type in _SPECTRA:
+            owner.attributes["type"], owner.children[:] = self._by_wavelength(owner, key)
         elif name == "value" and owner.type == "srgb":
             replace(owner, colour(owner, "color", self._array(key), bounded=False))
+        elif name == "value" and owner.type == "d65":
+            value = self._array(key)
+            scale = max(float(value.max()), 1.0)  # colours are at most 1
+            owner.children[:] = [colour(owner, "color", value / scale, bounded=True), number(owner, "scale", scale)]
         elif name == "value" and owner.type == "rawconstant" and self._array(key).size == 3:
             replace(owner, triple(owner, "vector", name, self._array(key)))
         else:
@@ -130,7 +136,9 @@ class Replacing:
 
     def _put_nested(self, owner: Element, below: list[str], name: str, key: str) -> None:
         """Write a value below `owner` that does not belong to an object in the scene's files."""
-        if name == "value" and len(below) == 1:
+        if owner.type in _CONDUCTORS and below in (["eta"], ["k"]):
+            self._put_metal(owner, key)
+        elif name == "value" and len(below) == 1:
             self._put_spectrum(owner, below[0], key)
         elif name == "values" and len(below) == 1:
             self._put_values(owner, below[0], key)
@@ -141,8 +149,23 @@ class Replacing:
         else:
             raise self._fail(key, "the object that it belongs to is not in the scene's files")
 
+    def _put_metal(self, owner: Element, key: str) -> None:
+        """Write eta and k. A material's name sets both, so either must be written with the other."""
+        stem = key.rsplit(".", 2)[0]
+        owner.drop("material")
+        for each in ("eta", "k"):
+            if f"{stem}.{each}.values" in self.params.properties:
+                self._put_values(owner, each, f"{stem}.{each}.values")
+            else:
+                replace(owner, colour(owner, each, self._array(f"{stem}.{each}.value"), bounded=False))
+
     def _put_values(self, owner: Element, name: str, key: str) -> None:
         """Write the values of a spectrum with its wavelengths."""
+        kind, parts = self._by_wavelength(owner, key)
+        replace(owner, owner.new("spectrum", *parts, type=kind, name=name))
+
+    def _by_wavelength(self, owner: Element, key: str) -> tuple[str, list[Element]]:
+        """Return the type and the parameters of the spectrum whose values are the scene parameter `key`."""
         stem, values = key.rpartition(".")[0], owner.new("string", name="values", value=numbers(self._array(key)))
         if f"{stem}.wavelengths" in self.params.properties:
             wavelengths = numbers(self._array(f"{stem}.wavelengths"))
@@ -151,7 +174,7 @@ class Replacing:
             ends, kind = np.ravel(self.params[f"{stem}.range"]), "regular"
             names = ("wavelength_min", "wavelength_max")
             parts = [number(owner, each, float(end)) for each, end in zip(names, ends, strict=True)]
-        replace(owner, owner.new("spectrum", values, *parts, type=kind, name=name))
+        return kind, [values, *parts]
 
     def _put_number(self, owner: Element, name: str, value: Array, key: str) -> None:
         if value.size != 1:
@@ -165,18 +188,16 @@ class Replacing:
     def _put_spectrum(self, owner: Element, name: str, key: str) -> None:
         if owner.type == "spot" and name == "texture":
             raise self._fail(key, "Mitsuba requires an image as a spot's texture; recover the spot's intensity instead")
-        if owner.type in _CONDUCTORS and name in ("eta", "k"):
-            # A material's name sets both, so either must be written with the other.
-            stem = key.rpartition(f".{name}.value")[0]
-            for each in ("eta", "k"):
-                replace(owner, colour(owner, each, self._array(f"{stem}.{each}.value"), bounded=False), "material")
-            return
         if owner.type in ("principled", "principledthin") and name in LOBES and self._array(key).any():
             given = owner.find(name)
             if given is None or (given.tag == "float" and float(given.value) == 0):
                 why = f"a {owner.type} has no such lobe if its file has no {name}, or 0, so the value had no effect"
                 raise self._fail(key, why)
-        replace(owner, colour(owner, name, self._array(key), bounded=parameter_kind(self.params, key) == "bsdf"))
+        value, kind = self._array(key), parameter_kind(self.params, key)
+        if kind == "emitter" and value.size == 1 and mi.is_spectral:  # a <float> would be multiplied by D65
+            replace(owner, owner.new("spectrum", name=name, value=numbers(value)))
+            return
+        replace(owner, colour(owner, name, value, bounded=kind == "bsdf"))
 
     def _put_image(self, owner: Element, key: str) -> None:
         image = self._array(key)
@@ -279,12 +300,8 @@ def export_scene(
     names `source` and the key if a value cannot be expressed. Raises OSError.
     """
     replacing, root = Replacing(description, params, source), description.root
-    # The colour of a lamp determines its spectrum of D65.
-    keys = list(keys)
-    factors = {emitted(key) for key in keys if is_upsampled(params, key)}
     for key in keys:
-        if key not in factors:
-            replacing.put(key)
+        replacing.put(key)
     replacing.writers |= beside or {}  # before assets, which then get other names
     replacing.copy_assets()
     options = [

@@ -179,7 +179,7 @@ def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False
     if kind is not None:
         is_set = paths in ("camera", "both")  # the integrator has the option
         way = f"use integrator.paths: {kind}" if is_set else f"use integrator: {{type: reslrb, paths: {kind}}}"
-        has_its_own = any(f"; {word} " in obstacle for word in ("give", "let", "take", "remove"))
+        has_its_own = any(f"; {word} " in obstacle for word in ("give", "let", "load", "take", "remove"))
         raise UnsupportedScene(f"{obstacle}{', or' if has_its_own else ';'} {way}")
     other = next((reason for reason in reasons.values() if reason != obstacle), None)
     raise UnsupportedScene(obstacle + (f"; other paths cannot render it either: {other}" if other else ""))
@@ -264,6 +264,11 @@ def camera_finds_nothing(scene: Any) -> bool:
 
 def _unsampled(scene: Any) -> str | None:
     """Return the reason why Mitsuba cannot sample rays of some emitter, or None if it can."""
+    children = SceneGraph.of(scene).children
+    for emitter in scene.emitters() if mi.is_spectral else ():
+        if any(child.class_name() == "BlackBodySpectrum" for child in children.get(emitter, ())):
+            instead = "load the scene with `reslrb_cli.load_scene`, or give the light as a `regular` spectrum"
+            return f"Mitsuba cannot sample the wavelengths of emitter {emitter.id()}, a `blackbody`; {instead}"
     try:
         emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
     except UnsupportedScene as error:

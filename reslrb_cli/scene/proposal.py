@@ -98,16 +98,16 @@ _RADIANCE = re.compile(r"\bradiance\.value$")
 
 #: Bounds by the end of a key, and the quantity; the first match counts.
 _BOUNDS = (
-    (r"(reflectance|transmittance|base_color|color\d)\.(value|data)$", "[0, 1]"),
+    (r"(reflectance|transmittance|base_color|color\d)\.(values?|data)$", "[0, 1]"),
     (r"\b(vertex|face)_\w*$", "[0, 1]"),
     (r"\b(alpha\w*|roughness)(\.(value|data))?$", "[0.02, 1]"),
-    (r"\b(eta|k)\.(value|data)$", "[0, 10]"),
+    (r"\b(eta|k)\.(values?|data)$", "[0, 10]"),
     (r"\b(eta|nd)$", "[1.01, 3]"),
     (r"\bVd$", "[10, 100]"),
-    (r"\b(radiance|irradiance|intensity)\.(value|data)$", "[0, .inf]"),
+    (r"\b(radiance|irradiance|intensity)\.(values?|data)$", "[0, .inf]"),
     (r"^[^.]*\.(data|scale|sun_scale|sky_scale)$", "[0, .inf]"),
     (r"\bturbidity$", "[1, 10]"),
-    (r"\.value$|\.data$|\.specular$", "[0, 1]"),
+    (r"\.values?$|\.data$|\.specular$", "[0, 1]"),
 )
 
 #: Bounds of a glass's coefficient C in µm² with a pole in the ultraviolet.

@@ -34,6 +34,8 @@ Array = np.ndarray[Any, Any]
 DARKEST = 1e-4
 #: Least emission, because a lamp without light has no spectrum.
 DIMMEST = 1e-30
+#: Values below the step of single precision at 0.5. Mitsuba's spectra are 0 there, such as those of black.
+UNRESOLVED = 2.0**-25
 #: Centre and half of the range of wavelengths, in nm.
 CENTRE, WIDTH = 595.0, 235.0
 NEWTON_STEPS = 3
@@ -198,6 +200,7 @@ def colours_of(found: Array) -> Array:
         v = (c[..., 0] * wavelength + c[..., 1]) * wavelength + c[..., 2]
         with np.errstate(invalid="ignore"):
             S = np.where(np.isinf(c[..., 2]), c[..., 2] > 0, 0.5 + 0.5 * v / np.sqrt(1 + np.square(v)))
+        S = np.where(S < UNRESOLVED, 0, S)
         result += S[..., None] * weight
     return result
 
@@ -257,9 +260,10 @@ class Upsampling:
 
     @property
     def keys(self) -> list[str]:
-        """Scene parameters that are functions of the colours."""
-        own = [key for found in self._found.values() for key in found.keys]
-        return [*own, *(emitted(key) for key in own if emitted(key) in self.params.properties)]
+        """Scene parameters that have the recovered colours. The scene's files have elements for these parameters, but
+        not for the D65 factors of lamps.
+        """
+        return [key for found in self._found.values() for key in found.keys]
 
     def place(self) -> list[Any]:
         """Set the scene's parameters from the colours, as `Deformation.place`."""

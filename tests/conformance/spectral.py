@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,21 @@ from conformance.scenes import camera, lamp, rgb, stage
 import reslrb_cli as rl
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import loads
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.records.images import write_file
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.images import read_photo
 from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.parameters import select_parameters
+from reslrb_cli.scene.proposal import propose
 from reslrb_cli.scene.upsampling import DARKEST, coefficients, colour_in_scene, colours_of
+from reslrb_cli.scene.xml.read import Description
 
 #: Wavelengths in nm, and spectra with these nodes.
 NODES = np.linspace(400, 700, 7)
@@ -233,6 +240,65 @@ def test_a_run_recovers_spectra_and_exports_them(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.ravel(made[key]), np.ravel(run.parameters[key]), rtol=1e-5)
 
 
+def test_a_bump_map_is_no_colour(tmp_path: Path) -> None:
+    """Its bitmap stays raw, although it may have the name of a spot's colour. The bitmap of a reflectance does not."""
+    write_file(tmp_path / "a.exr", np.full((4, 4, 3), 0.5, np.float32), linear=True)
+    file = '<string name="filename" value="a.exr"/><boolean name="raw" value="true"/>'
+    paint = f'<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{file}</texture></bsdf>'
+    bumps = f'<bsdf type="bumpmap"><texture type="bitmap" name="texture">{file}</texture>{paint}</bsdf>'
+    first, last = SCENE.index("<bsdf"), SCENE.index("</bsdf>") + len("</bsdf>")
+    (tmp_path / "scene.xml").write_text(SCENE[:first] + bumps + SCENE[last:])
+    scene = load_scene(tmp_path / "scene.xml")
+    assert np.isfinite(np.array(render_image(integrator("reslrb", 2), scene, 0, 0, 4))).all()
+    [key] = [key for key in mi.traverse(scene).properties if key.endswith("reflectance.data")]
+    np.testing.assert_allclose(colour_in_scene(mi.traverse(scene), key), 0.5, rtol=0.01)
+
+
+def camera_sees_a_black_body(scene: dict[str, Any]) -> np.ndarray:
+    """Return the colour that camera paths see if Mitsuba loads the scene. Assert that light paths are refused."""
+    stock = mi.load_dict(scene, optimize=False)
+    with pytest.raises(UnsupportedScene, match="of emitter emitter, a `blackbody`; load the scene with"):
+        render_image(integrator("reslrb", 2), stock, 0, 0, 1)
+    return renders(lambda seed: render_image(integrator("path", 2), stock, 0, seed, 1024), range(4)).mean((0, 1, 2))
+
+
+def test_a_black_body_becomes_a_regular_spectrum() -> None:
+    """Mitsuba cannot sample its wavelengths along light paths, but camera paths evaluate it."""
+    glow = {"type": "sphere", "radius": 0.3, "center": [0, 1.5, 3],
+            "emitter": {"type": "area", "radiance": {"type": "blackbody", "temperature": 3000.0}}}  # fmt: skip
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 4]).scale(3)}
+    own = {"type": "scene", "wall": wall, "glow": glow, "sensor": furnace()["sensor"]}
+    seen = camera_sees_a_black_body(own)
+    gc.collect()  # light paths ask the emitters of all scenes in memory
+    scene = rl.load_scene(own)
+    assert np.shape(mi.traverse(scene)["glow.emitter.radiance.values"]) == (95,)
+    found = renders(lambda seed: render_image(integrator("reslrb", 2), scene, 0, seed, 1024), range(4)).mean((0, 1, 2))
+    np.testing.assert_allclose(found, seen, rtol=0.02)
+
+
+def test_spectra_get_bounds_and_black_lamps_are_not_proposed() -> None:
+    """Mitsuba's coefficients of black belong to a reflectance of 4e-9."""
+    black = {"type": "diffuse", "reflectance": rgb(0, 0, 0)}
+    before = mi.ScalarTransform4f().translate([0, 0, 0.8]).scale(0.2)
+    panel = {"type": "rectangle", "to_world": before, "bsdf": black,
+             "emitter": {"type": "area", "radiance": rgb(2, 2, 2)}}  # fmt: skip
+    metal = {"type": "sphere", "radius": 0.2, "center": [1, 0, 0],
+             "bsdf": {"type": "roughconductor", "material": "Cu"}}  # fmt: skip
+    scene = Case(furnace() | {"panel": panel, "metal": metal}, []).scene
+    found = {each.info.key: each for each in propose(scene, 0, lamps=True)}
+    assert {key: each.bounds for key, each in found.items() if key.endswith("values")} == {
+        "wall.bsdf.reflectance.values": "[0, 1]",
+        "wall.emitter.radiance.values": "[0, .inf]",
+        "metal.bsdf.eta.values": "[0, 10]",
+        "metal.bsdf.k.values": "[0, 10]",
+    }
+    own = found["panel.bsdf.reflectance.value"]
+    assert own.share > 0.02
+    assert own.info.value is not None
+    assert own.info.value.high == 0
+    assert not own.first
+
+
 def test_a_recovered_colour_of_a_lamp_is_exported(tmp_path: Path) -> None:
     """The colour determines the lamp's spectrum of D65, which has no element of its own."""
     start = SCENE.index('<spectrum type="regular" name="radiance">')
@@ -254,6 +320,31 @@ def test_a_recovered_colour_of_a_lamp_is_exported(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
     np.testing.assert_allclose(colour_in_scene(made, key), np.ravel(run.parameters[key]), rtol=0.01)
+
+
+#: Forms of spectra that the exported scene must give in another way.
+FORMS = """<scene version="3.0.0"><sensor type="perspective"/>
+<emitter type="point" id="bulb"><spectrum name="intensity" value="12"/></emitter>
+<emitter type="point" id="tinted"><spectrum type="d65" name="intensity"><rgb name="color" value="1, 0.5, 0.2"/>
+    </spectrum></emitter>
+<emitter type="point" id="tube"><spectrum type="illuminant" name="intensity"><string name="name" value="FL2"/>
+    </spectrum></emitter>
+<shape type="sphere" id="ball"><bsdf type="conductor"><string name="material" value="Cu"/></bsdf></shape></scene>"""
+
+
+def test_every_form_of_a_spectrum_is_exported(tmp_path: Path) -> None:
+    """A number of an emitter is uniform, and not D65. A material's name gives eta and k, so both are written."""
+    (tmp_path / "scene.xml").write_text(FORMS)
+    found: list[Description] = []
+    scene = load_scene(tmp_path / "scene.xml", look=found.append)
+    keys = ["bulb.intensity.value", "tinted.intensity.value", "tube.intensity.values", "ball.bsdf.k.values"]
+    selection = select_parameters(scene, [ParameterSpec(key=key) for key in keys], "c.yaml")
+    selection.set_arrays({key: 2.0 * selection.array(key) for key in keys})
+    export_scene(found[0], selection.params, selection.scene_keys, {"type": "path"}, tmp_path / "made", "RUN")
+    made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
+    for key in keys:
+        own = colour_in_scene(made, key) if key.startswith("tinted") else np.ravel(made[key])
+        np.testing.assert_allclose(own, selection.array(key).ravel(), rtol=0.01, err_msg=key)
 
 
 CHANNEL = """<spectrum type="sensitivity" name="{}"><string name="camera" value="Nikon 5100"/>

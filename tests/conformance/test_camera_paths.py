@@ -444,6 +444,16 @@ def test_sensors_that_light_paths_cannot_connect_to():
         images(scene, "reslrb", range(1), 4, max_depth=4, estimator="stack", paths="both")
 
 
+def test_lamps_whose_rays_mitsuba_cannot_sample(combined: None):
+    """`camera` renders their light. `both` is refused, with the advice to use `camera`."""
+    checks = {"type": "checkerboard", "color0": rgb(1, 0.8, 0.6), "color1": rgb(0.3, 0.3, 0.3)}
+    scene = stage({"lamp": lamp() | {"emitter": {"type": "area", "radiance": checks}}}, looks())
+    ours = images(scene, "reslrb", range(8), 64, max_depth=3, estimator="stack", paths="camera")
+    assert compare(ours, images(scene, "path", range(50, 58), 64, max_depth=3))
+    with pytest.raises(UnsupportedScene, match=r"cannot sample the rays of emitter .*use integrator.paths: camera"):
+        images(scene, "reslrb", range(1), 4, max_depth=3, estimator="stack", paths="both")
+
+
 def test_moving_light_uses_light_paths_in_its_image_too():
     case = next(case for case in CASES if case.name == "gaussian")
     scene = Case(case.scene(), case.keys)

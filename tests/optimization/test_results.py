@@ -17,6 +17,7 @@ from reslrb_cli.optimization import loading, loop
 from reslrb_cli.optimization.assemble import assemble_scene, quantity
 from reslrb_cli.optimization.problem import ErrorMeter
 from reslrb_cli.optimization.results import Results, summary
+from reslrb_cli.scene.dispersion import register
 
 # Parameters summarised in a few numbers, and results that exist whenever a run ends.
 
@@ -163,6 +164,7 @@ EMITTERS = {
     "sky": ({"type": "sunsky"}, "turbidity", ""),
     "bsdf": ({"type": "rectangle", "light": {"type": "area"}}, "bsdf.reflectance.value", ""),
     "roughness": ({"type": "roughconductor"}, "alpha.value", ""),
+    "index": ({"type": "dispersivedielectric", "material": "F2"}, "nd", "nd"),
 }
 
 
@@ -174,6 +176,7 @@ def test_quantities(name):
         scene = {**scene, "bitmap": bitmap}
     if scene["type"] == "projector":
         scene = {**scene, "irradiance": {**IMAGE, "bitmap": bitmap}}
+    register()
     params = mi.traverse(mi.load_dict(scene))
     assert quantity(params, key) == expected
 

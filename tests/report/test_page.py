@@ -188,7 +188,8 @@ def test_dark_scenes_are_shown_brighter_and_say_so(tmp_path):
 
 def test_swatches_have_the_colours_of_the_values(tmp_path):
     """All moments of a lamp share one exposure, in sRGB. Values that are not colours have no swatch."""
-    markup = render_run(make_run(tmp_path / "lamp", keys=(FLOOR, LAMP, "plate.eta.value")))
+    keys = FLOOR, LAMP, "plate.eta.value", "paint.reflectance.values"  # the last one is a spectrum of three values
+    markup = render_run(make_run(tmp_path / "lamp", keys=keys))
     swatches = [
         tuple(map(int, found.split(","))) for found in re.findall(r'"swatch" style="background:rgb\((.*?)\)"', markup)
     ]

@@ -23,8 +23,8 @@ Array = np.ndarray[Any, Any]
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 
 
-#: Parameters of three numbers that are not visible colours.
-NO_COLORS = ("eta", "k")
+#: Parameters of three numbers that are not visible colours. `values` are those of a spectrum at its wavelengths.
+NO_COLORS = ("eta", "k", "values")
 
 #: Quantities of geometry, which are neither light nor colour.
 PLACES = ("length", "degrees", "scale")

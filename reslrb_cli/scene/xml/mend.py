@@ -9,6 +9,9 @@ The plugins `regular`, `irregular` and `blackbody` need wavelengths, which only 
 variants, `convert_spectra` replaces these plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba
 converts a `<spectrum>` element to a colour with the CIE matching functions. For emitters, the result is the colour of
 light. Otherwise, the result is the colour of a surface under D65.
+
+In spectral variants, `convert_spectra` replaces only `blackbody`: Mitsuba cannot sample its wavelengths in light paths,
+and ends with an error of Dr.Jit.
 """
 
 from __future__ import annotations
@@ -198,7 +201,8 @@ def mend(description: Description) -> list[Note]:
     mender.mend_below(root)
     if mi.is_spectral:
         upsample_bitmaps(description)
-    for spectrum in convert_spectra(root) if not mi.is_spectral else ():
+    replaced = convert_spectra(root)
+    for spectrum in () if mi.is_spectral else replaced:
         wrong = f"RGB variants have no spectrum `{spectrum.type}`"
         mender.notes.append(Note(spectrum, wrong, done="read as its colour"))
     root.attributes["version"] = "3.0.0"
@@ -309,10 +313,12 @@ _LINEAR = (".exr", ".hdr", ".pfm", ".rgbe")
 def upsample_bitmaps(description: Description) -> None:
     """Remove `raw` from the scene's bitmaps that are colours. In a spectral variant, Mitsuba would not convert raw
     colours to spectra. Raises ConfigError if the file of a colour is not linear. Bitmaps with one channel stay.
+
+    Bump maps are no colours. Their bitmap may have the same name as the texture of a spot.
     """
     root = description.root
     named = root.by_id()
-    for owner in root.objects():
+    for owner in (item for item in root.objects() if item.type != "bumpmap"):
         for child in owner.children:
             bitmap = named.get(child.id, child) if child.tag == "ref" else child
             raw = bitmap.find("raw") if bitmap.type == "bitmap" else None
@@ -343,7 +349,8 @@ def convert_spectra(root: Element) -> list[Element]:
 
     Raises ConfigError if a plugin is not a valid spectrum, or if it is not the parameter of an object.
     """
-    named = {id: item for id, item in root.by_id().items() if item.type in _SPECTRA}
+    types = ("blackbody",) if mi.is_spectral else _SPECTRA
+    named = {id: item for id, item in root.by_id().items() if item.type in types}
     used = []
     for owner in root.objects():
         kept = []
