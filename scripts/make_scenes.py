@@ -46,18 +46,22 @@ def images() -> dict[str, Image]:
         "caustic_heightmap/heights.exr": heights(32),
         "lens_pose/beam.exr": beam(64),
         "mixed_room/wallpaper.exr": wallpaper(32),
+        "table/planks.exr": planks(96),
     }
 
 
 def meshes() -> dict[str, tuple[np.ndarray, ...]]:
-    """Return all meshes in the format of `height_field`. The keys are their paths below the scenes folder. The slab has
-    no texture coordinates.
+    """Return all meshes in the format of `height_field`. The keys are their paths below the scenes folder. The slab and
+    the handle have no texture coordinates.
     """
     return {
         "caustic_slab/slab.ply": height_field(96, 1.0, slab, texcoords=False),
         "caustic_heightmap/face.ply": height_field(128, 0.805, lambda x, z: 0 * x),
         "lens_pose/lens.ply": height_field(64, 0.6, lens),
         "mixed_room/pane.ply": height_field(64, 0.2, pane),
+        "table/vase.ply": revolved(VASE, 40),
+        "table/handle.ply": handle(24, 10),
+        "table/glass.ply": revolved(glass_ball(0.27, 0.5, 28), 72, (1.1, 0.8)),
     }
 
 
@@ -266,6 +270,84 @@ def pane(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     """
     vectors = [((26, 9), 0.4, 5.0e-3), ((-13, 24), 1.9, 4.2e-3), ((37, -20), 4.1, 1.6e-3), ((15, 33), 2.7, 1.4e-3)]
     return waves(x, z, vectors)
+
+
+#: Radius and height along the walls of a vase, from the foot over the outside to the centre inside. It has no base.
+VASE = [
+    (0.17, 0), (0.17, 0.02), (0.22, 0.06), (0.29, 0.16), (0.335, 0.29), (0.345, 0.42), (0.32, 0.55), (0.26, 0.67),
+    (0.19, 0.77), (0.145, 0.86), (0.13, 0.95), (0.14, 1.03), (0.175, 1.1), (0.165, 1.115), (0.14, 1.1), (0.11, 1.03),
+    (0.1, 0.95), (0.11, 0.86), (0.15, 0.77), (0, 0.7),
+]  # fmt: skip
+
+
+def glass_ball(radius: float, height: float, rings: int) -> list[tuple[float, float]]:
+    """Return radius and height along a spheroid that stands at height 0."""
+    angle = np.linspace(0, np.pi, rings)
+    profile = [(radius * np.sin(a), height / 2 * (1 - np.cos(a))) for a in angle]
+    return [(0, 0), *profile[1:-1], (0, height)]
+
+
+def revolved(profile: list[tuple[float, float]], sides: int, axes: tuple[float, float] = (1, 1)
+             ) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """Return the surface that a profile of radii and heights describes about the z axis. Each cross-section is an
+    ellipse with these half-axes, in units of the radius.
+
+    The profile ends on the axis, and the outside is on its right-hand side. u is the angle to the x axis, divided by
+    pi, so there is no seam. v is the height, divided by the largest height.
+    """
+    radius, z = np.array(profile).T
+    angle = np.arange(sides) / sides * 2 * np.pi
+    ring = np.stack([axes[0] * np.cos(angle), axes[1] * np.sin(angle)], -1)
+    is_closed = radius[0] == 0
+    inner = slice(1 if is_closed else 0, -1)
+    walls = np.concatenate([radius[inner, None, None] * ring, np.repeat(z[inner], sides).reshape(-1, sides, 1)], -1)
+    index = np.arange(walls[..., 0].size).reshape(-1, sides)
+    following = np.roll(index, -1, 1)
+    a, b, c, d = index[:-1], index[1:], following[1:], following[:-1]
+    ends = [z[-1], z[0]] if is_closed else [z[-1]]
+    positions = np.concatenate([walls.reshape(-1, 3), [[0, 0, end] for end in ends]])
+    last = np.full(sides, index.size)
+    sheets = [(a, d, c), (a, c, b), (last, index[-1], following[-1])]
+    if is_closed:
+        sheets.append((last + 1, following[0], index[0]))
+    u = np.concatenate([np.tile(1 - abs(1 - angle / np.pi), len(walls)), np.full(len(ends), 0.5)])
+    uv = np.stack([u, positions[:, 2] / z.max()], -1)
+    return with_normals(positions, np.concatenate([np.stack(each, -1).reshape(-1, 3) for each in sheets]), uv)
+
+
+def handle(along: int, around: int) -> tuple[np.ndarray, ...]:
+    """Return the handle of the vase: a bent tube whose open ends are inside the vase."""
+    t = np.linspace(-0.55 * np.pi, 0.62 * np.pi, along + 1)[:, None]
+    angle = np.arange(around) / around * 2 * np.pi
+    out, up = np.cos(t), np.sin(t)
+    thick = 0.032 + 0.008 * np.cos(angle)[None]
+    x = 0.22 + (0.24 + thick * np.cos(angle)) * out - 0.06 * up
+    z = 0.74 + (0.23 + thick * np.cos(angle)) * up
+    y = np.broadcast_to(0.04 * np.sin(angle), x.shape)
+    positions = np.stack([x, y, z], -1).reshape(-1, 3)
+    index = np.arange(len(positions)).reshape(along + 1, around)
+    a, b = index[:-1], index[1:]
+    c, d = np.roll(b, -1, 1), np.roll(a, -1, 1)
+    faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
+    return with_normals(positions, faces)
+
+
+def with_normals(positions: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+    """Return a mesh in the format of `height_field`. The normal of a vertex is the mean of the normals of its faces,
+    weighted by their angles.
+    """
+    positions = quantise(positions, 2.0**-20).astype(np.float64)
+    corner = positions[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    total = np.zeros_like(positions)
+    for k in range(3):
+        one, other = corner[:, (k + 1) % 3] - corner[:, k], corner[:, (k + 2) % 3] - corner[:, k]
+        cosine = (one * other).sum(-1) / np.linalg.norm(one, axis=-1) / np.linalg.norm(other, axis=-1)
+        np.add.at(total, faces[:, k], normal * np.arccos(np.clip(cosine, -1, 1))[:, None])
+    total /= np.linalg.norm(total, axis=-1, keepdims=True)
+    vertices = [total] if uv is None else [total, uv]
+    return positions.astype(np.float32), *(quantise(each, 2.0**-20) for each in vertices), faces.astype(np.int32)
 
 
 # ---- Tools ----------------------------------------------------------------------------------------------------------

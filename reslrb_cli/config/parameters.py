@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 from pydantic import BeforeValidator, Discriminator, Field, WithJsonSchema, model_validator
 from typing_extensions import Self
@@ -36,10 +36,11 @@ from reslrb_cli.config.base import (
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
-#: The parts of a motion, applied in reverse order. Translations along an axis are parts of a translation.
-Word = Literal["translation", "x", "y", "z", "rotation", "scale"]
-WORDS: tuple[Word, ...] = ("translation", "x", "y", "z", "rotation", "scale")
+#: The parts of a motion, applied in reverse order. A translation and a rotation have a part for each axis.
+Word = Literal["translation", "x", "y", "z", "rotation", "rotation_x", "rotation_y", "rotation_z", "scale"]
+WORDS: tuple[Word, ...] = get_args(Word)
 AXES: tuple[Word, ...] = ("x", "y", "z")
+ANGLES: tuple[Word, ...] = ("rotation_x", "rotation_y", "rotation_z")
 
 #: Name of a heightmap's parameter, appended to the name of its mesh.
 HEIGHTMAP = "heightmap"
@@ -66,6 +67,9 @@ class ByWord(Section, Generic[Part]):
     y: Part | None = Field(default=None, description="Of the translation along y, in scene units.")
     z: Part | None = Field(default=None, description="Of the translation along z, in scene units.")
     rotation: Part | None = Field(default=None, description="Of each angle, in degrees.")
+    rotation_x: Part | None = Field(default=None, description="Of the angle about x, in degrees.")
+    rotation_y: Part | None = Field(default=None, description="Of the angle about y, in degrees.")
+    rotation_z: Part | None = Field(default=None, description="Of the angle about z, in degrees.")
     scale: Part | None = Field(default=None, description="Of the scale factor.")
 
     def words(self) -> dict[str, Part]:
@@ -142,12 +146,15 @@ class MotionSpec(Section):
     free: Annotated[list[Word], Field(min_length=1), _EACH_ONCE] = Field(default=["translation", "rotation"])
     """Parts of the motion to recover. `translation`: three numbers, in scene units. `x`, `y`, `z`: a translation along
     one axis, as in `free: [x, y]`. `rotation`: three angles in degrees, about the x axis, then the y axis, then the z
-    axis of the scene. `scale`: one factor for all axes."""
+    axis of the scene. `rotation_x`, `rotation_y`, `rotation_z`: one of these angles, as in `free: [x, y,
+    rotation_z]` for an object that stands on a table. `scale`: one factor for all axes."""
 
     @model_validator(mode="after")
     def _check_axes(self) -> Self:
         if "translation" in self.free and any(axis in self.free for axis in AXES):
             raise located("free", "has both `translation` and an axis of it; name the axes, or `translation` alone")
+        if "rotation" in self.free and any(angle in self.free for angle in ANGLES):
+            raise located("free", "has both `rotation` and an angle of it; name the angles, or `rotation` alone")
         return self
 
 

@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.config.parameters import ANGLES
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job, first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
@@ -47,7 +48,7 @@ RELIEF = 0.02
 #: Size of a direction of a motion's component (rotations are in degrees), and of a glass's n_d and V_d. None: `REACH`
 #: times the scene's size. A thousandth of the size is a step beyond the rounding of rays: a V_d of 10 was too small.
 #: The size of a glass's coefficients is their own value.
-UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.05, "Vd": 50.0}
+UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.05, "Vd": 50.0} | dict.fromkeys(ANGLES, 10.0)
 
 #: Least number of paths whose values are added to a sum in memory at once.
 PACKET = 8

@@ -32,7 +32,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import AXES, HEIGHTMAP
+from reslrb_cli.config.parameters import ANGLES, AXES, HEIGHTMAP
 from reslrb_cli.scene.graph import bounds, face_normals, triangles
 
 #: Analytic shapes whose `to_world` moves their surface interactions and their samples.
@@ -235,18 +235,23 @@ class Motion:
         """Return M, or only the rotation of M if `scaled` is false."""
         transform = mi.AffineTransform4f
         pivot = mi.Vector3f(self.pivot)
-        if "translation" in self.names:
-            moved = values[self.names["translation"]]
-        else:
-            moved = mi.Vector3f(*(values[self.names[axis]] if axis in self.names else 0 for axis in AXES))
-        result = transform().translate(pivot + moved) if scaled else transform()
-        if "rotation" in self.names:
-            angles = values[self.names["rotation"]]
+        moved = self._vector(values, "translation", AXES)
+        result = transform().translate(pivot + (0 if moved is None else moved)) if scaled else transform()
+        angles = self._vector(values, "rotation", ANGLES)
+        if angles is not None:
             for axis in (2, 1, 0):
                 result = result @ transform().rotate([float(axis == k) for k in range(3)], angles[axis])
         if scaled and "scale" in self.names:
             result = result @ transform().scale(values[self.names["scale"]])
         return result @ transform().translate(-pivot) if scaled else result
+
+    def _vector(self, values: Mapping[str, Any], word: str, parts: Sequence[str]) -> mi.Vector3f | None:
+        """Return the value of `word`, or the vector of its free `parts`. If nothing is free, return None."""
+        if word in self.names:
+            return values[self.names[word]]
+        if not any(part in self.names for part in parts):
+            return None
+        return mi.Vector3f(*(values[self.names[part]] if part in self.names else 0 for part in parts))
 
 
 @dataclass
@@ -351,9 +356,11 @@ class Deformation:
         for item in items:
             self._place(item).motion = motion
         for word, name in names.items():
-            start = {"scale": mi.Float(1), **dict.fromkeys(AXES, mi.Float(0))}.get(word, mi.Vector3f(0))
+            is_number = word in AXES or word in ANGLES
+            start = mi.Float(1) if word == "scale" else mi.Float(0) if is_number else mi.Vector3f(0)
             self.values[name] = _opaque(start)
-            self.quantities[name] = {"rotation": "degrees", "scale": "scale"}.get(word, "length")
+            is_angle = word == "rotation" or word in ANGLES
+            self.quantities[name] = "degrees" if is_angle else "scale" if word == "scale" else "length"
 
     def add_heightmap(self, items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
         """Add a heightmap to the meshes `items`. They must not have one yet."""

@@ -277,9 +277,10 @@ def _check_effect(items: list[Movable], word: str, pivot: bool, place: Place) ->
     """Raise ConfigError if the free part of a motion moves nothing."""
     id, alone = f"`{items[0].id}`", len(items) == 1 and not pivot
     obstacle = None
-    if word != "rotation" and all(item.node.class_name() == "DirectionalEmitter" for item in items):
+    turns = word.startswith("rotation")
+    if not turns and all(item.node.class_name() == "DirectionalEmitter" for item in items):
         obstacle = f"{word} does not move {id}, which is a direction; free: [rotation]"
-    elif alone and items[0].is_point and word in ("rotation", "scale"):
+    elif alone and items[0].is_point and (turns or word == "scale"):
         obstacle = f"{word} about itself does not move {id}, which is a point"
     elif alone and not items[0].is_shape and word == "scale":
         obstacle = f"scale about itself does not move {id}, which has no size"

@@ -113,6 +113,7 @@ ENTRIES: dict[str, str | tuple[str, ...]] = {
     "{motion: {of: []}}": "parameters[0].motion.of: must have at least one entry",
     "{motion: {of: a, free: [shear]}}": ("parameters[0].motion.free[0]: must be one of", "rotation"),
     "{motion: {of: a, free: [translation, x]}}": "motion.free: has both `translation` and",
+    "{motion: {of: a, free: [rotation_x, rotation]}}": "motion.free: has both `rotation` and",
     "{motion: {of: a, free: [x, y]}, bounds: {z: [0, 1]}}": "parameters[0].bounds.z: has no effect: `motion.free` has",
     "{motion: {of: a, pivot: [1, 2]}}": "motion.pivot: must be a point, [x, y, z], not",
     "{motion: {of: a, about: [1, 2, 3]}}": "parameters[0].motion.about: unknown key",

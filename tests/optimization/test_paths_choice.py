@@ -256,7 +256,7 @@ def test_beams_and_scaled_emitters_are_left_to_light_paths():
     ("lens_pose", [], "light"), ("lens_pose", ["integrator.paths=both"], "both"),
     ("lens_pose", ["integrator.attached_sampling=follow"], "light"),
     ("moved_box", [], "camera"), ("moved_box", ["integrator.max_depth=6"], "camera"),
-    ("moved_box", ["integrator.paths=light"], "light"),
+    ("moved_box", ["integrator.paths=light"], "light"), ("table", [], "both"),
 ])  # fmt: skip
 def test_paths_of_runs_that_move_shapes(name: str, settings: list[str], paths: str):
     problem = assemble_scene(load(ROOT / "configs" / f"{name}.yaml", settings))

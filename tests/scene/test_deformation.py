@@ -106,6 +106,28 @@ def test_axes_move_alone(scene):
     assert [float(dr.grad(leaf)[0]) / len(before) for leaf in leaves.values()] == pytest.approx([1, 10])
 
 
+def test_angles_turn_alone(scene):
+    """Only the free angles turn, in the order of `rotation`, and have the derivatives of these angles."""
+    before = positions(select(scene, motion("box"))) - [1, 2, 3]
+    start = {"rotation_z": -70, "rotation_x": 20}
+    selection = select(scene, motion("box", *start, pivot=[1, 2, 3], initial=start))
+    assert selection.keys == ["box.rotation_z", "box.rotation_x"]
+    assert [selection.deformation.quantities.get(key) for key in selection.keys] == ["degrees", "degrees"]
+    assert np.allclose(positions(selection), [1, 2, 3] + before @ turn([20, 0, -70]).T, atol=1e-5)
+    weights = np.random.default_rng(0).normal(size=before.shape).astype(np.float32)
+    leaves = {key: mi.Float(selection.value(key)) for key in selection.keys}
+    dr.enable_grad(leaves)
+    selection.hand_over({key: mi.Float(leaf) for key, leaf in leaves.items()})
+    dr.backward(dr.sum(selection.params[MESH] * mi.Float(weights.ravel())))
+    selection.collect()
+
+    def objective(x: float, z: float) -> float:
+        return float(np.sum(weights * (before @ turn([x, 0, z]).T)))
+
+    expected = [objective(20, -69.5) - objective(20, -70.5), objective(20.5, -70) - objective(19.5, -70)]
+    assert [float(dr.grad(leaf)[0]) for leaf in leaves.values()] == pytest.approx(expected, rel=1e-4)
+
+
 def test_all_parts_rotate_about_the_centre_of_their_box(scene):
     before = {key: positions(select(scene, motion("box")), key) for key in (MESH, "other.vertex_positions")}
     together = np.concatenate(list(before.values()))
