@@ -10,7 +10,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -127,24 +127,25 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def switched_on(switch: Callable[[bool], None], config: pytest.Config) -> Iterator[None]:
+    """Turn an option of LLVM on during a test, if tests compile without LLVM's optimisations."""
+    if is_quick(config):
+        switch(True)
+    yield
+    if is_quick(config):
+        switch(False)
+
+
 @pytest.fixture
 def combined(llvm: str, pytestconfig: pytest.Config) -> Iterator[None]:
     """Compile the kernels of a test with LLVM's combiner, which comparisons of two masks need (compilation.py)."""
-    if is_quick(pytestconfig):
-        combine(True)
-    yield
-    if is_quick(pytestconfig):
-        combine(False)
+    yield from switched_on(combine, pytestconfig)
 
 
 @pytest.fixture
 def registers(llvm: str, pytestconfig: pytest.Config) -> Iterator[None]:
     """Compile the kernels of a test with LLVM's allocation of registers, for kernels that run for seconds."""
-    if is_quick(pytestconfig):
-        allocate_registers(True)
-    yield
-    if is_quick(pytestconfig):
-        allocate_registers(False)
+    yield from switched_on(allocate_registers, pytestconfig)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,6 +1,6 @@
 """The documentation site builds without warnings. Its pages fit phones and desktops and need no network.
 
-Building the site takes seconds, so that it needs `-m long`. By default, links and the table of contents are checked
+Building the site takes seconds, so these tests are `long`. By default, links and the table of contents are checked
 without Sphinx.
 """
 
