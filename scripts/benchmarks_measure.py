@@ -43,7 +43,7 @@ EXPERIMENTS = {
     "furnace": "the walls of a closed sphere",
     "lens_pose": "a lens's place, and its tilt in degrees",
     "moved_box": "a box's place, and its turn in degrees, from its outline and its shadow",
-    "table": "where a vase and a lump of glass stand, their turns in degrees, and the vase's radius",
+    "table": "the places of a vase and a lump of glass, their turns in degrees, and the vase's radius",
     "prism": "the index of a prism's glass, and its Abbe number, from a rainbow",
     "caustic_heightmap": "the relief of a glass face",
     "paper/figure1": "the relief of a glass face, finely",
