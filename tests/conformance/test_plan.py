@@ -294,7 +294,7 @@ def test_without_an_image_other_vertices_are_not_connected(scene: dict, monkeypa
     original, shares = stack.walk_back, []
 
     def noting(p: Any, form: Any, ring: Any, state: stack.StackState, *rest: Any) -> Any:
-        connected = (state.needed > 0) | dr.any(state.since != 0)
+        connected = (state.useful > 0) | dr.any(state.D != 0)
         shares.append(float(np.mean(np.array(connected, dtype=float))))
         return original(p, form, ring, state, *rest)
 
