@@ -117,7 +117,7 @@ def comparable(config: Config, by: str) -> Config:
     No integrator uses Russian roulette, because naive AD does not differentiate its decision.
     """
     assert isinstance(config.integrator, ReslrbConfig), "checked by `own_label`"
-    own = config.integrator.undecided_off()
+    own = config.integrator.plain()
     alike: dict[str, Any] = {**ALIKE[Reference.PTRACER], "rr_depth": NEVER}
     shared: dict[str, Any] = {"max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
     if by == "ptracer":

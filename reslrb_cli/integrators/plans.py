@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from reslrb_cli.config.integrators import UNDECIDED
+from reslrb_cli.config.integrators import PLAIN
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.scene.catalog import entry_value, parameter_kind
@@ -148,8 +148,8 @@ class SamplingOptions:
 
     - `paths` are light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
         only one kind of paths remains.
-    - `chosen` has the values of the other settings that a run may decide (`DECIDABLE`). A setting without an entry has
-        its value in `UNDECIDED`. Camera paths alone are never guided.
+    - `chosen` has the values of the other settings that a run may decide (`AUTO_VALUES`). A setting without an entry is
+        plain. Camera paths alone are never guided.
     - If `whole` is true, images of light paths alone have the same film border as images with camera paths.
     - `given` are distributions (H, W) of camera paths over the pixels by sensor, for all scenes with the same sensors.
         Other distributions are stored for each scene and its parameters.
@@ -176,8 +176,8 @@ class SamplingOptions:
 
     @property
     def on(self) -> frozenset[str]:
-        """Settings in `chosen` with another value than in `UNDECIDED`, as for `Plan.on`."""
-        return frozenset(name for name, value in self.chosen.items() if value != UNDECIDED[name])
+        """Settings in `chosen` that are not plain, as for `Plan.on`."""
+        return frozenset(name for name, value in self.chosen.items() if value != PLAIN[name])
 
 
 def set_up(scene: mi.Scene) -> None:

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.llvm import loaded_fault
 from reslrb_cli.backend.variant import check_variant, works_under
-from reslrb_cli.config.integrators import DECIDABLE, UNDECIDED
+from reslrb_cli.config.integrators import AUTO_VALUES, PLAIN
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import Trajectory, WalkAd
@@ -38,7 +38,7 @@ OPTIONS: dict[str, Any] = {
     "attached": "auto",
     "filter_normalization": "attached",
     "attached_sampling": "auto",
-    **UNDECIDED,
+    **PLAIN,
 }
 
 
@@ -112,9 +112,9 @@ def make_reslrb(**given: Any) -> Reslrb:
             f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
             f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
         )
-    light_share, chosen = options.pop("light_share"), {name: options.pop(name) for name in DECIDABLE}
+    light_share, chosen = options.pop("light_share"), {name: options.pop(name) for name in AUTO_VALUES}
     for name, value in chosen.items():
-        one_of(name, value, DECIDABLE[name])
+        one_of(name, value, AUTO_VALUES[name])
     motion = Motion(
         options.pop("attached"),
         options.pop("filter_normalization"),

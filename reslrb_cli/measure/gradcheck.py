@@ -18,7 +18,7 @@ from functools import cached_property
 
 import numpy as np
 
-from reslrb_cli.config.integrators import UNDECIDED
+from reslrb_cli.config.integrators import PLAIN
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.arena import NO_TIME
@@ -340,4 +340,4 @@ def _draws_plainly(config: Config) -> bool:
     `pixels: measured` make the paths differ.
     """
     options = config.integrator.options()
-    return all(options.get(name, UNDECIDED[name]) == UNDECIDED[name] for name in ("guiding", "sequence", "pixels"))
+    return all(options.get(name, PLAIN[name]) == PLAIN[name] for name in ("guiding", "sequence", "pixels"))

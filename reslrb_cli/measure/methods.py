@@ -17,7 +17,7 @@ from reslrb_cli.backend.variant import choose
 from reslrb_cli.config.integrators import (
     AUTO_ESTIMATOR,
     ESTIMATOR_OPTIONS,
-    UNDECIDED,
+    PLAIN,
     AnyIntegrator,
     LightTracerOptions,
 )
@@ -31,7 +31,7 @@ from reslrb_cli.records.measurements import Method
 #: Options that a case inherits from the configuration's integrator if its own integrator has them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    *UNDECIDED,
+    *PLAIN,
 )
 
 #: Options that set the kinds of paths.
@@ -49,7 +49,7 @@ def paths_in_records(config: Config) -> dict[str, Any]:
     """
     options = config.integrator.options()
     usual = "light" if isinstance(config.integrator, LightTracerOptions) else "camera"
-    return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
+    return records_of(str(options.get("paths", usual)), options.get("light_share", PLAIN["light_share"]))
 
 
 #: The estimator of a case that names none, as in the plugin.
@@ -61,7 +61,7 @@ _TYPES = {str(kind.model_fields["type"].default): kind for kind in get_args(get_
 
 #: Options that records show with the estimator's name.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
-_ESTIMATOR_OPTIONS |= set(UNDECIDED)
+_ESTIMATOR_OPTIONS |= set(PLAIN)
 
 _OPTION = "--integrators"
 #: A user's own integrator.
@@ -96,7 +96,7 @@ class Case:
             adjoint = {"adjoint": "independent"}  # valid with any loss
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
         # A run chooses options that are `auto` by measurement, but a method has fixed values.
-        left = {name for name in SHARED if name not in own or (name in UNDECIDED and shared.get(name) == "auto")}
+        left = {name for name in SHARED if name not in own or (name in PLAIN and shared.get(name) == "auto")}
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name not in left}
         if "paths" in self.options:  # the experiment's share belongs to its own paths
             values.pop("light_share", None)
@@ -108,7 +108,7 @@ class Case:
         values |= given
         if self.type == "reslrb":
             values.setdefault("estimator", PLUGIN_ESTIMATOR)
-        for option, fixed in {"estimator": AUTO_ESTIMATOR, **UNDECIDED}.items():
+        for option, fixed in {"estimator": AUTO_ESTIMATOR, **PLAIN}.items():
             if values.get(option) == "auto" and not auto:
                 raise ConfigError(blame, option, f"`auto` is for whole runs; use `{fixed}`, or another value")
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
@@ -123,7 +123,7 @@ class Case:
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
         usual = {option: ReslrbConfig.model_fields[option].default for option in _ESTIMATOR_OPTIONS}
-        usual |= {} if name == "auto" else UNDECIDED
+        usual |= {} if name == "auto" else PLAIN
         other = [
             f"{option}={value}"
             for option, value in self.options.items()
@@ -313,7 +313,7 @@ REFERENCE = "reslrb:stack(paths=auto)"
 REFERENCES = {
     "light": "reslrb:stack",
     "camera": "reslrb:stack(paths=camera)",
-    "both": f"reslrb:stack(paths=both,light_share={UNDECIDED['light_share']})",
+    "both": f"reslrb:stack(paths=both,light_share={PLAIN['light_share']})",
 }
 
 #: An `rr_depth` at which Russian roulette never starts.

@@ -225,10 +225,10 @@ def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> Non
 def make_configured(config: Config, integrator: Integrator, paths: str) -> StepIntegrator:
     """Make `integrator`, which `config` gives for the run or for the target. `paths` is the result of `paths_of`.
 
-    Options that a run decides by measurement (`guiding`, `sequence`, ...) are off.
+    Settings that are `auto` have their plain values.
     """
     if isinstance(integrator, ReslrbConfig):
-        integrator = integrator.undecided_off().model_copy(update={"paths": paths})
+        integrator = integrator.plain().model_copy(update={"paths": paths})
     elif isinstance(integrator, WalkAdConfig):
         integrator = integrator.model_copy(update={"paths": paths})
     options: dict[str, Any] = integrator.options()

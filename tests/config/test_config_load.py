@@ -13,7 +13,7 @@ import pytest
 from config.test_config_bad_input import PARAMETER, changed
 from make_reference import DOCS, EXAMPLE, json_schema, markdown
 
-from reslrb_cli.config.integrators import DECIDABLE, ESTIMATOR_OPTIONS, UNDECIDED, Prb, Reslrb
+from reslrb_cli.config.integrators import AUTO_VALUES, ESTIMATOR_OPTIONS, PLAIN, Prb, Reslrb
 from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
 from reslrb_cli.config.optimizers import SGD, Adam
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
@@ -70,7 +70,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto",
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "light_share": 0.5,
-        **dict.fromkeys(DECIDABLE, "auto"),
+        **dict.fromkeys(AUTO_VALUES, "auto"),
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}
@@ -276,7 +276,7 @@ def test_the_table_names_every_estimator() -> None:
 def test_options_and_defaults_match_the_estimators(name: str) -> None:
     options = Reslrb(estimator=name).options()  # type: ignore[arg-type]
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator"}
-    shared |= {"attached", "filter_normalization", "attached_sampling", *UNDECIDED}
+    shared |= {"attached", "filter_normalization", "attached_sampling", *PLAIN}
     #: Options that are constant in every run.
     constants = {"stack_size", "jacobian_damping"}
     known = {key: value for key, value in options_of(name).items() if key not in constants}
@@ -309,7 +309,7 @@ def test_impossible_paths(options: dict[str, Any], words: str) -> None:
 
 
 def test_auto_is_stack() -> None:
-    assert Reslrb(max_depth=4).undecided_off().options() == Reslrb(estimator="stack", max_depth=4).options()
+    assert Reslrb(max_depth=4).plain().options() == Reslrb(estimator="stack", max_depth=4).options()
 
 
 @pytest.mark.parametrize(
@@ -323,11 +323,11 @@ def test_measured_options_if_the_estimator_is_measured(name: str, off: str, on: 
     assert given(estimator="stack") == off
     assert given(estimator="stack", **{name: "auto"}) == "auto"
     assert given(**{name: off}) == off
-    # Objects that are made before any measurement have an undecided option off.
+    # Objects that are made before any measurement have the plain value.
     for own in (Reslrb(), Reslrb(**{name: "auto", "estimator": "reservoir"})):
-        assert getattr(own.undecided_off(), name) == off
+        assert getattr(own.plain(), name) == off
     asked = Reslrb(**{name: on})
-    assert getattr(asked.undecided_off(), name) == on
+    assert getattr(asked.plain(), name) == on
 
 
 # The reference pages in docs/ agree with the schema.
