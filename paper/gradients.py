@@ -148,8 +148,8 @@ def take_pictures(config: Config, spp: int, masked: bool = False) -> dict[str, n
     adjoint = np.array(dr.grad(image))
     if masked:
         sensor = problem.scene.sensors()[view.sensor]
-        seen = sees_specular(problem.scene, sensor)
-        adjoint *= (interior(adjoint.shape, sensor) & ~(seen.alone | seen.mixed))[:, :, None]
+        seen = sees_specular(problem.scene, sensor, partly=True)
+        adjoint *= (interior(adjoint.shape, sensor) & ~seen)[:, :, None]
     return {"target": np.array(view.target), "initial": initial, "adjoint": adjoint}
 
 

@@ -38,7 +38,7 @@ from reslrb_cli.scene.upsampling import values_of
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
-from reslrb_cli.transport.film import PixelShares
+from reslrb_cli.transport.pixel_shares import PixelShares
 from reslrb_cli.transport.plan import Plan, make_plan
 from reslrb_cli.transport.samples import Samples, passes, tracked_values
 from reslrb_cli.transport.sobol import make_coordinates

@@ -25,7 +25,8 @@ from reslrb_cli.estimators.base import one_of
 from reslrb_cli.scene.catalog import entry_value, parameter_kind
 from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
 from reslrb_cli.scene.dispersion import bends_light
-from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals, look_up
+from reslrb_cli.scene.graph import SceneGraph, interpolates_normals, look_up
+from reslrb_cli.scene.rays import emitted_rays
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_emission

@@ -39,7 +39,8 @@ from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.edges import weigh_edges
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
-from reslrb_cli.transport.film import AdjointImage, PixelShares
+from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.pixel_shares import PixelShares
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
 from reslrb_cli.transport.walk import Splat, walk

@@ -28,10 +28,10 @@ from reslrb_cli.optimization.loading import (
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import Array, Masked, View, color_channels, own_channels
 from reslrb_cli.records.images import luminance
-from reslrb_cli.scene.graph import visible
 from reslrb_cli.scene.images import Photo, read_photo, turned_line
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
+from reslrb_cli.scene.rays import visible
 from reslrb_cli.scene.values import resample
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
 from reslrb_cli.transport.film import FINE, responses_of
@@ -62,7 +62,7 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
     width, height = (int(n) for n in sensor.film().crop_size())
     if lacking:
         if "specular" in mask.kinds:
-            found.left_out["specular"] = sees_specular(scene, sensor).alone
+            found.left_out["specular"] = sees_specular(scene, sensor)
         if "border" in mask.kinds:
             found.left_out["border"] = ~interior((height, width), sensor)
     if photo is not None:

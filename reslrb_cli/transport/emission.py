@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.graph import sensor_rays
+from reslrb_cli.scene.rays import sensor_rays
 from reslrb_cli.transport.connection import forward_derivatives
 from reslrb_cli.transport.film import AdjointImage, Colours
 from reslrb_cli.transport.lamp_light import moving_splats, small_splat
