@@ -22,8 +22,7 @@ from scipy import stats
 
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config.integrators import Prb, Ptracer, WalkAdConfig
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.integrators import Prb, Ptracer, ReslrbConfig, WalkAdConfig
 from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError

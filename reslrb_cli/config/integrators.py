@@ -114,7 +114,7 @@ def _own_estimator(value: Any, handler: ValidatorFunctionWrapHandler, info: Vali
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 
 
-class Reslrb(AttachingTracer):
+class ReslrbConfig(AttachingTracer):
     """Reservoir light replay backpropagation: light tracing with memory that does not depend on path length."""
 
     type: Literal["reslrb"] = "reslrb"
@@ -209,7 +209,7 @@ class Reslrb(AttachingTracer):
             raise located(option, f"has no effect with estimator `{self.estimator}`, only with {owners}; remove it")
         return self
 
-    def plain(self) -> Reslrb:
+    def plain(self) -> ReslrbConfig:
         """Return these options with the plain value of each setting that is `auto`."""
         values = {"estimator": AUTO_ESTIMATOR, **PLAIN}
         return self.model_copy(update={name: plain for name, plain in values.items() if getattr(self, name) == "auto"})
@@ -233,14 +233,17 @@ class Reslrb(AttachingTracer):
 #: take its value from here.
 PLAIN: dict[str, Any] = {
     name: mark.value
-    for name, setting in Reslrb.model_fields.items()
+    for name, setting in ReslrbConfig.model_fields.items()
     for mark in setting.metadata
     if isinstance(mark, Plain)
 }
 
 #: The possible decisions on each setting that may be `auto`. The first is its plain value.
 AUTO_VALUES: dict[str, tuple[str, ...]] = {
-    name: (plain, *(value for value in get_args(Reslrb.model_fields[name].annotation) if value not in ("auto", plain)))
+    name: (
+        plain,
+        *(value for value in get_args(ReslrbConfig.model_fields[name].annotation) if value not in ("auto", plain)),
+    )
     for name, plain in PLAIN.items()
     if name != "light_share"
 }
@@ -312,7 +315,7 @@ class Own(Integrator, json_schema_extra=NEEDS_TYPE):
 
 
 AnyIntegrator = Annotated[
-    Reslrb | Ptracer | Prb | PrbProjective | WalkAdConfig | TrajectoryConfig | Own, ByType("reslrb")
+    ReslrbConfig | Ptracer | Prb | PrbProjective | WalkAdConfig | TrajectoryConfig | Own, ByType("reslrb")
 ]
 
 

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.camera import splat_camera_paths
-from reslrb_cli.integrators.plans import Motion, SamplingOptions
+from reslrb_cli.integrators.plans import AttachedOptions, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.scene.deformation import Surroundings
@@ -162,7 +162,7 @@ class WalkAd(LightTracer):
     ) -> None:  # fmt: skip
         """Make the integrator. If `attached`, rays and film positions also have derivatives."""
         sampling = SamplingOptions(paths=paths, light_share=light_share)
-        super().__init__(motion=Motion(attached, filter_normalization), sampling=sampling, **common)
+        super().__init__(motion=AttachedOptions(attached, filter_normalization), sampling=sampling, **common)
 
     def graph(self, job: Job) -> mi.TensorXf:
         """Return the image (H, W, C) with its whole graph. Call it with enabled gradients."""
@@ -216,7 +216,7 @@ class Trajectory(LightTracer):
     """
 
     def __init__(self, max_depth: int = -1, **common: Any) -> None:
-        super().__init__(max_depth, motion=Motion(attached=False), **common)
+        super().__init__(max_depth, motion=AttachedOptions(attached=False), **common)
         if max_depth == -1:
             raise ValueError('"max_depth" is missing: it is the size of the record')
 

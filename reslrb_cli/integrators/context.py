@@ -22,8 +22,8 @@ from reslrb_cli.guiding.collect import bsdf_groups
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.integrators.plans import (
+    AttachedOptions,
     Differentiated,
-    Motion,
     SamplingOptions,
     attach,
     bounces,
@@ -164,7 +164,7 @@ class Preparation:
     """Options of a light tracer, and facts about the last scene."""
 
     def __init__(
-        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, sampling: SamplingOptions
+        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: AttachedOptions, sampling: SamplingOptions
     ) -> None:  # fmt: skip
         self.sampling = sampling
         self.guiding = Guiding() if "guiding" in sampling.on else None

@@ -1,10 +1,10 @@
 """Options of a light tracer, differentiated parameters, and the features of a plan that both need (`scene_rows`).
 `autotune/sampling.py` has the features that a run decides.
 
-`SamplingOptions` has the choice of paths. `Motion` has the options of attached derivatives, and `attach` adds them to a
-plan. The values `follow` and `stay` of `attached_sampling` (`estimators/attached.py`) differ only if a nonspecular
-surface scatters moving light to another visible surface. `bounces` tests whether this happens. In a caustic of few
-segments, moving light does not bounce, because paths end where light first lands.
+`SamplingOptions` has the choice of paths. `AttachedOptions` has the options of attached derivatives, and `attach` adds
+them to a plan. The values `follow` and `stay` of `attached_sampling` (`estimators/attached.py`) differ only if a
+nonspecular surface scatters moving light to another visible surface. `bounces` tests whether this happens. In a caustic
+of few segments, moving light does not bounce, because paths end where light first lands.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class Differentiated:
 
 
 @dataclass(frozen=True)
-class Motion:
+class AttachedOptions:
     """Options of attached derivatives.
 
     `attached` is true, false, or `auto` (true if a parameter moves anything). `filter_normalization` is `attached` or
@@ -205,7 +205,7 @@ def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bo
     return (True, False) if sampling == "stay" else (not all(glossy), any(glossy))
 
 
-def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
+def attach(plan: Plan, which: Differentiated, motion: AttachedOptions, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
     """Return the plan with attached derivatives if requested. Raises UnsupportedScene if attached derivatives are
     requested but do not exist.
     """

@@ -20,7 +20,7 @@ from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import Trajectory, WalkAd
 from reslrb_cli.integrators.context import resolve_sensor
 from reslrb_cli.integrators.own import OwnIntegrator
-from reslrb_cli.integrators.plans import Motion, SamplingOptions
+from reslrb_cli.integrators.plans import AttachedOptions, SamplingOptions
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.integrators.step import interface_of
@@ -115,7 +115,7 @@ def make_reslrb(**given: Any) -> Reslrb:
     light_share, chosen = options.pop("light_share"), {name: options.pop(name) for name in AUTO_VALUES}
     for name, value in chosen.items():
         one_of(name, value, AUTO_VALUES[name])
-    motion = Motion(
+    motion = AttachedOptions(
         options.pop("attached"),
         options.pop("filter_normalization"),
         obstacle,

@@ -34,7 +34,7 @@ from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.context import Preparation, sensor_number
 from reslrb_cli.integrators.forward import tangent_of
-from reslrb_cli.integrators.plans import Motion, SamplingOptions
+from reslrb_cli.integrators.plans import AttachedOptions, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.edges import weigh_edges
@@ -58,7 +58,7 @@ class LightTracer(StepIntegrator):
 
     def __init__(
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
-        freeze: bool = False, motion: Motion | None = None, sampling: SamplingOptions | None = None,
+        freeze: bool = False, motion: AttachedOptions | None = None, sampling: SamplingOptions | None = None,
     ) -> None:  # fmt: skip
         """Make the tracer. Raises ValueError, which names the option, for an invalid value.
 
@@ -73,7 +73,7 @@ class LightTracer(StepIntegrator):
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        motion, sampling = motion or Motion(), sampling or SamplingOptions()
+        motion, sampling = motion or AttachedOptions(), sampling or SamplingOptions()
         self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion, sampling)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:

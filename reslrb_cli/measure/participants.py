@@ -17,8 +17,7 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
-from reslrb_cli.measure.methods import NEVER, all_estimators, parse_checked
-from reslrb_cli.measure.methods import Case as Listed
+from reslrb_cli.measure.methods import NEVER, NamedIntegrator, all_estimators, parse_checked
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
@@ -103,7 +102,7 @@ class CheckSettings:
     """
 
     config: Config
-    integrators: Sequence[Listed]
+    integrators: Sequence[NamedIntegrator]
     budget_s: float
     seeds: int | None = None
     spp: int | None = None
@@ -270,7 +269,7 @@ class Participants:
         known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
         self.exact = {key: value for key, value in known.items() if value is not None}
 
-    def _able(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
+    def _able(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[NamedIntegrator]:
         """Return the estimators that can take part. Raises ConfigError if an estimator that the user named cannot take
         part, or if no estimator can take part.
         """
@@ -285,7 +284,7 @@ class Participants:
             raise next(iter(refused.values()))
         return listed
 
-    def _check(self, case: Listed, config: Config, problem: Problem) -> None:
+    def _check(self, case: NamedIntegrator, config: Config, problem: Problem) -> None:
         """Raise ConfigError if the estimator cannot render the scene or, if light moves, differentiate it."""
         ours, estimator = case.type == "reslrb", case.options.get("estimator")
         if not self._situation.moved:
@@ -324,7 +323,7 @@ class Participants:
                     made[_alike(label, reference)] = make_integrator(kind, **options | alike)
         return made
 
-    def references(self, key: str, listed: Listed) -> list[Reference]:
+    def references(self, key: str, listed: NamedIntegrator) -> list[Reference]:
         """Return the references that the scene allows for the gradient of a parameter by an integrator."""
         if listed.type == "custom" and self._situation.moved:  # our camera paths have no derivatives of moving light
             return [Reference.FINITE_DIFFERENCE]

@@ -12,8 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.integrators import Integrator, Own, WalkAdConfig
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.integrators import Integrator, Own, ReslrbConfig, WalkAdConfig
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import IN_MEMORY, Config

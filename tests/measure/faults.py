@@ -22,7 +22,7 @@ from reslrb_cli.estimators.stack import Stack
 from reslrb_cli.measure.extreme import CASES
 from reslrb_cli.measure.extreme.suite import run_case
 from reslrb_cli.measure.gradcheck import Gradcheck
-from reslrb_cli.measure.methods import Case, parse_checked
+from reslrb_cli.measure.methods import NamedIntegrator, parse_checked
 from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.records.measurements import GradcheckRecord
@@ -45,7 +45,7 @@ run: {{spp: 64}}
     return loads(text, name, [*overrides])
 
 
-def estimators_of(names: str) -> list[Case]:
+def estimators_of(names: str) -> list[NamedIntegrator]:
     """Return the estimators of a list such as `stack,reservoir(capacity=2)`."""
     return parse_checked(re.sub(r"(^|,)(?![^(]*\))", r"\1reslrb:", names))
 

@@ -23,7 +23,7 @@ from cli import tiny
 from runs.going_on import MOTION, one_thread, optimize
 from runs.hosts import hosts, make_certificates, missing
 
-from reslrb_cli.cluster.connection import Place, connected
+from reslrb_cli.cluster.connection import Cluster, connected
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.loop import iterate
@@ -105,7 +105,7 @@ def test_workers_run_users_code_with_permission(experiment: Path) -> None:
     compare(experiment, OWN_SETS, 1)
     course = make(experiment, *OWN_SETS)
     (experiment / "own.py").write_text(OWN + "# another\n")
-    with pytest.raises(ConfigError, match="has changed since"), engine.engine_at(course, Place(1), threads=1):
+    with pytest.raises(ConfigError, match="has changed since"), engine.engine_at(course, Cluster(1), threads=1):
         pass
 
 
@@ -116,7 +116,7 @@ def check(folder: Path, case: str, workers: int) -> None:
 def compare(folder: Path, sets: list[str], workers: int) -> None:
     """Compare the results bit by bit, with one thread each."""
     alone, course = both(folder, *sets)
-    with engine.engine_at(course, Place(workers), threads=1) as local:
+    with engine.engine_at(course, Cluster(workers), threads=1) as local:
         course.compute_with(local)
         together = end(course)
     assert {name: array.tobytes() for name, array in alone.items()} == {
@@ -198,7 +198,7 @@ def beside(folder: Path, workers: int, iterations: int, *sets: str):
     """Yield a course with `workers` workers and their client, and compare its result with one process."""
     sets = ("run.shards=4", f"run.iterations={iterations}", "views=[{sensor: 0}]", *sets)
     alone, course = both(folder, *sets)
-    with engine.engine_at(course, Place(workers), threads=1) as local:
+    with engine.engine_at(course, Cluster(workers), threads=1) as local:
         course.compute_with(local)
         yield course, local._client
         together = end(course)
@@ -278,7 +278,7 @@ class Unchanged:
 def test_a_call_that_ends_every_worker_ends_the_run(caplog: pytest.LogCaptureFixture) -> None:
     ended = pytest.raises(MachineError, match="--cluster: the same call ended 4 workers, the last one at tls://")
     workload = calls.Workload({"a": b"one"}, reads)
-    with connected(Place(1)) as (client, _), ended:
+    with connected(Cluster(1)) as (client, _), ended:
         list(calls.Workers(client, workload, lambda state: Unchanged())(None, fail, [()]))
     warnings = [record.message for record in caplog.records if record.name == "reslrb_cli.cluster.calls"]
     assert warnings  # a busy machine may lose some
@@ -323,7 +323,7 @@ def test_memory_does_not_grow(experiment: Path) -> None:
 
     sizes: dict[int, list[int]] = {}
     course = make(experiment, "run.shards=4", "run.iterations=2001", "views=[{sensor: 0}]")
-    with engine.engine_at(course, Place(2), threads=1) as local:
+    with engine.engine_at(course, Cluster(2), threads=1) as local:
         course.compute_with(local)
         with one_thread():
             for state, _ in iterate(course.problem, course.state):

@@ -1,9 +1,9 @@
 """Automatic decisions about the sampling of a run, taken before its first iteration.
 
 `AUTOMATIC` has one entry for each setting of the integrator that may be `auto`. To add a setting, add its entry here,
-and the setting to `Reslrb` in `config/integrators.py`, marked `Plain` with its plain value. `Plan.on` contains the
-settings that have another value. All other code (Mitsuba's plugin, the printed line, manifest, checkpoints,
-page, `inspect`, resumed runs) reads these tables and the list of `Decision`s.
+and the setting to `ReslrbConfig` in `config/integrators.py`, marked `Plain` with its plain value. `Plan.on` contains
+the settings that have another value. All other code (Mitsuba's plugin, the printed line, manifest, checkpoints, page,
+`inspect`, resumed runs) reads these tables and the list of `Decision`s.
 
 A decision follows a rule or a race. A rule uses facts of the scene and the configuration. A race compares steps of both
 ways (`race.py`), with dL/dI fixed at one image.
