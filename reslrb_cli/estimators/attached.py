@@ -52,7 +52,7 @@ from reslrb_cli.estimators.base import Pass, SurfacePoint, VertexHooks
 from reslrb_cli.estimators.stack import Ring, Stack, StackState, walk_back
 from reslrb_cli.transport.bsdf import Hit, Scattering, evaluate, stays_behind
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import MAY_LACK, Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Numbers, Samples
 from reslrb_cli.transport.walk import (
@@ -355,4 +355,4 @@ def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
         objective = dr.dot(adjoint.B, emission.E)
         if plan.moving_emission:
             objective += dr.dot(adjoint.origin, emission.ray.o) + dr.dot(adjoint.direction, emission.ray.d)
-        dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        dr.backward_from(objective, flags=MAY_LACK)

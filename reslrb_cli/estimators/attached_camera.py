@@ -26,6 +26,7 @@ from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.stack import Ring, StackState
 from reslrb_cli.transport.bsdf import EventNumbers, Scattering, scatter
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, next_event_again
+from reslrb_cli.transport.factors import MAY_LACK
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -92,7 +93,7 @@ class AttachedCameraFrame:
             following = hit.si.spawn_ray(scattering.d)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             objective = dr.dot(P, factor * (own + later)) + dr.select(scattered, moved, 0)
-            dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            dr.backward_from(objective, flags=MAY_LACK)
             # A lane without light may compute NaN, which must not reach earlier vertices.
             B = dr.detach(own + later) * self.roulette
             here = connected | scattered | lit

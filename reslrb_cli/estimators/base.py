@@ -18,7 +18,7 @@ from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks
 from reslrb_cli.transport.connection import Connection, stand_in, transmittance
 from reslrb_cli.transport.emission import Emission, sample_emission
-from reslrb_cli.transport.factors import NO_ZERO, Product, showing
+from reslrb_cli.transport.factors import MAY_LACK, NO_ZERO, Product, showing
 from reslrb_cli.transport.film import AdjointImage, Colours
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
@@ -175,7 +175,7 @@ def differentiate_passage(
         weight = adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), dr.detach(transmission), 0)
         objective = dr.select(hit, weight * transmission, 0)
         # The scene may have masks without differentiated parameters.
-        dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        dr.backward_from(objective, flags=MAY_LACK)
 
     with dr.resume_grad(when=p.plan.differentiate_null):
         on_crossing = differentiate if p.plan.differentiate_null else None

@@ -22,11 +22,9 @@ from reslrb_cli.estimators.base import STACK_SIZE, Pass, PathAdjoint, differenti
 from reslrb_cli.estimators.stack import Frame, Ring, StackState, pass_vertex, walk_back
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
+from reslrb_cli.transport.factors import MAY_LACK
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex
-
-#: A differentiated parameter may receive no light.
-_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 class Radiance(CameraHooks):
@@ -119,7 +117,7 @@ class CameraSweep(CameraHooks):
                 towards = dr.detach(event.f * event.through * event.scale)
                 radiance = event.radiance(self.p.samples.scene, vertex.si)
                 objective += dr.select(event.active, weight * towards * radiance, 0)
-            dr.backward_from(objective, flags=_MAY_LACK)
+            dr.backward_from(objective, flags=MAY_LACK)
 
 
 def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:

@@ -24,6 +24,7 @@ from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.arena import NO_TIME
 from reslrb_cli.measure.comparison import (
     ROUNDING,
+    STOCK_ROUNDING,
     Family,
     compare_equal_seeds,
     compare_expectations,
@@ -33,9 +34,6 @@ from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import plays_roulette, records_of
 from reslrb_cli.measure.participants import CheckSettings, Participants, Way
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
-
-#: Relative difference of a stock integrator on the same paths: it rounds the visibility of points differently.
-STOCK_ROUNDING = 1e-3
 
 #: References that know the gradient only along a few directions.
 ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)

@@ -34,6 +34,7 @@ from reslrb_cli.measure.scenes import small
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import check_integrator
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.targets import multiple_of
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
@@ -63,12 +64,6 @@ LESSONS = 8
 
 #: Seeds for choosing the step of finite differences.
 PILOT_SEEDS = 2
-
-
-def multiple_of(spp: int, unit: int | None) -> int:
-    """Return the greatest multiple of `unit` that is at most `spp`, but at least `unit`."""
-    unit = unit or 1
-    return max(spp // unit, 1) * unit
 
 
 def shrink(scene: Any, sensor: int, pixels: int) -> None:

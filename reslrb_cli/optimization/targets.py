@@ -95,6 +95,22 @@ def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
     return line + (f": {', '.join(parts)}" if parts else "")
 
 
+def multiple_of(spp: int, unit: int | None) -> int:
+    """Return the greatest multiple of `unit` that is at most `spp`, but at least `unit`."""
+    unit = unit or 1
+    return max(spp // unit, 1) * unit
+
+
+def with_short_target(config: Config, most: int) -> Config:
+    """Return the experiment with at most `most` samples per pixel for a rendered target, or with one pass of more."""
+    render = config.target.render
+    if render is None:
+        return config
+    spp = min(render.spp, multiple_of(most, (render.integrator or config.integrator).options().get("samples_per_pass")))
+    target = config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
+    return config.model_copy(update={"target": target})
+
+
 def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
     """Read or render every view's target. Returns the problem with `truth` set to the true values of rendered targets.
 
