@@ -135,13 +135,6 @@ def differing(way: str, names: tuple[str, ...], orders: Iterator[np.random.Gener
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("way", ["both"])
-def test_results_do_not_depend_on_earlier_work(way: str) -> None:
-    with one_thread():
-        assert differing(way, ("mirror", "zero", "moving"), map(np.random.default_rng, range(1)), 7) == []
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("way", WAYS)
 def test_results_do_not_depend_on_200_orders_of_earlier_work(way: str) -> None:
     with one_thread():

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cli import tiny
+from kit import count_iterations, wait_for
 from runs.going_on import MOTION, one_thread, optimize
 from runs.hosts import hosts, make_certificates, missing
 
@@ -75,6 +76,10 @@ def end(course: RunProgress, after: Callable[[int], object] = lambda iteration: 
         return course.problem.values() | ({} if guiding is None else guiding.state()[1])
 
 
+def bits(arrays: dict[str, np.ndarray]) -> dict[str, bytes]:
+    return {name: array.tobytes() for name, array in arrays.items()}
+
+
 def test_workers_give_the_results_of_one_process(experiment: Path) -> None:
     check(experiment, "guided, scaled", 1)
 
@@ -119,9 +124,7 @@ def compare(folder: Path, sets: list[str], workers: int) -> None:
     with engine.engine_at(course, Cluster(workers), threads=1) as local:
         course.compute_with(local)
         together = end(course)
-    assert {name: array.tobytes() for name, array in alone.items()} == {
-        name: array.tobytes() for name, array in together.items()
-    }
+    assert bits(alone) == bits(together)
 
 
 # --- the side of a worker ---------------------------------------------------------------------------------------------
@@ -202,9 +205,7 @@ def beside(folder: Path, workers: int, iterations: int, *sets: str):
         course.compute_with(local)
         yield course, local._client
         together = end(course)
-    assert {name: array.tobytes() for name, array in alone.items()} == {
-        name: array.tobytes() for name, array in together.items()
-    }
+    assert bits(alone) == bits(together)
 
 
 def hang(dask_worker: Any) -> None:
@@ -375,8 +376,7 @@ def test_isolated_hosts_give_the_same(net, tmp_path: Path) -> None:
     for host in range(2):
         net.worker(host, host)
     remote = reslrb(net, 2, *RUN, *more, "--cluster", net.address(2), "--set", "run.name=remote")
-    metrics = tmp_path / "runs" / "remote" / "metrics.jsonl"
-    wait_for(lambda: metrics.exists() and len(metrics.read_text().splitlines()) > 4, 120)
+    wait_for(lambda: count_iterations(tmp_path / "runs" / "remote") > 4, 120)
     net.cut(0)
     time.sleep(20)
     net.cut(0, False)
@@ -412,7 +412,7 @@ def test_a_run_survives_five_kills_of_scheduler_or_coordinator(net, tmp_path: Pa
             assert run.wait(300) == 0, said(net, run)
             break
         least = 10 * (kill + 1) - rng.randrange(5)
-        wait_for(lambda least=least: done(folder) >= least, 120)
+        wait_for(lambda least=least: count_iterations(folder) >= least, 120)
         time.sleep(rng.uniform(0, 0.3))
         os.killpg((scheduler if whom == "scheduler" else run).pid, signal.SIGKILL)
         if whom == "scheduler":
@@ -424,21 +424,9 @@ def test_a_run_survives_five_kills_of_scheduler_or_coordinator(net, tmp_path: Pa
     assert values(folder) == values(tmp_path / "runs" / "local")
 
 
-def done(folder: Path) -> int:
-    metrics = folder / "metrics.jsonl"
-    return len(metrics.read_text().splitlines()) if metrics.exists() else 0
-
-
 def made(folder: Path) -> Path:
     folder.mkdir()
     return folder
-
-
-def wait_for(holds: Callable[[], bool], seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 BAD = [
