@@ -18,11 +18,11 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.scene.rays import sensor_rays
-from reslrb_cli.transport.connection import forward_derivatives
 from reslrb_cli.transport.factors import MAY_LACK
 from reslrb_cli.transport.film import AdjointImage, Colours
 from reslrb_cli.transport.lamp_light import moving_splats, small_splat
 from reslrb_cli.transport.lamps import environment_ray, keep_one, lamp_ray
+from reslrb_cli.transport.masks import forward_derivatives
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import VISIBLE_STREAM, Samples
 
