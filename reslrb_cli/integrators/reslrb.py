@@ -28,7 +28,7 @@ from reslrb_cli.estimators.chain_edges import (
     with_intervals,
 )
 from reslrb_cli.estimators.edges import differentiate_edges
-from reslrb_cli.guiding.collect import hear
+from reslrb_cli.guiding.collect import collect
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
@@ -218,10 +218,10 @@ class LightTracer(StepIntegrator):
         with dr.suspend_grad():
             samples = self.passes(replace(job, seed=learning_seed(job.seed)), Purpose.BOTH)[0]
             if self.freezes([samples]) and samples.width <= freezing.MOST_PATHS_APART:
-                said = self.preparation.recordings.call("hear", samples, hear, gradient)
+                collected = self.preparation.recordings.call("collect", samples, collect, gradient)
             else:
-                said = hear(samples, gradient)
-            guiding.learn(sensor_number(job.scene, job.sensor), samples.width, said)
+                collected = collect(samples, gradient)
+            guiding.learn(sensor_number(job.scene, job.sensor), samples.width, collected)
 
     def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
         """Return the image (H, W, C), without derivatives."""
