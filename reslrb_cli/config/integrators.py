@@ -229,6 +229,13 @@ class ReslrbConfig(AttachingTracer):
         return None if self.file is None else code_file(self.file)
 
 
+def traced_paths(paths: str, light_share: float) -> str:
+    """Return the kinds of paths that are traced: `both` with a share of 0 or 1 are paths of one kind."""
+    if paths == "both" and light_share in (0, 1):
+        return "light" if light_share else "camera"
+    return paths
+
+
 #: The plain value of each setting that a run may decide. `light_share` is never `auto`; measurements of single steps
 #: take its value from here.
 PLAIN: dict[str, Any] = {

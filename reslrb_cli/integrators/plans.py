@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from reslrb_cli.config.integrators import PLAIN
+from reslrb_cli.config.integrators import PLAIN, traced_paths
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.scene.catalog import entry_value, parameter_kind
@@ -168,9 +168,7 @@ class SamplingOptions:
         one_of("paths", self.paths, ("light", "camera", "both"))
         if not 0 <= self.light_share <= 1:
             raise ValueError(f'"light_share" must lie in [0, 1], not {self.light_share}')
-        paths = self.paths
-        if paths == "both" and self.light_share in (0, 1):
-            paths = "light" if self.light_share else "camera"
+        paths = traced_paths(self.paths, self.light_share)
         chosen = {**self.chosen, "guiding": "off"} if paths == "camera" else self.chosen  # no table has its starts
         for name, value in {"paths": paths, "whole": self.whole or paths != "light", "chosen": chosen}.items():
             object.__setattr__(self, name, value)

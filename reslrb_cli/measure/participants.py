@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.integrators import traced_paths
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ATTACHED
@@ -149,9 +150,8 @@ class Way:
     def of(cls, config: Config) -> Way:
         """Return the paths of an integrator. Integrators without the option `paths` use light paths."""
         options = config.integrator.options()
-        paths, share = options.get("paths", "light"), options.get("light_share", 0.5)
-        if paths == "both" and share in (0, 1):
-            paths = "light" if share else "camera"
+        share = options.get("light_share", 0.5)
+        paths = traced_paths(options.get("paths", "light"), share)
         return cls(paths, share) if paths == "both" else cls(paths)
 
     @property
