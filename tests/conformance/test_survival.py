@@ -116,10 +116,10 @@ def test_the_probability_is_bounded_on_both_sides() -> None:
         assert (raised <= np.maximum(np.array(throughput)[:5], 1 / chance if chance else np.inf)).all()
 
 
-def walked(squares: tuple[float, float] = (4.0, 9.0), light: float = 2.0, **changes: Any) -> Collected:
-    """Return the result of a walk of one path with two later vertices, which contributed `squares`."""
+def walked(totals: tuple[float, float] = (4.0, 9.0), light: float = 2.0, **changes: Any) -> Collected:
+    """Return the result of a walk of one path with two later vertices, which contributed `totals`."""
     whole, zeros = np.zeros((4, BINS)), np.zeros(CELLS)
-    whole[:, 0] = [*squares, light, 2.0]
+    whole[:, 0] = [*totals, light, 2.0]
     return replace(Collected(None, np.zeros((2, CELLS)), zeros, zeros, whole, []), **changes)
 
 
@@ -151,8 +151,8 @@ def test_cells_share_with_their_neighbours_and_none_is_zero() -> None:
 def test_walks_without_contributions_change_nothing() -> None:
     onward = Onward.nothing(BOX)
     assert np.isinf(onward.chances(1.0)).all()
-    for squares, light in (((0.0, 1.0), 1.0), ((1.0, 0.0), 1.0), ((np.nan, 1.0), 1.0), ((1.0, 1.0), 0.0)):
-        assert onward.with_more(walked(squares, light), 1) is onward
+    for totals, light in (((0.0, 1.0), 1.0), ((1.0, 0.0), 1.0), ((np.nan, 1.0), 1.0), ((1.0, 1.0), 0.0)):
+        assert onward.with_more(walked(totals, light), 1) is onward
 
 
 def test_without_data_all_paths_survive() -> None:
