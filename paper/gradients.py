@@ -22,8 +22,7 @@ from scipy import stats
 
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config.integrators import Prb, Ptracer, WalkAdConfig
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.integrators import Prb, Ptracer, ReslrbConfig, WalkAdConfig
 from reslrb_cli.config.loader import dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
@@ -117,7 +116,7 @@ def comparable(config: Config, by: str) -> Config:
     No integrator uses Russian roulette, because naive AD does not differentiate its decision.
     """
     assert isinstance(config.integrator, ReslrbConfig), "checked by `own_label`"
-    own = config.integrator.undecided_off()
+    own = config.integrator.plain()
     alike: dict[str, Any] = {**ALIKE[Reference.PTRACER], "rr_depth": NEVER}
     shared: dict[str, Any] = {"max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
     if by == "ptracer":
@@ -148,8 +147,8 @@ def take_pictures(config: Config, spp: int, masked: bool = False) -> dict[str, n
     adjoint = np.array(dr.grad(image))
     if masked:
         sensor = problem.scene.sensors()[view.sensor]
-        seen = sees_specular(problem.scene, sensor)
-        adjoint *= (interior(adjoint.shape, sensor) & ~(seen.alone | seen.mixed))[:, :, None]
+        seen = sees_specular(problem.scene, sensor, partly=True)
+        adjoint *= (interior(adjoint.shape, sensor) & ~seen)[:, :, None]
     return {"target": np.array(view.target), "initial": initial, "adjoint": adjoint}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,22 @@ def work_in(folder: Path, patch: pytest.MonkeyPatch) -> None:
     """Make `folder` the working directory, with a cache of its own."""
     patch.chdir(folder)
     patch.setenv("RESLRB_CACHE", str(folder / "cache"))
+
+
+def wait_for(happened: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Wait until `happened()` is true. Fail after `seconds`."""
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def count_iterations(run: Path) -> int:
+    """Return the number of complete lines in the metrics of a run."""
+    try:
+        return (run / "metrics.jsonl").read_bytes().count(b"\n")
+    except OSError:  # there is no file yet
+        return 0
 
 
 #: The reflectance of a surface that shows `poster.exr` with nearest-texel lookup.

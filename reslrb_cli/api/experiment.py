@@ -407,13 +407,13 @@ def convergence(
             raise ConfigError(config.source, "scene", reason)
         from reslrb_cli.measure.convergence import Session
         from reslrb_cli.measure.judgement import Judgement
-        from reslrb_cli.measure.methods import Plan
+        from reslrb_cli.measure.methods import ConvergencePlan
         from reslrb_cli.report.tables import result_lines
 
         for option, count in [("rounds", rounds), *(("spps", each) for each in spps)]:
             if count is not None and count < 1:
                 raise ConfigError(option, "", f"is {count}; at least 1 is needed")
-        plan = Plan.of(
+        plan = ConvergencePlan.of(
             config, objective, integrators, reference, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps))
         )
         with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:

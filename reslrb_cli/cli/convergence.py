@@ -27,7 +27,7 @@ from reslrb_cli.report.format import WITHOUT_BORDER, Columns
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence import Session
     from reslrb_cli.measure.judgement import ConvergenceResults
-    from reslrb_cli.measure.methods import Plan
+    from reslrb_cli.measure.methods import ConvergencePlan
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,13 @@ def command(**given: Any) -> int:
     from reslrb_cli.config.loader import check_code
 
     load_packages()  # before the imports below need them
-    from reslrb_cli.measure.methods import Plan
+    from reslrb_cli.measure.methods import ConvergencePlan
 
     config, objective, json_file = options.config(), options.objective, options.json_file
     if objective == "loss":
         check_code(config)
     check_writable("--json", json_file)
-    plan = Plan.of(
+    plan = ConvergencePlan.of(
         config, objective, options.integrators, options.reference, budget_s=options.budget, rounds=options.rounds,
         spps=options.spps or (),
     )  # fmt: skip
@@ -87,7 +87,7 @@ def command(**given: Any) -> int:
     return exit_code(interrupted, done, {record.status for record in results.methods})
 
 
-def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
+def _run(plan: ConvergencePlan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write. Return the results, and True if the user interrupted."""
     from reslrb_cli.measure.convergence import Role, Session
     from reslrb_cli.measure.judgement import Judgement
@@ -135,7 +135,7 @@ def _table(session: Session) -> Columns:
     return method_columns(labels, [*session.facts.get("shapes", ()), "999 rounds"])
 
 
-def _conditions(plan: Plan, session: Session) -> str:
+def _conditions(plan: ConvergencePlan, session: Session) -> str:
     """Describe the measurement in one line."""
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth

@@ -24,7 +24,7 @@ from reslrb_cli.cli.options import (
     start_variant,
 )
 from reslrb_cli.cli.terminal import echo
-from reslrb_cli.cluster.connection import Place
+from reslrb_cli.cluster.connection import Cluster
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def command(**given: Any) -> int:
     options = OptimizeOptions(**given)
     if options.quiet:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING)
-    workers = None if options.cluster is None else Place.parse(options.cluster)
+    workers = None if options.cluster is None else Cluster.parse(options.cluster)
     if options.resumed is not None:
         if options.dry_run:
             raise click.UsageError("--dry-run is for a new run, --resume continues one; give only one of them")
@@ -115,14 +115,14 @@ def command(**given: Any) -> int:
     return _begin(options.config_file, options, workers)
 
 
-def _check_shards(config: Config, workers: Place | None) -> None:
+def _check_shards(config: Config, workers: Cluster | None) -> None:
     """Raise ConfigError if `--cluster` is used with only one shard."""
     if workers is not None and config.shards == 1:
         reason = "--cluster needs more than one shard; set run.shards to auto, or to a number above 1"
         raise ConfigError(config.source, "run.shards", reason)
 
 
-def _begin(config_file: Path, options: OptimizeOptions, workers: Place | None) -> int:
+def _begin(config_file: Path, options: OptimizeOptions, workers: Cluster | None) -> int:
     from reslrb_cli.records.run_folder import check_output
 
     config = options.config()
@@ -148,7 +148,7 @@ def _callbacks(config: Config, options: OptimizeOptions) -> list[Callback]:
     return callbacks_of(config, options.log, "--log")
 
 
-def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
+def _resume(run: Path, options: OptimizeOptions, workers: Cluster | None) -> int:
     from reslrb_cli.runs.resume import open_earlier
 
     with open_earlier(run, options.overrides) as earlier:
@@ -166,7 +166,7 @@ def _resume(run: Path, options: OptimizeOptions, workers: Place | None) -> int:
         return _run(begun, workers, callbacks, options.quiet)
 
 
-def _run(begun: PreparedRun, workers: Place | None, callbacks: list[Callback], quiet: bool) -> int:
+def _run(begun: PreparedRun, workers: Cluster | None, callbacks: list[Callback], quiet: bool) -> int:
     """Run in the folder. Signals are handled before the folder is created, so the folder always records how the run
     ended.
     """

@@ -62,14 +62,14 @@ OWN_SETTINGS = {
 
 
 @dataclass(frozen=True)
-class Place:
+class Cluster:
     """A number of `workers` on this machine, or the scheduler at `address`."""
 
     workers: int = 0
     address: str | None = None
 
     @classmethod
-    def parse(cls, text: str) -> Place:
+    def parse(cls, text: str) -> Cluster:
         """Parse `local:N` or `tls://HOST:PORT`. Raises ConfigError if the text has another form, or if dask is not
         installed.
         """
@@ -103,7 +103,7 @@ class Place:
 
 
 @contextlib.contextmanager
-def connected(place: Place) -> Iterator[tuple[Client, Path]]:
+def connected(place: Cluster) -> Iterator[tuple[Client, Path]]:
     """Connect to the workers at a place. Yields a client, and a folder that is removed at the end.
 
     Raises MachineError if no worker can be started or the scheduler does not answer. Raises ConfigError without

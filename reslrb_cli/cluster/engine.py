@@ -24,7 +24,7 @@ import numpy as np
 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.cluster.calls import Workers, Workload
-from reslrb_cli.cluster.connection import Place, connected
+from reslrb_cli.cluster.connection import Cluster, connected
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import MachineError
 from reslrb_cli.optimization.assemble import assemble_scene
@@ -135,7 +135,7 @@ def workload_of(course: RunProgress, folder: Path, threads: int | None, own: boo
 
 
 @contextlib.contextmanager
-def engine_at(course: RunProgress, place: Place, threads: int | None = None) -> Iterator[Workers]:
+def engine_at(course: RunProgress, place: Cluster, threads: int | None = None) -> Iterator[Workers]:
     """Load a run's experiment on the workers at `place`, and provide the workers as an `Engine`. Each worker has
     `threads` threads. If `threads` is None, each worker of this machine gets its share of the cores.
 

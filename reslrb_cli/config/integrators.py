@@ -84,8 +84,10 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class Undecided:
-    """Mark of a setting that a run decides (`optimization/autotune/sampling.py`), with its value without a decision."""
+class Plain:
+    """Mark of a setting that a run may decide (`optimization/autotune/sampling.py`), with its plain value: the value
+    where no run decides, as in Mitsuba's plugin.
+    """
 
     value: str | float
 
@@ -112,7 +114,7 @@ def _own_estimator(value: Any, handler: ValidatorFunctionWrapHandler, info: Vali
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 
 
-class Reslrb(AttachingTracer):
+class ReslrbConfig(AttachingTracer):
     """Reservoir light replay backpropagation: light tracing with memory that does not depend on path length."""
 
     type: Literal["reslrb"] = "reslrb"
@@ -126,7 +128,9 @@ class Reslrb(AttachingTracer):
     connections, stored in thread-local memory. `auto`: `stack`, the most efficient one in every experiment on CPUs.
     On a GPU, `event` was more efficient in configs/cornell_floor.yaml, and less efficient in configs/grey_room.yaml.
     `FILE.py:CLASS`: your own estimator, a file relative to the config file and a class in it, which needs
-    `--allow-code` on the command line ([Your own estimator](your_estimator.md))."""
+    `--allow-code` on the command line ([Your own estimator](your_estimator.md)). With an estimator that you name, also
+    with `stack`, no setting is `auto` unless you say so: `paths` is `light`, `guiding` and `edges` are `off`,
+    `sequence` is `independent`, and `pixels` is `even`."""
     capacity: Annotated[Count, Field(le=CAPACITY)] = 1
     """Number of connections (`reservoir`) or scattering events (`event`) that are stored for each path. Each adds
     code to the kernel; `gather` uses all connections. Only with estimators `reservoir` and `event`."""
@@ -139,7 +143,7 @@ class Reslrb(AttachingTracer):
     turns with the surface, as in `ptracer`. It then sweeps over edges of objects that do not move, and the derivative
     lacks this effect. `stay`: light still arrives at the same point. `auto`: `stay` after diffuse surfaces, `follow`
     after glossy ones, where `stay` is noisy."""
-    paths: Annotated[Literal["auto", "light", "camera", "both"], Undecided("light")] = "auto"
+    paths: Annotated[Literal["auto", "light", "camera", "both"], Plain("light")] = "auto"
     """Where paths start. `light`: at the emitters. Finds caustics and light through glass; mirrors and clear glass are
     black. `camera`: at the sensor. Finds reflections in mirrors, the view through glass, and most light in rooms, but
     no caustics of small lamps. Only with estimators `auto` and `stack`. `both`: at both, with each path weighted by how
@@ -150,10 +154,10 @@ class Reslrb(AttachingTracer):
     camera paths have the rest. `auto` is then `camera` if no surface is a mirror, clear glass or metal, `both` if the
     sensor sees a mirror or clear glass, and otherwise `light`. Runs that move lamps always use `light`. The default is
     `auto` with estimator `auto`, and `light` with an estimator that you name."""
-    light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), Undecided(0.5)] = 0.5
+    light_share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), Plain(0.5)] = 0.5
     """Fraction of the samples that are light paths, with `paths: both`. With 0 or 1 the code of the other side is not
     compiled."""
-    guiding: Annotated[Literal["auto", "on", "off"], Undecided("off")] = "auto"
+    guiding: Annotated[Literal["auto", "on", "off"], Plain("off")] = "auto"
     """Importance sampling of light paths, learned in earlier steps. `on`: paths start where earlier paths contributed
     to the gradient and the image (at least a quarter start anywhere), and end early where earlier paths contributed
     little. In scenes with glossy surfaces, paths are also aimed at points that the sensor sees. From the second step
@@ -162,13 +166,13 @@ class Reslrb(AttachingTracer):
     and without guiding, before the first iteration, show that it is more efficient. Runs that move geometry or lamps
     are guided only with `paths: both`. The default is `auto` with estimator `auto`, and `off` with an estimator that
     you name."""
-    sequence: Annotated[Literal["auto", "independent", "low_discrepancy"], Undecided("independent")] = "auto"
+    sequence: Annotated[Literal["auto", "independent", "low_discrepancy"], Plain("independent")] = "auto"
     """Random numbers that decide where light paths start and how they first scatter. `low_discrepancy`: spread evenly
     over all paths of a step, and independent between steps. This reduces noise where little else decides where light
     goes, as in a beam through glass, and a little elsewhere. `auto`: `low_discrepancy`, or `independent` if
     paths are guided. The default is `auto` with estimator `auto`, and
     `independent` with an estimator that you name."""
-    pixels: Annotated[Literal["auto", "even", "measured"], Undecided("even")] = "auto"
+    pixels: Annotated[Literal["auto", "even", "measured"], Plain("even")] = "auto"
     """Number of camera paths in each pixel. `even`: the same in all pixels. `measured`: a quarter of the paths is
     spread evenly, and the others go to the pixels whose noise adds most to the noise of the gradient, by the curvature
     of the loss (0 in pixels that a mask leaves out). A few paths through each pixel measure this before the first
@@ -176,7 +180,7 @@ class Reslrb(AttachingTracer):
     get noisier. `auto`: `measured` if there are camera paths, the loss is `l2`, and the measurement takes at most 2 %
     of the samples of the run. The default is `auto` with estimator `auto`, and `even` with an estimator that you
     name."""
-    edges: Annotated[Literal["auto", "on", "off"], Undecided("off")] = "auto"
+    edges: Annotated[Literal["auto", "on", "off"], Plain("off")] = "auto"
     """Whether the derivatives of moving shapes contain their outlines and shadows: the light that edges cover and
     uncover. `on`: a step also samples points on the edges of moving shapes, as lamps, the sensor and other surfaces see
     them. Meshes, rectangles, disks, spheres and cylinders have edges. `auto`: `on` if finite differences before the
@@ -184,10 +188,10 @@ class Reslrb(AttachingTracer):
     `auto` with estimator `auto`, and `off` with an estimator that you name."""
 
     @model_validator(mode="after")
-    def _leave_off(self) -> Self:
-        """Turn off measured options that the user has not set, if the user has named an estimator."""
+    def _leave_plain(self) -> Self:
+        """Give settings their plain values unless the user has set them, if the user has named an estimator."""
         if self.estimator != "auto":  # without assignment, which would mark them as given
-            self.__dict__.update({name: off for name, off in UNDECIDED.items() if name not in self.model_fields_set})
+            self.__dict__.update({name: plain for name, plain in PLAIN.items() if name not in self.model_fields_set})
         return self
 
     @model_validator(mode="after")
@@ -198,19 +202,17 @@ class Reslrb(AttachingTracer):
                 f"`{self.estimator}` needs the connections of light paths, and paths: camera has none; "
                 "remove it, or use stack",
             )
-        if self.light_share != UNDECIDED["light_share"] and self.paths in ("light", "camera"):
+        if self.light_share != PLAIN["light_share"] and self.paths in ("light", "camera"):
             raise located("light_share", f"has no effect with paths: {self.paths}, only with both; remove it")
         for option in sorted(self.idle() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
             raise located(option, f"has no effect with estimator `{self.estimator}`, only with {owners}; remove it")
         return self
 
-    def undecided_off(self) -> Reslrb:
-        """Return these options with estimator `stack` instead of `auto`, and with all measured options turned off."""
-        undecided = {name: off for name, off in UNDECIDED.items() if getattr(self, name) == "auto"}
-        if self.estimator == "auto":
-            undecided["estimator"] = AUTO_ESTIMATOR
-        return self.model_copy(update=undecided) if undecided else self
+    def plain(self) -> ReslrbConfig:
+        """Return these options with the plain value of each setting that is `auto`."""
+        values = {"estimator": AUTO_ESTIMATOR, **PLAIN}
+        return self.model_copy(update={name: plain for name, plain in values.items() if getattr(self, name) == "auto"})
 
     def idle(self) -> set[str]:
         """Return the options that belong only to other estimators."""
@@ -227,19 +229,29 @@ class Reslrb(AttachingTracer):
         return None if self.file is None else code_file(self.file)
 
 
-#: Settings that a run decides if they are `auto`, and their values without a decision, as in Mitsuba's plugin.
-#: `light_share` is never `auto`; measurements of single steps take its value from here.
-UNDECIDED: dict[str, Any] = {
+def traced_paths(paths: str, light_share: float) -> str:
+    """Return the kinds of paths that are traced: `both` with a share of 0 or 1 are paths of one kind."""
+    if paths == "both" and light_share in (0, 1):
+        return "light" if light_share else "camera"
+    return paths
+
+
+#: The plain value of each setting that a run may decide. `light_share` is never `auto`; measurements of single steps
+#: take its value from here.
+PLAIN: dict[str, Any] = {
     name: mark.value
-    for name, setting in Reslrb.model_fields.items()
+    for name, setting in ReslrbConfig.model_fields.items()
     for mark in setting.metadata
-    if isinstance(mark, Undecided)
+    if isinstance(mark, Plain)
 }
 
-#: The possible decisions on each setting that may be `auto`. The first is its value without a decision.
-DECIDABLE: dict[str, tuple[str, ...]] = {
-    name: (off, *(value for value in get_args(Reslrb.model_fields[name].annotation) if value not in ("auto", off)))
-    for name, off in UNDECIDED.items()
+#: The possible decisions on each setting that may be `auto`. The first is its plain value.
+AUTO_VALUES: dict[str, tuple[str, ...]] = {
+    name: (
+        plain,
+        *(value for value in get_args(ReslrbConfig.model_fields[name].annotation) if value not in ("auto", plain)),
+    )
+    for name, plain in PLAIN.items()
     if name != "light_share"
 }
 
@@ -310,7 +322,7 @@ class Own(Integrator, json_schema_extra=NEEDS_TYPE):
 
 
 AnyIntegrator = Annotated[
-    Reslrb | Ptracer | Prb | PrbProjective | WalkAdConfig | TrajectoryConfig | Own, ByType("reslrb")
+    ReslrbConfig | Ptracer | Prb | PrbProjective | WalkAdConfig | TrajectoryConfig | Own, ByType("reslrb")
 ]
 
 

@@ -29,8 +29,7 @@ from reslrb_cli.config.base import (
     located,
     wrong,
 )
-from reslrb_cli.config.integrators import AnyIntegrator, Integrator, Own, passes_obstacle
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.integrators import AnyIntegrator, Integrator, Own, ReslrbConfig, passes_obstacle
 from reslrb_cli.config.optimizers import (
     L2,
     Adam,

@@ -52,7 +52,7 @@ from reslrb_cli.estimators.base import Pass, SurfacePoint, VertexHooks
 from reslrb_cli.estimators.stack import Ring, Stack, StackState, walk_back
 from reslrb_cli.transport.bsdf import Hit, Scattering, evaluate, stays_behind
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import MAY_LACK, Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Numbers, Samples
 from reslrb_cli.transport.walk import (
@@ -237,8 +237,8 @@ class AttachedFrame:
             this, reached = segment_again(p.samples, self.before, ray, pi, numbers, connected, scattered)
             there, following = this.connection, this.next_ray(attached=True)
             seen = connected & there.active
-            delta = p.adjoint.lookup(there.u, seen, p.colours, plan.attached_normalization) * p.scale
-            own = dr.select(seen, delta * there.f * there.rest, 0)
+            delta = p.adjoint.lookup(there.u, seen, p.colours, plan.attached_normalization)
+            own = dr.select(seen, delta * p.scale * there.f * there.rest, 0)
             later = dr.select(scattered, this.scattering.s * B, 0)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             dr.backward_from(dr.dot(P, reached * (own + later)) + dr.select(scattered, moved, 0))
@@ -257,18 +257,15 @@ class AttachedState:
 
 
 class AttachedSweep(VertexHooks):
-    """Forward pass. The pass splats the image and pushes the vertices before number `end`. Paths end at this number.
+    """Forward pass. The pass splats the image if there is one, and pushes the vertices that the ring takes."""
 
-    If `end` is None, the pass pushes all vertices.
-    """
-
-    def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
+    def __init__(self, p: Pass, ring: Ring) -> None:
         super().__init__(p)
-        self.ring, self.end = ring, end
+        self.ring = ring
 
     def start(self, product: Product) -> AttachedState:
         plan = self.p.plan
-        stack = StackState.begin(AttachedFrame.blank(plan), self.ring, mi.Float(1))
+        stack = StackState.empty(AttachedFrame.blank(plan), self.ring, mi.Float(1))
         return AttachedState(stack, Before.start(plan))
 
     def wants(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
@@ -278,7 +275,7 @@ class AttachedSweep(VertexHooks):
         return mi.Bool(True) if self.p.block is not None else self._useful(state, vertex)
 
     def goes_on(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
-        return mi.Bool(True) if self.end is None else state.stack.count < self.end
+        return self.ring.takes(state.stack.count)
 
     def vertex(
         self, state: AttachedState, vertex: Vertex, connection: Connection, scattering: Scattering,
@@ -289,23 +286,21 @@ class AttachedSweep(VertexHooks):
             C = vertex.product.times(connection.c, vertex.depth).scaled(p.scale)
             p.splat(connection.u, C.value(), seen, self.colours)
         here = vertex.active & self._useful(state, vertex)
-        if self.end is not None:
-            here = here & (state.stack.count < self.end)
         frame = AttachedFrame(
             point=SurfacePoint.of(plan, vertex),
             sample_1=scattering.sample_1,
             sample_2=scattering.sample_2,
             prefix=vertex.product.value(),
-            roulette=state.stack.throughput,
+            roulette=state.stack.T,
             connected=dr.select(seen, mi.UInt32(1), 0),
             aperture=[connection.sample] if plan.needs.thin_lens else [],
             before=state.before,
         )
-        stack = state.stack.pushed(frame, self.ring, here, seen)
+        stack = state.stack.push(frame, self.ring, here, seen)
         return AttachedState(stack, Before.of(plan, vertex, scattering))
 
     def survived(self, state: AttachedState, factor: mi.Float) -> AttachedState:
-        return AttachedState(state.stack.scaled(factor), state.before)
+        return AttachedState(state.stack.with_factor(factor), state.before)
 
     def _useful(self, state: AttachedState, vertex: Vertex) -> mi.Bool:
         """Return the lanes in which the vertex, or one before it, depends on a parameter."""
@@ -334,10 +329,10 @@ class AttachedStack(Stack):
         sweep = AttachedSweep(p, ring)
         state: AttachedState = p.walk(sweep)
 
-        def before(end: mi.UInt32) -> StackState:
-            return again.walk(AttachedSweep(again, ring, end), end > 0).stack
+        def retrace(ring: Ring) -> StackState:
+            return again.walk(AttachedSweep(again, ring), ring.takes(mi.UInt32(0))).stack
 
-        return walk_back(p.along(sweep), AttachedFrame.blank(p.plan), ring, state.stack, Adjoint.none(), before)
+        return walk_back(p.along(sweep), AttachedFrame.blank(p.plan), ring, state.stack, Adjoint.none(), retrace)
 
 
 def begins(plan: Plan, vertex: Vertex) -> mi.Bool:
@@ -360,4 +355,4 @@ def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
         objective = dr.dot(adjoint.B, emission.E)
         if plan.moving_emission:
             objective += dr.dot(adjoint.origin, emission.ray.o) + dr.dot(adjoint.direction, emission.ray.d)
-        dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        dr.backward_from(objective, flags=MAY_LACK)

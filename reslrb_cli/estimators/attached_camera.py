@@ -26,6 +26,7 @@ from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.stack import Ring, StackState
 from reslrb_cli.transport.bsdf import EventNumbers, Scattering, scatter
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, next_event_again
+from reslrb_cli.transport.factors import MAY_LACK
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -92,7 +93,7 @@ class AttachedCameraFrame:
             following = hit.si.spawn_ray(scattering.d)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             objective = dr.dot(P, factor * (own + later)) + dr.select(scattered, moved, 0)
-            dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            dr.backward_from(objective, flags=MAY_LACK)
             # A lane without light may compute NaN, which must not reach earlier vertices.
             B = dr.detach(own + later) * self.roulette
             here = connected | scattered | lit
@@ -112,23 +113,20 @@ class AttachedCameraState:
 
 
 class AttachedCameraSweep(CameraHooks):
-    """Forward pass. The pass sums the image and pushes the vertices before number `end`. Paths end at this number.
+    """Forward pass. The pass sums the image if there is one, and pushes the vertices that the ring takes."""
 
-    If `end` is None, the pass pushes all vertices.
-    """
-
-    def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
-        self.p, self.ring, self.end = p, ring, end
+    def __init__(self, p: Pass, ring: Ring) -> None:
+        self.p, self.ring = p, ring
         self.delta = mi.Spectrum(0)  # assigned at the start
 
     def start(self, first: FilmRay) -> AttachedCameraState:
         plan = self.p.plan
         self.delta = self.p.delta(first.u, mi.Bool(True), self.colours) * first.weight
-        stack = StackState.begin(AttachedCameraFrame.blank(plan), self.ring, mi.Float(1))
+        stack = StackState.empty(AttachedCameraFrame.blank(plan), self.ring, mi.Float(1))
         return AttachedCameraState(stack, Before.start(plan), [] if self.p.block is None else [mi.Spectrum(0)])
 
     def goes_on(self, state: AttachedCameraState, vertex: Vertex) -> mi.Bool:
-        return mi.Bool(True) if self.end is None else state.stack.count < self.end
+        return self.ring.takes(state.stack.count)
 
     def vertex(
         self, state: AttachedCameraState, vertex: Vertex, met: MetLight | None, event: NextEvent | None,
@@ -146,22 +144,20 @@ class AttachedCameraSweep(CameraHooks):
         on_surface = vertex.active & vertex.si.is_valid()
         useful = mi.Bool(True) if concerns_emission(plan) else on_surface & begins(plan, vertex)
         here = vertex.active & ((state.stack.count > 0) | useful)
-        if self.end is not None:
-            here = here & (state.stack.count < self.end)
         frame = AttachedCameraFrame(
             point=SurfacePoint.of(plan, vertex),
             sample_1=scattering.sample_1,
             sample_2=scattering.sample_2,
             prefix=self.delta * P,
-            roulette=state.stack.throughput,
+            roulette=state.stack.T,
             met=[] if met is None else [dr.select(met.active, met.weight, 0)],
             scale=[] if event is None else [dr.select(event.active, event.scale, 0)],
             place=[] if event is None else [event.sample],
             leaves=[dr.select(on_surface, mi.UInt32(0), 1)] if plan.needs.environment is not None else [],
             before=state.before,
         )
-        stack = state.stack.pushed(frame, self.ring, here, contributes)
+        stack = state.stack.push(frame, self.ring, here, contributes)
         return AttachedCameraState(stack, Before.of(plan, vertex, scattering, state.before), L)
 
     def survived(self, state: AttachedCameraState, factor: mi.Float) -> AttachedCameraState:
-        return AttachedCameraState(state.stack.scaled(factor), state.before, state.L)
+        return AttachedCameraState(state.stack.with_factor(factor), state.before, state.L)

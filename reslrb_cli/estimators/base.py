@@ -16,10 +16,11 @@ import mitsuba as mi
 
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks
-from reslrb_cli.transport.connection import Connection, stand_in, transmittance
+from reslrb_cli.transport.connection import Connection, stand_in
 from reslrb_cli.transport.emission import Emission, sample_emission
-from reslrb_cli.transport.factors import NO_ZERO, Product, showing
+from reslrb_cli.transport.factors import MAY_LACK, NO_ZERO, Product, showing
 from reslrb_cli.transport.film import AdjointImage, Colours
+from reslrb_cli.transport.masks import transmittance
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
@@ -175,11 +176,12 @@ def differentiate_passage(
         weight = adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), dr.detach(transmission), 0)
         objective = dr.select(hit, weight * transmission, 0)
         # The scene may have masks without differentiated parameters.
-        dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        dr.backward_from(objective, flags=MAY_LACK)
 
     with dr.resume_grad(when=p.plan.differentiate_null):
         on_crossing = differentiate if p.plan.differentiate_null else None
-        return transmittance(p.plan, p.samples.scene, si, depth, replace(connection, active=active), on_crossing).value
+        target = connection.target
+        return transmittance(p.plan, p.samples.scene, si, depth, target, active, on_crossing).value
 
 
 def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:

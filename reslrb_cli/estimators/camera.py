@@ -19,14 +19,12 @@ import mitsuba as mi
 from reslrb_cli.estimators.attached import Adjoint
 from reslrb_cli.estimators.attached_camera import AttachedCameraFrame, AttachedCameraSweep
 from reslrb_cli.estimators.base import STACK_SIZE, Pass, PathAdjoint, differentiate_passage
-from reslrb_cli.estimators.stack import Frame, Ring, StackState, push, walk_back
+from reslrb_cli.estimators.stack import Frame, Ring, StackState, pass_vertex, walk_back
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
+from reslrb_cli.transport.factors import MAY_LACK
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex
-
-#: A differentiated parameter may receive no light.
-_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 class Radiance(CameraHooks):
@@ -65,13 +63,12 @@ class CameraState:
 
 
 class CameraSweep(CameraHooks):
-    """Forward pass of camera paths. The pass sums the image, differentiates radiances, and pushes vertices.
-
-    With `end`, the pass traces paths again, pushes only vertices before number `end`, and ends paths at this number.
+    """Forward pass of camera paths. The pass sums the image, differentiates radiances, and pushes vertices. If the ring
+    has an `end`, the pass only pushes vertices.
     """
 
-    def __init__(self, p: Pass, ring: Ring, end: mi.UInt32 | None = None) -> None:
-        self.p, self.ring, self.end = p, ring, end
+    def __init__(self, p: Pass, ring: Ring) -> None:
+        self.p, self.ring = p, ring
         self.delta = mi.Spectrum(0)  # assigned at the start
 
     def start(self, first: FilmRay) -> CameraState:
@@ -80,7 +77,7 @@ class CameraSweep(CameraHooks):
         return CameraState(stack, [] if self.p.block is None else [mi.Spectrum(0)])
 
     def goes_on(self, state: CameraState, vertex: Vertex) -> mi.Bool:
-        return mi.Bool(True) if self.end is None else state.stack.count < self.end
+        return self.ring.takes(state.stack.count)
 
     def vertex(
         self, state: CameraState, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
@@ -89,9 +86,9 @@ class CameraSweep(CameraHooks):
         found = [] if met is None else [(P.times(met.Le * met.weight, depth), met.active)]
         found += [] if event is None else [(P.times(event.c, depth), event.active)]
         L = [sum((dr.select(active, C.value(), 0) for C, active in found), own) for own in state.L]
-        if self.end is None and plan.differentiate_emission and found:
+        if self.ring.end is None and plan.differentiate_emission and found:
             self._differentiate_emission(vertex, met, event)
-        if self.end is None and plan.differentiate_null and event is not None:
+        if self.ring.end is None and plan.differentiate_null and event is not None:
             C, active = found[-1]
             adjoint = PathAdjoint(dr.select(active, self.delta * C.nonzero, 0), C)
             differentiate_passage(self.p, vertex.si, depth, event, active, adjoint)
@@ -99,16 +96,14 @@ class CameraSweep(CameraHooks):
             return CameraState(state.stack, L)
         stack, delta_r = state.stack, mi.Spectrum(0)
         if met is not None:
-            stack = stack.plus(self.delta * met.Le * met.weight, met.active)
+            stack = stack.with_contribution(self.delta * met.Le * met.weight, met.active)
         if event is not None:
             delta_r = dr.select(event.active, self.delta * event.rest * event.through, 0)
         here = vertex.active & vertex.si.is_valid() & (depth < plan.max_depth) & plan.differentiates(vertex.bsdf)
-        if self.end is not None:
-            here = here & (stack.count < self.end)
-        return CameraState(push(plan, stack, self.ring, here, vertex, scattering, event, delta_r), L)
+        return CameraState(pass_vertex(plan, stack, self.ring, here, vertex, scattering, event, delta_r), L)
 
     def survived(self, state: CameraState, factor: mi.Float) -> CameraState:
-        return CameraState(state.stack.scaled(factor), state.L)
+        return CameraState(state.stack.with_factor(factor), state.L)
 
     def _differentiate_emission(self, vertex: Vertex, met: MetLight | None, event: NextEvent | None) -> None:
         """Add the derivatives at a vertex with respect to the radiance of emitters."""
@@ -122,7 +117,7 @@ class CameraSweep(CameraHooks):
                 towards = dr.detach(event.f * event.through * event.scale)
                 radiance = event.radiance(self.p.samples.scene, vertex.si)
                 objective += dr.select(event.active, weight * towards * radiance, 0)
-            dr.backward_from(objective, flags=_MAY_LACK)
+            dr.backward_from(objective, flags=MAY_LACK)
 
 
 def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
@@ -136,7 +131,7 @@ def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
     if p.block is not None:
         p.splat(first.u, state.L[0] * first.weight, mi.Bool(True), hooks.colours)
 
-    def before(end: mi.UInt32) -> StackState:
-        return camera_walk(p.samples, sweep(again, ring, end), end > 0)[1].stack
+    def retrace(ring: Ring) -> StackState:
+        return camera_walk(p.samples, sweep(again, ring), ring.takes(mi.UInt32(0)))[1].stack
 
-    walk_back(p.along(hooks), form, ring, state.stack, Adjoint.none() if attached else state.stack.since, before)
+    walk_back(p.along(hooks), form, ring, state.stack, Adjoint.none() if attached else state.stack.D, retrace)

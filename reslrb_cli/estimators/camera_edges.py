@@ -42,7 +42,6 @@ from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.camera import Radiance
 from reslrb_cli.estimators.edges import (
     LAMP_EDGES,
-    MAY_LACK,
     OTHER_EDGES,
     PATHS_PER_OUTLINE,
     SENSOR_EDGES,
@@ -63,7 +62,7 @@ from reslrb_cli.transport.camera import FilmRay, camera_walk
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.edges import sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.emission import Emission
-from reslrb_cli.transport.factors import Product, showing
+from reslrb_cli.transport.factors import MAY_LACK, Product, showing
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 

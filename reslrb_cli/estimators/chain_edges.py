@@ -28,14 +28,14 @@ import mitsuba as mi
 from reslrb_cli.estimators.attached import Adjoint
 from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.camera import Radiance
-from reslrb_cli.estimators.edges import AROUND, MAY_LACK, Contribution, edge_samples, for_camera, moved_by, ray_offset
-from reslrb_cli.estimators.stack import Ring, StackState, pop
+from reslrb_cli.estimators.edges import AROUND, Contribution, edge_samples, for_camera, moved_by, ray_offset
+from reslrb_cli.estimators.stack import Ring, StackState, differentiate_frames
 from reslrb_cli.transport.bsdf import EventNumbers, evaluate, scatter
 from reslrb_cli.transport.camera import FilmRay, camera_walk
 from reslrb_cli.transport.chains import MOST_VERTICES, Chain, Chains, LampChains, SensorChains
 from reslrb_cli.transport.edges import pick
 from reslrb_cli.transport.emission import Emission
-from reslrb_cli.transport.factors import Product, showing
+from reslrb_cli.transport.factors import MAY_LACK, Product, showing
 from reslrb_cli.transport.jumps import ChainEdge, random_interval, random_lines, sample_edge
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
@@ -194,11 +194,11 @@ def _stack_of(p: Pass, chains: Chains, edge: ChainEdge, ring: Ring) -> StackStat
         hit, scattering, passes, product = chains.event(chain, active)
         one = Product.one(False, False)
         vertex = Vertex(hit.si, hit.bsdf, chain.ray, chain.pi, chain.count, one, active)
-        stack = stack.pushed(SpecularFrame(SurfacePoint.of(p.plan, vertex), scattering.sample_1), ring, passes, passes)
+        stack = stack.push(SpecularFrame(SurfacePoint.of(p.plan, vertex), scattering.sample_1), ring, passes, passes)
         chain = chains.onward(chain, hit, scattering, passes, product)
         return passes & (chain.count < edge.over.count), chain, stack
 
-    stack = StackState.begin(SpecularFrame.blank(p.plan), ring, mi.Float(1))
+    stack = StackState.empty(SpecularFrame.blank(p.plan), ring, mi.Float(1))
     state = edge.active, chains.start(edge.u, edge.active), stack
     return dr.while_loop(state, lambda active, *_: active, body, label="chain to an edge")[2]
 
@@ -240,4 +240,5 @@ def differentiate_edges_behind_chains(own: Pass) -> None:
     )
     vertices = dr.select(active, edge.over.count, 0)
     own = replace(own, colours=own.samples.film.colours(edge.over.ray.wavelengths))
-    pop(own, SpecularFrame.blank(own.plan), ring, _stack_of(own, chains, edge, ring), vertices, mi.UInt32(0), adjoint)
+    form, stack = SpecularFrame.blank(own.plan), _stack_of(own, chains, edge, ring)
+    differentiate_frames(own, form, ring, stack, vertices, mi.UInt32(0), adjoint)

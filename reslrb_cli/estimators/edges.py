@@ -57,7 +57,7 @@ from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEven
 from reslrb_cli.transport.connection import Connection, shading_correction
 from reslrb_cli.transport.edges import Chances, Outline, sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.emission import Emission
-from reslrb_cli.transport.factors import Product, showing
+from reslrb_cli.transport.factors import MAY_LACK, Product, showing
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
@@ -307,10 +307,6 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
             to_lamp = mi.Ray3f(beside.past.o, outline.view.to_y)  # not from p, which may lie behind a surface
             moved -= _carried(samples, outline.view.emitter, to_lamp, adjoint, active)
         dr.backward_from(moved, flags=MAY_LACK)
-
-
-#: The result depends on no parameter if, for example, no lane is active.
-MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 # ---- Seen from the sensor ----

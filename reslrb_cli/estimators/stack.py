@@ -2,9 +2,9 @@
 vertices on a stack. The walk back visits the vertices in reverse order, and adds their derivatives.
 
 P_j is the throughput before vertex j, so P_1 = E at the first vertex. s_j is the scattering factor and c_j the
-connection factor at vertex j. Each of s_j and c_j is f = bsdf * cos times numbers r without a derivative. delta_j is
-dL/dI at the film position of c_j, times `Pass.scale`. B_j is the contribution of all later connections to the
-objective, per unit of throughput behind s_j. The recursion starts at the last vertex.
+connection factor at vertex j. Each of s_j and c_j is f = bsdf * cos times numbers r without a derivative. The numbers
+of c_j include `Pass.scale`. delta_j is dL/dI at the film position of c_j. B_j is the contribution of all later
+connections to the objective, per unit of throughput behind s_j. The recursion starts at the last vertex.
 
     dS     += P_j [ delta_j dc_j + B_j ds_j ]
     B_{j-1} = delta_j c_j + s_j B_j                      B = 0 behind the last vertex
@@ -29,7 +29,8 @@ one vertex again, and `dr.backward_from` adds their derivatives to the parameter
 
 Only differentiated vertices are pushed. If there are others, the forward pass combines the vertices between two pushed
 vertices. T is the throughput, including roulette, since the last pushed vertex. D is the contribution of all vertices
-since the last pushed vertex, per unit of throughput behind it. Without such gaps, D is 0 and T only has roulette's 1/q.
+since the last pushed vertex, per unit of throughput behind it. If all vertices are pushed, D is 0 and T only has
+roulette's 1/q.
 
     B = (D + T delta_k c_k) + (T s_k) B_k                of the vertex that was pushed before k
 
@@ -130,10 +131,14 @@ def read(stack: list[dr.Local], form: T, place: mi.UInt32) -> T:
 class Ring:
     """Map from vertex numbers to places on the stack. The ring has one extra place with number `size`, which receives
     discarded values.
+
+    `end` is the number of the first vertex that is not pushed, or None to push all. A walk with an `end` traces paths
+    again for one block of vertices.
     """
 
     size: int
     wraps: bool
+    end: mi.UInt32 | None = None
 
     @staticmethod
     def of(plan: Plan, stack_size: int, last: int = 0) -> Ring:
@@ -148,6 +153,10 @@ class Ring:
         """Return the place of a vertex."""
         return number % self.size if self.wraps else number
 
+    def takes(self, number: mi.UInt32) -> mi.Bool:
+        """Return the lanes in which vertex `number` is to be pushed. Paths end at the first other vertex."""
+        return mi.Bool(True) if self.end is None else number < self.end
+
     def bottom(self, count: mi.UInt32) -> mi.UInt32:
         """Return the first vertex that is still on the stack after `count` vertices."""
         return dr.select(count > self.size, count - self.size, 0) if self.wraps else mi.UInt32(0)
@@ -157,82 +166,76 @@ class Ring:
 class StackState:
     """Loop state of the forward pass.
 
-    `count` vertices have been pushed, with the numbers 0 to `count` - 1. The last contribution comes from the vertex
-    with number `needed` - 1, or from vertices behind it that are not pushed. `since` is D behind this vertex.
-    `throughput` is T at the current vertex. T is a Float if all vertices are pushed, because it only has roulette's
-    1/q, which is the same for all channels. `stack` has an array for each member of a frame.
+    `count` vertices have been pushed, with the numbers 0 to `count` - 1. Only the first `useful` of them have a
+    contribution at the vertex or behind it. `D` is D behind the last useful vertex. `T` is T at the current vertex, a
+    Float if all vertices are pushed, because roulette's 1/q is the same for all channels. `stack` has an array for
+    each member of a frame.
     """
 
     stack: list[dr.Local]
     count: mi.UInt32
-    needed: mi.UInt32
-    throughput: mi.Float | mi.Spectrum
-    since: mi.Spectrum
+    useful: mi.UInt32
+    T: mi.Float | mi.Spectrum
+    D: mi.Spectrum
 
     @staticmethod
-    def begin(form: Any, ring: Ring, throughput: mi.Float | mi.Spectrum) -> StackState:
-        """Return an empty stack for frames like `form`. `form` is None if no vertex is ever pushed. `throughput`
-        is 1.
-        """
+    def empty(form: Any, ring: Ring, T: mi.Float | mi.Spectrum) -> StackState:
+        """Return an empty stack for frames like `form`. `form` is None if no vertex is ever pushed. `T` is 1."""
         stack = [] if form is None else allocate(form, ring.size)
-        return StackState(stack, mi.UInt32(0), mi.UInt32(0), throughput, mi.Spectrum(0))
+        return StackState(stack, mi.UInt32(0), mi.UInt32(0), T, mi.Spectrum(0))
 
-    def gap(self) -> mi.Spectrum:
-        """Return D behind the last pushed vertex. It is 0 if that vertex comes after the last contribution."""
-        return dr.select(self.needed == self.count, self.since, 0)
+    def D_here(self) -> mi.Spectrum:
+        """Return D at the current vertex. It is 0 if the last pushed vertex is not useful so far."""
+        return dr.select(self.useful == self.count, self.D, 0)
 
-    def plus(self, value: mi.Spectrum, active: mi.Bool) -> StackState:
-        """Return the state after a contribution in active lanes. `value` is delta times the contribution, per unit of
-        throughput.
+    def with_contribution(self, value: mi.Spectrum, active: mi.Bool) -> StackState:
+        """Return the state after a contribution of a vertex that is not pushed. `value` is delta c_j."""
+        D = dr.select(active, self.D_here() + self.T * value, self.D)
+        return replace(self, useful=dr.select(active, self.count, self.useful), D=D)
+
+    def with_factor(self, factor: mi.Float | mi.Spectrum) -> StackState:
+        """Return the state behind a factor of the path, which multiplies T."""
+        return replace(self, T=self.T * factor)
+
+    def push(self, frame: Any, ring: Ring, here: mi.Bool, contributes: mi.Bool) -> StackState:
+        """Return the state after pushing a vertex in lanes `here`, as far as the ring takes it. In lanes `contributes`,
+        the vertex has its own contribution.
         """
-        since = dr.select(active, self.gap() + self.throughput * value, self.since)
-        return replace(self, needed=dr.select(active, self.count, self.needed), since=since)
-
-    def scaled(self, factor: mi.Float | mi.Spectrum) -> StackState:
-        """Return the state behind a factor of the path, which multiplies the throughput."""
-        return replace(self, throughput=self.throughput * factor)
-
-    def pushed(self, frame: Any, ring: Ring, here: mi.Bool, contributes: mi.Bool) -> StackState:
-        """Return the state after pushing a vertex in lanes `here`. In lanes `contributes`, the vertex has its own
-        contribution.
-        """
+        here = here & ring.takes(self.count)
         place = dr.select(here, ring.place(self.count), ring.size)
         write(self.stack, frame, place, here)
         count, contributes = self.count + dr.select(here, mi.UInt32(1), 0), here & contributes
         return StackState(
             self.stack,
             count,
-            needed=dr.select(contributes, count, self.needed),
-            throughput=dr.select(here, 1, self.throughput),
-            since=dr.select(contributes, 0, self.since),
+            useful=dr.select(contributes, count, self.useful),
+            T=dr.select(here, 1, self.T),
+            D=dr.select(contributes, 0, self.D),
         )
 
 
-def walk_back(
-    p: Pass, form: Any, ring: Ring, state: StackState, adjoint: A, again: Callable[[mi.UInt32], StackState]
-) -> A:
-    """Differentiate the pushed vertices up to the last contribution, from the last to the first. Returns the adjoint
-    before the first vertex.
+def walk_back(p: Pass, form: Any, ring: Ring, state: StackState, adjoint: A, again: Callable[[Ring], StackState]) -> A:
+    """Differentiate the useful vertices from the last to the first. Return the adjoint before the first vertex.
 
     `form` is a frame, such as `Frame.blank`. A frame's `differentiate(p, adjoint)` adds the derivatives of a vertex. It
     takes the adjoint behind the vertex, such as B_k, and returns the adjoint behind the vertex that was pushed before.
 
-    `adjoint` is the adjoint behind the vertex with number `state.needed` - 1. `again(end)` traces the paths again, and
-    pushes the vertices before number `end`. `again` is called only if paths may be longer than the stack.
+    `adjoint` is the adjoint behind the last useful vertex. `again(ring)` traces the paths again up to the ring's `end`.
+    `again` is called only if paths may be longer than the stack.
     """
     if not state.stack:
         return adjoint
     bottom = ring.bottom(state.count)
-    adjoint = pop(p, form, ring, state, state.needed, bottom, adjoint)
+    adjoint = differentiate_frames(p, form, ring, state, state.useful, bottom, adjoint)
     if not ring.wraps:
         return adjoint
 
     def block(left: mi.UInt32, adjoint: A) -> tuple[mi.UInt32, A]:
-        bottom = ring.bottom(left)
-        return bottom, pop(p, form, ring, again(left), left, bottom, adjoint)
+        bottom, retraced = ring.bottom(left), again(replace(ring, end=left))
+        return bottom, differentiate_frames(p, form, ring, retraced, left, bottom, adjoint)
 
     _, adjoint = dr.while_loop(
-        state=(dr.minimum(bottom, state.needed), adjoint),
+        state=(dr.minimum(bottom, state.useful), adjoint),
         cond=lambda left, adjoint: left > 0,
         body=block,
         labels=("left", "adjoint"),
@@ -241,8 +244,10 @@ def walk_back(
     return adjoint
 
 
-def pop(p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, bottom: mi.UInt32, adjoint: A) -> A:
-    """Differentiate the vertices from number top - 1 down to bottom. Traces no ray."""
+def differentiate_frames(
+    p: Pass, form: Any, ring: Ring, state: StackState, top: mi.UInt32, bottom: mi.UInt32, adjoint: A
+) -> A:
+    """Differentiate the vertices on the stack from number top - 1 down to bottom. Traces no ray."""
 
     def body(number: mi.UInt32, adjoint: A, stack: list[dr.Local]) -> tuple[mi.UInt32, A, list[dr.Local]]:
         return number - 1, read(stack, form, ring.place(number - 1)).differentiate(p, adjoint), stack
@@ -287,8 +292,8 @@ class Frame:
     @staticmethod
     def empty_stack(plan: Plan, ring: Ring) -> StackState:
         """Return the state before the first vertex."""
-        throughput = mi.Float(1) if pushes_all(plan) else mi.Spectrum(1)
-        return StackState.begin(Frame.blank(plan) if plan.differentiate_bsdfs else None, ring, throughput)
+        T = mi.Float(1) if pushes_all(plan) else mi.Spectrum(1)
+        return StackState.empty(Frame.blank(plan) if plan.differentiate_bsdfs else None, ring, T)
 
     def differentiate(self, p: Pass, B: mi.Spectrum) -> mi.Spectrum:
         """Add the derivatives of both factors, given B_k (C,). Returns B of the vertex that was pushed before."""
@@ -302,7 +307,7 @@ class Frame:
         return self.own + self.onward * B
 
 
-def push(
+def pass_vertex(
     plan: Plan, state: StackState, ring: Ring, here: mi.Bool, vertex: Vertex, scattering: Scattering,
     connection: Connection | None, delta_r: mi.Spectrum,
 ) -> StackState:  # fmt: skip
@@ -310,25 +315,25 @@ def push(
 
     `delta_r` (C,) is delta_k r_c: delta times the connection without its BSDF, or 0 if the connection does not count.
     """
-    T, P, on = state.throughput, vertex.product.value(), scattering.active
+    T, P, on = state.T, vertex.product.value(), scattering.active
     wo, own, visible = mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False)
     if connection is not None:
         wo, own, visible = connection.wo, delta_r * connection.f, connection.active
     if not state.stack:  # no BSDF is differentiated, so only B_0 is needed
-        return state.plus(own, visible).scaled(scattering.s)
+        return state.with_contribution(own, visible).with_factor(scattering.s)
     frame = Frame(
         point=SurfacePoint.of(plan, vertex),
         wo_c=wo,
         wo_s=scattering.wo,
         adjoint_c=showing(P * delta_r),
         adjoint_s_per_b=dr.select(on, P * (scattering.correction / scattering.pdf), 0),
-        own=state.gap() + T * own,
+        own=state.D_here() + T * own,
         onward=dr.select(on, T * scattering.s, 0),
         lobe=lobe_of(plan, scattering),
     )
     if not pushes_all(plan):
-        state = state.plus(own, visible & ~here).scaled(scattering.s)
-    return state.pushed(frame, ring, here, visible)
+        state = state.with_contribution(own, visible & ~here).with_factor(scattering.s)
+    return state.push(frame, ring, here, visible)
 
 
 def pushes_all(plan: Plan) -> bool:
@@ -344,13 +349,12 @@ class LightSweep(VertexHooks):
 
     - If delta is known beforehand, the only walk.
     - If delta is known after the image, the second walk. `visibility` is the result of the first walk (`Gathering`).
-    - If paths are longer than the stack, another walk for each block. It pushes the vertices before number `end`, and
-        ends there.
+    - If paths are longer than the stack, another walk for each block, up to the `end` of its ring.
     """
 
-    def __init__(self, p: Pass, ring: Ring, visibility: Visibility | None = None, end: mi.UInt32 | None = None) -> None:
+    def __init__(self, p: Pass, ring: Ring, visibility: Visibility | None = None) -> None:
         super().__init__(p)
-        self.ring, self.visibility, self.end = ring, visibility, end
+        self.ring, self.visibility = ring, visibility
 
     def start(self, product: Product) -> StackState:
         return Frame.empty_stack(self.p.plan, self.ring)
@@ -362,9 +366,7 @@ class LightSweep(VertexHooks):
         return None if self.visibility is None else self.visibility.of(vertex.depth, vertices(self.p.plan))
 
     def goes_on(self, state: StackState, vertex: Vertex) -> mi.Bool:
-        if self.end is not None:
-            return state.count < self.end
-        return mi.Bool(True) if self.visibility is None else vertex.depth < self.visibility.last
+        return self.ring.takes(state.count) if self.visibility is None else vertex.depth < self.visibility.last
 
     def vertex(
         self, state: StackState, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
@@ -374,16 +376,14 @@ class LightSweep(VertexHooks):
         p.splat(connection.u, C.value(), visible, self.colours)
         delta = p.delta(connection.u, visible, self.colours)
         here = vertex.active & plan.differentiates(vertex.bsdf)
-        if self.end is not None:
-            here = here & (state.count < self.end)
-        elif plan.differentiate_null:
+        if self.ring.end is None and plan.differentiate_null:
             own = PathAdjoint(dr.select(visible, delta * C.nonzero, 0), C)
             differentiate_passage(p, vertex.si, vertex.depth, connection, visible, own)
         delta_r = dr.select(visible, delta * p.scale * connection.rest * connection.through, 0)
-        return push(plan, state, self.ring, here, vertex, scattering, connection, delta_r)
+        return pass_vertex(plan, state, self.ring, here, vertex, scattering, connection, delta_r)
 
     def survived(self, state: StackState, factor: mi.Float) -> StackState:
-        return state.scaled(factor)
+        return state.with_factor(factor)
 
 
 class Stack(Estimator):
@@ -419,7 +419,7 @@ class Stack(Estimator):
         sweep = LightSweep(p, ring, visibility)
         state: StackState = p.walk(sweep, active)
 
-        def before(end: mi.UInt32) -> StackState:
-            return again.walk(LightSweep(again, ring, end=end), end > 0)
+        def retrace(ring: Ring) -> StackState:
+            return again.walk(LightSweep(again, ring), ring.takes(mi.UInt32(0)))
 
-        return walk_back(p.along(sweep), Frame.blank(p.plan), ring, state, state.since, before)
+        return walk_back(p.along(sweep), Frame.blank(p.plan), ring, state, state.D, retrace)

@@ -21,8 +21,8 @@ Because most cells are underestimated, each cell is averaged with the larger cub
 weight of LEAN rays. Each cube is in turn averaged with the next larger cube, up to the whole scene. Every cell's m / c
 is at least FLOOR times the scene's m / c.
 
-`Hearing`: contributions of light paths to gradient and image, for each cell in which paths start. A separate walk with
-its own random numbers computes the contributions, for each path and each differentiated BSDF.
+`Collecting`: contributions of light paths to gradient and image, for each cell in which paths start. A separate walk
+with its own random numbers computes the contributions, for each path and each differentiated BSDF.
 
     G = sum_i delta_i C_i n_i        n_i: number of factors of C_i from this BSDF
 
@@ -65,24 +65,24 @@ class Trail:
     beyond the last place.
     """
 
-    said: list[dr.Local]
+    parts: list[dr.Local]
     left: list[dr.Local]
     roulette: list[dr.Local]
     count: mi.UInt32  # vertices so far
     later: list[mi.Spectrum | mi.Float]
 
     @staticmethod
-    def begin(voices: int) -> Trail:
-        """Return an empty trail for `voices` quantities and the image."""
-        later = [*(mi.Spectrum(0) for _ in range(voices)), mi.Float(0)]
-        said, left = allocate(later, PLACES), allocate([mi.UInt32(0), mi.Float(0)], PLACES)
-        return Trail(said, left, allocate([mi.Float(0)], PLACES), mi.UInt32(0), later)
+    def begin(number: int) -> Trail:
+        """Return an empty trail for `number` quantities and the image."""
+        later = [*(mi.Spectrum(0) for _ in range(number)), mi.Float(0)]
+        parts, left = allocate(later, PLACES), allocate([mi.UInt32(0), mi.Float(0)], PLACES)
+        return Trail(parts, left, allocate([mi.Float(0)], PLACES), mi.UInt32(0), later)
 
-    def with_vertex(self, said: list[mi.Spectrum | mi.Float]) -> Trail:
+    def with_vertex(self, parts: list[mi.Spectrum | mi.Float]) -> Trail:
         """Return the trail with one more vertex and its contributions. The contribution to the image comes last."""
         fits, place = self._place(self.count)
-        write(self.said, said, place, fits)
-        later = [a + dr.select(fits, 0, part) for a, part in zip(self.later, said, strict=True)]
+        write(self.parts, parts, place, fits)
+        later = [a + dr.select(fits, 0, part) for a, part in zip(self.later, parts, strict=True)]
         return replace(self, count=self.count + 1, later=later)
 
     def leaves(self, cell: mi.UInt32, inverse: mi.Float) -> None:
@@ -101,8 +101,8 @@ class Trail:
         return fits, dr.select(fits, number, PLACES)
 
 
-def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Return the later contributions of all paths in the form of `Said`. Values that are not finite do not count.
+def later_contributions(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Return the later contributions of all paths in the form of `Collected`. Values that are not finite do not count.
 
     Roulette divides the weight of surviving paths by q. To undo the roulette weight, the walk back multiplies the
     squared contribution by q. The walk back also divides the number of vertices by q. With this correction, the means
@@ -119,18 +119,18 @@ def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
         leaves, q = inverse > 0, dr.rcp(weight)
         parts, image = after[:-1], after[-1]
         still = [*(dr.squared_norm(part * inverse) for part in parts), image * dr.square(inverse)]
-        for voice, square in enumerate(still):
-            add(squares, square * q, cell + voice * CELLS, leaves)
+        for k, square in enumerate(still):
+            add(squares, square * q, cell + k * CELLS, leaves)
         add(followed, mi.Float(trail.count - height) * weight, cell, leaves)
         add(left, mi.Float(1), cell, leaves)
-        return place, [still + array.read(place) for still, array in zip(after, trail.said, strict=True)], trail
+        return place, [still + array.read(place) for still, array in zip(after, trail.parts, strict=True)], trail
 
     dr.while_loop(
         state=(dr.minimum(trail.count, PLACES), trail.later, trail),
         cond=lambda height, after, trail: height > 0,
         body=body,
         labels=("height", "after", "trail"),
-        label="walk back over what is heard",
+        label="walk back over contributions",
     )
     return squares, followed, left
 
@@ -161,21 +161,21 @@ class Onward:
         """Return the state before the first walk."""
         return Onward(np.asarray(box, np.float32), np.zeros((4, CELLS), np.float32))
 
-    def with_more(self, said: Said, paths: int) -> Onward:
+    def with_more(self, collected: Collected, paths: int) -> Onward:
         """Return the state after one more walk of `paths` paths. All quantities of the gradient have equal weights, and
         the image is last.
 
         A walk without contributions to gradient or image adds nothing.
         """
-        *means, light, count = np.array(said.whole, np.float64).reshape(-1, BINS).sum(1) / paths
+        *means, light, count = np.array(collected.whole, np.float64).reshape(-1, BINS).sum(1) / paths
         contributions, light, length = np.array(means), float(light), 1 + float(count)
-        heard = np.isfinite(contributions) & (contributions > 0)
-        if not (heard[:-1].any() and heard[-1] and np.isfinite(light) and light > 0):
+        known = np.isfinite(contributions) & (contributions > 0)
+        if not (known[:-1].any() and known[-1] and np.isfinite(light) and light > 0):
             return self
-        squares = np.array(said.squares).reshape(-1, CELLS)
-        unit = np.divide(light**2, contributions, out=np.zeros(len(heard)), where=heard)
-        gradient = unit[:-1] @ squares[:-1] / heard[:-1].sum()
-        newest = np.stack([gradient, unit[-1] * squares[-1], np.array(said.followed), np.array(said.left)])
+        squares = np.array(collected.squares).reshape(-1, CELLS)
+        unit = np.divide(light**2, contributions, out=np.zeros(len(known)), where=known)
+        gradient = unit[:-1] @ squares[:-1] / known[:-1].sum()
+        newest = np.stack([gradient, unit[-1] * squares[-1], np.array(collected.followed), np.array(collected.left)])
         old = KEEP if self.light > 0 else 0.0
         light, length = (old * a + (1 - old) * b for a, b in ((self.light, light), (self.length, length)))
         return Onward(self.box, (KEEP * self.sums + newest).astype(np.float32), light, length)
@@ -258,7 +258,7 @@ def meets(group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
     return dr.select(met, mi.UInt32(1), 0)
 
 
-def voices(plan: Plan) -> int:
+def quantities(plan: Plan) -> int:
     """Return the number of separate quantities: groups of BSDFs, emission, moving parameters, and the image. The image
     comes last.
     """
@@ -266,7 +266,7 @@ def voices(plan: Plan) -> int:
 
 
 @dataclass
-class Heard:
+class PathSums:
     """Loop state of the hooks.
 
     `counts` tells how often the path met each group's BSDFs. `sums` are G (C,) of groups, emission and moving
@@ -281,46 +281,46 @@ class Heard:
     factor: list[mi.Float]  # r of the vertex, if paths are aimed
 
 
-class Hearing(Hooks):
-    """Hooks that sum the contributions of each path. dL/dI is multiplied by `loudness`, which is the reciprocal of the
-    largest |dL/dI|. Contributions are not divided by the number of paths.
+class Collecting(Hooks):
+    """Hooks that sum the contributions of each path. dL/dI is multiplied by `unit_scale`, which is the reciprocal of
+    the largest |dL/dI|. Contributions are not divided by the number of paths.
     """
 
-    def __init__(self, samples: Samples, adjoint: AdjointImage, loudness: mi.Float) -> None:
-        self.samples, self.adjoint, self.loudness = samples, adjoint, loudness
+    def __init__(self, samples: Samples, adjoint: AdjointImage, unit_scale: mi.Float) -> None:
+        self.samples, self.adjoint, self.unit_scale = samples, adjoint, unit_scale
         self.groups = bsdf_groups(samples.plan)
         assert samples.guide is not None
         self.survival = samples.guide.table.survival
         self.film = film_blocks(samples.sensor) if samples.plan.aimed else None
         # Squares by group and block of the film, if paths are aimed.
-        self.places = [dr.zeros(mi.Float, voices(samples.plan) * self.film.count)] if self.film else []
+        self.places = [dr.zeros(mi.Float, quantities(samples.plan) * self.film.count)] if self.film else []
 
-    def start(self, product: Product) -> Heard:
-        number, factor = voices(self.samples.plan) - 1, [mi.Float(1)] if self.film else []
+    def start(self, product: Product) -> PathSums:
+        number, factor = quantities(self.samples.plan) - 1, [mi.Float(1)] if self.film else []
         counts, sums = [mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)]
         light = dr.max(dr.abs(self.colours.seen(product.magnitude())))
-        return Heard(counts, sums, mi.Float(0), light, Trail.begin(number), factor)
+        return PathSums(counts, sums, mi.Float(0), light, Trail.begin(number), factor)
 
     def vertex(
-        self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
-    ) -> Heard:  # fmt: skip
+        self, state: PathSums, vertex: Vertex, connection: Connection, scattering: Scattering, numbers: list[mi.Float]
+    ) -> PathSums:  # fmt: skip
         plan, active = self.samples.plan, connection.active
         C = vertex.product.times(connection.c, vertex.depth)
-        said = self.adjoint.lookup(connection.u, active, self.colours) * self.loudness * C.magnitude()
-        said = dr.select(active, said, 0)
+        contribution = self.adjoint.lookup(connection.u, active, self.colours) * self.unit_scale * C.magnitude()
+        contribution = dr.select(active, contribution, 0)
         met = [meets(group, vertex) for group in self.groups]
-        parts = [said * mi.Float(count + here) for count, here in zip(state.counts, met, strict=True)]
+        parts = [contribution * mi.Float(count + here) for count, here in zip(state.counts, met, strict=True)]
         if plan.differentiate_emission:
-            parts.append(said)
+            parts.append(contribution)
         if plan.attached:
-            parts.append(dr.abs(said))
+            parts.append(dr.abs(contribution))
         image = dr.squared_norm(dr.select(active, self.colours.seen(C.value()), 0))
         for r in state.factor:
             assert self.film is not None
             block = self.film.block(connection.u)
-            for voice, square in enumerate([*(dr.squared_norm(part) for part in parts), image]):
+            for k, square in enumerate([*(dr.squared_norm(part) for part in parts), image]):
                 valid = active & dr.isfinite(square) & (square > 0) & (r > 0)
-                place = block + voice * self.film.count
+                place = block + k * self.film.count
                 dr.scatter_reduce(dr.ReduceOp.Add, self.places[0], square / r, place, valid)
         sums = [total + part for total, part in zip(state.sums, parts, strict=True)]
         trail = state.trail.with_vertex([*parts, image])
@@ -332,26 +332,26 @@ class Hearing(Hooks):
         trail.leaves(self.survival.cell(vertex.si.p, scattering.d), inverse)
         return replace(state, counts=counts, sums=sums, image=state.image + image, trail=trail)
 
-    def aimed(self, state: Heard, factor: mi.Float) -> Heard:
+    def aimed(self, state: PathSums, factor: mi.Float) -> PathSums:
         # Leave out the weight of a roulette that is being learned from.
         return replace(state, factor=[factor])
 
-    def survived(self, state: Heard, factor: mi.Float) -> Heard:
+    def survived(self, state: PathSums, factor: mi.Float) -> PathSums:
         state.trail.survives(factor)
         return state
 
 
 @dataclass
-class Said:
+class Collected:
     """Evaluated contributions of guided samples: sums over paths.
 
-    - `starts` (voices * cells) has squared contributions for each quantity and each cell in which paths start. The
+    - `starts` (quantities * cells) has squared contributions for each quantity and each cell in which paths start. The
         image is the last quantity.
-    - `squares` (voices * CELLS) has squared later contributions at throughput 1, for each cell of a ray that leaves a
-        vertex. `followed` counts later vertices, and `left` (CELLS) counts rays.
+    - `squares` (quantities * CELLS) has squared later contributions at throughput 1, for each cell of a ray that leaves
+        a vertex. `followed` counts later vertices, and `left` (CELLS) counts rays.
     - `whole` (rows * BINS) has the squared contributions for each quantity, the weights of paths at the emitter, and
         the paths' vertex counts.
-    - `places` (voices * blocks, or empty) has squared contributions for each block of the film. The values are
+    - `places` (quantities * blocks, or empty) has squared contributions for each block of the film. The values are
         corrected to paths without aiming.
     """
 
@@ -363,33 +363,33 @@ class Said:
     places: list[mi.Float]
 
 
-def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
+def collect(samples: Samples, gradient: mi.TensorXf) -> Collected:
     """Return the contributions of guided samples. `gradient` (H, W, C) is dL/dI. Values that are not finite are left
     out.
     """
     plan, adjoint = samples.plan, samples.film.adjoint(gradient)
     assert plan.grid is not None
-    loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
-    loudness = dr.select(loudest > 0, dr.rcp(loudest), 0)
-    dr.make_opaque(loudness)
-    hooks = Hearing(samples, adjoint, loudness)
-    heard: Heard = walk(samples, hooks)
+    largest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
+    unit_scale = dr.select(largest > 0, dr.rcp(largest), 0)
+    dr.make_opaque(unit_scale)
+    hooks = Collecting(samples, adjoint, unit_scale)
+    found: PathSums = walk(samples, hooks)
     sampler = samples.sampler()
     samples.time(sampler.next_1d)
     drawn = samples.drawn(*samples.emission_numbers(sampler))  # the numbers that the walk used
     assert drawn is not None
-    squares = [dr.squared_norm(total) for total in heard.sums] + [heard.image]
+    squares = [dr.squared_norm(total) for total in found.sums] + [found.image]
     cells = plan.grid.cells
     sums = dr.zeros(mi.Float, len(squares) * cells)
-    for voice, square in enumerate(squares):
+    for k, square in enumerate(squares):
         value = square / dr.square(drawn.weight)
         counts = dr.isfinite(value) & (value > 0)
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, counts)
-    rows = [*squares, heard.light, mi.Float(heard.trail.count)]
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + k * cells, counts)
+    rows = [*squares, found.light, mi.Float(found.trail.count)]
     whole, lane = dr.zeros(mi.Float, len(rows) * BINS), dr.arange(mi.UInt32, samples.width) % BINS
     for number, value in enumerate(rows):
         dr.scatter_reduce(dr.ReduceOp.Add, whole, value, lane + number * BINS, dr.isfinite(value))
     # One kernel: a later evaluation would trace everything again.
-    said = Said(sums, *walk_back(heard.trail), whole, hooks.places)
-    dr.eval(said)
-    return said
+    result = Collected(sums, *later_contributions(found.trail), whole, hooks.places)
+    dr.eval(result)
+    return result

@@ -36,7 +36,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.guiding.collect import KEEP, NAMES, Onward, Said
+from reslrb_cli.guiding.collect import KEEP, NAMES, Collected, Onward
 from reslrb_cli.transport.aim import AIM_SLOTS, BLOCKS, Aim, Blocks
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.factors import CELLS, Survival, box_of
@@ -127,32 +127,32 @@ class Learned:
         return Learned(np.zeros((2, grid.cells), np.float32), np.zeros(grid.cells, np.float32))
 
     def with_more(
-        self, grid: Grid, heard: Array, draws: Array, onward: Onward | None = None, film: Array | None = None
+        self, grid: Grid, newer: Array, draws: Array, onward: Onward | None = None, film: Array | None = None
     ) -> Learned:
         """Return the state after newer paths.
 
-        `heard` (voices, cells) holds the contributions of the newer paths, with the image last. `draws` (cells) holds
-        the number of newer paths per cell. Each quantity is scaled to a total of 1. `onward` already includes the newer
-        paths.
+        `newer` (quantities, cells) holds the contributions of the newer paths, with the image last. `draws` (cells)
+        holds the number of newer paths per cell. Each quantity is scaled to a total of 1. `onward` already includes the
+        newer paths.
         """
         sums = np.float32(KEEP) * self.sums
         means = np.zeros(grid.cells, np.float32)
         np.divide(grid.measures(), draws, out=means, where=draws > 0, casting="same_kind")
-        guided = _add(sums, heard, means)
+        guided = _add(sums, newer, means)
         started = np.float32(KEEP) * self.draws
         started += draws
         worse = float(draws.sum() * np.mean(guided)) if guided else 1.0
         return Learned(sums, started, self.calls, onward, self._places(film), worse)
 
-    def _places(self, heard: Array | None) -> Array:
-        """Return `film`, updated with the newer contributions to each block (voices, blocks). The last row belongs to
-        the image.
+    def _places(self, newer: Array | None) -> Array:
+        """Return `film`, updated with the newer contributions to each block (quantities, blocks). The last row belongs
+        to the image.
         """
-        if heard is None:
+        if newer is None:
             return self.film
-        shape = 2, heard.shape[1]
+        shape = 2, newer.shape[1]
         film = np.float32(KEEP) * self.film if self.film.shape == shape else np.zeros(shape, np.float32)
-        _add(film, heard, np.ones(shape[1], np.float32))
+        _add(film, newer, np.ones(shape[1], np.float32))
         return film
 
     def on(self, grid: Grid, before: Grid) -> Learned:
@@ -178,28 +178,28 @@ class Learned:
         measures, found = coarser.measures().astype(np.float32), []
         draws = _blurred(coarser, grid.summed(self.draws, coarser))
         for row in self.sums:
-            square, loud = _blurred(coarser, grid.summed(row, coarser)), np.zeros(coarser.cells, np.float32)
-            np.divide(square, draws, out=loud, where=draws > 0)
-            np.sqrt(loud, out=loud)
-            loud *= measures
-            total = loud.sum()
-            found.append(loud / total if np.isfinite(total) and total > 0 else measures / measures.sum())
+            square, density = _blurred(coarser, grid.summed(row, coarser)), np.zeros(coarser.cells, np.float32)
+            np.divide(square, draws, out=density, where=draws > 0)
+            np.sqrt(density, out=density)
+            density *= measures
+            total = density.sum()
+            found.append(density / total if np.isfinite(total) and total > 0 else measures / measures.sum())
         return coarser, found
 
 
-def _add(sums: Array, heard: Array, means: Array) -> list[float]:
-    """Add the contributions `heard` (voices, n) to `sums` (2, n). The last row of `heard` belongs to the image. Each
-    quantity is first scaled to a total of 1.
+def _add(sums: Array, newer: Array, means: Array) -> list[float]:
+    """Add the contributions `newer` (quantities, n) to `sums` (2, n). The last row of `newer` belongs to the image.
+    Each quantity is first scaled to a total of 1.
 
     `means` (n) holds the weight of each place in a quantity's total. Returns the mean of `means` for each quantity. A
     quantity without a finite total is left out.
     """
     found = []
-    for voice, said in enumerate(heard.astype(np.float32, copy=False)):
-        total = said @ means
+    for k, row in enumerate(newer.astype(np.float32, copy=False)):
+        total = row @ means
         if np.isfinite(total) and total > 0:
-            sums[int(voice == len(heard) - 1)] += said / total
-            found.append(float(said @ np.square(means)) / float(total))
+            sums[int(k == len(newer) - 1)] += row / total
+            found.append(float(row @ np.square(means)) / float(total))
     return found
 
 
@@ -345,10 +345,10 @@ class Guiding:
         """
         if number not in self.films:
             return None
-        film, said = self.films[number], np.zeros((2, 0)) if learned is None else learned.film
+        film, sums = self.films[number], np.zeros((2, 0)) if learned is None else learned.film
         even = film.areas() / film.areas().sum()
-        loud = list(np.sqrt(said, dtype=np.float64)) if said.shape == (2, film.count) else [even, even]
-        gradient, image = (_shares(row, even) for row in loud)
+        rows = list(np.sqrt(sums, dtype=np.float64)) if sums.shape == (2, film.count) else [even, even]
+        gradient, image = (_shares(row, even) for row in rows)
         if delta is not None:
             gradient = (1 - NOW) * gradient + NOW * _shares(film.root_means(delta), even)
         return Aim.of(film, purpose.value * gradient + (1 - purpose.value) * image)
@@ -409,7 +409,7 @@ class Guiding:
             learned.calls = calls
         return learned is None or learns_after(calls)
 
-    def learn(self, number: int, paths: int, said: Said) -> None:
+    def learn(self, number: int, paths: int, collected: Collected) -> None:
         """Update a sensor's table with the contributions of `paths` paths (`collect.py`).
 
         These paths are drawn from the table for BOTH, and are used for nothing else.
@@ -420,10 +420,10 @@ class Guiding:
         if before is None:
             before = Learned.nothing(self.grid)
             before.calls = 1
-        onward = self._onward(number).with_more(said, paths)
-        heard, draws = np.array(said.starts).reshape(-1, self.grid.cells), paths * (counts / self.grid.slots)
-        film = np.array(said.places[0]).reshape(len(heard), -1) if said.places else None
-        learned = before.with_more(self.grid, heard, draws, onward, film)
+        onward = self._onward(number).with_more(collected, paths)
+        newer, draws = np.array(collected.starts).reshape(-1, self.grid.cells), paths * (counts / self.grid.slots)
+        film = np.array(collected.places[0]).reshape(len(newer), -1) if collected.places else None
+        learned = before.with_more(self.grid, newer, draws, onward, film)
         if learned.worse > WRONG and learned.calls % EVERY == 0:
             learned.calls = 0  # the scene has changed, so it learns as often as at the start
         self.learned[number] = learned

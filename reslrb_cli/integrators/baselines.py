@@ -16,14 +16,14 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.camera import splat_camera_paths
-from reslrb_cli.integrators.plans import Motion, SamplingOptions
+from reslrb_cli.integrators.plans import AttachedOptions, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import MAY_LACK, Product
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.lamp_light import moving_splats
 from reslrb_cli.transport.samples import Samples, in_passes
@@ -106,10 +106,6 @@ class Projective(Replayed):
         return None
 
 
-#: A differentiated parameter may receive no light.
-_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
-
-
 class NaiveAD(Replayed):
     """Integrator, such as `ptracer`, that is differentiated through the whole computation graph of its image.
 
@@ -125,7 +121,7 @@ class NaiveAD(Replayed):
             with _no_word_of_signals():
                 image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
             # If none of a few paths hits anything, evaluated loops end before the image depends on a parameter.
-            dr.backward_from(image * derivative(dr.detach(image)), flags=_MAY_LACK)
+            dr.backward_from(image * derivative(dr.detach(image)), flags=MAY_LACK)
         return dr.detach(image)
 
 
@@ -162,7 +158,7 @@ class WalkAd(LightTracer):
     ) -> None:  # fmt: skip
         """Make the integrator. If `attached`, rays and film positions also have derivatives."""
         sampling = SamplingOptions(paths=paths, light_share=light_share)
-        super().__init__(motion=Motion(attached, filter_normalization), sampling=sampling, **common)
+        super().__init__(motion=AttachedOptions(attached, filter_normalization), sampling=sampling, **common)
 
     def graph(self, job: Job) -> mi.TensorXf:
         """Return the image (H, W, C) with its whole graph. Call it with enabled gradients."""
@@ -176,7 +172,7 @@ class WalkAd(LightTracer):
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         with dr.resume_grad(), dr.isolate_grad():
             image = self.graph(job)
-            dr.backward_from(image * derivative(dr.detach(image)), flags=_MAY_LACK)
+            dr.backward_from(image * derivative(dr.detach(image)), flags=MAY_LACK)
         return dr.detach(image)
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -216,7 +212,7 @@ class Trajectory(LightTracer):
     """
 
     def __init__(self, max_depth: int = -1, **common: Any) -> None:
-        super().__init__(max_depth, motion=Motion(attached=False), **common)
+        super().__init__(max_depth, motion=AttachedOptions(attached=False), **common)
         if max_depth == -1:
             raise ValueError('"max_depth" is missing: it is the size of the record')
 
@@ -234,6 +230,6 @@ class Trajectory(LightTracer):
                 with dr.isolate_grad():  # as in `backward_stored`; without it, the derivatives of textures are lost
                     differentiate_visible_emission(part, adjoint)
                     with dr.resume_grad():
-                        dr.backward_from(walk(part, RecordedObjective(part, adjoint)), flags=_MAY_LACK)
+                        dr.backward_from(walk(part, RecordedObjective(part, adjoint)), flags=MAY_LACK)
 
             in_passes(parts, differentiate, None, job.params)

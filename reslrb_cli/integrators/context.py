@@ -22,8 +22,8 @@ from reslrb_cli.guiding.collect import bsdf_groups
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.integrators.plans import (
+    AttachedOptions,
     Differentiated,
-    Motion,
     SamplingOptions,
     attach,
     bounces,
@@ -38,7 +38,7 @@ from reslrb_cli.scene.upsampling import values_of
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
-from reslrb_cli.transport.film import PixelShares
+from reslrb_cli.transport.pixel_shares import PixelShares
 from reslrb_cli.transport.plan import Plan, make_plan
 from reslrb_cli.transport.samples import Samples, passes, tracked_values
 from reslrb_cli.transport.sobol import make_coordinates
@@ -164,7 +164,7 @@ class Preparation:
     """Options of a light tracer, and facts about the last scene."""
 
     def __init__(
-        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, sampling: SamplingOptions
+        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: AttachedOptions, sampling: SamplingOptions
     ) -> None:  # fmt: skip
         self.sampling = sampling
         self.guiding = Guiding() if "guiding" in sampling.on else None

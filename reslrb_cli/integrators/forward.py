@@ -15,10 +15,11 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.attached import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
-from reslrb_cli.transport.connection import Connection, before_lamps, forward_derivatives, passage, transmittance
+from reslrb_cli.transport.connection import Connection, before_lamps, passage
 from reslrb_cli.transport.emission import primary_ray, sample_emission, visible_tangent
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.lamp_light import small_splat
+from reslrb_cli.transport.masks import forward_derivatives, transmittance
 from reslrb_cli.transport.samples import Numbers, Samples, in_passes
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
@@ -169,8 +170,8 @@ def tangent_of_passage(
     plan = samples.plan
     if not plan.needs.has_null:
         return *passage(plan, samples.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
-    seen = replace(connection, active=before_lamps(plan, samples.scene, vertex.si, connection.active))
-    passed = transmittance(plan, samples.scene, vertex.si, vertex.depth, seen, tangents=True)
+    active = before_lamps(plan, samples.scene, vertex.si, connection.active)
+    passed = transmittance(plan, samples.scene, vertex.si, vertex.depth, connection.target, active, tangents=True)
     return passed.reached, passed.value, passed.tangent[0]
 
 

@@ -1,10 +1,10 @@
 """Options of a light tracer, differentiated parameters, and the features of a plan that both need (`scene_rows`).
 `autotune/sampling.py` has the features that a run decides.
 
-`SamplingOptions` has the choice of paths. `Motion` has the options of attached derivatives, and `attach` adds them to a
-plan. The values `follow` and `stay` of `attached_sampling` (`estimators/attached.py`) differ only if a nonspecular
-surface scatters moving light to another visible surface. `bounces` tests whether this happens. In a caustic of few
-segments, moving light does not bounce, because paths end where light first lands.
+`SamplingOptions` has the choice of paths. `AttachedOptions` has the options of attached derivatives, and `attach` adds
+them to a plan. The values `follow` and `stay` of `attached_sampling` (`estimators/attached.py`) differ only if a
+nonspecular surface scatters moving light to another visible surface. `bounces` tests whether this happens. In a caustic
+of few segments, moving light does not bounce, because paths end where light first lands.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from reslrb_cli.config.integrators import UNDECIDED
+from reslrb_cli.config.integrators import PLAIN, traced_paths
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.scene.catalog import entry_value, parameter_kind
 from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
 from reslrb_cli.scene.dispersion import bends_light
-from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals, look_up
+from reslrb_cli.scene.graph import SceneGraph, interpolates_normals, look_up
+from reslrb_cli.scene.rays import emitted_rays
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_emission
@@ -122,7 +123,7 @@ class Differentiated:
 
 
 @dataclass(frozen=True)
-class Motion:
+class AttachedOptions:
     """Options of attached derivatives.
 
     `attached` is true, false, or `auto` (true if a parameter moves anything). `filter_normalization` is `attached` or
@@ -148,8 +149,8 @@ class SamplingOptions:
 
     - `paths` are light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
         only one kind of paths remains.
-    - `chosen` has the values of the other settings that a run may decide (`DECIDABLE`). A setting without an entry has
-        its value in `UNDECIDED`. Camera paths alone are never guided.
+    - `chosen` has the values of the other settings that a run may decide (`AUTO_VALUES`). A setting without an entry is
+        plain. Camera paths alone are never guided.
     - If `whole` is true, images of light paths alone have the same film border as images with camera paths.
     - `given` are distributions (H, W) of camera paths over the pixels by sensor, for all scenes with the same sensors.
         Other distributions are stored for each scene and its parameters.
@@ -167,17 +168,15 @@ class SamplingOptions:
         one_of("paths", self.paths, ("light", "camera", "both"))
         if not 0 <= self.light_share <= 1:
             raise ValueError(f'"light_share" must lie in [0, 1], not {self.light_share}')
-        paths = self.paths
-        if paths == "both" and self.light_share in (0, 1):
-            paths = "light" if self.light_share else "camera"
+        paths = traced_paths(self.paths, self.light_share)
         chosen = {**self.chosen, "guiding": "off"} if paths == "camera" else self.chosen  # no table has its starts
         for name, value in {"paths": paths, "whole": self.whole or paths != "light", "chosen": chosen}.items():
             object.__setattr__(self, name, value)
 
     @property
     def on(self) -> frozenset[str]:
-        """Settings in `chosen` with another value than in `UNDECIDED`, as for `Plan.on`."""
-        return frozenset(name for name, value in self.chosen.items() if value != UNDECIDED[name])
+        """Settings in `chosen` that are not plain, as for `Plan.on`."""
+        return frozenset(name for name, value in self.chosen.items() if value != PLAIN[name])
 
 
 def set_up(scene: mi.Scene) -> None:
@@ -204,7 +203,7 @@ def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bo
     return (True, False) if sampling == "stay" else (not all(glossy), any(glossy))
 
 
-def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
+def attach(plan: Plan, which: Differentiated, motion: AttachedOptions, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
     """Return the plan with attached derivatives if requested. Raises UnsupportedScene if attached derivatives are
     requested but do not exist.
     """

@@ -14,13 +14,13 @@ import mitsuba as mi
 
 from reslrb_cli.backend.llvm import loaded_fault
 from reslrb_cli.backend.variant import check_variant, works_under
-from reslrb_cli.config.integrators import DECIDABLE, UNDECIDED
+from reslrb_cli.config.integrators import AUTO_VALUES, PLAIN
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import Trajectory, WalkAd
 from reslrb_cli.integrators.context import resolve_sensor
 from reslrb_cli.integrators.own import OwnIntegrator
-from reslrb_cli.integrators.plans import Motion, SamplingOptions
+from reslrb_cli.integrators.plans import AttachedOptions, SamplingOptions
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.integrators.step import interface_of
@@ -38,7 +38,7 @@ OPTIONS: dict[str, Any] = {
     "attached": "auto",
     "filter_normalization": "attached",
     "attached_sampling": "auto",
-    **UNDECIDED,
+    **PLAIN,
 }
 
 
@@ -112,10 +112,10 @@ def make_reslrb(**given: Any) -> Reslrb:
             f"estimator {estimator} has no derivatives of moving light: it would need the Jacobians that reservoir "
             f"computes at every vertex, without a benefit; use {', '.join(ATTACHED)}"
         )
-    light_share, chosen = options.pop("light_share"), {name: options.pop(name) for name in DECIDABLE}
+    light_share, chosen = options.pop("light_share"), {name: options.pop(name) for name in AUTO_VALUES}
     for name, value in chosen.items():
-        one_of(name, value, DECIDABLE[name])
-    motion = Motion(
+        one_of(name, value, AUTO_VALUES[name])
+    motion = AttachedOptions(
         options.pop("attached"),
         options.pop("filter_normalization"),
         obstacle,

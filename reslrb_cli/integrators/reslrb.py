@@ -28,18 +28,19 @@ from reslrb_cli.estimators.chain_edges import (
     with_intervals,
 )
 from reslrb_cli.estimators.edges import differentiate_edges
-from reslrb_cli.guiding.collect import hear
+from reslrb_cli.guiding.collect import collect
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.context import Preparation, sensor_number
 from reslrb_cli.integrators.forward import tangent_of
-from reslrb_cli.integrators.plans import Motion, SamplingOptions
+from reslrb_cli.integrators.plans import AttachedOptions, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.edges import weigh_edges
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
-from reslrb_cli.transport.film import AdjointImage, PixelShares
+from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.pixel_shares import PixelShares
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
 from reslrb_cli.transport.walk import Splat, walk
@@ -57,7 +58,7 @@ class LightTracer(StepIntegrator):
 
     def __init__(
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
-        freeze: bool = False, motion: Motion | None = None, sampling: SamplingOptions | None = None,
+        freeze: bool = False, motion: AttachedOptions | None = None, sampling: SamplingOptions | None = None,
     ) -> None:  # fmt: skip
         """Make the tracer. Raises ValueError, which names the option, for an invalid value.
 
@@ -72,7 +73,7 @@ class LightTracer(StepIntegrator):
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        motion, sampling = motion or Motion(), sampling or SamplingOptions()
+        motion, sampling = motion or AttachedOptions(), sampling or SamplingOptions()
         self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion, sampling)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
@@ -217,10 +218,10 @@ class LightTracer(StepIntegrator):
         with dr.suspend_grad():
             samples = self.passes(replace(job, seed=learning_seed(job.seed)), Purpose.BOTH)[0]
             if self.freezes([samples]) and samples.width <= freezing.MOST_PATHS_APART:
-                said = self.preparation.recordings.call("hear", samples, hear, gradient)
+                collected = self.preparation.recordings.call("collect", samples, collect, gradient)
             else:
-                said = hear(samples, gradient)
-            guiding.learn(sensor_number(job.scene, job.sensor), samples.width, said)
+                collected = collect(samples, gradient)
+            guiding.learn(sensor_number(job.scene, job.sensor), samples.width, collected)
 
     def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
         """Return the image (H, W, C), without derivatives."""

@@ -328,11 +328,9 @@ def largest_ball_radius(curvature: Array) -> float | None:
     return 1 / sharp if sharp > 1e-9 else None
 
 
-def stepover(radius: float, scallop: float = SCALLOP) -> float:
-    """Return the distance (mm) between passes of a ball with this `radius`. The passes leave scallops of the height
-    `scallop` (mm).
-    """
-    height = min(scallop, radius)
+def stepover(radius: float) -> float:
+    """Return the distance (mm) between passes of a ball with this `radius`. The passes leave scallops of SCALLOP."""
+    height = min(SCALLOP, radius)
     return float(2 * np.sqrt(2 * radius * height - height**2))
 
 

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 from reslrb_cli.backend.doctor import memory_bytes
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.measure.methods import Measurement
-from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
+from reslrb_cli.measure.processes import CannotStart, Ended, Process, Stopped
 
 #: If all processes together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
@@ -29,13 +29,13 @@ class Contestant:
     """One of several workers that are compared. `process` is None if no worker runs. `cold` is the answer for its first
     step, which includes compilation.
 
-    A refusal (`Refused`) ends the measurement, unless `may_refuse` is True.
+    A refusal (`CannotStart`) ends the measurement, unless `may_refuse` is True.
     """
 
     process: Any
     may_refuse: bool
     end: Ended | None = None
-    refusal: Refused | None = None
+    refusal: CannotStart | None = None
     late: bool = False
     cold: dict[str, Any] | None = None
 
@@ -168,7 +168,7 @@ class Arena(Generic[Measured, Worker, Item]):
 
     def run(self) -> Iterator[Item]:
         """Measure. Yields an item after each round. Ends early, with the finished results, after `stop()`. Then all
-        workers have ended. Raises Refused if a required worker cannot start.
+        workers have ended. Raises CannotStart if a required worker cannot start.
         """
         try:
             yield from self._course()
@@ -194,7 +194,7 @@ class Arena(Generic[Measured, Worker, Item]):
             return result
         except Ended as end:
             member.end = end
-        except Refused as refusal:
+        except CannotStart as refusal:
             if not member.may_refuse:
                 raise
             member.refusal = refusal

@@ -19,7 +19,7 @@ from typing import Any
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure.arena import MAX_ROUNDS, NO_TIME, Arena, Contestant
-from reslrb_cli.measure.methods import Case, Sweep, paths_in_records
+from reslrb_cli.measure.methods import NamedIntegrator, Sweep, paths_in_records
 from reslrb_cli.measure.processes import Stopped
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
 
@@ -38,7 +38,7 @@ class BenchResult:
     baseline's times, round by round. They are None if either time is missing.
     """
 
-    case: Case
+    case: NamedIntegrator
     value: int
     record: BenchRecord
     kernel_ratio: Spread | None
@@ -50,7 +50,7 @@ class BenchResult:
 class BenchRun(Contestant):
     """One case at one value. `steps` has its steps by round."""
 
-    case: Case
+    case: NamedIntegrator
     config: Config
     steps: dict[int, dict[str, Any]] = field(default_factory=dict)
 
@@ -114,7 +114,7 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
     MOST_ROUNDS = MAX_ROUNDS
 
     def _set_up(self) -> int:
-        self.runs, self.left_out = dict[int, list[BenchRun]](), list[Case]()
+        self.runs, self.left_out = dict[int, list[BenchRun]](), list[NamedIntegrator]()
         self.size: dict[str, int | None] = dict.fromkeys(SIZES)
         return len(self.plan.values)
 

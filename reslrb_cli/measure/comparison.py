@@ -192,6 +192,9 @@ POWER = 0.9
 #: Relative error of single precision in a sum over many samples, which is added to the standard error.
 ROUNDING = 1e-4
 
+#: Relative difference of a stock integrator on the same paths: it rounds the visibility of points differently.
+STOCK_ROUNDING = 1e-3
+
 #: If a deviation by this fraction of the gradient, such as that of a missing gradient, would not be detected, the
 #: comparison is open.
 RESOLUTION = 1.0

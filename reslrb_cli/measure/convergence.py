@@ -18,8 +18,8 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.arena import NO_TIME, Arena, Contestant
 from reslrb_cli.measure.gradients import places
-from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Refused
+from reslrb_cli.measure.methods import ConvergencePlan, NamedIntegrator
+from reslrb_cli.measure.processes import CannotStart
 from reslrb_cli.records.measurements import BenchStatus, Method
 
 #: The module of the functions that processes run.
@@ -104,7 +104,7 @@ class Member(Contestant):
         self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
 
 
-class Session(Arena[Plan, Member, int]):
+class Session(Arena[ConvergencePlan, Member, int]):
     """Running processes and their samples (see `Arena`).
 
     `judges` maps names of independent stock integrators to their members. `facts` are those of `survey`, which an
@@ -150,13 +150,13 @@ class Session(Arena[Plan, Member, int]):
         if referee.end is not None:
             memory = referee.end.status is BenchStatus.OUT_OF_MEMORY
             code = ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
-            raise Refused(f"--reference {plan.reference.label}: {referee.end.reason}", code)
+            raise CannotStart(f"--reference {plan.reference.label}: {referee.end.reason}", code)
         self.facts = facts or {}
         if facts is None:
             self._say(f"dL/dI was not computed: {NO_TIME}")
         return facts is not None
 
-    def _why_not(self, case: Case) -> str | None:
+    def _why_not(self, case: NamedIntegrator) -> str | None:
         """Return why a method of the default list is left out, or None if it takes part."""
         if not self.plan.default:
             return None
@@ -180,7 +180,9 @@ class Session(Arena[Plan, Member, int]):
             config = plan.independent_config(name)
             same = [] if plan.objective == "loss" else [m for m in self.of(Role.CASE) if m.config == config]
             self.judges[name] = (
-                same[0] if same else self._add(Role.INDEPENDENT, Case(name, name, {}), config, self._noise_free)
+                same[0]
+                if same
+                else self._add(Role.INDEPENDENT, NamedIntegrator(name, name, {}), config, self._noise_free)
             )
         for key, reason in facts["why"].items():
             if facts["independent"][key] is None:
@@ -190,7 +192,7 @@ class Session(Arena[Plan, Member, int]):
     def _noise_free(self) -> str:
         return "image" if self.plan.objective == "image" else "fixed"
 
-    def _add(self, role: Role, case: Case, config: Config, objective: str) -> Member:
+    def _add(self, role: Role, case: NamedIntegrator, config: Config, objective: str) -> Member:
         plan, number, spp = self.plan, len(self.members), config.run.spp
         if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
             spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))

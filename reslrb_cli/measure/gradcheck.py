@@ -18,12 +18,13 @@ from functools import cached_property
 
 import numpy as np
 
-from reslrb_cli.config.integrators import UNDECIDED
+from reslrb_cli.config.integrators import PLAIN
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.arena import NO_TIME
 from reslrb_cli.measure.comparison import (
     ROUNDING,
+    STOCK_ROUNDING,
     Family,
     compare_equal_seeds,
     compare_expectations,
@@ -33,9 +34,6 @@ from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import plays_roulette, records_of
 from reslrb_cli.measure.participants import CheckSettings, Participants, Way
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
-
-#: Relative difference of a stock integrator on the same paths: it rounds the visibility of points differently.
-STOCK_ROUNDING = 1e-3
 
 #: References that know the gradient only along a few directions.
 ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
@@ -340,4 +338,4 @@ def _draws_plainly(config: Config) -> bool:
     `pixels: measured` make the paths differ.
     """
     options = config.integrator.options()
-    return all(options.get(name, UNDECIDED[name]) == UNDECIDED[name] for name in ("guiding", "sequence", "pixels"))
+    return all(options.get(name, PLAIN[name]) == PLAIN[name] for name in ("guiding", "sequence", "pixels"))

@@ -24,7 +24,15 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
-from reslrb_cli.measure.comparison import ROUNDING, TAIL, Family, compare_expectations, entry_count, tail_weight
+from reslrb_cli.measure.comparison import (
+    ROUNDING,
+    STOCK_ROUNDING,
+    TAIL,
+    Family,
+    compare_expectations,
+    entry_count,
+    tail_weight,
+)
 from reslrb_cli.measure.convergence import FEWEST, Member, Role, Session
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
@@ -38,9 +46,6 @@ from reslrb_cli.records.measurements import (
     Verdict,
 )
 from reslrb_cli.statistics import jackknife_variance
-
-#: Relative difference of a stock integrator on the same paths: it rounds the visibility of points differently.
-STOCK_ROUNDING = 1e-3
 
 #: Remark on noise with heavy tails.
 HEAVY = "single steps dominate the variance: the intervals are too narrow; take more steps"

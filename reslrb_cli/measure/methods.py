@@ -1,7 +1,7 @@
-"""The methods that measurements compare (`Case`), and the plans of measurements. Does not import Mitsuba.
+"""The methods that measurements compare (`NamedIntegrator`), and the plans of measurements. Does not import Mitsuba.
 
-A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is the plan of the command `bench`. `Plan`
-is the plan of the command `convergence`.
+A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is the plan of the command `bench`.
+`ConvergencePlan` is the plan of the command `convergence`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from reslrb_cli.backend.variant import choose
 from reslrb_cli.config.integrators import (
     AUTO_ESTIMATOR,
     ESTIMATOR_OPTIONS,
-    UNDECIDED,
+    PLAIN,
     AnyIntegrator,
     LightTracerOptions,
+    ReslrbConfig,
 )
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
@@ -31,7 +31,7 @@ from reslrb_cli.records.measurements import Method
 #: Options that a case inherits from the configuration's integrator if its own integrator has them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    *UNDECIDED,
+    *PLAIN,
 )
 
 #: Options that set the kinds of paths.
@@ -49,7 +49,7 @@ def paths_in_records(config: Config) -> dict[str, Any]:
     """
     options = config.integrator.options()
     usual = "light" if isinstance(config.integrator, LightTracerOptions) else "camera"
-    return records_of(str(options.get("paths", usual)), options.get("light_share", UNDECIDED["light_share"]))
+    return records_of(str(options.get("paths", usual)), options.get("light_share", PLAIN["light_share"]))
 
 
 #: The estimator of a case that names none, as in the plugin.
@@ -61,7 +61,7 @@ _TYPES = {str(kind.model_fields["type"].default): kind for kind in get_args(get_
 
 #: Options that records show with the estimator's name.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
-_ESTIMATOR_OPTIONS |= set(UNDECIDED)
+_ESTIMATOR_OPTIONS |= set(PLAIN)
 
 _OPTION = "--integrators"
 #: A user's own integrator.
@@ -70,7 +70,7 @@ _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+|[^():]+\.py:\w+))?(?:\((
 
 
 @dataclass(frozen=True)
-class Case:
+class NamedIntegrator:
     """One integrator with its options, but without a depth. `label` is the user's text for the integrator. `source` is
     the command-line option that contains the text.
     """
@@ -96,7 +96,7 @@ class Case:
             adjoint = {"adjoint": "independent"}  # valid with any loss
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
         # A run chooses options that are `auto` by measurement, but a method has fixed values.
-        left = {name for name in SHARED if name not in own or (name in UNDECIDED and shared.get(name) == "auto")}
+        left = {name for name in SHARED if name not in own or (name in PLAIN and shared.get(name) == "auto")}
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name not in left}
         if "paths" in self.options:  # the experiment's share belongs to its own paths
             values.pop("light_share", None)
@@ -108,7 +108,7 @@ class Case:
         values |= given
         if self.type == "reslrb":
             values.setdefault("estimator", PLUGIN_ESTIMATOR)
-        for option, fixed in {"estimator": AUTO_ESTIMATOR, **UNDECIDED}.items():
+        for option, fixed in {"estimator": AUTO_ESTIMATOR, **PLAIN}.items():
             if values.get(option) == "auto" and not auto:
                 raise ConfigError(blame, option, f"`auto` is for whole runs; use `{fixed}`, or another value")
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
@@ -123,7 +123,7 @@ class Case:
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
         usual = {option: ReslrbConfig.model_fields[option].default for option in _ESTIMATOR_OPTIONS}
-        usual |= {} if name == "auto" else UNDECIDED
+        usual |= {} if name == "auto" else PLAIN
         other = [
             f"{option}={value}"
             for option, value in self.options.items()
@@ -132,12 +132,12 @@ class Case:
         return f"{name}({','.join(other)})" if other else name
 
 
-def parse_cases(text: str, source: str = _OPTION) -> list[Case]:
+def parse_cases(text: str, source: str = _OPTION) -> list[NamedIntegrator]:
     """Parse a list of cases. Raises ConfigError if a case has a wrong format or is listed twice.
 
-    `source` is the command-line option that contains the list. `Case.at` checks the options of the cases.
+    `source` is the command-line option that contains the list. `NamedIntegrator.at` checks the options of the cases.
     """
-    cases: list[Case] = []
+    cases: list[NamedIntegrator] = []
     for item in _split(text):
         if match := _ITEM.fullmatch(item):
             kind, options = match["type"], {} if match["estimator"] is None else {"estimator": match["estimator"]}
@@ -156,7 +156,7 @@ def parse_cases(text: str, source: str = _OPTION) -> list[Case]:
                 reason = f"all share one depth; use --set integrator.{pair}, or bench --max-depth"
                 raise ConfigError(source, item, reason)
             options[name] = parse(value, f"{source} {item}", str)
-        case = Case(item, kind, options, source)
+        case = NamedIntegrator(item, kind, options, source)
         if case.label in [other.label for other in cases]:
             raise ConfigError(source, "", f"`{item}` is given twice")
         cases.append(case)
@@ -168,7 +168,7 @@ def _absolute(file: str, name: str) -> str:
     return f"{Path(file).expanduser().absolute()}:{name}"
 
 
-def parse_checked(text: str) -> list[Case]:
+def parse_checked(text: str) -> list[NamedIntegrator]:
     """Parse the list of a gradient check: estimators of `reslrb`, and the user's own integrators. Raises
     ConfigError.
     """
@@ -183,7 +183,7 @@ def parse_checked(text: str) -> list[Case]:
     return cases
 
 
-def all_estimators(config: Config) -> list[Case]:
+def all_estimators(config: Config) -> list[NamedIntegrator]:
     """Return every estimator of `reslrb`. The estimator that the configuration selects keeps the options from the
     configuration.
 
@@ -198,9 +198,9 @@ def all_estimators(config: Config) -> list[Case]:
             options = {option: getattr(own, option) for option in names}
             text = ",".join(f"{option}={value}" for option, value in options.items())
             label = f"reslrb:{name}({text})" if text else f"reslrb:{name}"
-            cases.append(Case(label, "reslrb", {"estimator": name} | options))
+            cases.append(NamedIntegrator(label, "reslrb", {"estimator": name} | options))
     if isinstance(own, ReslrbConfig) and own.paths == "auto":
-        cases.append(Case("reslrb:stack(paths=both)", "reslrb", {"estimator": "stack", "paths": "both"}))
+        cases.append(NamedIntegrator("reslrb:stack(paths=both)", "reslrb", {"estimator": "stack", "paths": "both"}))
     return cases
 
 
@@ -248,7 +248,7 @@ class Measurement:
 
     config: Config
     variant: str
-    cases: Sequence[Case]
+    cases: Sequence[NamedIntegrator]
     memory_limit: int | None
     budget_s: float
     rounds: int | None = None
@@ -275,15 +275,15 @@ class Sweep(Measurement):
     swept: str = "depth"
 
     @property
-    def baseline(self) -> Case:
+    def baseline(self) -> NamedIntegrator:
         """The first `ptracer` case in the list, or the first case if the list has no `ptracer`."""
         return next((case for case in self.cases if case.type == "ptracer"), self.cases[0])
 
-    def may_refuse(self, case: Case) -> bool:
+    def may_refuse(self, case: NamedIntegrator) -> bool:
         """True if the measurement skips `case` when the case's integrator does not support the scene."""
         return self.default and case != self.baseline
 
-    def at(self, case: Case, value: int) -> Config:
+    def at(self, case: NamedIntegrator, value: int) -> Config:
         """Return the experiment of one case at one value. Raises ConfigError."""
         config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
         depth = value if self.swept == "depth" else config.integrator.max_depth
@@ -313,7 +313,7 @@ REFERENCE = "reslrb:stack(paths=auto)"
 REFERENCES = {
     "light": "reslrb:stack",
     "camera": "reslrb:stack(paths=camera)",
-    "both": f"reslrb:stack(paths=both,light_share={UNDECIDED['light_share']})",
+    "both": f"reslrb:stack(paths=both,light_share={PLAIN['light_share']})",
 }
 
 #: An `rr_depth` at which Russian roulette never starts.
@@ -337,18 +337,20 @@ ALL = "all"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(Measurement):
+class ConvergencePlan(Measurement):
     """The plan of `convergence`. Errors are relative to the `reference`. `objective` is a key of `DEFAULTS`.
 
     `spps` are the samples per pixel of a step. If it is empty, those of `run` are used.
     """
 
     objective: str
-    reference: Case
+    reference: NamedIntegrator
     spps: Sequence[int] = ()
 
     @classmethod
-    def of(cls, config: Config, objective: str, integrators: str | None, reference: str | None, **others: Any) -> Plan:
+    def of(
+        cls, config: Config, objective: str, integrators: str | None, reference: str | None, **others: Any
+    ) -> ConvergencePlan:
         """Return a plan from lists as text. None stands for the default list. `others` are further fields. Raises
         ConfigError.
         """
@@ -369,11 +371,11 @@ class Plan(Measurement):
         return self.objective != "loss"
 
     @property
-    def entries(self) -> list[tuple[Case, int]]:
+    def entries(self) -> list[tuple[NamedIntegrator, int]]:
         """The compared cases, each with its samples per pixel."""
         return [(case, spp) for case in self.cases for spp in self.spps or [self.config.run.spp]]
 
-    def config_of(self, case: Case, spp: int) -> Config:
+    def config_of(self, case: NamedIntegrator, spp: int) -> Config:
         """Return the experiment with the integrator of a case and this sample count. Raises ConfigError."""
         return case.at(with_run(self.config, spp=spp), self.config.integrator.max_depth, self.known)
 
@@ -383,7 +385,7 @@ class Plan(Measurement):
         auto = self.reference.label == REFERENCE
         return self.reference.at(self.config, self.config.integrator.max_depth, True, auto)
 
-    def settled_reference(self, paths: str) -> Case:
+    def settled_reference(self, paths: str) -> NamedIntegrator:
         """Return the reference case for the scene's kinds of `paths`. It has edges if any of the cases has."""
         if self.reference.label != REFERENCE:
             return self.reference
@@ -398,7 +400,7 @@ class Plan(Measurement):
         """
         depth = self.config.integrator.max_depth
         options = {"rr_depth": NEVER} if name == "ptracer" and self.plays_roulette(depth) else {}
-        return Case(name, name, options, "the independent reference").at(self.config, depth, True)
+        return NamedIntegrator(name, name, options, "the independent reference").at(self.config, depth, True)
 
     def check(self) -> None:
         """Raise ConfigError if an integrator of the list, or the reference, is invalid."""
@@ -406,7 +408,7 @@ class Plan(Measurement):
             self.config_of(case, spp)
         _ = self.reference_config
 
-    def method(self, case: Case, config: Config, spp: int, known: bool, reference: bool) -> Method:
+    def method(self, case: NamedIntegrator, config: Config, spp: int, known: bool, reference: bool) -> Method:
         """Describe a case for records. `reference` is True for the reference."""
         options: dict[str, Any] = config.integrator.options()
         adjoint = None if known else config.adjoint

@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.integrators import traced_paths
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ATTACHED
@@ -17,8 +18,7 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
-from reslrb_cli.measure.methods import NEVER, all_estimators, parse_checked
-from reslrb_cli.measure.methods import Case as Listed
+from reslrb_cli.measure.methods import NEVER, NamedIntegrator, all_estimators, parse_checked
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
@@ -35,6 +35,7 @@ from reslrb_cli.measure.scenes import small
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import check_integrator
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.targets import multiple_of
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
@@ -64,12 +65,6 @@ LESSONS = 8
 
 #: Seeds for choosing the step of finite differences.
 PILOT_SEEDS = 2
-
-
-def multiple_of(spp: int, unit: int | None) -> int:
-    """Return the greatest multiple of `unit` that is at most `spp`, but at least `unit`."""
-    unit = unit or 1
-    return max(spp // unit, 1) * unit
 
 
 def shrink(scene: Any, sensor: int, pixels: int) -> None:
@@ -103,7 +98,7 @@ class CheckSettings:
     """
 
     config: Config
-    integrators: Sequence[Listed]
+    integrators: Sequence[NamedIntegrator]
     budget_s: float
     seeds: int | None = None
     spp: int | None = None
@@ -155,9 +150,8 @@ class Way:
     def of(cls, config: Config) -> Way:
         """Return the paths of an integrator. Integrators without the option `paths` use light paths."""
         options = config.integrator.options()
-        paths, share = options.get("paths", "light"), options.get("light_share", 0.5)
-        if paths == "both" and share in (0, 1):
-            paths = "light" if share else "camera"
+        share = options.get("light_share", 0.5)
+        paths = traced_paths(options.get("paths", "light"), share)
         return cls(paths, share) if paths == "both" else cls(paths)
 
     @property
@@ -270,7 +264,7 @@ class Participants:
         known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
         self.exact = {key: value for key, value in known.items() if value is not None}
 
-    def _able(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[Listed]:
+    def _able(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[NamedIntegrator]:
         """Return the estimators that can take part. Raises ConfigError if an estimator that the user named cannot take
         part, or if no estimator can take part.
         """
@@ -285,7 +279,7 @@ class Participants:
             raise next(iter(refused.values()))
         return listed
 
-    def _check(self, case: Listed, config: Config, problem: Problem) -> None:
+    def _check(self, case: NamedIntegrator, config: Config, problem: Problem) -> None:
         """Raise ConfigError if the estimator cannot render the scene or, if light moves, differentiate it."""
         ours, estimator = case.type == "reslrb", case.options.get("estimator")
         if not self._situation.moved:
@@ -324,7 +318,7 @@ class Participants:
                     made[_alike(label, reference)] = make_integrator(kind, **options | alike)
         return made
 
-    def references(self, key: str, listed: Listed) -> list[Reference]:
+    def references(self, key: str, listed: NamedIntegrator) -> list[Reference]:
         """Return the references that the scene allows for the gradient of a parameter by an integrator."""
         if listed.type == "custom" and self._situation.moved:  # our camera paths have no derivatives of moving light
             return [Reference.FINITE_DIFFERENCE]

@@ -53,7 +53,7 @@ class Stopped(Exception):
     """The user wants to stop."""
 
 
-class Refused(ReslrbError):
+class CannotStart(ReslrbError):
     """A process could not start. The reason holds for all processes."""
 
     def __init__(self, line: str, exit_code: int) -> None:
@@ -90,7 +90,7 @@ class Process:
             self._process.stdin.flush()
 
     def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
-        """Wait for the next answer. Raises Ended or Refused. Raises Stopped after `stop()`."""
+        """Wait for the next answer. Raises Ended or CannotStart. Raises Stopped after `stop()`."""
         assert self._process.stdout is not None
         with selectors.DefaultSelector() as selector:
             selector.register(self._process.stdout, selectors.EVENT_READ)
@@ -106,7 +106,7 @@ class Process:
         line, _, self._buffer = self._buffer.partition(b"\n")
         answer: dict[str, Any] = json.loads(line)
         if answer.get("failure") == "refused":
-            raise Refused(answer["reason"], answer["exit_code"])
+            raise CannotStart(answer["reason"], answer["exit_code"])
         if "failure" in answer:
             raise Ended(BenchStatus(answer["failure"]), answer["reason"])
         return answer

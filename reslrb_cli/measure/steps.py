@@ -20,14 +20,14 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.methods import IMAGES
-from reslrb_cli.measure.participants import ALIKE, multiple_of
+from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.processes import Begun
 from reslrb_cli.measure.references import Situation, choose, of_gradient, of_image
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.optimization.targets import make_targets, multiple_of, with_short_target
 from reslrb_cli.optimization.views import View, set_targets, target_arrays, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.records.measurements import Reference
@@ -207,15 +207,18 @@ def survey(problem: Problem, objective: str) -> tuple[dict[str, Any], dict[str, 
     if objective == "image":
         return facts | {"shapes": {"image": [height, width, int(sensor.film().base_channels_count())]}}, {"mask": mask}
     paths = PATHS[objective]
-    problem, shortened = shorten_target(problem, paths // pixels)
-    problem = make_targets(problem, lambda line: None)
+    config = with_short_target(problem.config, paths // pixels)
+    full, short = problem.config.target.render, config.target.render
+    problem = make_targets(replace(problem, config=config), lambda line: None)
     count = IMAGES if objective == "loss" else 1
     spp = multiple_of(paths // (count * pixels), problem.samples_per_pass)
     adjoints = []
     for number in range(count):
         image = problem.render(problem.sensors[0], spp, number, _PURPOSE)
         adjoints.append(adjoint(problem, image, mask))
-    facts["pictures"] = f"dL/dI at {'an image' if count == 1 else f'{count} images'} of {spp} spp{shortened}"
+    facts["pictures"] = f"dL/dI at {'an image' if count == 1 else f'{count} images'} of {spp} spp"
+    if full and short and short.spp < full.spp:
+        facts["pictures"] += f", the target of {short.spp}, not {full.spp}"
     return facts, {"mask": mask, "adjoints": np.stack(adjoints), **target_arrays(problem.views[:1])}
 
 
@@ -266,20 +269,6 @@ def _unlike(config: Config) -> str | None:
     if all(options.get(name, value) == value for name, value in alike.items()):
         return None
     return "its attached derivatives are those of " + ", ".join(f"{name}: {value}" for name, value in alike.items())
-
-
-def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
-    """Return the problem with limited samples per pixel for a rendered target, and a message about the limit."""
-    render = problem.config.target.render
-    if render is None:
-        return problem, ""
-    own = (render.integrator or problem.config.integrator).options().get("samples_per_pass")
-    spp = multiple_of(most, own)
-    if spp >= render.spp:
-        return problem, ""
-    target = problem.config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
-    shorter = replace(problem, config=problem.config.model_copy(update={"target": target}))
-    return shorter, f", the target of {spp}, not {render.spp}"
 
 
 class Sampler(TimedSteps):

@@ -15,6 +15,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.targets import with_short_target
 from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.metrics import Record
@@ -67,7 +68,7 @@ def forecast_lines(
     before its first iteration, and returns the problem that the run would have. Raises the same errors as the run.
     """
     # Errors are not part of a step.
-    problem = before(replace(assemble(with_short_target(config), say, cache), truth={}))
+    problem = before(replace(assemble(with_short_target(config, 4 * config.run.spp), say, cache), truth={}))
     say("measuring a few steps")
     iteration_s, start_s, compile_s, peak = measure_steps(problem)
     iterations = config.run.iterations
@@ -83,14 +84,3 @@ def forecast_lines(
         f"time of the iterations: {duration(elapsed_s)} ({sums}), and {duration(compile_s)} to compile kernels, which "
         "is done now and stored",
     ]
-
-
-def with_short_target(config: Config) -> Config:
-    """Return the experiment with a rendered target that has at most the sample count of four steps."""
-    render = config.target.render
-    if render is None:
-        return config
-    unit = (render.integrator or config.integrator).options().get("samples_per_pass") or 1
-    spp = min(render.spp, -(-4 * config.run.spp // unit) * unit)
-    target = config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
-    return config.model_copy(update={"target": target})

@@ -12,8 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.integrators import Integrator, Own, WalkAdConfig
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.integrators import Integrator, Own, ReslrbConfig, WalkAdConfig, traced_paths
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import IN_MEMORY, Config
@@ -181,10 +180,8 @@ def paths_of(
         return "light"
     if moves and (isinstance(integrator, WalkAdConfig) or integrator.attached_sampling == "follow"):
         return "light"  # naive differentiation and `follow` have no derivatives of camera paths
-    if integrator.paths == "both" and integrator.light_share in (0, 1):
-        return "light" if integrator.light_share else "camera"
     if integrator.paths != "auto":
-        return integrator.paths
+        return traced_paths(integrator.paths, integrator.light_share)
     if camera_finds_nothing(scene) or scaled_emitter(scene) is not None:
         return "light"
     looked = [scene.sensors()[sensor] for sensor in sensors]
@@ -225,10 +222,10 @@ def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> Non
 def make_configured(config: Config, integrator: Integrator, paths: str) -> StepIntegrator:
     """Make `integrator`, which `config` gives for the run or for the target. `paths` is the result of `paths_of`.
 
-    Options that a run decides by measurement (`guiding`, `sequence`, ...) are off.
+    Settings that are `auto` have their plain values.
     """
     if isinstance(integrator, ReslrbConfig):
-        integrator = integrator.undecided_off().model_copy(update={"paths": paths})
+        integrator = integrator.plain().model_copy(update={"paths": paths})
     elif isinstance(integrator, WalkAdConfig):
         integrator = integrator.model_copy(update={"paths": paths})
     options: dict[str, Any] = integrator.options()

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.doctor import free_bytes, local_bytes
 from reslrb_cli.config.files import in_words
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.integrators import ReslrbConfig
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators.stack import entry_bytes

@@ -66,7 +66,6 @@ class Task:
     """
 
     iteration: int
-    shard: int
     parts: tuple[Part, ...]
     spp: int
     weight: float
@@ -104,7 +103,6 @@ def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[T
     return [
         Task(
             iteration,
-            shard,
             tuple(
                 Part(view.sensor, scale, seed(config.run.seed, iteration, view.sensor, purpose), view.blur)
                 for view, scale in own
@@ -113,7 +111,7 @@ def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[T
             1 / shares,
             images or shares > 1,
         )
-        for shard, (own, purpose) in enumerate(zip(sets, purposes, strict=True))
+        for own, purpose in zip(sets, purposes, strict=True)
     ]
 
 

@@ -28,10 +28,10 @@ from reslrb_cli.optimization.loading import (
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import Array, Masked, View, color_channels, own_channels
 from reslrb_cli.records.images import luminance
-from reslrb_cli.scene.graph import visible
 from reslrb_cli.scene.images import Photo, read_photo, turned_line
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
+from reslrb_cli.scene.rays import visible
 from reslrb_cli.scene.values import resample
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
 from reslrb_cli.transport.film import FINE, responses_of
@@ -62,7 +62,7 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
     width, height = (int(n) for n in sensor.film().crop_size())
     if lacking:
         if "specular" in mask.kinds:
-            found.left_out["specular"] = sees_specular(scene, sensor).alone
+            found.left_out["specular"] = sees_specular(scene, sensor)
         if "border" in mask.kinds:
             found.left_out["border"] = ~interior((height, width), sensor)
     if photo is not None:
@@ -93,6 +93,22 @@ def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
     parts = [f"{count} {WORDS[kind]}" for kind, count in counts.items()]
     line = f"{name}: {left} of {total} pixels ({left / total:.1%}) are left out"
     return line + (f": {', '.join(parts)}" if parts else "")
+
+
+def multiple_of(spp: int, unit: int | None) -> int:
+    """Return the greatest multiple of `unit` that is at most `spp`, but at least `unit`."""
+    unit = unit or 1
+    return max(spp // unit, 1) * unit
+
+
+def with_short_target(config: Config, most: int) -> Config:
+    """Return the experiment with at most `most` samples per pixel for a rendered target, or with one pass of more."""
+    render = config.target.render
+    if render is None:
+        return config
+    spp = min(render.spp, multiple_of(most, (render.integrator or config.integrator).options().get("samples_per_pass")))
+    target = config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
+    return config.model_copy(update={"target": target})
 
 
 def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:

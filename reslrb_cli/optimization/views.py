@@ -194,7 +194,7 @@ class View:
         if self.fixed is None:
             return
         seen = sees_specular(scene, scene.sensors()[self.sensor])
-        weights = np.where(seen.alone, np.float32(0), self.fixed)
+        weights = np.where(seen, np.float32(0), self.fixed)
         if weights.any():  # glass before the whole film would leave no pixels, so the mask stays
             self.weigh(weights)
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.backend.doctor import device_name
-from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.integrators import ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import flattened

@@ -19,7 +19,7 @@ from reslrb_cli.records.sweeps import Combination, Failure, SweepPlan, config_fi
 from reslrb_cli.report.page.sweep import incomparable, objective, run_record, run_records, trial_values
 from reslrb_cli.report.sources import SweepRuns, read_run, read_sweep_runs
 from reslrb_cli.runs.loggers import package
-from reslrb_cli.runs.sweep import RANGE, Plan, Varied, is_left, named, parse_vary, with_chosen
+from reslrb_cli.runs.sweep import RANGE, PreparedSweep, Varied, is_left, named, parse_vary, with_chosen
 from reslrb_cli.seeds import seed
 
 #: Numbers of proposals for one trial, by Optuna and then at random. All of them can be combinations of earlier trials.
@@ -36,7 +36,7 @@ def load_optuna() -> Any:
     return optuna
 
 
-def check_search(plan: Plan) -> None:
+def check_search(plan: PreparedSweep) -> None:
     """Raise ConfigError if nothing is varied, Optuna is missing, or no figure of the trials can be compared."""
     if not plan.sweep.keys:
         raise ConfigError("--search", "", f"needs settings to choose, such as --vary 'optimizer.learning_rate={RANGE}'")

@@ -83,7 +83,7 @@ class Varied:
 
 
 @dataclass(frozen=True)
-class Plan:
+class PreparedSweep:
     """Checked sweep. `configs` maps each combination's name to its configuration with the first seed. Those of a search
     are combinations that were only checked.
     """
@@ -136,7 +136,7 @@ def make_plan(
     overrides: Sequence[str],
     allow_code: bool = False,
     trials: int | None = None,
-) -> Plan:
+) -> PreparedSweep:
     """Make every combination of the varied settings, check its configuration, and plan `seeds` seeds for each.
 
     With `trials`, plan a search with this number of combinations. It checks every value of every list, and both ends of
@@ -188,7 +188,7 @@ def make_plan(
     codes = {str(file): digests.pop(str(file)) for file in sorted(own)}
     run_seeds = list(range(first, first + seeds))
     plan = SweepPlan(str(path), list(overrides), combinations, run_seeds, codes=codes, files=digests, search=search)
-    return Plan(plan, configs)
+    return PreparedSweep(plan, configs)
 
 
 def _one_by_one(varied: Sequence[Varied]) -> Iterator[tuple[Override, ...]]:
@@ -251,7 +251,7 @@ def _bounded(name: str) -> str:
 
 
 @contextlib.contextmanager
-def started(folder: Path, plan: Plan) -> Iterator[SweepPlan]:
+def started(folder: Path, plan: PreparedSweep) -> Iterator[SweepPlan]:
     """Start the sweep of `plan` in `folder`, and lock the folder while the block runs.
 
     Raises ConfigError if the folder holds a sweep or anything else.
@@ -315,7 +315,7 @@ def _unwritable(folder: Path, error: OSError) -> ConfigError | MachineError:
     return ConfigError("-o", "", f"cannot write to {folder} ({error.strerror}); give another folder")
 
 
-def _write_configs(folder: Path, plan: Plan) -> None:
+def _write_configs(folder: Path, plan: PreparedSweep) -> None:
     """Write the configurations of a new sweep, before its plan. Raises ConfigError if the folder holds other files."""
     # a sweep that was killed at its start has written only configurations
     if others := sorted(path.name for path in folder.iterdir() if path.name != "configs"):

@@ -23,8 +23,8 @@ from reslrb_cli.glasses import Glass
 from reslrb_cli.lens.solid import Sheet
 from reslrb_cli.records.images import luminance
 from reslrb_cli.report.page.workshop import shown_ssim
-from reslrb_cli.scene.graph import brightness
 from reslrb_cli.scene.images import read_image
+from reslrb_cli.scene.rays import brightness
 
 Array = np.ndarray[Any, Any]
 

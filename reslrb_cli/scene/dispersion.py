@@ -26,7 +26,7 @@ import numpy as np
 
 from reslrb_cli.colorimetry import colour_of, illuminant, sensitivity
 from reslrb_cli.glasses import Glass, cauchy_shape, find_glass, index_of
-from reslrb_cli.scene.graph import visible
+from reslrb_cli.scene.rays import visible
 
 #: Names of our plugins in scene files.
 GLASS, ILLUMINANT, SENSITIVITY = "dispersivedielectric", "illuminant", "sensitivity"

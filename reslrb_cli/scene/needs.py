@@ -15,19 +15,8 @@ import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.dispersion import GLASS_CLASS
-from reslrb_cli.scene.graph import (
-    Lamp,
-    SceneGraph,
-    bent_faces,
-    bounds,
-    emitted_rays,
-    face_normals,
-    failure,
-    grid,
-    sensor_rays,
-    small_lamps,
-    triangles,
-)
+from reslrb_cli.scene.graph import Lamp, SceneGraph, bent_faces, bounds, face_normals, small_lamps, triangles
+from reslrb_cli.scene.rays import emitted_rays, failure, grid, sensor_rays
 
 #: Sensors to which light paths can connect: they have `sample_direction`, with the density of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")

@@ -20,9 +20,10 @@ from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters
 from reslrb_cli.scene.dispersion import COEFFICIENT
 from reslrb_cli.scene.export import LOBES
-from reslrb_cli.scene.graph import SceneGraph, grid, sensor_rays
+from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.images import decode_srgb, read_bitmap
 from reslrb_cli.scene.needs import surfaces_met
+from reslrb_cli.scene.rays import grid, sensor_rays
 
 Image = np.ndarray[Any, Any]
 

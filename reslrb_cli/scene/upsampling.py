@@ -26,7 +26,7 @@ import numpy as np
 from reslrb_cli.backend.installation import package_folder
 from reslrb_cli.backend.memory import flat, own_memory
 from reslrb_cli.scene.deformation import Leaf, collect, push
-from reslrb_cli.scene.graph import visible
+from reslrb_cli.scene.rays import visible
 
 Array = np.ndarray[Any, Any]
 

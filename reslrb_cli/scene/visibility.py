@@ -9,7 +9,6 @@ would compensate for the missing light (`find_depth`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from typing import Any
@@ -18,8 +17,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.graph import SceneGraph, brightness, sensor_rays
+from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import LOOK, surfaces_met, what_is_seen
+from reslrb_cli.scene.rays import brightness, sensor_rays
 
 #: Primary rays of a pixel are spread over this many rows and columns of cells.
 CELLS = 4
@@ -54,31 +54,22 @@ def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
     return np.asarray(maximum_filter(pixels, 2 * _margin(sensor) + 1))
 
 
-@dataclass(frozen=True)
-class SeenSpecular:
-    """Pixels (H, W) of a sensor's crop window whose reconstruction filter reaches smooth specular lobes.
+def sees_specular(scene: mi.Scene, sensor: mi.Sensor, partly: bool = False) -> np.ndarray:
+    """Return the pixels, boolean (H, W) of a sensor's crop window, whose reconstruction filter reaches surfaces that
+    have only smooth specular lobes (glass, mirrors). These surfaces stay black under light tracing.
 
-    `alone` marks surfaces that have only smooth specular lobes (glass, mirrors). Surfaces without other lobes stay
-    black under light tracing. `mixed` marks surfaces that have smooth specular lobes and other lobes (coats, blends,
-    thin panes). Light tracing lacks a part of the light of these surfaces.
-    """
+    With `partly`, surfaces that also have other lobes count as well (coats, blends, thin panes). Light tracing lacks a
+    part of the light of these surfaces.
 
-    alone: np.ndarray
-    mixed: np.ndarray
-
-
-def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
-    """Trace CELLS^2 primary rays per pixel through see-through surfaces. Mark the pixels whose filter reaches smooth
-    specular lobes.
-
-    The function may miss objects smaller than a cell. The rays are the same at every call.
+    The function traces CELLS^2 primary rays per pixel through see-through surfaces, the same rays at every call. It may
+    miss objects smaller than a cell.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     count = width * height
     lane = dr.arange(mi.UInt32, count)
     corner = mi.Point2f(lane % width, lane // width)
     random = mi.PCG32(count)
-    alone, mixed = dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
+    seen = dr.zeros(mi.Bool, count)
     for cell in range(CELLS * CELLS):
         # Opaque, so that all cells have one kernel.
         row, column = dr.opaque(mi.Float, cell // CELLS), dr.opaque(mi.Float, cell % CELLS)
@@ -86,11 +77,9 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
         u = (corner + (mi.Point2f(column, row) + jitter) / CELLS) / mi.Vector2f(width, height)
         aperture = mi.Point2f(random.next_float32(), random.next_float32())
         ray, _ = sensor_rays(sensor, sensor.shutter_open(), u, aperture)
-        only, beside = _first_surfaces(scene, ray, count)
-        alone, mixed = alone | only, mixed | beside
-        dr.eval(alone, mixed, random)
-    masks = (np.array(mask, dtype=bool).reshape(height, width) for mask in (alone, mixed))
-    return SeenSpecular(*(spread(mask, sensor) for mask in masks))
+        seen |= _meets_specular(scene, ray, count, partly)
+        dr.eval(seen, random)
+    return spread(np.array(seen, dtype=bool).reshape(height, width), sensor)
 
 
 def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
@@ -114,20 +103,19 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
     return spread(cells, sensor)
 
 
-def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:
-    """Return whether a surface has only delta lobes, and whether a surface has delta lobes beside other lobes.
-
-    The surfaces lie along a ray, up to the first surface that is not see-through.
+def _meets_specular(scene: mi.Scene, ray: mi.Ray3f, count: int, partly: bool) -> mi.Bool:
+    """Return whether a surface along a ray, up to the first surface that is not see-through, has only delta lobes. With
+    `partly`, return whether a surface has any delta lobe.
     """
     lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
-    alone, mixed = dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
+    others = int(mi.BSDFFlags.Null | mi.BSDFFlags.Smooth)
+    found = dr.zeros(mi.Bool, count)
     for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, count)):
         flags = si.bsdf().flags()
         specular = reached & si.is_valid() & ((flags & lobes) != 0)
-        beside = specular & (mi.has_flag(flags, mi.BSDFFlags.Null) | mi.has_flag(flags, mi.BSDFFlags.Smooth))
-        alone, mixed = alone | (specular & ~beside), mixed | beside
-        dr.schedule(alone, mixed)
-    return alone, mixed
+        found |= specular if partly else specular & ((flags & others) == 0)
+        dr.schedule(found)
+    return found
 
 
 #: Primary rays for each pixel and each texel, and rays of one pass.

@@ -13,7 +13,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.graph import Lamp, sensor_rays
+from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.scene.rays import sensor_rays
 from reslrb_cli.transport.bsdf import EventNumbers, Scattering, begins_caustic, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import density_of_rays

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.graph import sensor_rays
+from reslrb_cli.scene.rays import sensor_rays
 from reslrb_cli.transport.bsdf import EventNumbers, Hit, Scattering, scatter
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect

@@ -1,103 +1,18 @@
-"""Connections of a light path's vertex to the sensor, straight through surfaces that only mask or filter light.
+"""Connections of a light path's vertex to the sensor.
 
-These surfaces have Mitsuba's `Null` lobes, and `transmittance` handles them. `connect` finds the position of a vertex
-on the film.
+`connect` finds the position of a vertex on the film. `passage` traces the shadow ray, which surfaces that only mask or
+filter light let through (`masks.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.masks import transmittance
 from reslrb_cli.transport.plan import Plan
-
-
-def forward_derivatives(*values: mi.Spectrum) -> list[mi.Spectrum]:
-    """Return the derivatives of `values` along the parameters' tangents. Values that depend on no parameter have zero
-    derivatives.
-
-    One propagation handles all values. A second propagation would meet the graph edges of the first propagation. The
-    tangents of the parameters remain for the next vertex.
-    """
-    tracked = [value for value in values if dr.grad_enabled(value)]
-    if tracked:
-        dr.forward_to(tracked, flags=dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
-    return [dr.detach(dr.grad(value)) if dr.grad_enabled(value) else dr.zeros(type(value)) for value in values]
-
-
-@dataclass
-class Passage:
-    """Loop state of a ray on its way through null surfaces.
-
-    `value` (C,) is the product of the transmissions so far, and `tangent` its derivative (empty unless requested).
-    `reached` becomes true once nothing blocks the way.
-    """
-
-    active: mi.Bool
-    value: mi.Spectrum
-    crossings: mi.UInt32
-    reached: mi.Bool
-    tangent: list[mi.Spectrum] = field(default_factory=list)
-
-
-def transmittance(
-    plan: Plan, scene: mi.Scene, start: mi.Interaction3f, depth: mi.UInt32, connection: Connection,
-    on_crossing: Callable[[mi.Spectrum, mi.Bool], None] | None = None, loop_mode: str = "symbolic",
-    tangents: bool = False,
-) -> Passage:  # fmt: skip
-    """Follow a connection from the vertex `start` at `depth` through null surfaces, as far as the depth limit allows.
-
-    Each crossing counts as a vertex, as in Mitsuba's `path`. At each crossing, `on_crossing(transmission, active)` gets
-    the crossing's transmission (C,). `transmission` is tracked if gradients are enabled. `on_crossing` can therefore
-    differentiate the transmission. With `tangents`, the derivative along the parameters' tangents is computed (forward
-    mode). With `tangents`, gradients must be suspended, because the loop itself must not track any gradients. If
-    `plan.passes_lamps`, lamps do not block the way.
-    """
-
-    target, limit = connection.target, plan.max_depth - depth - 1
-
-    def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, mi.Ray3f]:
-        si = scene.ray_intersect(ray, passage.active)
-        hit = passage.active & si.is_valid()
-        with dr.resume_grad(when=tangents):
-            transmission = si.bsdf().eval_null_transmission(si, hit)
-            if tangents:
-                [d_transmission], transmission = forward_derivatives(transmission), dr.detach(transmission)
-        if on_crossing is not None:
-            on_crossing(transmission, hit)
-            transmission = dr.detach(transmission)
-        tangent = passage.tangent
-        if tangents:
-            tangent = [dr.select(hit, tangent[0] * transmission + passage.value * d_transmission, tangent[0])]
-        lamp = mi.Bool(False)
-        if plan.passes_lamps:
-            lamp = hit & (si.emitter(scene) != dr.zeros(mi.EmitterPtr))
-            transmission = dr.select(lamp, 1, transmission)
-            tangent = [dr.select(lamp, passage.tangent[0], own) for own in tangent]
-        blocked = hit & ~lamp & (dr.all(transmission == 0) | (passage.crossings >= limit))
-        state = Passage(
-            active=hit & ~blocked,
-            value=dr.select(hit, passage.value * transmission, passage.value),
-            crossings=passage.crossings + dr.select(hit & ~lamp, mi.UInt32(1), 0),
-            reached=passage.reached | (passage.active & ~hit),
-            tangent=tangent,
-        )
-        return state, dr.select(hit, si.spawn_ray_to(target), ray)
-
-    passage = Passage(
-        mi.Bool(connection.active), mi.Spectrum(1), mi.UInt32(0), mi.Bool(False), [mi.Spectrum(0)] if tangents else []
-    )
-    passage, _ = dr.while_loop(
-        state=(passage, start.spawn_ray_to(target)),
-        cond=lambda passage, ray: passage.active,
-        body=body,
-        label="null surfaces",
-        mode=loop_mode,
-    )
-    return passage
 
 
 def shading_correction(
@@ -251,7 +166,7 @@ def passage(
     """
     active, one = before_lamps(plan, scene, si, connection.active), mi.Spectrum(1)
     if plan.needs.has_null or plan.passes_lamps:
-        through = transmittance(plan, scene, si, depth, replace(connection, active=active), loop_mode=loop_mode)
+        through = transmittance(plan, scene, si, depth, connection.target, active, loop_mode=loop_mode)
         return through.reached, through.value
     if known is None:
         return active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), one

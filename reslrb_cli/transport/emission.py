@@ -17,11 +17,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.graph import sensor_rays
-from reslrb_cli.transport.connection import forward_derivatives
+from reslrb_cli.scene.rays import sensor_rays
+from reslrb_cli.transport.factors import MAY_LACK
 from reslrb_cli.transport.film import AdjointImage, Colours
 from reslrb_cli.transport.lamp_light import moving_splats, small_splat
 from reslrb_cli.transport.lamps import environment_ray, keep_one, lamp_ray
+from reslrb_cli.transport.masks import forward_derivatives
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import VISIBLE_STREAM, Samples
 
@@ -219,7 +220,7 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, ray: mi.Ray3f, a
             behind = mi.Spectrum(dr.select(transmission != 0, (total - radiance) / dr.detach(transmission), 0))
             objective += dr.select(state.active, adjoint * behind, 0) * transmission
         # The scene may have masks without differentiated parameters.
-        dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        dr.backward_from(objective, flags=MAY_LACK)
 
     with dr.resume_grad():
         _look(plan, scene, ray, differentiate, "symbolic")
@@ -289,7 +290,7 @@ def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> N
         with dr.resume_grad():
             u, C, active, colours = small_splat(samples)
             objective = dr.dot(adjoint.lookup(u, active, colours), C)
-            dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            dr.backward_from(objective, flags=MAY_LACK)
     if plan.visible_moving_lamps:
         with dr.resume_grad():
             for u, C, active, colours in moving_splats(samples):

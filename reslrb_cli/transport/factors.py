@@ -44,6 +44,8 @@ Array = np.ndarray[Any, Any]
 NO_ZERO = -1  # no factor of this channel is zero
 MANY_ZEROS = -2  # two or more factors are zero: value and derivatives vanish
 DIM = 0.1  # minimum value of a factor in a magnitude, as a fraction of its stand-in
+#: Flags for propagating derivatives of a result that may depend on no parameter, for example if no lane is active.
+MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:

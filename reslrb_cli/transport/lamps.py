@@ -19,7 +19,8 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.graph import Lamp, no_wavelengths
+from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.scene.rays import no_wavelengths
 from reslrb_cli.transport.plan import Plan
 
 DEFENSIVE = 0.1  # share of uniform samples, instead of samples proportional to differentiated radiance

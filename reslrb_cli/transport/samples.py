@@ -27,8 +27,9 @@ from reslrb_cli.transport.aim import Aim
 from reslrb_cli.transport.bsdf import EventNumbers
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.factors import Survival
-from reslrb_cli.transport.film import Film, PixelShares
+from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.lamps import sums_of_areas
+from reslrb_cli.transport.pixel_shares import PixelShares
 from reslrb_cli.transport.plan import Grid, Plan
 from reslrb_cli.transport.sobol import Net, Points
 

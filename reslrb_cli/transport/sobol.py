@@ -129,15 +129,15 @@ class Net:
 
 
 class Points:
-    """Coordinates of the lanes' Sobol points, returned in order. `used` is the index of the first returned coordinate.
-    `seed` is opaque.
+    """Coordinates of the lanes' Sobol points, returned in order. `used` is the index of the next coordinate. `seed` is
+    opaque.
 
     With `net`, the first requested coordinate is stratified. Without a net, no coordinate is stratified, because a
     guide has already stratified the lanes.
     """
 
-    def __init__(self, seed: mi.UInt32, width: int, net: Net | None, used: int = 0) -> None:
-        self.seed, self.lane, self.net, self.used = seed, dr.arange(mi.UInt32, width), net, used
+    def __init__(self, seed: mi.UInt32, width: int, net: Net | None) -> None:
+        self.seed, self.lane, self.net, self.used = seed, dr.arange(mi.UInt32, width), net, 0
         # In coarse steps, so that another number of paths uses the same kernel.
         self.digits = 24 if width <= 2**24 else DIGITS
 

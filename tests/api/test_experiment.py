@@ -27,7 +27,7 @@ import reslrb_cli as rl
 from reslrb_cli.config.loader import changed, dump, load, with_integrator
 from reslrb_cli.measure import convergence as session
 from reslrb_cli.measure.convergence import Session
-from reslrb_cli.measure.methods import Plan
+from reslrb_cli.measure.methods import ConvergencePlan
 
 #: Settings that make a run cheap and exactly repeatable.
 FAST = {"run.certainty": False, "run.iterations": 3}
@@ -265,7 +265,9 @@ def test_gradcheck_writes_the_records_of_the_command(folder: Path) -> None:
 class Played(Session):
     """Session with simulated processes, and a clock that only these processes advance."""
 
-    def __init__(self, plan: Plan, folder: Path, stop: Callable[[], bool], say: Callable[[str], None], **given: Any):
+    def __init__(
+        self, plan: ConvergencePlan, folder: Path, stop: Callable[[], bool], say: Callable[[str], None], **given: Any
+    ):
         stage = Stage()
         super().__init__(plan, folder, stop, say, stage.start, stage.clock)
 

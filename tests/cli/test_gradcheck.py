@@ -58,8 +58,8 @@ def test_failures_are_named(
 ) -> None:
     from reslrb_cli.estimators import stack
 
-    right = stack.push
-    monkeypatch.setattr(stack, "push", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.5))
+    right = stack.pass_vertex
+    monkeypatch.setattr(stack, "pass_vertex", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.5))
     json_file = tmp_path / "a.jsonl"
     assert call(*SMALL, "--seeds", "8", "--integrators", "reslrb:stack,reslrb:gather", "--json", str(json_file)) == 1
     rows = measured(json_file)

@@ -43,17 +43,22 @@ FOLDER = [
 KEY = "poster.reflectance.data"
 
 
-@pytest.fixture
-def experiment(llvm, tmp_path, monkeypatch):
-    """Texture of shape (4, 4, 3). The working directory holds its scene and a configuration."""
+def write_box(folder):
+    """Write the scene and its configuration. Returns the scene's texture (4, 4, 3)."""
     import mitsuba as mi
 
     texture = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
-    mi.Bitmap(texture).write(str(tmp_path / "poster.exr"))
-    (tmp_path / "scene.xml").write_text(SCENE)
-    (tmp_path / "box.yaml").write_text(CONFIG)
-    monkeypatch.chdir(tmp_path)
+    mi.Bitmap(texture).write(str(folder / "poster.exr"))
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "box.yaml").write_text(CONFIG)
     return texture
+
+
+@pytest.fixture
+def experiment(llvm, tmp_path, monkeypatch):
+    """Texture of shape (4, 4, 3). The working directory holds its scene and a configuration."""
+    monkeypatch.chdir(tmp_path)
+    return write_box(tmp_path)
 
 
 def names(folder):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.test_optimize import CONFIG, KEY, SCENE
+from cli.test_optimize import KEY, SCENE, write_box
 from cli.tiny import manifest as read_manifest
 from cli.tiny import outcome, read_metrics, settings
 from kit import scene, sensor, shape
@@ -21,12 +21,7 @@ LAMP, WALL = "lamp.emitter.radiance.value", "wall.reflectance.value"
 @pytest.fixture(autouse=True)
 def _experiment(llvm, tmp_path, monkeypatch):
     """Working directory with a scene and a configuration."""
-    import mitsuba as mi
-
-    texture = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
-    mi.Bitmap(texture).write(str(tmp_path / "poster.exr"))
-    (tmp_path / "scene.xml").write_text(SCENE)
-    (tmp_path / "box.yaml").write_text(CONFIG)
+    write_box(tmp_path)
     monkeypatch.chdir(tmp_path)
 
 

@@ -8,7 +8,6 @@ import json
 import os
 import shutil
 import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import pytest
 from cli import tiny
 from cli.tiny import reslrb
 from click.testing import CliRunner
+from kit import count_iterations, wait_for
 
 from reslrb_cli.cli import jobs, main, sweep
 from reslrb_cli.cli.optimize import Progress
@@ -323,23 +323,6 @@ def test_a_sweep_locks_its_folder(folder, monkeypatch):
     assert said == ["s: is in use by another `reslrb sweep`; end that first\n"]
 
 
-def count_lines(run):
-    """Return the number of iterations in the metrics of a run."""
-    path = run / "metrics.jsonl"
-    try:
-        return len(path.read_text().splitlines())
-    except OSError:  # there is no file yet, or its lines are about to be cut back
-        return 0
-
-
-def wait_for(happened, seconds=60.0):
-    """Wait until `happened()` is true. Fail after `seconds`."""
-    end = time.monotonic() + seconds
-    while not happened():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def test_a_crashed_process_is_reported_by_its_last_message(monkeypatch):
     for end, code, said in (
         ("print('>>> no room'); print('x'); sys.stdout.flush(); os.kill(os.getpid(), 9)", -9,
@@ -400,7 +383,7 @@ def test_a_run_ends_with_its_killed_sweep(llvm, tmp_path):
     settings = tiny.settings(*QUICK, "run.iterations=100000")
     process = tiny.start(tmp_path, *settings, "-o", "s", command="sweep")  # each of its runs also has a process
     run = tmp_path / "s/seed=0"
-    wait_for(lambda: count_lines(run) > 6)
+    wait_for(lambda: count_iterations(run) > 6)
     worker = json.loads((run / "manifest.json").read_text())["process"]["pid"]
     process.kill()
     process.communicate()

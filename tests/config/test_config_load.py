@@ -13,7 +13,7 @@ import pytest
 from config.test_config_bad_input import PARAMETER, changed
 from make_reference import DOCS, EXAMPLE, json_schema, markdown
 
-from reslrb_cli.config.integrators import DECIDABLE, ESTIMATOR_OPTIONS, UNDECIDED, Prb, Reslrb
+from reslrb_cli.config.integrators import AUTO_VALUES, ESTIMATOR_OPTIONS, PLAIN, Prb, ReslrbConfig
 from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
 from reslrb_cli.config.optimizers import SGD, Adam
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
@@ -66,11 +66,11 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.target.render is not None
     assert config.target.render.spp == 1024
     assert config.parameters[0].initial == "scene"
-    assert isinstance(config.integrator, Reslrb)
+    assert isinstance(config.integrator, ReslrbConfig)
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto",
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "light_share": 0.5,
-        **dict.fromkeys(DECIDABLE, "auto"),
+        **dict.fromkeys(AUTO_VALUES, "auto"),
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}
@@ -269,14 +269,14 @@ def test_a_heightmap_has_its_own_resolution() -> None:
 def test_the_table_names_every_estimator() -> None:
     names = list(ESTIMATORS)
     assert list(ESTIMATOR_OPTIONS) == ["auto", *names]
-    assert list(get_args(Reslrb.model_fields["estimator"].annotation)) == ["auto", *names]
+    assert list(get_args(ReslrbConfig.model_fields["estimator"].annotation)) == ["auto", *names]
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_options_and_defaults_match_the_estimators(name: str) -> None:
-    options = Reslrb(estimator=name).options()  # type: ignore[arg-type]
+    options = ReslrbConfig(estimator=name).options()  # type: ignore[arg-type]
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator"}
-    shared |= {"attached", "filter_normalization", "attached_sampling", *UNDECIDED}
+    shared |= {"attached", "filter_normalization", "attached_sampling", *PLAIN}
     #: Options that are constant in every run.
     constants = {"stack_size", "jacobian_damping"}
     known = {key: value for key, value in options_of(name).items() if key not in constants}
@@ -284,14 +284,14 @@ def test_options_and_defaults_match_the_estimators(name: str) -> None:
 
 
 def test_paths_unsupported_by_the_named_estimator() -> None:
-    assert (Reslrb().paths, Reslrb().light_share) == ("auto", 0.5)
-    assert Reslrb(estimator="stack").paths == "light"
-    named = Reslrb(estimator="stack", paths="both")
+    assert (ReslrbConfig().paths, ReslrbConfig().light_share) == ("auto", 0.5)
+    assert ReslrbConfig(estimator="stack").paths == "light"
+    named = ReslrbConfig(estimator="stack", paths="both")
     assert (named.paths, named.light_share) == ("both", 0.5)
-    again = Reslrb(**Reslrb(paths="camera").model_dump())  # as the run folder stores it
+    again = ReslrbConfig(**ReslrbConfig(paths="camera").model_dump())  # as the run folder stores it
     assert again.paths == "camera"
-    written = Reslrb().model_dump(exclude_none=True)
-    assert (Reslrb(**written).paths, Reslrb(**written).pixels) == ("auto", "auto")
+    written = ReslrbConfig().model_dump(exclude_none=True)
+    assert (ReslrbConfig(**written).paths, ReslrbConfig(**written).pixels) == ("auto", "auto")
 
 
 @pytest.mark.parametrize(
@@ -305,11 +305,11 @@ def test_paths_unsupported_by_the_named_estimator() -> None:
 )
 def test_impossible_paths(options: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        Reslrb(**options)
+        ReslrbConfig(**options)
 
 
 def test_auto_is_stack() -> None:
-    assert Reslrb(max_depth=4).undecided_off().options() == Reslrb(estimator="stack", max_depth=4).options()
+    assert ReslrbConfig(max_depth=4).plain().options() == ReslrbConfig(estimator="stack", max_depth=4).options()
 
 
 @pytest.mark.parametrize(
@@ -317,17 +317,17 @@ def test_auto_is_stack() -> None:
 )
 def test_measured_options_if_the_estimator_is_measured(name: str, off: str, on: str) -> None:
     def given(**options: Any) -> str:
-        return str(getattr(Reslrb(**options), name))
+        return str(getattr(ReslrbConfig(**options), name))
 
     assert given() == "auto"
     assert given(estimator="stack") == off
     assert given(estimator="stack", **{name: "auto"}) == "auto"
     assert given(**{name: off}) == off
-    # Objects that are made before any measurement have an undecided option off.
-    for own in (Reslrb(), Reslrb(**{name: "auto", "estimator": "reservoir"})):
-        assert getattr(own.undecided_off(), name) == off
-    asked = Reslrb(**{name: on})
-    assert getattr(asked.undecided_off(), name) == on
+    # Objects that are made before any measurement have the plain value.
+    for own in (ReslrbConfig(), ReslrbConfig(**{name: "auto", "estimator": "reservoir"})):
+        assert getattr(own.plain(), name) == off
+    asked = ReslrbConfig(**{name: on})
+    assert getattr(asked.plain(), name) == on
 
 
 # The reference pages in docs/ agree with the schema.

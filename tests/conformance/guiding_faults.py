@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.guiding.collect import hear
+from reslrb_cli.guiding.collect import collect
 from reslrb_cli.guiding.tables import Purpose
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.integrators.reslrb import Reslrb
@@ -110,7 +110,7 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
         assert tables is not None
         [samples] = parts
         with dr.suspend_grad():
-            tables.learn(0, samples.width, hear(samples, gradient))
+            tables.learn(0, samples.width, collect(samples, gradient))
         again = replace(samples, guide=replace(samples.guide, table=tables.table(0, Purpose.BOTH)))
         right(self, [again], gradient, params, state)
 

@@ -53,9 +53,9 @@ def test_blocks_partition_the_film_with_the_densities_of_their_slots(size: tuple
 def test_paths_are_aimed_at_recorded_contributions() -> None:
     _, ours, _ = guided("roughplastic", 2)
     tables = ours.preparation.guiding
-    said = np.sqrt(tables.learned[0].film)
-    assert said.shape == (2, tables.films[0].count)
-    for purpose, row in ((Purpose.GRADIENT, said[0]), (Purpose.IMAGE, said[1])):
+    film = np.sqrt(tables.learned[0].film)
+    assert film.shape == (2, tables.films[0].count)
+    for purpose, row in ((Purpose.GRADIENT, film[0]), (Purpose.IMAGE, film[1])):
         density = np.array(tables.table(0, purpose).aim.density, np.float64)
         assert np.corrcoef(density, row)[0, 1] > 0.99
 

@@ -39,7 +39,7 @@ from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import interface_of, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.records.clock import peak_mib, reset_peak
-from reslrb_cli.transport.film import EVEN, MOST_SLOTS, PixelShares
+from reslrb_cli.transport.pixel_shares import EVEN, MOST_SLOTS, PixelShares
 
 pytestmark = pytest.mark.usefixtures("samples")
 

@@ -124,14 +124,14 @@ def test_roulette_ignores_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
 SMALL = Grid((1, 1, 1, 1), (0.0, 0.25, 1.0))
 
 
-def heard(*rows: Any) -> np.ndarray:
+def newer(*rows: Any) -> np.ndarray:
     return np.stack([np.broadcast_to(np.asarray(row, np.float64), (SMALL.cells,)) for row in rows])
 
 
 def test_no_group_dominates_and_non_finite_values_are_dropped() -> None:
     draws, first, other = np.ones(SMALL.cells), np.zeros(SMALL.cells), np.zeros(SMALL.cells)
     first[:16], other[16:] = 1, 1
-    quiet = Learned.nothing(SMALL).with_more(SMALL, heard(first, 1e-12 * other, 0, 1), draws)
+    quiet = Learned.nothing(SMALL).with_more(SMALL, newer(first, 1e-12 * other, 0, 1), draws)
     density = quiet.density(SMALL, Purpose.GRADIENT.value)
     # The mean squares are 1 / 0.25 and 1 / 0.75, each over its whole emitter. The density is their root times the
     # measure.
@@ -140,12 +140,12 @@ def test_no_group_dominates_and_non_finite_values_are_dropped() -> None:
     both = quiet.density(SMALL, Purpose.BOTH.value)
     assert both == pytest.approx((density + SMALL.measures()) / 2, rel=1e-6)
     for wrong in (np.inf, np.nan, 0.0):
-        louder = Learned.nothing(SMALL).with_more(SMALL, heard(first, wrong, 1), draws)
-        only = Learned.nothing(SMALL).with_more(SMALL, heard(first, 1), draws)
+        louder = Learned.nothing(SMALL).with_more(SMALL, newer(first, wrong, 1), draws)
+        only = Learned.nothing(SMALL).with_more(SMALL, newer(first, 1), draws)
         np.testing.assert_array_equal(
             louder.density(SMALL, Purpose.GRADIENT.value), only.density(SMALL, Purpose.GRADIENT.value)
         )
-    silent = Learned.nothing(SMALL).with_more(SMALL, heard(0, np.nan), draws)
+    silent = Learned.nothing(SMALL).with_more(SMALL, newer(0, np.nan), draws)
     for purpose in Purpose:
         assert silent.density(SMALL, purpose.value) == pytest.approx(SMALL.measures())
 
@@ -219,9 +219,9 @@ def test_cells_are_as_fine_as_the_paths_allow() -> None:
 def test_old_samples_count_little() -> None:
     draws, before, now = np.ones(SMALL.cells), np.zeros(SMALL.cells), np.zeros(SMALL.cells)
     before[:16], now[16:] = 1, 1
-    learned = Learned.nothing(SMALL).with_more(SMALL, heard(before, 1), draws)
+    learned = Learned.nothing(SMALL).with_more(SMALL, newer(before, 1), draws)
     for _ in range(20):
-        learned = learned.with_more(SMALL, heard(now, 1), draws)
+        learned = learned.with_more(SMALL, newer(now, 1), draws)
     assert learned.density(SMALL, Purpose.GRADIENT.value)[:16].sum() < 0.02
 
 
@@ -259,14 +259,14 @@ def test_a_recorded_walk_collects_the_same_as_a_plain_one(name: str) -> None:
         assert dr.thread_count() > 1 or np.array_equal(one.sums, other.sums)
         assert dr.thread_count() > 1 or np.array_equal(one.draws, other.draws)
     counts = recorded.preparation.recordings.counts()
-    assert 1 <= counts["hear"] <= 2
+    assert 1 <= counts["collect"] <= 2
     assert counts["fused"] <= 2
 
 
 def test_walks_of_many_paths_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(freezing, "MOST_PATHS_APART", 1)
     counts = taught("two_emitters", 2, freeze=True).preparation.recordings.counts()
-    assert "hear" not in counts
+    assert "collect" not in counts
     assert counts["fused"] > 0
 
 
@@ -321,13 +321,13 @@ def test_the_worth_of_a_table_is_its_effect_on_the_second_moment(weight: float) 
     others = (1 - (rare * grid.measures()).sum() / weight) / (~rare * grid.measures()).sum()
     draws = paths * grid.measures() * np.where(rare, 1 / weight, others)
     assert draws.sum() == pytest.approx(paths)
-    heard = np.stack([rare * draws, ~rare * draws])
-    alone = Learned.nothing(grid).with_more(grid, heard[[0, 0]], draws)
+    newer = np.stack([rare * draws, ~rare * draws])
+    alone = Learned.nothing(grid).with_more(grid, newer[[0, 0]], draws)
     assert alone.worse == pytest.approx(weight, rel=1e-5)
-    assert Learned.nothing(grid).with_more(grid, heard, draws).worse == pytest.approx(
+    assert Learned.nothing(grid).with_more(grid, newer, draws).worse == pytest.approx(
         (weight + 1 / others) / 2, rel=1e-5
     )
-    assert Learned.nothing(grid).with_more(grid, 0 * heard, draws).worse == 1
+    assert Learned.nothing(grid).with_more(grid, 0 * newer, draws).worse == 1
 
 
 @pytest.mark.parametrize("paths", [100, 4096, 20_000, 10**7])
@@ -336,10 +336,10 @@ def test_a_grid_is_as_fine_as_its_walks_can_resolve(paths: int, weights: list[fl
     finest = grid_for([True] * 4, weights, 1)
     grid = grid_for([True] * 4, weights, 1, paths)
     assert finest.coarser(grid.cells) == grid  # made of the same cuts
-    heard, used = 0.0, []
+    newer, used = 0.0, []
     for _ in range(200):
-        heard = KEEP * heard + paths
-        used.append(finest.coarser(min(FINE * heard, most_cells(paths))).cells)
+        newer = KEEP * newer + paths
+        used.append(finest.coarser(min(FINE * newer, most_cells(paths))).cells)
     assert max(used) == grid.cells <= finest.cells
 
 
@@ -352,9 +352,9 @@ def test_a_coarse_grid_agrees_with_the_finest() -> None:
     assert grid.cells < finest.cells
     random, both = np.random.default_rng(7), [Learned.nothing(each) for each in (finest, grid)]
     for _ in range(3):
-        heard, draws = random.gamma(0.1, size=(3, finest.cells)), paths * finest.measures()
-        both[0] = both[0].with_more(finest, heard, draws)
-        few = np.stack([finest.summed(row, grid) for row in heard])
+        newer, draws = random.gamma(0.1, size=(3, finest.cells)), paths * finest.measures()
+        both[0] = both[0].with_more(finest, newer, draws)
+        few = np.stack([finest.summed(row, grid) for row in newer])
         both[1] = both[1].with_more(grid, few, finest.summed(draws, grid))
         for share in (0.0, 0.5, 1.0):
             expected = finest.summed(both[0].density(finest, share), grid)
@@ -434,10 +434,10 @@ def learned() -> Guiding:
     guiding.grid = GRID
     for number in (0, 3):
         draws = random.random(GRID.cells) * 100
-        said = Learned.nothing(GRID).with_more(GRID, random.random((4, GRID.cells)), draws)
+        learned = Learned.nothing(GRID).with_more(GRID, random.random((4, GRID.cells)), draws)
         squares, light, length = random.random((4, CELLS)).astype(np.float32), random.random(), 1 + random.random()
         onward = Onward(random.random((2, 3)).cumsum(0).astype(np.float32), squares, light, length)
-        guiding.learned[number] = Learned(said.sums, said.draws, 5 + number, onward)
+        guiding.learned[number] = Learned(learned.sums, learned.draws, 5 + number, onward)
     return guiding
 
 

@@ -13,7 +13,7 @@ from conformance.gradient_cases import FLOOR
 from conformance.operations import count, tracking, with_change
 from turns import a_few, taking_turns
 
-from reslrb_cli.config.integrators import DECIDABLE
+from reslrb_cli.config.integrators import AUTO_VALUES
 from reslrb_cli.estimators import gather, reservoir, stack
 from reslrb_cli.integrators.context import Preparation
 from reslrb_cli.integrators.plugin import make_integrator
@@ -202,7 +202,7 @@ def test_rows_explain_needed_features() -> None:
 
 def test_every_automatic_setting_has_a_row_with_the_reason_of_its_decision() -> None:
     plan = integrator("reslrb", 5).plan(scene := Case(plain(), (FLOOR,)).scene, scene.sensors()[0])
-    decisions = [Decision(setting=setting, value="auto", why=f"reason {k}") for k, setting in enumerate(DECIDABLE)]
+    decisions = [Decision(setting=setting, value="auto", why=f"reason {k}") for k, setting in enumerate(AUTO_VALUES)]
     texts = [row.reason for row in plan_rows(plan, decisions)]
     assert all(any(text.endswith(f"{each.setting}: auto, {each.why}") for text in texts) for each in decisions)
 
@@ -294,7 +294,7 @@ def test_without_an_image_other_vertices_are_not_connected(scene: dict, monkeypa
     original, shares = stack.walk_back, []
 
     def noting(p: Any, form: Any, ring: Any, state: stack.StackState, *rest: Any) -> Any:
-        connected = (state.needed > 0) | dr.any(state.since != 0)
+        connected = (state.useful > 0) | dr.any(state.D != 0)
         shares.append(float(np.mean(np.array(connected, dtype=float))))
         return original(p, form, ring, state, *rest)
 

@@ -22,7 +22,7 @@ from turns import a_few
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, load, rgb, room
-from reslrb_cli.scene.graph import no_wavelengths
+from reslrb_cli.scene.rays import no_wavelengths
 from reslrb_cli.transport.film import AdjointImage, Film
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -132,13 +132,6 @@ def differing(way: str, names: tuple[str, ...], orders: Iterator[np.random.Gener
             if not all(is_same(*pair) for pair in pairs):
                 found.append(f"{way}: {before}")
     return found
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("way", ["both"])
-def test_results_do_not_depend_on_earlier_work(way: str) -> None:
-    with one_thread():
-        assert differing(way, ("mirror", "zero", "moving"), map(np.random.default_rng, range(1)), 7) == []
 
 
 @pytest.mark.long

@@ -16,8 +16,8 @@ from conformance.attached_cases import CASES as MOVING
 from conformance.drawing import SPP, by_harsh_table, guided, harsh
 
 from reslrb_cli.estimators.attached import AttachedSweep
-from reslrb_cli.guiding import collect
-from reslrb_cli.guiding.collect import BINS, FLOOR, LEAN, SURE, Onward, Said, hear
+from reslrb_cli.guiding import collect as collecting
+from reslrb_cli.guiding.collect import BINS, FLOOR, LEAN, SURE, Collected, Onward, collect
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import Case, integrator, seeds
@@ -116,11 +116,11 @@ def test_the_probability_is_bounded_on_both_sides() -> None:
         assert (raised <= np.maximum(np.array(throughput)[:5], 1 / chance if chance else np.inf)).all()
 
 
-def walked(said: tuple[float, float] = (4.0, 9.0), light: float = 2.0, **changes: Any) -> Said:
-    """Return the result of a walk of one path with two later vertices, which contributed `said`."""
+def walked(totals: tuple[float, float] = (4.0, 9.0), light: float = 2.0, **changes: Any) -> Collected:
+    """Return the result of a walk of one path with two later vertices, which contributed `totals`."""
     whole, zeros = np.zeros((4, BINS)), np.zeros(CELLS)
-    whole[:, 0] = [*said, light, 2.0]
-    return replace(Said(None, np.zeros((2, CELLS)), zeros, zeros, whole, []), **changes)
+    whole[:, 0] = [*totals, light, 2.0]
+    return replace(Collected(None, np.zeros((2, CELLS)), zeros, zeros, whole, []), **changes)
 
 
 def cell_of(x: int, y: int, z: int) -> int:
@@ -151,8 +151,8 @@ def test_cells_share_with_their_neighbours_and_none_is_zero() -> None:
 def test_walks_without_contributions_change_nothing() -> None:
     onward = Onward.nothing(BOX)
     assert np.isinf(onward.chances(1.0)).all()
-    for said, light in (((0.0, 1.0), 1.0), ((1.0, 0.0), 1.0), ((np.nan, 1.0), 1.0), ((1.0, 1.0), 0.0)):
-        assert onward.with_more(walked(said, light), 1) is onward
+    for totals, light in (((0.0, 1.0), 1.0), ((1.0, 0.0), 1.0), ((np.nan, 1.0), 1.0), ((1.0, 1.0), 0.0)):
+        assert onward.with_more(walked(totals, light), 1) is onward
 
 
 def test_without_data_all_paths_survive() -> None:
@@ -174,18 +174,18 @@ def test_learned_state_does_not_depend_on_the_unit_of_light() -> None:
         np.testing.assert_allclose(Onward.nothing(BOX).with_more(brighter, 1).chances(0.5) * unit, s, rtol=1e-5)
 
 
-def walk_of(scene: Case, ours: Any, seed: int) -> Said:
+def walk_of(scene: Case, ours: Any, seed: int) -> Collected:
     """Return the data of one walk, from which a table would learn, with sums by cell as NumPy arrays."""
     leaves = scene.leaves()
     job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(seed), SPP, scene.params)
     samples = ours.passes(job, Purpose.BOTH)[0]
-    found = hear(samples, scene.adjoint)
+    found = collect(samples, scene.adjoint)
     scene.release(leaves)
     squares = np.array(found.squares).reshape(-1, CELLS)
     return replace(found, squares=squares, followed=np.array(found.followed), left=np.array(found.left))
 
 
-def heard(name: str, change: Callable[[Case, Any], None], count: int, block: int) -> np.ndarray:
+def collected(name: str, change: Callable[[Case, Any], None], count: int, block: int) -> np.ndarray:
     """Return the data that walks of two bounces collect after the first vertex, by octant of the outgoing ray. Each
     seed has one row. A row holds the squared contributions of each quantity, the later vertices, and the rays.
     """
@@ -207,7 +207,7 @@ def certain(scene: Case, ours: Any) -> None:
 @functools.cache
 def heard_of_all() -> np.ndarray:
     """Return the data that walks without roulette collect. Their weights are 1, which no power changes."""
-    return heard("two_emitters", certain, 24, 1)
+    return collected("two_emitters", certain, 24, 1)
 
 
 @pytest.mark.parametrize("fault", [None, "square", "length"])
@@ -217,10 +217,10 @@ def test_collected_values_do_not_depend_on_roulette(fault: str | None, monkeypat
     """
     expected = heard_of_all()
     if fault is not None:
-        right = collect.Trail.survives
+        right = collecting.Trail.survives
         power = {"square": 3.0, "length": 0.0}[fault]
-        monkeypatch.setattr(collect.Trail, "survives", lambda self, weight: right(self, weight**power))
-    result = compare(heard("two_emitters", harsh, 24, 0), expected, block=None)
+        monkeypatch.setattr(collecting.Trail, "survives", lambda self, weight: right(self, weight**power))
+    result = compare(collected("two_emitters", harsh, 24, 0), expected, block=None)
     print(fault, result)
     assert bool(result) == (fault is None)
 
@@ -276,7 +276,7 @@ def test_vertices_beyond_the_capacity_are_summed(monkeypatch: pytest.MonkeyPatch
     scene, ours, _ = guided("two_emitters", 1, max_depth=3)
     found = []
     for places in (32, 1):
-        monkeypatch.setattr(collect, "PLACES", places)
+        monkeypatch.setattr(collecting, "PLACES", places)
         found.append(walk_of(scene, ours, 5))
     assert found[0].left.sum() > 0
     for name in ("squares", "followed", "left"):

@@ -411,7 +411,7 @@ def test_a_fault_is_found(fault: Fault, monkeypatch: pytest.MonkeyPatch):
 WALKS_BACK = {
     "walk_back_forgets_what_is_met": ("CameraSweep.vertex", "if met is not None:", "if False:", 16),
     "blocks_forget_what_is_met": ("CameraSweep.vertex", "if met is not None:",
-                                  "if met is not None and self.end is None:", 1),
+                                  "if met is not None and self.ring.end is None:", 1),
 }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from reslrb_cli.estimators.stack import Stack
 from reslrb_cli.measure.extreme import CASES
 from reslrb_cli.measure.extreme.suite import run_case
 from reslrb_cli.measure.gradcheck import Gradcheck
-from reslrb_cli.measure.methods import Case, parse_checked
+from reslrb_cli.measure.methods import NamedIntegrator, parse_checked
 from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.records.measurements import GradcheckRecord
@@ -45,7 +45,7 @@ run: {{spp: 64}}
     return loads(text, name, [*overrides])
 
 
-def estimators_of(names: str) -> list[Case]:
+def estimators_of(names: str) -> list[NamedIntegrator]:
     """Return the estimators of a list such as `stack,reservoir(capacity=2)`."""
     return parse_checked(re.sub(r"(^|,)(?![^(]*\))", r"\1reslrb:", names))
 
@@ -216,7 +216,7 @@ FAULTS = [
           by("reservoir event gather", "walk_ad", "finite_difference")),
     Fault("zero_factor_of_prefix_dropped", "black_texels", "estimators.gather:AdjointSum.adjoint_of_factor",
           "(f[c] == 0) & (zero == NO_ZERO)", "mi.Bool(False)", by("gather", "walk_ad")),
-    Fault("zero_factor_not_pushed", "black_texels", "estimators.stack:push",
+    Fault("zero_factor_not_pushed", "black_texels", "estimators.stack:pass_vertex",
           "dr.select(on, P *", "dr.select(on & dr.any(scattering.f != 0), P *",
           by("stack", "walk_ad", "finite_difference")),
     Fault("second_zero_factor_forgotten", "pure_colours", "transport.factors:Product.times",
@@ -236,7 +236,7 @@ FAULTS = [
     Fault("visible_emission_not_differentiated", "furnace",
           "transport.emission:differentiate_visible_emission",
           'plan.visible_emission and plan.paths == "light" and (', "False and (", by("stack", "walk_ad", "analytic")),
-    Fault("shading_normals_uncorrected_beside_zero", "black_solid", "estimators.stack:push",
+    Fault("shading_normals_uncorrected_beside_zero", "black_solid", "estimators.stack:pass_vertex",
           "scattering.correction / scattering.pdf", "1 / scattering.pdf", by("stack", "walk_ad")),
     Fault("mask_forgotten_beside_zero", "behind_mask", "estimators.gather:adjoint_of_connection",
           "rest *= differentiate_passage(", "differentiate_passage(", by("gather", "walk_ad", "finite_difference")),
@@ -271,13 +271,13 @@ FAULTS = [
     Fault("visibility_inverted", "cornell", "estimators.gather:Visibility.of",
           "& 1) != 0", "& 1) == 0", by("gather stack", *GRADIENT)),
     Fault("stack_without_last_vertex", "cornell", "estimators.stack:walk_back",
-          "state.needed, bottom", "state.needed - dr.select(state.needed > 0, mi.UInt32(1), 0), bottom",
+          "state.useful, bottom", "state.useful - dr.select(state.useful > 0, mi.UInt32(1), 0), bottom",
           by("stack", *GRADIENT)),
     Fault("blocks_begin_anew", "cornell_stack_of_2", "estimators.stack:walk_back",
-          "again(left), left, bottom, adjoint)", "again(left), left, bottom, 0 * adjoint)",
+          "retraced, left, bottom, adjoint)", "retraced, left, bottom, 0 * adjoint)",
           by("stack", *GRADIENT)),
-    Fault("stack_forgets_what_it_does_not_push", "cornell", "estimators.stack:push",
-          "own=state.gap() + T * own", "own=T * own",
+    Fault("stack_forgets_what_it_does_not_push", "cornell", "estimators.stack:pass_vertex",
+          "own=state.D_here() + T * own", "own=T * own",
           by("stack", *GRADIENT)),
     Fault("candidates_by_their_own_factor_alone", "cornell_reservoir",
           "estimators.reservoir:ReservoirSelection.vertex",
@@ -302,8 +302,8 @@ FAULTS = [
     Fault("adjoints_of_origin_and_direction_exchanged", "wavy_glass", BACK,
           "(mi.Vector3f(dr.grad(ray.o)), dr.grad(ray.d), B)", "(dr.grad(ray.d), mi.Vector3f(dr.grad(ray.o)), B)",
           by("stack", *MOVED)),
-    Fault("last_vertex_of_the_attached_stack", "wavy_glass", "estimators.stack:StackState.pushed",
-          "dr.select(contributes, count, self.needed)", "dr.select(contributes, self.count, self.needed)",
+    Fault("last_vertex_of_the_attached_stack", "wavy_glass", "estimators.stack:StackState.push",
+          "dr.select(contributes, count, self.useful)", "dr.select(contributes, self.count, self.useful)",
           by("stack", *MOVED)),
     Fault("next_ray_detached", "wavy_glass", "transport.walk:Segment.next_ray",
           "ray if attached else dr.detach(ray)", "dr.detach(ray)", by("stack", "ptracer", "finite_difference")),

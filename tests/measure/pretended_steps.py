@@ -14,8 +14,8 @@ from reslrb_cli.config.loader import loads
 from reslrb_cli.measure.bench import STEPS
 from reslrb_cli.measure.convergence import Session
 from reslrb_cli.measure.judgement import ConvergenceResults, Judgement
-from reslrb_cli.measure.methods import Plan, parse_cases
-from reslrb_cli.measure.processes import Ended, Refused, Stopped
+from reslrb_cli.measure.methods import ConvergencePlan, parse_cases
+from reslrb_cli.measure.processes import CannotStart, Ended, Stopped
 from reslrb_cli.records.measurements import BenchStatus, MethodRecord
 
 # Processes that only pretend to measure, for tests of sweeps.
@@ -45,7 +45,7 @@ class Pretended:
         if stop():
             raise Stopped
         if self.type in self.refusing:
-            raise Refused("no derivatives of moving light", 2)
+            raise CannotStart("no derivatives of moving light", 2)
         if self.ends.get((self.type, self.depth)) == self.asked:
             raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
         if self.question is None:
@@ -157,7 +157,7 @@ class Player:
             return self.stage.facts | {"warnings": ["old"]}
         if self.question is None:
             if self.played.refuses:
-                raise Refused("cannot be done here", 2)
+                raise CannotStart("cannot be done here", 2)
             return {"warnings": ["old"]}
         if self.played.ends == self.questions:
             raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGKILL")
@@ -199,17 +199,17 @@ LIST = "ptracer,reslrb:stack,reslrb:event"
 SIGNAL = float(TRUTH @ TRUTH)
 
 
-def plan(cases: str = LIST, **changes: Any) -> Plan:
+def plan(cases: str = LIST, **changes: Any) -> ConvergencePlan:
     values: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": parse_cases(cases),
         "reference": parse_cases("reslrb:stack")[0], "objective": "fixed", "memory_limit": None,
         "budget_s": 0.0, "rounds": 32,
     }  # fmt: skip
-    return Plan(**(values | changes))
+    return ConvergencePlan(**(values | changes))
 
 
 def play(
-    folder: Path, stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False
+    folder: Path, stage: Stage, what: ConvergencePlan, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Session, ConvergenceResults, list[str]]:
     said: list[str] = []
     session = Session(what, folder, stop, said.append, stage.start, stage.clock)

@@ -19,7 +19,7 @@ import pytest
 from cli.tiny import ended, measured
 from kit import diffuse, ref, scene, sensor, shape
 
-from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
+from reslrb_cli.measure.processes import CannotStart, Ended, Process, Stopped, last_words
 from reslrb_cli.measure.steps import scratch_bytes
 from reslrb_cli.records.measurements import BenchStatus
 
@@ -208,7 +208,7 @@ def test_a_crash_near_the_limit_is_attributed_to_memory() -> None:
 def test_a_refusal_applies_to_all() -> None:
     answer = {"failure": "refused", "reason": "x.yaml: scene.file: no such file", "exit_code": 2}
     process = Process(FIRST, command=[sys.executable, "-c", f"import json; print(json.dumps({answer!r}))"])
-    with pytest.raises(Refused, match=r"scene\.file: no such file") as caught:
+    with pytest.raises(CannotStart, match=r"scene\.file: no such file") as caught:
         process.answer(lambda: False)
     assert caught.value.exit_code == 2
     process.close()

@@ -15,7 +15,7 @@ from reslrb_cli.measure import arena
 from reslrb_cli.measure.arena import MAX_ROUNDS, MIN_ROUNDS, NO_TIME, Pace
 from reslrb_cli.measure.bench import Bench, BenchResult
 from reslrb_cli.measure.methods import Sweep, depths, parse_cases, sample_counts
-from reslrb_cli.measure.processes import Refused, Stopped
+from reslrb_cli.measure.processes import CannotStart, Stopped
 from reslrb_cli.records.measurements import BenchStatus, Spread
 from reslrb_cli.report.tables import bench_cells, bench_columns
 
@@ -283,7 +283,7 @@ def test_unnamed_cases_that_refuse_are_left_out():
 @pytest.mark.parametrize(("refusing", "default"), [("reslrb", False), ("ptracer", True)])
 def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool):
     Pretended.refusing = {refusing}
-    with pytest.raises(Refused, match="moving light"):
+    with pytest.raises(CannotStart, match="moving light"):
         play(sweep(default=default))
     assert Pretended.alive == 0
 

@@ -135,8 +135,8 @@ def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_slightly_wrong_derivative(monkeypatch: pytest.MonkeyPatch):
-    right = stack.push
-    monkeypatch.setattr(stack, "push", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.001))
+    right = stack.pass_vertex
+    monkeypatch.setattr(stack, "pass_vertex", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.001))
     found = failures(check(*SMALLER, estimators="stack,gather"))
     assert found == {("stack", name) for name in ("walk_ad", "finite_difference", "forward_mode")}
 

@@ -61,7 +61,7 @@ def left_out(problem: Problem) -> np.ndarray:
 
 
 def seen_by(problem: Problem) -> np.ndarray:
-    return sees_specular(problem.scene, problem.scene.sensors()[0]).alone
+    return sees_specular(problem.scene, problem.scene.sensors()[0])
 
 
 def test_the_mask_follows_the_glass(llvm: str, tmp_path: Path) -> None:

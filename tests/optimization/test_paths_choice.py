@@ -12,7 +12,7 @@ from cli import tiny
 from optimization.deciding import SMALL, begin, decision, fix_times
 from runs.going_on import optimize
 
-from reslrb_cli.config.integrators import Reslrb
+from reslrb_cli.config.integrators import ReslrbConfig
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
@@ -240,7 +240,7 @@ def test_beams_and_scaled_emitters_are_left_to_light_paths():
     def paths(**lights: Any) -> str:
         wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3])}
         scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "wall": wall, **lights})
-        return paths_of(Reslrb(), scene, [0])
+        return paths_of(ReslrbConfig(), scene, [0])
 
     def sun(scale: float) -> dict[str, Any]:
         return {"type": "directional", "to_world": mi.ScalarTransform4f().scale(scale)}

@@ -1,4 +1,4 @@
-"""Rules of verdicts, the posterior on which verdicts are based, and the test whether a loss fell."""
+"""Rules of verdicts, the posterior on which verdicts are based, and the test whether a parameter got worse."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from turns import a_few
 
 from reslrb_cli.optimization.results import got_worse
-from reslrb_cli.optimization.trend import Change, find_trend, window
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.posterior import Measured, joint, noise_covariance, pooled
 from reslrb_cli.optimization.uncertainty.verdicts import (
@@ -376,114 +374,6 @@ def test_entries_of_a_motion_have_their_own_noise():
     few = random.normal(size=(3, 3)) * sizes
     own = Measured(sizes, (-np.inf, np.inf), 1.0, few, sizes, True, sizes, last)
     np.testing.assert_allclose(own.noise, sizes**2, rtol=0.6)
-
-
-# Whether a loss fell beyond its noise: how often the verdict is right, and which verdicts never occur.
-
-ROUNDS = 200
-
-
-def shares_of_verdicts(make, iterations, seed=3):
-    """Return the frequency of each verdict for noisy series."""
-    random = np.random.default_rng(seed)
-    found = collections.Counter(find_trend(make(random, np.arange(iterations))).change for _ in range(ROUNDS))
-    return {change: found[change] / ROUNDS for change in Change}
-
-
-def noisy(curve, noise=0.1):
-    return lambda random, i: curve(i) * (1 + noise * random.normal(size=len(i)))
-
-
-def fireflies(curve):
-    """Return a function that makes noisy series. About one iteration in fifty has up to 50 added to its value."""
-
-    def make(random, i):
-        bright = (random.random(len(i)) < 0.02) * 50 * random.random(len(i))
-        return curve(i) * (1 + 0.1 * random.normal(size=len(i))) + bright
-
-    return make
-
-
-@pytest.mark.parametrize("iterations", a_few([20, 100, 1000], ["20", "100"]))
-def test_pure_noise_is_flat(iterations):
-    found = shares_of_verdicts(noisy(lambda i: np.ones(len(i))), iterations)
-    assert found[Change.FLAT] > (0.75 if iterations == 20 else 0.95)
-    assert max(found[Change.FELL], found[Change.ROSE]) < 0.04
-
-
-@pytest.mark.parametrize(
-    ("iterations", "decay"),
-    [pytest.param(i, d, marks=() if (i, d) in ((20, 8), (100, 3)) else pytest.mark.long)
-     for i in (20, 100, 1000) for d in (8, 3, 1)],
-)  # fmt: skip
-def test_a_fall_within_a_few_iterations_is_found(iterations, decay):
-    """Up to nine tenths of the run's first tenth may be as low as its end."""
-    found = shares_of_verdicts(noisy(lambda i: 1 + 5 * np.exp(-i / decay)), iterations)
-    assert found[Change.FELL] > 0.95
-    assert found[Change.FLAT] + found[Change.ROSE] < 0.01
-
-
-@pytest.mark.parametrize("iterations", a_few([50, 200], ["50"]))
-def test_fireflies_do_not_hide_a_fall(iterations):
-    found = shares_of_verdicts(fireflies(lambda i: 1 + 5 * np.exp(-8 * i / len(i))), iterations)
-    assert found[Change.FELL] > 0.8
-    assert found[Change.FLAT] + found[Change.ROSE] < 0.01
-
-
-def test_a_firefly_near_the_end_does_not_hide_a_fall():
-    random = np.random.default_rng(4)
-    values = np.concatenate([1 + 0.05 * random.normal(size=60), 0.2 + 0.02 * random.normal(size=40)])
-    values[-4] = 30.0
-    assert find_trend(values).change is Change.FELL
-
-
-@pytest.mark.parametrize("iterations", a_few([50, 200, 1000], ["50"]))
-def test_fireflies_do_not_count_as_a_rise(iterations):
-    assert shares_of_verdicts(fireflies(lambda i: np.ones(len(i))), iterations)[Change.ROSE] < 0.04
-
-
-def test_a_slow_rise_is_found():
-    found = shares_of_verdicts(noisy(lambda i: 1 + 0.5 * i / len(i)), 100)
-    assert found[Change.ROSE] > 0.95
-
-
-@pytest.mark.long
-def test_a_slow_fall_is_rarely_missed():
-    """The loss falls by a fifth over the run. A single iteration has noise of a tenth."""
-    for iterations in (50, 100, 200):
-        found = shares_of_verdicts(noisy(lambda i: 1 - 0.2 * i / len(i)), iterations)
-        assert found[Change.FLAT] < 0.12
-        assert found[Change.ROSE] < 0.01
-
-
-def test_a_jump_that_declines_counts_as_a_rise():
-    """With a rate far too large, Adam's loss jumps at once. The loss then falls slowly to a level above the start."""
-    found = shares_of_verdicts(noisy(lambda i: np.where(i == 0, 0.3, 1 + 20 * np.exp(-i / 10))), 100)
-    assert found[Change.ROSE] > 0.95
-
-
-def test_the_levels_are_the_first_and_the_last_tenth():
-    values = np.concatenate([np.tile([1.0, 3.0], 10), np.full(160, 9.0), np.tile([0.4, 0.6], 10)])
-    trend = find_trend(values)
-    assert (trend.start.mean, trend.end.mean) == (pytest.approx(2.0), pytest.approx(0.5))
-    # An interquartile mean leaves out half of the values. The kept half of these two values has the same spread as all
-    # values.
-    assert trend.start.error == pytest.approx(2 * np.std(values[:20], ddof=1) / np.sqrt(20))
-    assert trend.to_json()["change"] == "fell"
-    assert window(200) == 20
-
-
-def test_a_run_without_any_change():
-    trend = find_trend(np.full(30, 0.7))
-    assert (trend.change, trend.start.error) == (Change.FLAT, 0.0)
-
-
-def test_short_runs_and_non_finite_values():
-    assert find_trend(np.linspace(0, 1, 19)) is None
-    values = np.linspace(2, 1, 40)
-    values[[3, 17]] = np.nan, np.inf
-    assert find_trend(values).change is Change.FELL
-    assert find_trend(np.full(100, np.nan)) is None
 
 
 def test_worse_parameters():

@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 import pytest
 from cli import tiny
+from kit import count_iterations, wait_for
 from runs.going_on import MOTION, one_thread, optimize
 from runs.hosts import hosts, make_certificates, missing
 
-from reslrb_cli.cluster.connection import Place, connected
+from reslrb_cli.cluster.connection import Cluster, connected
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.loop import iterate
@@ -75,6 +76,10 @@ def end(course: RunProgress, after: Callable[[int], object] = lambda iteration: 
         return course.problem.values() | ({} if guiding is None else guiding.state()[1])
 
 
+def bits(arrays: dict[str, np.ndarray]) -> dict[str, bytes]:
+    return {name: array.tobytes() for name, array in arrays.items()}
+
+
 def test_workers_give_the_results_of_one_process(experiment: Path) -> None:
     check(experiment, "guided, scaled", 1)
 
@@ -105,7 +110,7 @@ def test_workers_run_users_code_with_permission(experiment: Path) -> None:
     compare(experiment, OWN_SETS, 1)
     course = make(experiment, *OWN_SETS)
     (experiment / "own.py").write_text(OWN + "# another\n")
-    with pytest.raises(ConfigError, match="has changed since"), engine.engine_at(course, Place(1), threads=1):
+    with pytest.raises(ConfigError, match="has changed since"), engine.engine_at(course, Cluster(1), threads=1):
         pass
 
 
@@ -116,12 +121,10 @@ def check(folder: Path, case: str, workers: int) -> None:
 def compare(folder: Path, sets: list[str], workers: int) -> None:
     """Compare the results bit by bit, with one thread each."""
     alone, course = both(folder, *sets)
-    with engine.engine_at(course, Place(workers), threads=1) as local:
+    with engine.engine_at(course, Cluster(workers), threads=1) as local:
         course.compute_with(local)
         together = end(course)
-    assert {name: array.tobytes() for name, array in alone.items()} == {
-        name: array.tobytes() for name, array in together.items()
-    }
+    assert bits(alone) == bits(together)
 
 
 # --- the side of a worker ---------------------------------------------------------------------------------------------
@@ -198,13 +201,11 @@ def beside(folder: Path, workers: int, iterations: int, *sets: str):
     """Yield a course with `workers` workers and their client, and compare its result with one process."""
     sets = ("run.shards=4", f"run.iterations={iterations}", "views=[{sensor: 0}]", *sets)
     alone, course = both(folder, *sets)
-    with engine.engine_at(course, Place(workers), threads=1) as local:
+    with engine.engine_at(course, Cluster(workers), threads=1) as local:
         course.compute_with(local)
         yield course, local._client
         together = end(course)
-    assert {name: array.tobytes() for name, array in alone.items()} == {
-        name: array.tobytes() for name, array in together.items()
-    }
+    assert bits(alone) == bits(together)
 
 
 def hang(dask_worker: Any) -> None:
@@ -278,7 +279,7 @@ class Unchanged:
 def test_a_call_that_ends_every_worker_ends_the_run(caplog: pytest.LogCaptureFixture) -> None:
     ended = pytest.raises(MachineError, match="--cluster: the same call ended 4 workers, the last one at tls://")
     workload = calls.Workload({"a": b"one"}, reads)
-    with connected(Place(1)) as (client, _), ended:
+    with connected(Cluster(1)) as (client, _), ended:
         list(calls.Workers(client, workload, lambda state: Unchanged())(None, fail, [()]))
     warnings = [record.message for record in caplog.records if record.name == "reslrb_cli.cluster.calls"]
     assert warnings  # a busy machine may lose some
@@ -323,7 +324,7 @@ def test_memory_does_not_grow(experiment: Path) -> None:
 
     sizes: dict[int, list[int]] = {}
     course = make(experiment, "run.shards=4", "run.iterations=2001", "views=[{sensor: 0}]")
-    with engine.engine_at(course, Place(2), threads=1) as local:
+    with engine.engine_at(course, Cluster(2), threads=1) as local:
         course.compute_with(local)
         with one_thread():
             for state, _ in iterate(course.problem, course.state):
@@ -375,8 +376,7 @@ def test_isolated_hosts_give_the_same(net, tmp_path: Path) -> None:
     for host in range(2):
         net.worker(host, host)
     remote = reslrb(net, 2, *RUN, *more, "--cluster", net.address(2), "--set", "run.name=remote")
-    metrics = tmp_path / "runs" / "remote" / "metrics.jsonl"
-    wait_for(lambda: metrics.exists() and len(metrics.read_text().splitlines()) > 4, 120)
+    wait_for(lambda: count_iterations(tmp_path / "runs" / "remote") > 4, 120)
     net.cut(0)
     time.sleep(20)
     net.cut(0, False)
@@ -412,7 +412,7 @@ def test_a_run_survives_five_kills_of_scheduler_or_coordinator(net, tmp_path: Pa
             assert run.wait(300) == 0, said(net, run)
             break
         least = 10 * (kill + 1) - rng.randrange(5)
-        wait_for(lambda least=least: done(folder) >= least, 120)
+        wait_for(lambda least=least: count_iterations(folder) >= least, 120)
         time.sleep(rng.uniform(0, 0.3))
         os.killpg((scheduler if whom == "scheduler" else run).pid, signal.SIGKILL)
         if whom == "scheduler":
@@ -424,21 +424,9 @@ def test_a_run_survives_five_kills_of_scheduler_or_coordinator(net, tmp_path: Pa
     assert values(folder) == values(tmp_path / "runs" / "local")
 
 
-def done(folder: Path) -> int:
-    metrics = folder / "metrics.jsonl"
-    return len(metrics.read_text().splitlines()) if metrics.exists() else 0
-
-
 def made(folder: Path) -> Path:
     folder.mkdir()
     return folder
-
-
-def wait_for(holds: Callable[[], bool], seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 BAD = [

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from cli import tiny
 from compilation import search_path
+from kit import count_iterations
 from runs.going_on import (
     MOTION,
     begin_alone,
@@ -237,19 +238,13 @@ def end(process: subprocess.Popen[str]) -> tuple[int, str]:
     return process.returncode, err
 
 
-def count(run: Path) -> int:
-    """Return the number of metrics lines."""
-    path = run / "metrics.jsonl"
-    return path.read_bytes().count(b"\n") if path.exists() else 0
-
-
 def kill_at_random(process: subprocess.Popen[str], run: Path, chance: random.Random) -> None:
     """Kill the process at a random moment, mostly in the middle of its iterations."""
     if chance.random() < 0.2:
         time.sleep(chance.uniform(0, 4))
     else:
-        before, limit = count(run), time.monotonic() + 60
-        while count(run) <= before and process.poll() is None and time.monotonic() < limit:
+        before, limit = count_iterations(run), time.monotonic() + 60
+        while count_iterations(run) <= before and process.poll() is None and time.monotonic() < limit:
             time.sleep(0.005)
         time.sleep(chance.uniform(0, 0.3))
     process.kill()
@@ -259,10 +254,7 @@ def kill_at_random(process: subprocess.Popen[str], run: Path, chance: random.Ran
 @pytest.mark.long
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
-@pytest.mark.parametrize(
-    ("kills", "iterations"), [(1, 30), pytest.param(50, 1200, marks=pytest.mark.long)], ids=["one", "fifty"]
-)
-def test_a_repeatedly_killed_run_reaches_the_same_end(tmp_path: Path, kills: int, iterations: int) -> None:
+def test_a_run_killed_fifty_times_reaches_the_same_end(tmp_path: Path) -> None:
     """Each killed life has its own process. The last life ends in this process."""
 
     def finish(*words: str) -> None:
@@ -273,10 +265,10 @@ def test_a_repeatedly_killed_run_reaches_the_same_end(tmp_path: Path, kills: int
             assert optimize(*words) == 0
 
     tiny.write_experiment(tmp_path)
-    whole = words = ["tiny.yaml", *SETS, "--set", f"run.iterations={iterations}"]
+    whole = words = ["tiny.yaml", *SETS, "--set", "run.iterations=1200"]
     finish(*whole, "--set", "run.name=whole")
     run, chance = tmp_path / "runs/tiny", random.Random(11)
-    for _ in range(kills):
+    for _ in range(50):
         kill_at_random(start(tmp_path, *words), run, chance)
         words = whole
         if run.exists():
@@ -285,11 +277,11 @@ def test_a_repeatedly_killed_run_reaches_the_same_end(tmp_path: Path, kills: int
             assert manifest["status"] in ("interrupted", "finished")
             assert left_over(run) == []  # a reader has repaired the folder
             if (run / "checkpoint/state.npz").exists():
-                assert int(state_of(run)["iteration"]) <= count(run)
+                assert int(state_of(run)["iteration"]) <= count_iterations(run)
                 words = ["--resume", str(run), "--quiet"]
             else:
                 shutil.rmtree(run)
     finish(*words)
     assert differences(tmp_path / "runs/whole", run) == []
-    assert [record["iteration"] for record in records_of(run)] == list(range(iterations))
+    assert [record["iteration"] for record in records_of(run)] == list(range(1200))
     assert read_manifest(run)["status"] == "finished"  # type: ignore[index]

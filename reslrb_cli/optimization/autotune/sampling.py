@@ -1,9 +1,9 @@
 """Automatic decisions about the sampling of a run, taken before its first iteration.
 
 `AUTOMATIC` has one entry for each setting of the integrator that may be `auto`. To add a setting, add its entry here,
-and the setting to `Reslrb` in `config/integrators.py`, marked `Undecided`. If the setting has another value than
-without a decision, `Plan.on` contains it. All other code (Mitsuba's plugin, the printed line, manifest, checkpoints,
-page, `inspect`, resumed runs) reads these tables and the list of `Decision`s.
+and the setting to `ReslrbConfig` in `config/integrators.py`, marked `Plain` with its plain value. `Plan.on` contains
+the settings that have another value. All other code (Mitsuba's plugin, the printed line, manifest, checkpoints, page,
+`inspect`, resumed runs) reads these tables and the list of `Decision`s.
 
 A decision follows a rule or a race. A rule uses facts of the scene and the configuration. A race compares steps of both
 ways (`race.py`), with dL/dI fixed at one image.
@@ -39,7 +39,7 @@ from typing import Any
 import mitsuba as mi
 
 from reslrb_cli.backend.doctor import device_name
-from reslrb_cli.config.integrators import DECIDABLE
+from reslrb_cli.config.integrators import AUTO_VALUES
 from reslrb_cli.config.schema import Config
 from reslrb_cli.guiding.pixels import noted_part
 from reslrb_cli.guiding.tables import sensor_bytes
@@ -112,7 +112,7 @@ class Tuner:
         if self._cache is not None:
             key = key_of({"setting": otherwise.setting, "of": of, **situation(self.problem)})
             kept = self._cache.get(key)
-            if kept is not None and kept.value in DECIDABLE[otherwise.setting]:
+            if kept is not None and kept.value in AUTO_VALUES[otherwise.setting]:
                 return replace(kept, setting=otherwise.setting, cached=True)
         share = self.problem.config.run.measuring
         if not share or (left_s := self._left_s(kernels)) is None:
@@ -321,7 +321,7 @@ def _guides_light_alone(problem: Problem) -> bool:
 
 @dataclass(frozen=True)
 class Automatic:
-    """Automatic setting of the integrator. `DECIDABLE` has its values.
+    """Automatic setting of the integrator. `AUTO_VALUES` has its values.
 
     - `decide` takes the decision.
     - `paths` are the kinds of paths that leave the setting open: those that can render the scene (`Problem.paths`).
@@ -399,7 +399,7 @@ def decided(config: Config, decisions: Iterable[Decision]) -> list[Decision]:
     """Return the decisions on settings that `config` leaves to `auto`. Raises TypeError for an unknown value."""
     found = [each for each in decisions if each.setting in AUTOMATIC and is_auto(config, each.setting)]
     for each in found:
-        if each.value not in (values := DECIDABLE[each.setting]):
+        if each.value not in (values := AUTO_VALUES[each.setting]):
             raise TypeError(f"{each.setting} is `{each.value}`; possible are {', '.join(values)}")
     return found
 
