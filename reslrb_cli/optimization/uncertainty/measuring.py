@@ -108,14 +108,14 @@ class Certainty:
                 scales = {key: self.scale(key) for key in gradients}
                 most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
                 plan = plan_changes(problem, scales, STEP, most)
-                curvature = measured = LossCurvature(problem, spp)
+                curvature = latest = LossCurvature(problem, spp)
                 directions, H, B = curvature.along(plan, go_on)
-                while hides(directions, H, measured.sure, gradients) and spp < MOST_MULTIPLE * config.run.spp:
+                while hides(directions, H, latest.sure, gradients) and spp < MOST_MULTIPLE * config.run.spp:
                     if not go_on.affords(PART * go_on.spent):
                         break
                     spp *= PART
-                    measured = LossCurvature(problem, spp)
-                    found = measured.along(plan, go_on)
+                    latest = LossCurvature(problem, spp)
+                    found = latest.along(plan, go_on)
                     if len(found[0]) < len(directions):
                         break
                     directions, H, B = found
