@@ -29,6 +29,8 @@ SIZE = 24
 #: angle is `TURN` degrees, so that all derivatives have a similar size.
 MOTION = ("x", "y", "z", "turn")
 TURN = 60.0
+#: Motion of a sheet by a heightmap: the heights of its corners. Heights in between are interpolated.
+HEIGHTS = ("h00", "h10", "h01", "h11")
 PLACES = ("to_world", "position", "vertex_positions")
 #: Step of the finite differences, a smaller one for hard shadows on other moving shapes, and one for small shapes that
 #: hide a moving one.
@@ -43,9 +45,9 @@ class EdgeCase:
     """Shapes of `OCCLUDERS`, and a lamp of `LAMPS`, or of `ROOMS` in a room. The shapes move, or the lamp moves if
     `lamp_moves` is true.
 
-    The derivatives are those of each object's `motion`, which has components of `MOTION`. `axis` is the axis of the
-    rotation. The gradient of each seed uses `spp` samples per pixel. Finite differences have the `step`, and use
-    `reference_spp`. `options` are options of `reslrb`.
+    The derivatives are those of each object's `motion`, which has components of `MOTION`, or of `HEIGHTS` for the
+    bumpy sheet. `axis` is the axis of the rotation. The gradient of each seed uses `spp` samples per pixel. Finite
+    differences have the `step`, and use `reference_spp`. `options` are options of `reslrb`.
     """
 
     occluder: str
@@ -69,6 +71,7 @@ class EdgeCase:
         shapes = OCCLUDERS[self.occluder]()
         names = ["lamp"] if self.lamp_moves else [*shapes]
         first: dict[str, Any] = {}
+        rises = {part: mi.Vector3f(rise.T) for part, rise in bumpy()[2].items()} if self.occluder == "bumpy" else {}
 
         def place(params: mi.SceneParameters, latents: Latents) -> None:
             for name in names:
@@ -82,7 +85,10 @@ class EdgeCase:
                 elif key.endswith("position"):
                     params[key] = motion @ mi.Point3f(first[key])
                 else:
-                    params[key] = dr.ravel(motion @ dr.unravel(mi.Point3f, first[key]))
+                    points = dr.unravel(mi.Point3f, first[key])
+                    for part, rise in rises.items():
+                        points += latents[f"{name}.{part}"] * rise
+                    params[key] = dr.ravel(motion @ points)
 
         start = {f"{name}.{part}": 0.0 for name in names for part in self.motion}
         scene = (_room(self.lamp) if self.lamp in ROOMS else _open(self.lamp)) | STILL.get(self.occluder, dict)()
@@ -152,6 +158,22 @@ def ball(center: tuple[float, float, float], radius: float, rows: int = 6, colum
     return points * radius + center, np.concatenate(faces)
 
 
+def bumpy(cells: int = 12) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return the vertices (N, 3) and faces of a bumpy sheet, and the motion (N, 3) of its vertices by each of the
+    `HEIGHTS`. The sheet leans back, and its bumps hide and shade other parts of it.
+    """
+    axis = np.linspace(0, 1, cells + 1)
+    u, v = (each.ravel() for each in np.meshgrid(axis, axis, indexing="ij"))
+    across, up, normal = np.array([1.4, 0, 0]), np.array([0, 0.9, 0.6]), np.array([0, -0.6, 0.9]) / np.hypot(0.6, 0.9)
+    height = 0.2 * np.sin(8 * u + 1) * np.cos(9 * v + 0.4)
+    points = np.outer(u - 0.5, across) + np.outer(v - 0.5, up) + np.outer(height, normal) + [0.1, 0, 0.7]
+    at = np.arange(u.size).reshape(cells + 1, cells + 1)
+    a, b, c, d = (corner.ravel() for corner in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    shares = ((1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v)
+    return points, faces, {part: np.outer(share, normal) for part, share in zip(HEIGHTS, shares, strict=True)}
+
+
 def _box(x: float, y: float, z: float, size: float = 1.0) -> Any:
     return mesh(*split_box((x, y, z), (0.3 * size, 0.25 * size, 0.3 * size)), OWN)
 
@@ -197,6 +219,7 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
     "mirror": lambda: {"shape": rectangle(MIRROR, transform(translate=[0.2, 0.8, 0.8], rotate=([1, 0, 0], 75),
                                                             scale=0.7))},
     "reflected": lambda: {"shape": _sphere(0.1, 0, 0.6)},
+    "bumpy": lambda: {"shape": mesh(*bumpy()[:2], TWO_SIDED)},
     "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
                      for n, name in enumerate(FLAT)},
 }  # fmt: skip
@@ -308,6 +331,7 @@ RECORDED = [
     EdgeCase("hidden", "point", spp=1024, reference_spp=8192, step=SMALLEST),
     EdgeCase("reflector", "upward", 3, spp=512, reference_spp=8192),
     EdgeCase("shaded", "point", step=SMALLEST, reference_spp=8192),
+    EdgeCase("bumpy", "area", motion=HEIGHTS, spp=512, reference_spp=8192, step=SMALLER),
     *(EdgeCase("box", lamp, lamp_moves=True, spp=1024) for lamp in ("area", "spot")),
     EdgeCase("none", "room", 3, lamp_moves=True, spp=1024),
     EdgeCase("reflected", "area", 3, spp=512, reference_spp=8192, options=BOTH),

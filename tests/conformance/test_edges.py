@@ -409,9 +409,11 @@ def test_later_steps_compile_nothing(freeze: bool):
 SPP = 512
 
 
-def peak(max_depth: int) -> int:
-    """Return the peak memory of a second step, in bytes beyond the memory before the step."""
-    moving, chosen = EdgeCase("box", "room").moving(), tracer(max_depth=max_depth)
+def peak(max_depth: int, paths: str) -> int:
+    """Return the peak memory of a second step, in bytes beyond the memory before the step. Paths reach the maximum
+    depth, without roulette.
+    """
+    moving, chosen = EdgeCase("box", "room").moving(), tracer(max_depth=max_depth, rr_depth=1000, paths=paths)
     moving.gradient(chosen, 1, SPP)
     gc.collect()
     dr.sync_thread()
@@ -424,12 +426,14 @@ def peak(max_depth: int) -> int:
 
 
 @pytest.mark.long
-def test_memory_is_flat_in_depth():
-    peaks = {depth: peak(depth) for depth in (3, 12)}
+@pytest.mark.parametrize(("paths", "share"), [("light", 1 / 3), ("camera", 1 / 3), ("both", 0.6)])
+def test_memory_is_flat_in_depth(paths: str, share: float):
+    """The peak is that of a few images. Both kinds of paths together need about five more images than one."""
+    peaks = {depth: peak(depth, paths) for depth in (4, 64)}
     print(peaks)
-    paths = SPP * SIZE**2
-    assert max(peaks.values()) < paths / 3
-    assert max(peaks.values()) - min(peaks.values()) < paths / 30, peaks  # less than a bit for a path
+    count = SPP * SIZE**2
+    assert max(peaks.values()) < share * count
+    assert max(peaks.values()) - min(peaks.values()) < count / 30, peaks  # less than a bit for a path
 
 
 @pytest.mark.long

@@ -187,23 +187,29 @@ def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
 
 
 @pytest.mark.long
-def test_noisy_curvature_is_measured_again_with_all_samples(folder, monkeypatch):
-    """If the first measurement finds no curvature of a colour, a second one with all samples does."""
-    asked, along = [], measuring.LossCurvature.along
+def test_noisy_curvature_is_measured_again_with_more_samples(folder, monkeypatch):
+    """If the first measurement finds no curvature of a colour, or noise takes most of it, one with more samples finds
+    it.
+    """
+    asked, along, limits = [], measuring.LossCurvature.along, dict[str, int]()
 
     def hidden(self, changes, go_on):
         asked.append(self.spp)
         directions, H, B = along(self, changes, go_on)
-        return directions, H * (self.spp > blind), B
+        self.sure = self.sure * (self.spp > limits["noisy"])
+        return directions, H * (self.spp > limits["blind"]), B
 
     monkeypatch.setattr(measuring.LossCurvature, "along", hidden)
+    monkeypatch.setattr(measuring, "MOST_MULTIPLE", 4)
     toy = replace(WORK[2], settings=("run.spp=256", "run.iterations=60", "optimizer.schedule=cosine"))
-    found = {}
-    for blind in (0, 64, 256):
+    found = []
+    for limits["blind"], limits["noisy"], wanted in (
+        (0, 0, [64]), (64, 0, [64, 256]), (0, 64, [64, 256]), (256, 0, [64, 256, 1024]), (1024, 0, [64, 256, 1024])
+    ):  # fmt: skip
         asked.clear()
-        found[blind] = run(folder, toy).certainty.parameters[WALL]
-        assert asked == ([64, 256] if blind else [64])
-    assert [each.verdict for each in found.values()] == [SETTLED, SETTLED, NOISE]
+        found.append(run(folder, toy).certainty.parameters[WALL].verdict)
+        assert asked == wanted
+    assert found == [SETTLED] * 4 + [NOISE]
 
 
 #: Parameters, and the target's samples per pixel. Noise in the target causes most of the error of these parameters.

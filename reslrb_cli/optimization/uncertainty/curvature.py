@@ -262,6 +262,8 @@ class LossCurvature:
         random = np.random.default_rng(self._seed(0, 0))
         self._picked = None if values <= MOST_VALUES else np.sort(random.choice(values, MOST_VALUES, replace=False))
         self._thinned = max(values / MOST_VALUES, 1.0)
+        #: Share (M,) of the curvature along each direction that remains without its standard error.
+        self.sure = np.zeros(0)
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises() if of_target else []
 
@@ -297,8 +299,9 @@ class LossCurvature:
             return [], np.zeros((0, 0)), np.zeros((0, 0))
         a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
         a = a * self._in_a_row(self._weights)
-        sure = _sure_share(a * b)
-        H = _symmetric(a @ b.T * self._thinned * np.sqrt(np.outer(sure, sure))) + self._of_regularizers(directions)
+        self.sure = _sure_share(a * b)
+        sure = np.sqrt(np.outer(self.sure, self.sure))
+        H = _symmetric(a @ b.T * self._thinned * sure) + self._of_regularizers(directions)
         if not self.noises:
             return directions, H, np.zeros_like(H)
         a, b = (np.nan_to_num(np.array(rows)) for rows in odd)

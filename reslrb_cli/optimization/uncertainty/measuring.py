@@ -37,8 +37,10 @@ ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 4, 16
 #: Random probes for large parameters; minimum number of renderings along directions, and iterations per rendering.
 PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
 #: Divisor of a step's samples for each of the two sets that measure curvature, and samples per pixel below which all
-#: are used. All are also used if noise hides the curvature of entries.
-PART, FEW = 4, 4
+#: are used. If noise hides the curvature of entries, more samples are used, up to a multiple of a step's.
+PART, FEW, MOST_MULTIPLE = 4, 4, 16
+#: Noise hides the curvature of an entry if less than this share of it remains without its standard error.
+LEAST_SURE = 0.5
 #: Step of the differences along directions, as a share of a parameter's scale.
 STEP = 0.05
 #: Maximum number of the last iterations, at most half of all, whose gradients and values are used; maximum number of
@@ -103,16 +105,20 @@ class Certainty:
             with clock.step() as times:
                 unit = problem.samples_per_pass or 1
                 spp = max(max(config.run.spp // PART, min(config.run.spp, FEW)) // unit, 1) * unit
-                curvature = LossCurvature(problem, spp)
                 scales = {key: self.scale(key) for key in gradients}
                 most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
                 plan = plan_changes(problem, scales, STEP, most)
+                curvature = latest = LossCurvature(problem, spp)
                 directions, H, B = curvature.along(plan, go_on)
-                if spp < config.run.spp and hides(directions, H, gradients) and go_on():
-                    again = LossCurvature(problem, config.run.spp)
-                    found = again.along(plan, go_on)
-                    if len(found[0]) == len(directions):
-                        directions, H, B = found
+                while hides(directions, H, latest.sure, gradients) and spp < MOST_MULTIPLE * config.run.spp:
+                    if not go_on.affords(PART * go_on.spent):
+                        break
+                    spp *= PART
+                    latest = LossCurvature(problem, spp)
+                    found = latest.along(plan, go_on)
+                    if len(found[0]) < len(directions):
+                        break
+                    directions, H, B = found
                 # By entry, if a parameter has no directions for its entries.
                 seen = {direction.key for direction in directions if direction.entry is not None}
                 left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
@@ -218,15 +224,15 @@ def brightness(gradient: Array, value: Array, channels: int) -> tuple[Array, Arr
     return np.einsum("ic,ic->c", g, x), np.log(np.maximum(np.linalg.norm(x, axis=0), 1e-300))
 
 
-def hides(directions: Sequence[ParameterDirection], curvature: Array, gradients: Gradients) -> bool:
+def hides(directions: Sequence[ParameterDirection], curvature: Array, sure: Array, gradients: Gradients) -> bool:
     """True if noise hides the curvature (M, M) along some combination of entries with gradients. The curvature is then
-    zero or negative.
+    zero or negative, or its standard error takes most of it. `sure` (M,) is the share without the standard error.
     """
     at = [place for place, each in enumerate(directions)
           if each.entry is not None and np.any(gradients[each.key][:, each.entry])]  # fmt: skip
     chosen = curvature[np.ix_(at, at)]
     size = np.diag(chosen)
-    if not at or np.any(size <= 0):
+    if not at or np.any(size <= 0) or np.any(sure[at] < LEAST_SURE):
         return bool(at)
     return bool(np.linalg.eigvalsh(chosen / np.sqrt(np.outer(size, size)))[0] <= 0)
 
@@ -242,6 +248,15 @@ class _Budget:
         self._last: float | None = None
         self._longest = self._spent = 0.0
 
+    @property
+    def spent(self) -> float:
+        """The seconds so far."""
+        return self._spent - self._longest
+
+    def affords(self, seconds: float) -> bool:
+        """Return whether that many more seconds are left."""
+        return self() and self.spent + seconds <= self._seconds
+
     def __call__(self) -> bool:
         now = time.perf_counter()
         if self._last is not None:
@@ -249,4 +264,4 @@ class _Budget:
             step = now - self._last
             self._longest, self._spent = max(self._longest, step), self._spent + step
         self._last = now
-        return not self._stop() and self._spent - self._longest <= self._seconds
+        return not self._stop() and self.spent <= self._seconds
