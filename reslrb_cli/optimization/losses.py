@@ -53,7 +53,8 @@ def relative_l2(
     """Return mean (I - T)² / (T² + ε), with ε in squared units of radiance.
 
     The denominator uses the target, which is constant. The computed gradient is therefore the gradient of the complete
-    loss. A denominator with the detached noisy image would contain the same noise as the numerator.
+    loss. A denominator with the detached noisy image would contain the same noise as the numerator. Noise of the target
+    darkens the minimum by the factor 1 - 2 v / (T² + ε), with the variance v (docs/losses.md).
     """
     return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
 

@@ -199,8 +199,9 @@ def _mark_seen(
 
 #: Depths to try; the last one counts as all light.
 DEPTHS = (8, 16, 32, 64)
-#: Mean share of a pixel's light that may be missing.
-LOST = 0.01
+#: Mean share of a pixel's light that may be missing. Recovered colours are too bright by up to this share. Their spread
+#: does not include this error, so the share must be smaller than most spreads.
+LOST = 0.001
 #: Rays per axis of the film, and paths for each of them.
 _RAYS, _PATHS = 48, 32
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from cli import tiny
 from cli.tiny import settings
-from kit import area, scene, sensor, shape
+from kit import area, diffuse, scene, sensor, shape
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
 
@@ -193,3 +193,59 @@ def test_colours_of_rooms_from_blender_are_recovered(tmp_path: Path, name: str, 
     assert len(errors) >= len(PARTS) - 1
     assert max(errors.values()) < 0.05, errors
     assert exposure == pytest.approx(ROOMS[name].exposure, rel=0.1)
+
+
+#: Surfaces of a closed box: the steps that place a square of side 2.
+BOX = {
+    "floor": '<scale x="2" y="3"/><translate y="1"/>',
+    "ceiling": '<scale x="2" y="3"/><translate y="1" z="2.5"/>',
+    "back": '<scale x="2" y="1.25"/><rotate x="1" angle="90"/><translate y="4" z="1.25"/>',
+    "front": '<scale x="2" y="1.25"/><rotate x="1" angle="90"/><translate y="-2" z="1.25"/>',
+    "left": '<scale x="1.25" y="3"/><rotate y="1" angle="90"/><translate x="-2" y="1" z="1.25"/>',
+    "right": '<scale x="1.25" y="3"/><rotate y="1" angle="90"/><translate x="2" y="1" z="1.25"/>',
+}
+
+
+def write_box(folder: Path, seed: int) -> dict[str, np.ndarray]:
+    """Write `box.xml`, a closed box with grey surfaces in view, and `box.exr`, its picture by `path` with random
+    colours. Return these colours. Ceiling and front are out of view, and have their true colours.
+    """
+    rng = np.random.default_rng(seed)
+    colours = {part: rng.uniform(0.1, 0.85, 3).round(3) for part in BOX}
+    hidden = ("ceiling", "front")
+    for name, true in (("box", False), ("true", True)):
+        parts = [sensor("0.1, -1.8, 1.3", "0, 3, 0.35", "0, 0, 1", size=(48, 30), fov=55, rfilter="gaussian")]
+        for part, place in BOX.items():
+            colour = colours[part] if true or part in hidden else (0.5, 0.5, 0.5)
+            inner = diffuse("{:g}, {:g}, {:g}".format(*colour))
+            parts.append(shape("rectangle", part, f'<bsdf type="twosided">{inner}</bsdf>', place=place))
+        place = '<scale x="0.6" y="0.5"/><rotate x="1" angle="180"/><translate y="2.2" z="2.48"/>'
+        parts.append(shape("rectangle", "lamp", diffuse("0, 0, 0"), area("12, 11, 10"), place=place))
+        (folder / f"{name}.xml").write_text(scene(*parts))
+    made = mi.load_file(str(folder / "true.xml"))
+    path = mi.load_dict({"type": "path", "max_depth": 16})
+    images = [np.array(mi.render(made, integrator=path, spp=1024, seed=number)) for number in range(8)]
+    mi.Bitmap(np.mean(images, axis=0)[:, :, :3].astype(np.float32)).write(str(folder / "box.exr"))
+    return {part: colour for part, colour in colours.items() if part not in hidden}
+
+
+def test_errors_of_a_box_are_as_large_as_their_spreads(tmp_path: Path) -> None:
+    """If 1 % of the light was missing, because paths were too short, all colours would be too bright by more than their
+    spread.
+    """
+    ratios = []
+    for seed in range(3):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        colours = write_box(folder, seed)
+        tiny.done("init", folder / "box.xml", "--target", folder / "box.exr", "-o", folder / "box.yaml")
+        tiny.done("optimize", folder / "box.yaml", *settings(f"run.output={folder}/runs"))
+        values = np.load(folder / "runs/box/parameters/parameters.npz")
+        certainty = tiny.manifest(folder / "runs/box")["results"]["certainty"]["parameters"]
+        for part, colour in colours.items():
+            [key] = [key for key in values.files if key.startswith(f"{part}.")]
+            ratios.append((values[key] - colour) / certainty[key]["spread"])
+            assert certainty[key]["verdict"] == "settled"
+    square = float(np.sqrt(np.mean(np.square(ratios))))
+    print(f"errors over spreads: root mean square {square:.2f}, mean {np.mean(ratios):.2f}")
+    assert 0.7 < square < 1.4

@@ -64,6 +64,21 @@ def test_values_and_gradients(name):
     np.testing.assert_allclose(np.array(attached.grad), derivative / image.size, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.parametrize("noise", [0.05, 0.1])
+def test_noise_of_the_target_darkens_the_minimum_of_relative_l2(noise):
+    """The minimum is at t (1 - 2 v / (t² + epsilon)) for targets of mean t and variance v (docs/losses.md)."""
+    t, deviation = 0.7, np.random.default_rng(4).standard_normal((64, 64, 3))
+    target = t * (1 + noise * np.concatenate([deviation, -deviation]))
+    slopes = []
+    for level in (t, 0.9 * t):
+        image = dr.full(mi.TensorXf, level, target.shape)
+        dr.enable_grad(image)
+        dr.backward(make_loss("relative_l2", epsilon=EPSILON)(image, mi.TensorXf(target.astype(np.float32))))
+        slopes.append(np.array(image.grad, dtype=np.float64).sum())
+    darker = 0.1 * slopes[0] / (slopes[0] - slopes[1])  # the slope is linear in the image
+    assert darker == pytest.approx(2 * (t * noise) ** 2 / (t**2 + EPSILON), rel=0.1)
+
+
 @pytest.mark.parametrize("name", POINTWISE)
 def test_black_and_negative_pixels_stay_finite(name):
     image = mi.TensorXf(np.array([[[0.0], [-0.3], [2.0]]], dtype=np.float32))
