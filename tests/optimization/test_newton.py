@@ -196,6 +196,9 @@ def test_noise_shortens_the_steps_and_a_steady_pull_does_not():
         dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(gradient.astype(np.float32)), axis=None))
         optimizer.step(1.0)
         lengths.append(np.abs(np.array(optimizer["p"]) - before))
+    turns = np.array(optimizer.moments()["p"]["2"], dtype=np.float64).ravel()
+    assert 20 < turns[:3].min() <= turns[:3].max() < 40
+    assert optimizer.averaged("p") == pytest.approx((1 + SHORTER * turns.mean()) * 0.5 / 0.3)
     first, last = (np.mean(part, axis=0) for part in (lengths[:10], lengths[-10:]))
     assert last[:3].max() < 0.25 * first[:3].min()
     assert last[3:].min() > 0.9 * first[3:].max()
@@ -223,6 +226,20 @@ def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):
     assert state.stopped == "every parameter is within 2.5 % of the optimum"
     assert np.abs(np.array(problem.optimizer["albedo"]) - 0.8).max() < 0.02
     assert record.lr == 1
+
+
+def test_a_run_goes_on_until_its_steps_are_means_of_many_gradients(tmp_path, steps, monkeypatch):
+    """Gradients have a random factor between 0.9 and 1.1. The value is close to the optimum early."""
+    random = np.random.default_rng(1)
+    steps.spoil = lambda call, key: float(random.uniform(0.9, 1.1))
+    ends = []
+    for least in (1, 12):
+        monkeypatch.setattr(loop, "AVERAGED", least)
+        problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=500"])
+        *_, (state, _) = loop.iterate(problem, standing(problem))
+        ends.append((state.iteration, float(np.abs(np.array(problem.optimizer["albedo"]) - 0.8).max())))
+    assert ends[0][0] < ends[1][0] < 60
+    assert ends[1][1] < 0.1 * ends[0][1]
 
 
 def test_a_run_whose_gradients_are_noise_does_not_end_early(tmp_path, steps):
