@@ -87,6 +87,11 @@ class Block:
         """Return a limit of the root mean square distance to the optimum. It is infinite if it is not known."""
         return float(np.sqrt(np.mean(np.square(self.rows[self.at[key], 5], dtype=np.float64))))
 
+    @property
+    def averaged(self) -> float:
+        """Number n of gradients in the mean."""
+        return float(self.rows[0, 6])
+
     def steps(self, now: JointState) -> Array:
         """Return the changes (M,) of the values. Coordinates without curvature do not move."""
         rows, H = self.rows.astype(np.float64), self.rows[:, FIELDS:].astype(np.float64)

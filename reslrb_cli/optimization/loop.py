@@ -97,10 +97,10 @@ def out_of_time(limit_s: float | None, state: State) -> str:
     return f"the time is up, after {state.elapsed_s:.3g} s of iterations"
 
 
-#: Fewest iterations of a run with `auto`, and fewest with textures, whose noise falls for longer. Distance to the
-#: optimum at which such a run ends: a share of a value's root mean square, or of this share of its extent if that is
-#: larger. It is a quarter of the tolerance of a verdict.
-LEAST_ITERATIONS, LEAST_OF_LARGE, CLOSE, LEAST_SHARE = 20, 45, 0.025, 0.2
+#: Fewest iterations of a run with `auto`. Distance to the optimum at which such a run ends: a share of a value's root
+#: mean square, or of this share of its extent if that is larger. It is a quarter of the tolerance of a verdict. Until
+#: steps are means of `AVERAGED` gradients, the error still falls fast, and the distance must be smaller by this factor.
+LEAST_ITERATIONS, CLOSE, LEAST_SHARE, AVERAGED = 20, 0.025, 0.2, 12
 
 
 def close_enough(problem: Problem, iteration: int) -> str:
@@ -108,14 +108,15 @@ def close_enough(problem: Problem, iteration: int) -> str:
     optimizer = problem.optimizer
     if not optimizer.measures_curvature:
         return ""
-    measured = 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last measurement of large parameters
-    least = LEAST_ITERATIONS if len(optimizer.block.at) == len(optimizer.keys()) else LEAST_OF_LARGE
-    if iteration < max(least, 1.5 * measured):
+    only_small = len(optimizer.block.at) == len(optimizer.keys())
+    measured = 0 if only_small else 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last measurement
+    if iteration < max(LEAST_ITERATIONS, 1.5 * measured):
         return ""
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
         extent = optimizer.extent(key)
         value = LEAST_SHARE if optimizer.variable(key).transform else rms(problem.selection.array(key)) / extent
-        if optimizer.to_go(key) > CLOSE * max(value, LEAST_SHARE):
+        factor = 1 if optimizer.averaged(key) >= AVERAGED else AVERAGED
+        if factor * optimizer.to_go(key) > CLOSE * max(value, LEAST_SHARE):
             return ""
     return f"every parameter is within {100 * CLOSE:g} % of the optimum"
 

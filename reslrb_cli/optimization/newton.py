@@ -4,25 +4,29 @@ Steps that know their scale (`Newton`, of `optimizer: auto`) have a measured cur
 They are for textures and other large parameters. `block.py` moves the small ones together. With the gradient g of an
 iteration, the entries i move as follows.
 
-    s_i  <-  0.9 s_i + 0.1 |g_i|                              size of the gradients of entry i
-    h_i   =  c s_i,   c = sum_j H_j s_j / sum_j s_j²          curvature
-    m_i  <-  0.5 m_i + clip(g_i, ±0.5 L h_i / 0.3)            momentum
-    x_i  <-  x_i - clip(0.3 m_i / h_i, ±L) / (1 + q n_i)      step
+    s_i, v_i                                                  means of |g_i| and g_i²
+    h_i   =  c_i s_i,   c_i = sum_j H_j s_j / sum_j s_j²      curvature; the sums are over all j with s_j <= s_i
+    L_i   =  L s_i² / v_i                                     longest step
+    m_i  <-  0.5 m_i + clip(g_i, ±0.5 L_i h_i / 0.3)         momentum
+    x_i  <-  x_i - clip(0.3 m_i / h_i, ±L_i) / (1 + q n_i)   step
 
 H is the second derivative of the loss, measured at common random numbers: H_i = z_i (g_i(x + d z) - g_i(x)) / d. The
 signs z are those of the next step. Random signs would give the diagonal (Hutchinson 1989). However, a pixel shows
 several texels, so neighbours that move together change the gradient more than one alone. Neighbours that move in
 opposite directions change it less. A measurement costs one gradient. It takes place in the iterations 0, 2, 6, 14, 30,
-and so on, because H changes as the parameters move. A single H_i is mostly noise. The least-squares factor c uses all
-entries, and s gives the differences between entries, as in Adam. Where the loss is not convex, the absolute value of
-the curvature counts.
+and so on, because H changes as the parameters move. A single H_i is mostly noise. The least-squares factor c_i
+therefore uses all entries with gradients of at most the size of s_i, and at least 2 % of the entries. A common factor
+would not do: where many paths reach an entry, its gradients fall to a small fraction of the first ones, and elsewhere
+they are noise from the start. The steps of dim entries would become too short. Where the loss is not convex, the
+absolute value of the curvature counts.
 
-L is a share of the parameter's extent. One gradient moves an entry by about L in all later steps together, because the
-clipped gradients add up to L. Otherwise, a texel that few paths reach would move by 2.5 L after one path. Steps of 0.3
-are a compromise. Larger steps keep more noise of the first, large gradients in directions that the images do not
-determine, such as differences of texels in one pixel. n_i counts the iterations in which g_i and m_i have opposite
-signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length.
-When it oscillates, or when noise dominates, its steps become shorter, as 1/n.
+L is a share of the parameter's extent. s_i² / v_i is about the share of the iterations in which paths reach the entry.
+It is between 0.6 and 1 for entries with a gradient in each iteration. One gradient moves an entry by about L_i in all
+later steps together, because the clipped gradients add up to L_i. Otherwise, one path would move a texel that few paths
+reach by many times L. Steps of 0.3 are a compromise. Larger steps keep more noise of the first, large gradients in
+directions that the images do not determine, such as differences of texels in one pixel. n_i counts the iterations in
+which g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their
+length. When it oscillates, or when noise dominates, its steps become shorter, as 1/n.
 
 `to_go` is a limit of the distance to the optimum. m_i contains only earlier samples, so the product g_i m_i has no bias
 from noise, and
@@ -46,9 +50,11 @@ import numpy as np
 from reslrb_cli.backend.memory import flat
 from reslrb_cli.optimization.block import Block
 
-#: Step as a share of Newton's, decay of the momentum, and decay of the gradients' size. docs/optimizers.md has
+#: Step as a share of Newton's, decay of the momentum, and decay of the means s and v. docs/optimizers.md has
 #: measurements.
-GAIN, MOMENTUM, MEMORY = 0.3, 0.5, 0.9
+GAIN, MOMENTUM, MEMORY = 0.3, 0.5, 0.99
+#: Classes of gradients by size, classes for a factor of two, and the smallest share of the entries that c uses.
+CLASSES, OCTAVE, SHARE = 128, 4, 0.02
 #: Displacement d of a measurement as a share of the extent, and the weight of the newest measurement.
 DISPLACEMENT, NEWEST = 0.05, 0.75
 #: L as a share of the extent, and q.
@@ -74,6 +80,10 @@ class Rule:
     def to_go(self, key: str) -> float:
         """Return a limit of the root mean square distance to the optimum. It is infinite if it is not known."""
         return math.inf
+
+    def averaged(self, key: str) -> float:
+        """Return the number of gradients whose mean a step uses, as the step's length shows it."""
+        return 1.0
 
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
         """Return the gradient of each entry that moves it by 1 at a rate of 1, summed over the steps, as a flat array.
@@ -114,6 +124,9 @@ class Joint(Rule, dropt.SGD):
     def to_go(self, key: str) -> float:
         return self._block.to_go(key)
 
+    def averaged(self, key: str) -> float:
+        return self._block.averaged
+
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
         return self._block.steepness(key)
 
@@ -121,32 +134,34 @@ class Joint(Rule, dropt.SGD):
 class Newton(Rule, dropt.Optimizer[Any]):
     """The update of `optimizer: auto` for one large parameter. The learning rate is the longest step L.
 
-    Data: m, s, n, H, the variable at the last measurement of H, and the mean square distances of the last iterations,
-    of width 1 each, newest first.
+    Data: m, s, n, H, the variable at the last measurement of H, the root of v, and arrays of width 1: the sum of the
+    weights in s and v, and the mean square distances of the last iterations, newest first.
     """
 
     longest = LONGEST
 
     def _step(self, cache: Any, value: Any, grad: Any, lr: Any, extra: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
-        velocity, size, turns, bent, earlier, *squares = extra
-        size = dr.lerp(dr.abs(grad), size, MEMORY)
+        velocity, size, turns, bent, earlier, spread, weights, *squares = extra
+        weights = dr.lerp(1, weights, MEMORY)
+        size, spread = dr.lerp(dr.abs(grad), size, MEMORY), _root_mean(grad, spread)
         steepness = _steepness(size, bent)
         known = steepness > 0
         weight = total(dr.select(known, steepness, 0))
         offsets = dr.select(known, grad * ((1 - MOMENTUM) * velocity / steepness), 0)
         square = dr.select(weight > 0, total(offsets) / weight, UNKNOWN)
         turns = turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
-        longest = dr.opaque(dr.leaf_t(grad), lr)
+        longest = dr.opaque(dr.leaf_t(grad), lr) * dr.select(known, dr.square(size / spread) / weights, 1)
         reach = longest * ((1 - MOMENTUM) / GAIN) * steepness
         velocity = MOMENTUM * velocity + dr.clip(grad, -reach, reach)
         step = dr.clip(GAIN * velocity / steepness, -longest, longest) / (1 + SHORTER * turns)
-        return value - dr.select(known, step, 0), (velocity, size, turns, bent, earlier, square, *squares[:-1])
+        kept = velocity, size, turns, bent, earlier, spread, weights, square, *squares[:-1]
+        return value - dr.select(known, step, 0), kept
 
     def _reset(self, key: str, value: Any, promoted: bool) -> None:
         array = value.array
-        zeros = [dr.opaque(type(array), 0, array.shape) for _ in range(5)]
-        unknown = [dr.opaque(dr.leaf_t(array), UNKNOWN) for _ in range(RECENT)]
-        self.state[key] = value, promoted, None, (*zeros, *unknown)
+        zeros = [dr.opaque(type(array), 0, array.shape) for _ in range(6)]
+        single = [dr.opaque(dr.leaf_t(array), each) for each in (0, *RECENT * [UNKNOWN])]
+        self.state[key] = value, promoted, None, (*zeros, *single)
 
     def forget(self) -> None:
         pass  # no long memory, and the measured curvature stays
@@ -158,12 +173,12 @@ class Newton(Rule, dropt.Optimizer[Any]):
 
     def bend(self, key: str, curvature: Any) -> None:
         """Take a measurement of H, in the shape of the parameter. Entries that are not finite keep their curvature."""
-        value, promoted, lr, (velocity, size, turns, bent, _, *squares) = self.state[key]
+        value, promoted, lr, (velocity, size, turns, bent, _, *others) = self.state[key]
         curvature = dr.select(dr.isfinite(curvature), curvature, bent)
         newest = dr.lerp(bent, curvature, NEWEST)
         bent = dr.select(dr.all(flat(bent) == 0), curvature, newest)
         dr.make_opaque(bent)
-        self.state[key] = value, promoted, lr, (velocity, size, turns, bent, dr.detach(value).array, *squares)
+        self.state[key] = value, promoted, lr, (velocity, size, turns, bent, dr.detach(value).array, *others)
 
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
         _, size, turns, bent, *_ = self.state[key][3]
@@ -171,8 +186,14 @@ class Newton(Rule, dropt.Optimizer[Any]):
         shorter = 1 + SHORTER * np.array(turns, dtype=np.float64).ravel()
         return np.asarray(np.where(steepness > 0, steepness * shorter * (1 - MOMENTUM) / GAIN, np.inf))
 
+    def averaged(self, key: str) -> float:
+        _, size, turns, bent, *_ = self.state[key][3]
+        steepness, turned = (np.array(each, dtype=np.float64).ravel() for each in (_steepness(size, bent), turns))
+        mean = np.sum(steepness * turned) / max(np.sum(steepness), 1e-300)
+        return float((1 + SHORTER * mean) * (1 - MOMENTUM) / GAIN)
+
     def to_go(self, key: str) -> float:
-        value, _, _, (_, size, _, bent, earlier, *squares) = self.state[key]
+        value, _, _, (_, size, _, bent, earlier, _, _, *squares) = self.state[key]
         left = np.abs([float(np.array(each).ravel()[0]) for each in squares])
         steepness = np.array(_steepness(size, bent), dtype=np.float64).ravel()
         moved = np.array(dr.detach(value).array - earlier, dtype=np.float64).ravel()
@@ -186,8 +207,24 @@ def _steepness(size: Any, bent: Any) -> Any:
     """Return the curvature of each entry, which is 0 if it is not known."""
     largest = dr.max(flat(size))
     unit = dr.select(largest > 0, size / largest, 0)  # squares of gradients would underflow
-    factor = total(bent * unit) / total(unit * unit)
-    return dr.select(largest > 0, dr.abs(factor) * unit, 0)
+    octaves = dr.clip(-OCTAVE * dr.log2(unit), 0, CLASSES - 1)
+    number = CLASSES - 1 - dr.uint32_array_t(octaves)(octaves)  # the class with the smallest gradients is the first
+    sums = []
+    for each in (bent * unit, unit * unit, dr.select(unit > 0, unit / unit, 0)):
+        classes = dr.zeros(type(unit), CLASSES)
+        dr.scatter_add(classes, each, number)
+        sums.append(dr.cumsum(classes))
+    least = SHARE * dr.max(sums[2])
+    number = dr.maximum(number, dr.sum(dr.select(sums[2] < least, dr.uint32_array_t(sums[2])(1), 0)))
+    squares = dr.gather(type(unit), sums[1], number)
+    return dr.select(squares > 0, dr.abs(dr.gather(type(unit), sums[0], number)) / squares * unit, 0)
+
+
+def _root_mean(grad: Any, spread: Any) -> Any:
+    """Return the root of the running mean of squares with one more gradient. Squares of gradients would underflow."""
+    largest = dr.maximum(dr.abs(grad), spread)
+    root = largest * dr.sqrt(dr.lerp(dr.square(grad / largest), dr.square(spread / largest), MEMORY))
+    return dr.select(largest > 0, root, 0)
 
 
 def total(value: Any) -> Any:

@@ -438,6 +438,10 @@ class Optimizer:
         """
         return float(self._own[key].to_go(key) / self.extent(key))
 
+    def averaged(self, key: str) -> float:
+        """Return the number of gradients whose mean a step of `auto` uses. It rises when noise dominates."""
+        return self._own[key].averaged(key)
+
     def _step_variable(self, key: str) -> None:
         own, variable = self._own[key], self._variables[key]
         gradient = variable.chain(dr.detach(own[key]), self.gradient(key))
