@@ -16,7 +16,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.newton import LONGEST, SHORTER
+from reslrb_cli.optimization.newton import LONGEST, SHORTER, _steepness
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.state import standing
 
@@ -217,6 +217,16 @@ def test_a_texel_that_few_paths_reach_moves_by_a_share_of_the_longest_step():
         values.append(np.array(optimizer["p"]))
     assert 0.2 * LONGEST < 0.5 - values[-1][-1] < LONGEST
     np.testing.assert_allclose(values[-1][:-1], 0.3, atol=0.02)
+
+
+def test_one_noisy_measurement_does_not_set_the_curvature_of_a_dim_texel():
+    """One of 400 entries is dim, and its measurement is 50 times too large. 2 % of the entries share their factor."""
+    size = np.linspace(0.5, 1.0, 400)
+    size[0] = 0.1
+    measured = 2 * size
+    measured[0] *= 50
+    found = np.array(_steepness(mi.Float(size), mi.Float(measured)))
+    np.testing.assert_allclose(found, 2 * size, rtol=0.05)
 
 
 def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):
