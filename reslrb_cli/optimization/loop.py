@@ -115,8 +115,8 @@ def close_enough(problem: Problem, iteration: int) -> str:
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
         extent = optimizer.extent(key)
         value = LEAST_SHARE if optimizer.variable(key).transform else rms(problem.selection.array(key)) / extent
-        factor = 1 if optimizer.averaged(key) >= AVERAGED else AVERAGED
-        if factor * optimizer.to_go(key) > CLOSE * max(value, LEAST_SHARE):
+        distance, limit = optimizer.to_go(key), CLOSE * max(value, LEAST_SHARE)
+        if distance > limit or (AVERAGED * distance > limit and optimizer.averaged(key) < AVERAGED):
             return ""
     return f"every parameter is within {100 * CLOSE:g} % of the optimum"
 

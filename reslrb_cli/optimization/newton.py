@@ -82,7 +82,7 @@ class Rule:
         return math.inf
 
     def averaged(self, key: str) -> float:
-        """Return the number of gradients whose mean a step uses, as the step's length shows it."""
+        """Return the number of gradients that a step averages, estimated from the factor that shortens the step."""
         return 1.0
 
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
@@ -210,7 +210,7 @@ def _steepness(size: Any, bent: Any) -> Any:
     octaves = dr.clip(-OCTAVE * dr.log2(unit), 0, CLASSES - 1)
     number = CLASSES - 1 - dr.uint32_array_t(octaves)(octaves)  # the class with the smallest gradients is the first
     sums = []
-    for each in (bent * unit, unit * unit, dr.select(unit > 0, unit / unit, 0)):
+    for each in (bent * unit, unit * unit, dr.select(unit > 0, type(unit)(1), 0)):
         classes = dr.zeros(type(unit), CLASSES)
         dr.scatter_add(classes, each, number)
         sums.append(dr.cumsum(classes))

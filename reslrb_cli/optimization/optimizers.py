@@ -439,7 +439,7 @@ class Optimizer:
         return float(self._own[key].to_go(key) / self.extent(key))
 
     def averaged(self, key: str) -> float:
-        """Return the number of gradients whose mean a step of `auto` uses. It rises when noise dominates."""
+        """Return the number of gradients that a step of `auto` averages. It rises if noise dominates."""
         return self._own[key].averaged(key)
 
     def _step_variable(self, key: str) -> None:
