@@ -7,8 +7,9 @@ iteration, the entries i move as follows.
     s_i, v_i                                                  means of |g_i| and g_i²
     h_i   =  c_i s_i,   c_i = sum_j H_j s_j / sum_j s_j²      curvature; the sums are over all j with s_j <= s_i
     L_i   =  L s_i² / v_i                                     longest step
-    m_i  <-  0.5 m_i + clip(g_i, ±0.5 L_i h_i / 0.3)         momentum
-    x_i  <-  x_i - clip(0.3 m_i / h_i, ±L_i) / (1 + q n_i)   step
+    d_i   =  h_i (1 + q n_i) / 0.3                            divisor of a step
+    m_i  <-  0.5 m_i + clip(g_i, ±0.5 L_i d_i)                momentum
+    x_i  <-  x_i - clip(m_i / d_i, ±L_i)                      step
 
 H is the second derivative of the loss, measured at common random numbers: H_i = z_i (g_i(x + d z) - g_i(x)) / d. The
 signs z are those of the next step. Random signs would give the diagonal (Hutchinson 1989). However, a pixel shows
@@ -21,12 +22,14 @@ they are noise from the start. The steps of dim entries would become too short. 
 absolute value of the curvature counts.
 
 L is a share of the parameter's extent. s_i² / v_i is about the share of the iterations in which paths reach the entry.
-It is between 0.6 and 1 for entries with a gradient in each iteration. One gradient moves an entry by about L_i in all
-later steps together, because the clipped gradients add up to L_i. Otherwise, one path would move a texel that few paths
-reach by many times L. Steps of 0.3 are a compromise. Larger steps keep more noise of the first, large gradients in
-directions that the images do not determine, such as differences of texels in one pixel. n_i counts the iterations in
-which g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their
-length. When it oscillates, or when noise dominates, its steps become shorter, as 1/n.
+It is between 0.6 and 1 for entries with a gradient in each iteration. One gradient moves an entry by at most L_i in all
+later steps together. Otherwise, one path would move a texel that few paths reach by many times L. Clipped gradients
+have a bias where their noise is skewed. The limit rises as the steps become shorter, so the bias disappears.
+
+Steps of 0.3 are a compromise. Larger steps keep more noise of the first, large gradients in directions that the images
+do not determine, such as differences of texels in one pixel. n_i counts the iterations in which g_i and m_i have
+opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length. When it
+oscillates, or when noise dominates, its steps become shorter, as 1/n.
 
 `to_go` is a limit of the distance to the optimum. m_i contains only earlier samples, so the product g_i m_i has no bias
 from noise, and
@@ -151,9 +154,10 @@ class Newton(Rule, dropt.Optimizer[Any]):
         square = dr.select(weight > 0, total(offsets) / weight, UNKNOWN)
         turns = turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
         longest = dr.opaque(dr.leaf_t(grad), lr) * dr.select(known, dr.square(size / spread) / weights, 1)
-        reach = longest * ((1 - MOMENTUM) / GAIN) * steepness
+        divisor = steepness * (1 + SHORTER * turns) / GAIN
+        reach = (1 - MOMENTUM) * longest * divisor
         velocity = MOMENTUM * velocity + dr.clip(grad, -reach, reach)
-        step = dr.clip(GAIN * velocity / steepness, -longest, longest) / (1 + SHORTER * turns)
+        step = dr.clip(velocity / divisor, -longest, longest)
         kept = velocity, size, turns, bent, earlier, spread, weights, square, *squares[:-1]
         return value - dr.select(known, step, 0), kept
 

@@ -72,9 +72,10 @@ def test_updates_follow_the_formula():
         h = curvature_by_size(s, curvature)
         n = n + (g * m < 0)
         longest = LONGEST * s**2 / v / (1 - 0.99 ** (iteration + 1))
-        reach = 0.5 * longest * h / 0.3
+        divisor = h * (1 + SHORTER * n) / 0.3
+        reach = 0.5 * longest * divisor
         m = 0.5 * m + np.clip(g, -reach, reach)
-        x = np.clip(x - np.clip(0.3 * m / h, -longest, longest) / (1 + SHORTER * n), 0, 1)
+        x = np.clip(x - np.clip(m / divisor, -longest, longest), 0, 1)
         np.testing.assert_allclose(np.array(optimizer["p"]), x, atol=1e-4)
     assert n.max() > 5
     assert longest.min() < 0.7 * LONGEST
@@ -217,6 +218,20 @@ def test_a_texel_that_few_paths_reach_moves_by_a_share_of_the_longest_step():
         values.append(np.array(optimizer["p"]))
     assert 0.2 * LONGEST < 0.5 - values[-1][-1] < LONGEST
     np.testing.assert_allclose(values[-1][:-1], 0.3, atol=0.02)
+
+
+def test_skewed_noise_leaves_no_bias():
+    """Noise of a tenth of the gradients is nine times as large as that of the others, with the opposite sign."""
+    optimizer, random = make({"p": np.full(60, 0.5)}), np.random.default_rng(4)
+    loss = np.full(60, 4.0), np.full(60, 0.5)
+    for iteration in range(150):
+        pull(optimizer, {"p": loss})
+        if iteration == 0:
+            measure(optimizer, {"p": loss})
+        noise = np.where(random.random(60) < 0.1, -0.9, 0.1).astype(np.float32)
+        dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(noise), axis=None))
+        optimizer.step(1.0)
+    assert np.array(optimizer["p"]).mean() == pytest.approx(0.5, abs=0.005)
 
 
 def test_one_noisy_measurement_does_not_set_the_curvature_of_a_dim_texel():
