@@ -1,18 +1,23 @@
 """Calibration of verdicts and spreads, over simulated runs whose true values are known.
 
-Adam or SGD minimises a quadratic function with noisy gradients. The cases combine tails of the noise, numbers of
-iterations, coupling between entries, schedules, rates, and a measured curvature that is wrong by a factor of 0.5 to 2.
-Half of the cases have one to four scalars. The other half have a texture of 16 x 16 texels, whose image is blurred.
+Adam, SGD or `auto` minimises a quadratic function with noisy gradients. The cases combine tails of the noise, numbers
+of iterations, coupling between entries, schedules, rates, and a measured curvature that is wrong by a factor of 0.5 to
+2. Half of the cases have one to four scalars. The other half have a texture of 16 x 16 texels, whose image is blurred.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
+from reslrb_cli.optimization.loop import close_enough, is_due
+from reslrb_cli.optimization.optimizers import SMALL, Optimizer
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.measuring import PROBES, brightness, gradient_count
 from reslrb_cli.optimization.uncertainty.posterior import Measured
@@ -87,9 +92,15 @@ def make_case(random: Random, number: int, is_texture: bool) -> Case:
     return Case(tails, iterations, coupling, H, root, random.uniform(0.15, 0.85, len(H)))
 
 
-def recover(random: Random, case: Case, is_texture: bool) -> tuple[Measured, Array, Array]:
+Gradient = Callable[[Array], Array]
+#: Values (N,) after the last of T iterations, values and gradients (T, N) of all iterations, and the movement (N,) by
+#: the last step per unit of gradient.
+Course = tuple[Array, Array, Array, Array]
+
+
+def recover(random: Random, case: Case, is_texture: bool, by_auto: bool, off: float) -> tuple[Measured, Array, Array]:
     """Run the optimiser. Return the measurements as of one parameter, all values, and all gradients (T, N)."""
-    count, truth, T = len(case.truth), case.truth, case.iterations
+    count, truth = len(case.truth), case.truth
     if not is_texture:
         distance = random.choice([-1, 1], count) * random.uniform(0.05, 0.5, count)
         start = np.clip(truth + distance, 0.02, 0.98)
@@ -107,6 +118,51 @@ def recover(random: Random, case: Case, is_texture: bool) -> tuple[Measured, Arr
         noise = np.sqrt(alike) * shared + np.sqrt(1 - alike) * own
         return np.asarray(case.H @ (x - truth) + size * (0.1 + grows * rms(x - truth)) * noise)
 
+    found = run_auto(case, start, gradient, off) if by_auto else run_at_a_rate(random, case, start, gradient)
+    x, values, gradients, moved = found
+    few = np.array([gradient(x) for _ in range(gradient_count(len(values)))])
+    return Measured(x, (0.0, 1.0), SCALE, few, moved, not is_texture, start), values, gradients
+
+
+def run_auto(case: Case, start: Array, gradient: Gradient, off: float) -> Course:
+    """Run `auto` until it ends by itself, or until the last iteration. The curvature that it measures is `off` times
+    the true one. Each scalar is one parameter.
+    """
+    T, count = case.iterations, len(start)
+    is_small = count <= SMALL
+    keys = [f"p{k}" for k in range(count)] if is_small else ["t"]
+    rows = start[:, None] if is_small else start[None]
+    tensors = {key: mi.TensorXf(row.astype(np.float32)) for key, row in zip(keys, rows, strict=True)}
+    optimizer = Optimizer("auto", 1.0, {}, tensors, dict.fromkeys(keys), dict.fromkeys(keys, (0.0, 1.0)))
+
+    def now(key: str | None = None) -> Array:
+        found = [np.array(dr.detach(optimizer[each]), dtype=np.float64) for each in ([key] if key else keys)]
+        return np.concatenate(found)
+
+    def accumulate(g: Array) -> None:
+        for key, row in zip(keys, np.reshape(g, rows.shape), strict=True):
+            dr.backward(dr.sum(optimizer[key] * mi.TensorXf(row.astype(np.float32)), axis=None))
+
+    problem, values, gradients = SimpleNamespace(optimizer=optimizer, selection=SimpleNamespace(array=now)), [], []
+    for iteration in range(T):
+        if iteration and close_enough(problem, iteration):
+            break
+        values.append(x := now())
+        gradients.append(g := gradient(x))
+        accumulate(g)
+        if is_small and is_due(iteration):
+            optimizer.block.bend(off * case.H)
+        elif not is_small and (iteration + 2) & (iteration + 1) == 0:
+            with optimizer.displaced(np.random.default_rng(iteration)):
+                accumulate(g + off * case.H @ (now() - x))
+        optimizer.step(1.0)
+    moved = np.concatenate([optimizer.response(key) for key in keys])
+    return now(), np.array(values), np.array(gradients), np.nan_to_num(moved)
+
+
+def run_at_a_rate(random: Random, case: Case, start: Array, gradient: Gradient) -> Course:
+    """Run Adam, or SGD with momentum, at a random rate and schedule."""
+    count, T = len(start), case.iterations
     rate, beta = np.exp(random.uniform(np.log(0.005), np.log(0.06))), random.choice([0.99, 0.999])
     by_adam, steepest = random.random() < 0.8, float(np.linalg.eigvalsh(case.H)[-1])
     progress = np.arange(T) / (T - 1)
@@ -125,9 +181,7 @@ def recover(random: Random, case: Case, is_texture: bool) -> tuple[Measured, Arr
             response = np.full(count, 13 * rate / steepest)
             step = 0.1 * response * m
         x = np.clip(x - factor * step, 0, 1)
-    few = np.array([gradient(x) for _ in range(gradient_count(T))])
-    own = Measured(x, (0.0, 1.0), SCALE, few, response * rates[-1], not is_texture, start)
-    return own, np.array(values), np.array(gradients)
+    return x, np.array(values), np.array(gradients), response * rates[-1]
 
 
 def judge_scalars(own: Measured, values: Array, gradients: Array, H: Array) -> list[ParameterCertainty]:
@@ -155,11 +209,11 @@ def judge_texture(
     return found["t"]
 
 
-def judge_runs(random: Random, is_texture: bool) -> Iterator[Judged]:
+def judge_runs(random: Random, is_texture: bool, by_auto: bool) -> Iterator[Judged]:
     for number in range(RUNS):
         case = make_case(random, number, is_texture)
         off = float(np.exp(random.uniform(np.log(0.5), np.log(2))))
-        own, values, gradients = recover(random, case, is_texture)
+        own, values, gradients = recover(random, case, is_texture, by_auto, off)
         errors = np.abs(own.value - case.truth)
         if not is_texture:
             for k, about in enumerate(judge_scalars(own, values, gradients, off * case.H)):
@@ -186,9 +240,10 @@ def figures(found: Sequence[Judged]) -> tuple[float, float, float]:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("by_auto", [False, True], ids=["adam", "auto"])
 @pytest.mark.parametrize("is_texture", [False, True], ids=["scalars", "textures"])
-def test_verdicts_are_calibrated(is_texture: bool) -> None:
-    found = list(judge_runs(np.random.default_rng(7), is_texture))
+def test_verdicts_are_calibrated(llvm: str, is_texture: bool, by_auto: bool) -> None:
+    found = list(judge_runs(np.random.default_rng(7), is_texture, by_auto))
     parts = {"all": found}
     for name in ("iterations", "tails", "coupling"):
         for value in sorted({getattr(each.case, name) for each in found}):
