@@ -404,6 +404,8 @@ class Optimizer:
         large = {key: own for key, own in self._own.items() if isinstance(own, Newton)}
         kept = self.stands_at, {key: (own.state[key], self._scene.get(key)) for key, own in self._own.items()}
         before, steps = self._descents(), {}
+        for key in self.block.at:  # otherwise, the block would add to the gradients of small parameters
+            self.set_value(key, dr.detach(self[key]))
         for key, own in large.items():
             v, variable = dr.detach(own[key]), self.variable(key)
             toward = own.toward(key, before[key])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 
 import drjit as dr
@@ -92,6 +93,18 @@ def test_a_measurement_leaves_values_and_gradients_as_they_were():
             np.testing.assert_array_equal(np.array(optimizer.gradient(key)), gradient)
             bent = optimizer.moments()[key]["3"]
             np.testing.assert_allclose(np.array(bent).ravel(), losses[key][0], rtol=1e-3)
+
+
+def test_a_measurement_adds_nothing_to_the_gradients_of_small_parameters():
+    optimizer = make({"large": MANY[1], "small": np.full(1, 0.5), "positive": np.full(1, 0.5)}, transforms={
+        "large": None, "small": None, "positive": make_transform("log", (0.0, 1.0))})  # fmt: skip
+    keys, found = optimizer.keys(), []
+    for within in (contextlib.nullcontext(), optimizer.displaced(np.random.default_rng(0))):
+        with within:
+            dr.backward(sum(dr.sum(dr.square(optimizer[key]), axis=None) for key in keys))
+        found.append([np.array(optimizer.gradient(key)) for key in keys])
+    for before, after in zip(*found, strict=True):
+        np.testing.assert_array_equal(before, after)
 
 
 def test_curvature_of_a_transformed_value_is_that_of_its_variable():
