@@ -21,6 +21,11 @@ gradients agree, a step uses the newest gradient. When noise dominates, it uses 
 The images hardly change if an exposure E rises and all colours c fall. A step dE, dc is therefore taken in E and E c,
 
     E <- E exp(du),   c <- ((1 + du) c + dc) exp(-du),   du = dE / E
+
+Beside an exposure, the logarithm of each channel's mean of a texture of colours is a coordinate too. The step of this
+coordinate multiplies all texels, and the texture's own step (`newton.py`) moves the texels against each other.
+Otherwise, each step of the exposure would wait for the texture's next steps, and exposure and texture would creep along
+the valley.
 """
 
 from __future__ import annotations
@@ -65,9 +70,16 @@ class Block:
     """
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
-        ends = np.cumsum([0, *sizes.values()])
-        self.at = {key: slice(int(ends[k]), int(ends[k + 1])) for k, key in enumerate(sizes)}
-        self.rows: Array = np.zeros((int(ends[-1]), FIELDS + int(ends[-1])), np.float32)
+        self.at: dict[str, slice] = {}
+        self.add(sizes)
+
+    def add(self, sizes: Mapping[str, int]) -> None:
+        """Add coordinates before the first step."""
+        M = sum(at.stop - at.start for at in self.at.values())
+        for key, size in sizes.items():
+            self.at[key] = slice(M, M + size)
+            M += size
+        self.rows: Array = np.zeros((M, FIELDS + M), np.float32)
         self.rows[:, 5] = np.inf
 
     def bend(self, curvature: Array) -> None:

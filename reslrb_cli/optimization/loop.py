@@ -108,8 +108,7 @@ def close_enough(problem: Problem, iteration: int) -> str:
     optimizer = problem.optimizer
     if not optimizer.measures_curvature:
         return ""
-    only_small = len(optimizer.block.at) == len(optimizer.keys())
-    measured = 0 if only_small else 2 ** ((iteration + 1).bit_length() - 1) - 2  # the last measurement
+    measured = 2 ** ((iteration + 1).bit_length() - 1) - 2 if optimizer.has_large else 0  # the last measurement
     if iteration < max(LEAST_ITERATIONS, 1.5 * measured):
         return ""
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
@@ -135,7 +134,7 @@ def measure_curvature(problem: Problem, iteration: int) -> None:
     optimizer = problem.optimizer
     if optimizer.block.at and is_due(iteration):
         measure_block(problem, iteration)
-    if len(optimizer.block.at) < len(optimizer.keys()) and (iteration + 2) & (iteration + 1) == 0:
+    if optimizer.has_large and (iteration + 2) & (iteration + 1) == 0:
         random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
         with optimizer.displaced(random):
             problem.apply()
@@ -169,7 +168,8 @@ def measure_block(problem: Problem, iteration: int) -> None:
         return
     curvature = LossCurvature(problem, part, of_target=False)
     directions, H, _ = curvature.along(changes, lambda: True)
-    at = np.array([block.at[each.key].start + (each.entry or 0) for each in directions])
+    # A texture has no entries, but channels.
+    at = np.array([block.at[each.key].start + (each.entry or each.channel or 0) for each in directions])
     slopes = np.concatenate([optimizer.slopes(key) for key in block.at])
     whole = np.zeros((len(slopes), len(slopes)))
     whole[np.ix_(at, at)] = H * np.outer(slopes[at], slopes[at])

@@ -1,22 +1,4 @@
-"""One interface to Dr.Jit's optimisers. Each parameter has its own optimiser, with transforms and bounds.
-
-Transforms (`Transform`, `Variable`): the optimiser moves an unconstrained variable u, and the scene gets x = T(u).
-
-    none      x = u
-    sigmoid   x = low + (high - low) / (1 + exp(-u))     between the bounds, which it never reaches
-    log       x = exp(u)                                 positive; a step is a relative change
-
-By the chain rule, dL/du = dL/dx T'(u). The factor T'(u) is applied to the accumulated gradient, so the kernels of a
-step do not depend on the factor. T is increasing in each entry.
-
-Smooth steps (`precondition`, `Smoother`) move v instead of u: x = T(S v).
-
-    S = (1 - l^2 Δ)^-1,   dL/dv = S dL/du                Nicolet, Jacobson and Jakob 2021 ("large steps"), eq. 9 to 12
-
-S is symmetric, and a step of gradient descent is S^2 dL/du. A step therefore moves details finer than l by a smaller
-amount. The reduction factor is the fourth power of the ratio of the detail's size to l. Refracting surfaces need this.
-The light from refracting surfaces depends on the surface's second derivatives. The curvature of a loss therefore grows
-with the fourth power of the spatial frequency. Without S, the map's finest ripple limits the step.
+"""One interface to Dr.Jit's optimisers. Each parameter has its own optimiser, with a `Variable` and bounds.
 
 Updates (`Optimizer`): each parameter has its own optimiser. A parameter whose gradient is not finite can therefore keep
 its moments and its number of steps.
@@ -39,161 +21,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
-import scipy.fft
 
 from reslrb_cli.backend.memory import flat
 from reslrb_cli.optimization.block import Block, JointState
 from reslrb_cli.optimization.newton import DISPLACEMENT, AdamRule, Descent, Joint, Newton
 from reslrb_cli.optimization.nonfinite import count_nonfinite
+from reslrb_cli.optimization.variables import Smoother, Transform, Variable
 from reslrb_cli.statistics import Array, rms
-
-Bounds = tuple[float, float] | None
-
-#: Limit of u: x stays away from the sigmoid's bounds by 1e-7 of their distance, and neither underflows nor overflows.
-SIGMOID_END, EXPONENT_END = 16.0, 80.0
-
-
-@dataclass(frozen=True)
-class Transform:
-    """Transform T with its inverse, its derivative T'(u), and the smallest and largest u. The functions accept any
-    Dr.Jit array type.
-    """
-
-    forward: Callable[[Any], Any]
-    inverse: Callable[[Any], Any]
-    derivative: Callable[[Any], Any]
-    low: float
-    high: float
-
-
-def make_transform(name: str, bounds: Bounds) -> Transform | None:
-    """Return the transform called `name`, or None for `none`. `bounds` are those of x. Raises KeyError for an unknown
-    name.
-    """
-    low, high = bounds or (-math.inf, math.inf)
-    if name == "none":
-        return None
-    if name == "sigmoid":
-        return Transform(
-            forward=lambda u: low + (high - low) * _logistic(u),
-            inverse=lambda x: dr.log((x - low) / (high - x)),
-            derivative=lambda u: (high - low) * _logistic(u) * _logistic(-u),
-            low=-SIGMOID_END,
-            high=SIGMOID_END,
-        )
-    if name != "log":
-        raise KeyError(name)
-    least = -EXPONENT_END if low <= 0 else max(math.log(low), -EXPONENT_END)
-    return Transform(dr.exp, dr.log, dr.exp, least, min(math.log(high), EXPONENT_END))
-
-
-def _logistic(u: Any) -> Any:
-    return 1 / (1 + dr.exp(-u))
-
-
-class Smoother:
-    """Smoothing operator S for textures and heightmaps of the shape (height, width, channels) with at least two texels.
-
-    `length` is l, as a fraction of the longer side, so the effect does not depend on the resolution. Δ is a sum of
-    differences of neighbours without flow through the edges, so the cosine transform diagonalises S. `gain` is the mean
-    of the diagonal of S^2, which is each entry's response to a gradient of the entry alone.
-    """
-
-    def __init__(self, shape: tuple[int, ...], length: float) -> None:
-        texels = length * max(shape[:2])  # l in texels, which are square
-        along = [2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in shape[:2]]
-        self._shape = shape
-        self._eigenvalues = 1 + texels**2 * (along[0][:, None] + along[1])[:, :, None]
-        self.gain = float(np.mean(self._eigenvalues**-2.0))
-
-    def smooth(self, value: Any) -> Any:
-        """Return S `value`, evaluated. S is symmetric, so S also turns the gradient by S v into the gradient by v."""
-        return self._scaled(value, 1 / self._eigenvalues)
-
-    def roughen(self, value: Any) -> Any:
-        """Return the inverse of `smooth`."""
-        return self._scaled(value, self._eigenvalues)
-
-    def _scaled(self, value: Any, factors: Array) -> Any:
-        array = np.array(dr.detach(value), dtype=np.float64)
-        spectrum = scipy.fft.dctn(array.reshape(self._shape), axes=(0, 1), norm="ortho")
-        result = np.asarray(scipy.fft.idctn(spectrum * factors, axes=(0, 1), norm="ortho"))
-        return type(value)(result.reshape(array.shape).astype(np.float32))
-
-
-@dataclass
-class Variable:
-    """Variable v of the optimiser for a parameter x: x = T(length * S v), with x within its bounds.
-
-    S is 1 or a `Smoother`. The optimiser receives the gradient `gain` times dL/dv. `length` and `gain` are 1 until they
-    are measured (`sensitivity.py`). `length` and `gain` reach kernels as data, so new values do not require new
-    kernels.
-    """
-
-    transform: Transform | None
-    bounds: Bounds
-    length: float = 1.0
-    gain: float = 1.0
-    smoother: Smoother | None = None
-
-    @property
-    def ends(self) -> Bounds:
-        """Smallest and largest u."""
-        return self.bounds if self.transform is None else (self.transform.low, self.transform.high)
-
-    def to_scene(self, v: Any) -> Any:
-        """Return x for v."""
-        u = self._u(v)
-        x = u if self.transform is None else self.transform.forward(u)
-        return x if self.bounds is None else dr.clip(x, self.bounds[0], self.bounds[1])  # rounding may exceed them
-
-    def from_scene(self, x: Any) -> Any:
-        """Return v for x."""
-        u = x if self.transform is None else self.transform.inverse(x)
-        if self.smoother is not None:
-            u = self.smoother.roughen(u)
-        return self.clamp(u * _opaque(x, 1 / self.length))
-
-    def clamp(self, v: Any) -> Any:
-        """Return v if its x is within the bounds, otherwise the nearest allowed value."""
-        ends = self.ends
-        if ends is None:
-            return v
-        if self.smoother is None:
-            return dr.clip(v, *(_opaque(v, end / self.length) for end in ends))
-        u = self._u(v)
-        if not dr.any(flat((u < ends[0]) | (u > ends[1])))[0]:
-            return v  # unchanged: transforming back and forth would round it again in each step
-        return self.smoother.roughen(dr.clip(u, *ends)) * _opaque(v, 1 / self.length)
-
-    def chain(self, v: Any, gradient: Any) -> Any:
-        """Return `gain` times dL/dv, given dL/dx."""
-        result = gradient * _opaque(v, self.length) * _opaque(v, self.gain)
-        if self.transform is not None:
-            result = result * self.transform.derivative(self._u(v))
-        return result if self.smoother is None else self.smoother.smooth(result)
-
-    def reach(self, v: Any, rate: float) -> float:
-        """Return the root mean square change of x if v moves by `rate`. For each entry, the larger of the upward and
-        downward movements counts.
-        """
-        value = self.to_scene(v)
-        up, down = (dr.abs(self.to_scene(v + side * rate) - value) for side in (1, -1))
-        return rms(np.array(dr.maximum(up, down)))
-
-    def _u(self, v: Any) -> Any:
-        u = v * _opaque(v, self.length)
-        return u if self.smoother is None else self.smoother.smooth(u)
-
-
-def _opaque(like: Any, number: float) -> Any:
-    return dr.opaque(dr.leaf_t(like), number)
-
 
 OPTIMIZERS: dict[str, Callable[..., Any]] = {
     "adam": AdamRule,
@@ -239,6 +78,8 @@ class Optimizer:
             for key in values
         }
         self._measures = type == "auto"
+        #: Textures whose brightness is part of the joint steps of `auto` (`balance`).
+        self.textures: list[str] = []
         self._variables: dict[str, Variable] = {}
         #: The scene's values of the parameters with variables.
         self._scene: dict[str, Any] = {}
@@ -282,8 +123,14 @@ class Optimizer:
     def balance(self, exposure: str, colours: Sequence[str]) -> None:
         """From now on, divide `colours` by the change of `exposure` in each step. The arguments are keys. Entries
         without a gradient stay, because no image shows them.
+
+        The joint steps of `auto` include the brightness of each channel of textures among `colours` instead. Call this
+        before the first step.
         """
         self._balanced = exposure, list(colours)
+        large = [key for key in colours if key in self._large and key not in self._variables]
+        self.textures = [key for key in large if len(dr.shape(self[key])) == 3]
+        self.block.add({key: dr.shape(self[key])[2] for key in self.textures})
 
     def forget(self) -> None:
         """Set the moments of all parameters to zero. `auto` has no long memory, and keeps its measured curvature."""
@@ -318,13 +165,18 @@ class Optimizer:
             own = self._own[key]
             before[key] = own.state[key], self[key]
             own.set_learning_rate(self._rates[key] * factor if own.longest is None else own.longest * self.extent(key))
-            if key in joint:
+            if key in joint and key not in self.textures:
                 self._move_variable(key, joint[key])
             elif key in self._variables:
                 self._step_variable(key)
             else:
                 own.step(eval=False)
-                own[key] = clamp(dr.detach(own[key]), self._bounds[key])
+                value = dr.detach(own[key])
+                if key in self.textures:
+                    factors = type(flat(value))(np.exp(joint[key]).tolist())
+                    dr.make_opaque(factors)
+                    value = value * type(value)(factors, (1, 1, len(factors)))
+                own[key] = clamp(value, self._bounds[key])
             counts[key] = count_nonfinite(self[key])
         dr.eval(counts)
         overflowed = {key: int(count[0]) for key, count in counts.items() if count[0]}
@@ -342,14 +194,25 @@ class Optimizer:
         return overflowed
 
     def _joint_steps(self, skip: Collection[str]) -> dict[str, Array]:
-        """Return the new values of the variables of small parameters, for `auto`."""
+        """Return the new values of the variables of small parameters, for `auto`. For a texture, return the changes of
+        the logarithms of its channels' means.
+        """
         block, M = self.block, len(self.block.rows)
         known, exposure = np.ones(M, bool), np.full(M, -1)
         gradient, value, longest, low, high = np.zeros((5, M))
         balanced, colours = self._balanced or ("", [])
         for key, at in block.at.items():
             variable, v = self.variable(key), dr.detach(self._own[key][key])
-            value[at], known[at] = np.array(v).ravel(), key not in skip
+            known[at] = key not in skip
+            if key in self.textures:
+                # The logarithms contain the texture's own steps, so the next joint step knows of them.
+                texels, most = np.array(v, dtype=np.float64), (self._bounds[key] or (0, math.inf))[1]
+                value[at], longest[at] = np.log(np.maximum(texels.mean((0, 1)), 1e-6)), LONGEST_OF_TRANSFORM
+                low[at], high[at] = -math.inf, np.log(max(most, 1e-6))
+                if key not in skip:
+                    gradient[at] = np.sum(texels * np.array(self.gradient(key)), axis=(0, 1))
+                continue
+            value[at] = np.array(v).ravel()
             if key not in skip:
                 gradient[at] = np.array(variable.chain(v, self.gradient(key))).ravel()
             longest[at] = LONGEST_OF_TRANSFORM if variable.transform else LONGEST_OF_SMALL * self.extent(key)
@@ -359,7 +222,8 @@ class Optimizer:
                 own = np.arange(place.start, place.stop)
                 exposure[at] = own if len(own) in (1, at.stop - at.start) else -1
         change = block.steps(JointState(value, gradient, longest, low, high, known, exposure))
-        return {key: value[at] + change[at] for key, at in block.at.items() if key not in skip}
+        new = {key: value[at] + change[at] for key, at in block.at.items() if key not in skip}
+        return new | {key: change[block.at[key]] for key in self.textures if key not in skip}
 
     def _move_variable(self, key: str, row: Array) -> None:
         """Set the optimiser's variable of a small parameter to `row`, within its bounds."""
@@ -374,7 +238,9 @@ class Optimizer:
             self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
 
     def slopes(self, key: str) -> Array:
-        """Return dx/dv of each entry of a parameter's variable, as a flat array."""
+        """Return dx/dv of each entry of a parameter's variable as a flat array, or 1 for a channel of `textures`."""
+        if key in self.textures:
+            return np.ones(dr.shape(self[key])[2])
         variable, v = self.variable(key), dr.detach(self._own[key][key])
         ones = dr.zeros(type(v), dr.shape(v)) + 1
         return np.array(variable.chain(v, ones), dtype=np.float64).ravel() / variable.gain
@@ -401,9 +267,11 @@ class Optimizer:
         Accumulate the gradient before, and within the block the gradient at the displaced values, with the same
         samples. Afterwards, values and gradients are as before.
         """
-        large = {key: own for key, own in self._own.items() if isinstance(own, Newton)}
+        large = self._large
         kept = self.stands_at, {key: (own.state[key], self._scene.get(key)) for key, own in self._own.items()}
         before, steps = self._descents(), {}
+        for key in self.block.at:  # otherwise, the block would add to the gradients of small parameters
+            self.set_value(key, dr.detach(self[key]))
         for key, own in large.items():
             v, variable = dr.detach(own[key]), self.variable(key)
             toward = own.toward(key, before[key])
@@ -436,7 +304,10 @@ class Optimizer:
         """Return an upper limit of the distance to the optimum as a share of the extent. Only for `auto`; infinity
         otherwise.
         """
-        return float(self._own[key].to_go(key) / self.extent(key))
+        distance = self._own[key].to_go(key)
+        if key in self.textures:
+            distance = max(distance, self.block.to_go(key) * rms(np.array(dr.detach(self[key]))))
+        return float(distance / self.extent(key))
 
     def averaged(self, key: str) -> float:
         """Return the number of gradients that a step of `auto` averages. It rises if noise dominates."""
@@ -469,6 +340,15 @@ class Optimizer:
     def measures_curvature(self) -> bool:
         """True for `auto`."""
         return self._measures
+
+    @property
+    def has_large(self) -> bool:
+        """True if the curvature of textures or other large parameters is measured for `auto`."""
+        return bool(self._large)
+
+    @property
+    def _large(self) -> dict[str, Newton]:
+        return {key: own for key, own in self._own.items() if isinstance(own, Newton)}
 
     def rate(self, key: str) -> float:
         """Return the learning rate of a parameter, before any schedule."""

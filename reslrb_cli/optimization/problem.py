@@ -16,8 +16,9 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
-from reslrb_cli.optimization.optimizers import Optimizer, Smoother, make_transform
+from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
+from reslrb_cli.optimization.variables import Smoother, make_transform
 from reslrb_cli.optimization.views import SHARED, View, slope, to_tensor
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.scene.catalog import COLOUR

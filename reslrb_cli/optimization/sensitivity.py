@@ -42,8 +42,8 @@ import numpy as np
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import gradient_step, render_image
-from reslrb_cli.optimization.optimizers import Bounds, Transform
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.variables import Bounds, Transform
 from reslrb_cli.records.decisions import Scaled, Sensitivity
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 
 import drjit as dr
@@ -12,19 +13,24 @@ from cli.tiny import manifest
 from optimization.toy import make_problem
 from runs.going_on import begin_alone, optimize
 
+from reslrb_cli.backend.memory import flat
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.newton import LONGEST, SHORTER, _steepness
-from reslrb_cli.optimization.optimizers import Optimizer, make_transform
+from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import standing
+from reslrb_cli.optimization.variables import make_transform
 
 AUTO = "optimizer={type: auto}"
 #: The loss sum of a_i / 2 (p_i - b_i)^2.
 MANY = np.array([3.0, 0.5, 20.0, 1.0, 8.0, 2.0]), np.array([0.9, 0.1, 0.4, 0.7, 0.2, 0.6])
 #: A loss that bends 20 times more along p + q than along p - q: its curvature, and the optimum.
 VALLEY, BEST = np.array([[21.0, 19.0], [19.0, 21.0]]), np.array([0.3, 0.6])
+
+#: Texels of a dark floor.
+DARK = np.linspace(0.2, 0.4, 16)
 
 
 def make(values, bounds=(0.0, 1.0), transforms=None) -> Optimizer:
@@ -93,6 +99,18 @@ def test_a_measurement_leaves_values_and_gradients_as_they_were():
             np.testing.assert_array_equal(np.array(optimizer.gradient(key)), gradient)
             bent = optimizer.moments()[key]["3"]
             np.testing.assert_allclose(np.array(bent).ravel(), losses[key][0], rtol=1e-3)
+
+
+def test_a_measurement_adds_nothing_to_the_gradients_of_small_parameters():
+    optimizer = make({"large": MANY[1], "small": np.full(1, 0.5), "positive": np.full(1, 0.5)}, transforms={
+        "large": None, "small": None, "positive": make_transform("log", (0.0, 1.0))})  # fmt: skip
+    keys, found = optimizer.keys(), []
+    for within in (contextlib.nullcontext(), optimizer.displaced(np.random.default_rng(0))):
+        with within:
+            dr.backward(sum(dr.sum(dr.square(optimizer[key]), axis=None) for key in keys))
+        found.append([np.array(optimizer.gradient(key)) for key in keys])
+    for before, after in zip(*found, strict=True):
+        np.testing.assert_array_equal(before, after)
 
 
 def test_curvature_of_a_transformed_value_is_that_of_its_variable():
@@ -181,6 +199,46 @@ def test_a_value_at_its_bound_does_not_lead_the_others_astray():
     values, _ = in_the_valley(np.array([0.9, 0.2]), bounds=(-2.0, 0.5))
     best = BEST[0] + VALLEY[0, 1] / VALLEY[0, 0] * (BEST[1] - 0.5)
     np.testing.assert_allclose(values[-1], [best, 0.5], atol=5e-3)
+
+
+def make_exposed() -> Optimizer:
+    values = {"exposure": mi.Float(1.0), "floor": dr.full(mi.TensorXf, 0.8, (4, 4, 1))}
+    bounds, transforms = {"exposure": None, "floor": (0.0, 1.0)}, {"exposure": make_transform("log", None)}
+    optimizer = Optimizer("auto", 1.0, {}, values, dict.fromkeys(values), bounds, transforms)
+    optimizer.balance("exposure", ["floor"])
+    return optimizer
+
+
+def pull_exposed(optimizer: Optimizer) -> np.ndarray:
+    """Accumulate the gradients of a picture with 16 pixels E t_i of texels, and 16 pixels E mean(t)² of light that they
+    reflect twice. Only the latter tell the exposure E. Return the derivatives of the pixels (32, 2) by the logarithms
+    of E and of all texels.
+    """
+    E, t = float(np.array(optimizer["exposure"])[0]), np.array(optimizer["floor"], dtype=np.float64).ravel()
+    once, twice = E * t, np.full(16, E * t.mean() ** 2)
+    off = once - 0.6 * DARK, twice - 0.6 * DARK.mean() ** 2
+    by_texel = E * off[0] + off[1].sum() * 2 * E * t.mean() / 16
+    by_exposure = off[0] @ once / E + off[1] @ twice / E
+    for key, gradient in (("exposure", by_exposure), ("floor", by_texel)):
+        optimizer.clear_gradient(key)
+        weight = mi.TensorXf(np.reshape(gradient, dr.shape(optimizer[key])).astype(np.float32))
+        dr.backward(dr.sum(flat(optimizer[key]) * weight.array))
+    return np.stack([np.concatenate([once, twice]), np.concatenate([once, 2 * twice])], axis=1)
+
+
+def test_a_texture_and_an_exposure_that_compensate_for_each_other_move_together():
+    """The exposure is 0.6, and the texels are dark. Separate steps would creep along the valley."""
+    optimizer = make_exposed()
+    for iteration in range(20):
+        slopes = pull_exposed(optimizer)
+        optimizer.block.bend(slopes.T @ slopes)
+        if iteration in (0, 2, 6, 14):
+            with optimizer.displaced(np.random.default_rng(iteration)):
+                pull_exposed(optimizer)
+        optimizer.step(1.0)
+    assert float(np.array(optimizer["exposure"])[0]) == pytest.approx(0.6, rel=0.01)
+    np.testing.assert_allclose(np.array(optimizer["floor"]).ravel(), DARK, rtol=0.05)
+    assert optimizer.to_go("floor") * optimizer.extent("floor") < 0.02
 
 
 def test_noise_shortens_the_steps_and_a_steady_pull_does_not():

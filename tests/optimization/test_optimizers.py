@@ -11,7 +11,8 @@ import pytest
 
 from reslrb_cli.config.optimizers import Adam as AdamSettings
 from reslrb_cli.optimization.loop import SCHEDULES, learning_rate_factor
-from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer, Smoother, Variable, make_transform
+from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer
+from reslrb_cli.optimization.variables import Smoother, Variable, make_transform
 from reslrb_cli.records.clock import StepClock
 
 # Optimisers, compared with their published formulas. Clamping, learning rates, and parameters that sit out a step.

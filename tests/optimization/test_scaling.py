@@ -17,7 +17,7 @@ from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
-from reslrb_cli.optimization.optimizers import Optimizer, Variable, make_transform
+from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.sensitivity import (
     measure_curvatures,
     measure_sensitivities,
@@ -26,6 +26,7 @@ from reslrb_cli.optimization.sensitivity import (
     scale_line,
 )
 from reslrb_cli.optimization.state import standing
+from reslrb_cli.optimization.variables import Variable, make_transform
 from reslrb_cli.records.decisions import Scaled
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
