@@ -28,7 +28,7 @@ import mitsuba as mi
 from reslrb_cli.estimators.attached import Adjoint
 from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.camera import Radiance
-from reslrb_cli.estimators.edges import AROUND, Contribution, edge_samples, for_camera, moved_by, ray_offset
+from reslrb_cli.estimators.edges import AROUND, Contribution, edge_samples, for_camera, moved_by
 from reslrb_cli.estimators.stack import Ring, StackState, differentiate_frames
 from reslrb_cli.transport.bsdf import EventNumbers, evaluate, scatter
 from reslrb_cli.transport.camera import FilmRay, camera_walk
@@ -37,6 +37,7 @@ from reslrb_cli.transport.edges import pick
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.factors import MAY_LACK, Product, showing
 from reslrb_cli.transport.jumps import ChainEdge, random_interval, random_lines, sample_edge
+from reslrb_cli.transport.masks import ray_offset
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.sobol import unit

@@ -58,14 +58,15 @@ from reslrb_cli.transport.connection import Connection, shading_correction
 from reslrb_cli.transport.edges import Chances, Outline, sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.factors import MAY_LACK, Product, showing
+from reslrb_cli.transport.masks import ray_offset
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 #: Paths of a step per sampled point on an outline, for each of the three terms.
 PATHS_PER_OUTLINE = 4
-#: Distance between an edge and the ray that hits the shape, in units of Mitsuba's ray offset, on spheres and
-#: cylinders. The ray hits them before the edge, by the square root of this distance. On other shapes it is 1.
-ROUND = 0.1
+#: Distance between an edge and the rays beside it, in units of Mitsuba's ray offset. A ray that grazes a face hits it
+#: far from the edge, so the distance is as small as rounding allows.
+BESIDE = 0.05
 #: Distance along a ray within which a surface counts as being at the edge, in units of Mitsuba's ray offset.
 AROUND = 30.0
 #: Streams of random numbers, mixed into the seed.
@@ -133,11 +134,6 @@ class Beside:
     active: mi.Bool
 
 
-def ray_offset(p: mi.Point3f) -> mi.Float:
-    """Return Mitsuba's ray offset at `p`."""
-    return mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
-
-
 def both_sides(
     samples: Samples, outline: Outline, creases: bool = False, everywhere: bool = False
 ) -> Beside:  # fmt: skip
@@ -154,7 +150,7 @@ def both_sides(
     def ray(side: float | mi.Float) -> mi.Ray3f:
         return with_wavelengths(mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d), outline)
 
-    over, past = ray(dr.select(outline.is_round, -ROUND, -1)), ray(1)
+    over, past = ray(-BESIDE), ray(BESIDE)
     pi = scene.ray_intersect_preliminary(over, coherent=False, active=active)
     active = active & pi.is_valid() & (pi.shape == outline.shape)
     before = mi.Ray3f(past)
@@ -510,7 +506,7 @@ def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
     offset = ray_offset(outline.p)
-    back = with_wavelengths(mi.Ray3f(outline.p + outline.normal * offset, outline.view.to_y), outline)
+    back = with_wavelengths(mi.Ray3f(outline.p + outline.normal * (BESIDE * offset), outline.view.to_y), outline)
     y = samples.scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
     outline.active = outline.active & y.is_valid()
     outline.view.distance = y.t

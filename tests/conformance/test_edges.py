@@ -118,6 +118,8 @@ FAULTS = [
     Fault("every_edge_counts", "points", "transport.edges:sample_outline",
           "(side * across_it > 0)", "mi.Bool(True)"),
     Fault("creases_left_out", "box-sphere_lamp-2", "transport.edges:sample_outline", "if creases:", "if False:"),
+    Fault("shadow_rays_start_above_the_surface", "grazing", "transport.masks:shadow_ray",
+          "if not plan.has_edges:", "if True:"),
     Fault("contact_counted_twice", "standing-front-2", "estimators.edges:_from_sensor",
           "beside.active & ~touches", "beside.active"),
     Fault("point_behind_not_scaled", "two-area-3", "estimators.edges:_from_sensor",
@@ -160,6 +162,8 @@ FAULTS = [
 
 
 FAULTS_OF_CAMERA_PATHS = [
+    Fault("rays_far_from_the_edge", "bumpy-area-2", "estimators.edges:both_sides",
+          "ray(-BESIDE), ray(BESIDE)", "ray(-1), ray(1)"),
     Fault("sides_exchanged", "box-sphere_lamp-2", "estimators.camera_edges:_from_sensor",
           "dr.select(over, beside.over, beside.past)", "dr.select(over, beside.past, beside.over)"),
     Fault("creases_left_out", "box-sphere_lamp-2", "estimators.camera_edges:_from_sensor",
@@ -212,9 +216,24 @@ def test_segments_between_surfaces_count(monkeypatch: pytest.MonkeyPatch):
     check_depth(monkeypatch)
 
 
-#: Checks of faults that hardly change an expectation.
+def check_grazing() -> None:
+    """Assert that the derivative by the height of a vertex is right. The sensor sees the faces around it at grazing
+    angles.
+    """
+    case = BY_NAME["bumpy-area-2"]
+    column = case.motion.index("seen")
+    agreement = compare(replace(case, spp=2048).gradients()[:, [column]], recorded(case)[:, [column]], block=None)
+    assert agreement, agreement
+
+
+def test_light_that_leaves_a_surface_at_a_grazing_angle():
+    check_grazing()
+
+
+#: Checks of faults that hardly change an expectation, or that the test of a case has too much noise for.
 EXACT: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
-    "depth": check_depth, "points": lambda monkeypatch: check_points("sensor", False),
+    "depth": check_depth, "grazing": lambda monkeypatch: check_grazing(),
+    "points": lambda monkeypatch: check_points("sensor", False),
 }  # fmt: skip
 
 
