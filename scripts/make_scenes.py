@@ -61,7 +61,7 @@ def meshes() -> dict[str, tuple[np.ndarray, ...]]:
         "mixed_room/pane.ply": height_field(64, 0.2, pane),
         "table/vase.ply": revolved(VASE, 40),
         "table/handle.ply": handle(24, 10),
-        "table/glass.ply": revolved(glass_ball(0.27, 0.5, 28), 72, (1.1, 0.8)),
+        "table/glass.ply": revolved(glass_ball(0.27, 0.5, 28), 72, (1.2, 0.7)),
     }
 
 
