@@ -32,13 +32,9 @@ if TYPE_CHECKING:
     from reslrb_cli.scene.xml.read import Description
 
 
-#: Pixels of a film with which a run takes minutes on two cores, with the samples below.
+#: Pixels of a film with which a run takes minutes on two cores, with these samples and at most these iterations.
 PIXELS = 2**14
-SPP, ITERATIONS, RATE = 16, 200, 0.03
-
-#: The same for parameters without an upper bound, whose rates are relative. Separating a lamp from the colours that it
-#: lights takes many steps.
-UNBOUNDED_ITERATIONS, UNBOUNDED_RATE = 300, 0.1
+SPP, ITERATIONS = 16, 300
 
 #: Maximum number of parameters in comments; a scene can have thousands.
 _MOST_OTHERS = 60
@@ -68,8 +64,6 @@ def _first_config(
     template values.
     """
     first = [proposal for proposal in proposals if proposal.first]
-    # Step sizes must be measured if a parameter is unbounded.
-    is_scaled = not all(proposal.is_bounded for proposal in first)
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
     listed = [text for text in others if len(text) <= _LONGEST][:_MOST_VARIABLES]
     named = [f"{number} is {_word(name)}" for number, name in enumerate(sensors[:_MOST_SENSORS])]
@@ -86,9 +80,7 @@ def _first_config(
         first=first,
         others=[proposal for proposal in proposals if not proposal.first],
         most_others=_MOST_OTHERS,
-        is_scaled=is_scaled,
-        iterations=UNBOUNDED_ITERATIONS if is_scaled else ITERATIONS,
-        rate=UNBOUNDED_RATE if is_scaled else RATE,
+        iterations=ITERATIONS,
         spp=SPP,
     )
 
@@ -98,16 +90,11 @@ def _comment(text: str) -> list[str]:
     return wrap(printable(text), _COMMENT - len("  # "), break_long_words=False)
 
 
-def _entry(proposal: Proposal, is_scaled: bool) -> str:
-    """Return the entry of a parameter. Unbounded parameters get their own learning rate if step sizes are not
-    measured.
-    """
+def _entry(proposal: Proposal) -> str:
+    """Return the entry of a parameter."""
     parts = [f"key: {_text(proposal.info.key)}"]
     parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
     parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
-    size = 0.0 if proposal.info.value is None else abs(proposal.info.value.mean)
-    if size and not (is_scaled or proposal.is_bounded):
-        parts.append(f"learning_rate: {float(f'{UNBOUNDED_RATE * size:.2g}')}")
     return "{" + ", ".join(parts) + "}"
 
 

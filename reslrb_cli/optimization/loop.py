@@ -167,7 +167,8 @@ def measure_block(problem: Problem, iteration: int) -> None:
     if not is_due(iteration, views * 2 * (len(changes) + 1) * part / spp):
         return
     curvature = LossCurvature(problem, part, of_target=False)
-    directions, H, _ = curvature.along(changes, lambda: True)
+    directions, *_ = curvature.along(changes, lambda: True)
+    H = curvature.for_steps(directions)
     # A texture has no entries, but channels.
     at = np.array([block.at[each.key].start + (each.entry or each.channel or 0) for each in directions])
     slopes = np.concatenate([optimizer.slopes(key) for key in block.at])

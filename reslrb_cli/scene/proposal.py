@@ -137,11 +137,6 @@ class Proposal:
     resolution: tuple[int, int] | None
     first: bool
 
-    @property
-    def is_bounded(self) -> bool:
-        """True if the bounds determine the parameter's size, and therefore the size of a step."""
-        return self.bounds is not None and "inf" not in self.bounds
-
 
 def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]:
     """Return the recoverable parameters of `scene`, seen through the sensor with this index. Mesh vertices are

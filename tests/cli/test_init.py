@@ -54,11 +54,8 @@ def test_a_scene_alone_gets_a_configuration_without_a_photograph(folder: Path) -
     config = load(folder / "room.yaml")
     assert [spec.keys for spec in config.parameters] == [[tiny.KEY]]
     assert config.parameters[0].bounds == (0, 1)
-    assert (config.loss.type, config.optimizer.schedule, config.integrator.max_depth) == ("relative_l2", "cosine", 8)
-    assert (config.optimizer.scale, config.optimizer.learning_rate) == ("none", 0.03)
-    # The lamp's own learning rate is a tenth of its present value. The lamp can then reach its true value once a user
-    # activates the line.
-    lamp = "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf], learning_rate: 0.8}"
+    assert (config.loss.type, config.optimizer.type, config.integrator.max_depth) == ("relative_l2", "auto", 8)
+    lamp = "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf]}"
     assert lamp in (folder / "room.yaml").read_text()
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2

@@ -21,6 +21,7 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.newton import LONGEST, SHORTER, _steepness
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import standing
+from reslrb_cli.optimization.uncertainty.curvature import raise_eigenvalues
 from reslrb_cli.optimization.variables import make_transform
 
 AUTO = "optimizer={type: auto}"
@@ -300,6 +301,23 @@ def test_one_noisy_measurement_does_not_set_the_curvature_of_a_dim_texel():
     measured[0] *= 50
     found = np.array(_steepness(mi.Float(size), mi.Float(measured)))
     np.testing.assert_allclose(found, 2 * size, rtol=0.05)
+
+
+def test_a_noisy_curvature_does_not_lead_to_long_steps():
+    """Three directions change 2,000 pixels almost alike, so two eigenvalues are smaller than their noise."""
+    random, common = np.random.default_rng(3), np.random.default_rng(2).normal(size=2000)
+    slopes = common * np.array([[1.0], [0.9], [-1.1]]) + 0.01 * random.normal(size=(3, 2000))
+    true = slopes @ slopes.T
+    least = []
+    for _ in range(50):
+        a, b = (slopes + 0.3 * random.normal(size=slopes.shape) for _ in range(2))
+        found = raise_eigenvalues(a, b, np.zeros((3, 3)))
+        least.append(np.linalg.eigvalsh(found)[0])
+        np.testing.assert_allclose(found, true, rtol=0.15)
+    assert min(least) > 3  # about the noise, 0.09 sqrt(2000)
+    assert max(least) < 50
+    certain = np.diag([0.0, 0.0, 1e5])
+    np.testing.assert_allclose(raise_eigenvalues(slopes, slopes, certain), true + certain, rtol=0.02)
 
 
 def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):

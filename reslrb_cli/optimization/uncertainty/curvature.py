@@ -264,6 +264,8 @@ class LossCurvature:
         self._thinned = max(values / MOST_VALUES, 1.0)
         #: Share (M,) of the curvature along each direction that remains without its standard error.
         self.sure = np.zeros(0)
+        #: Derivatives (M, N) of all pixels along each direction, by each set of samples. The first set has the weights.
+        self.slopes: tuple[Array, Array] = np.zeros((0, 0)), np.zeros((0, 0))
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises() if of_target else []
 
@@ -298,14 +300,19 @@ class LossCurvature:
         if not directions:
             return [], np.zeros((0, 0)), np.zeros((0, 0))
         a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
-        a = a * self._in_a_row(self._weights)
+        a = a * self._in_a_row(self._weights) * self._thinned
+        self.slopes = a, b
         self.sure = _sure_share(a * b)
         sure = np.sqrt(np.outer(self.sure, self.sure))
-        H = _symmetric(a @ b.T * self._thinned * sure) + self._of_regularizers(directions)
+        H = _symmetric(a @ b.T * sure) + self._of_regularizers(directions)
         if not self.noises:
             return directions, H, np.zeros_like(H)
         a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
         return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
+
+    def for_steps(self, directions: Sequence[ParameterDirection]) -> Array:
+        """Return H (M, M) along the directions of `along`, with eigenvalues of at least their standard errors."""
+        return raise_eigenvalues(*self.slopes, self._of_regularizers(directions))
 
     def _of_regularizers(self, directions: Sequence[ParameterDirection]) -> Array:
         """Return the curvature of regularizers along directions (M, M). It is zero between different parameters."""
@@ -468,6 +475,21 @@ def _of_channel(image: Array, channel: int | None) -> Array:
     if channel is None:
         return image
     return np.asarray(np.where(np.arange(image.shape[2]) == channel, image, 0.0))
+
+
+def raise_eigenvalues(a: Array, b: Array, certain: Array) -> Array:
+    """Return the sum of a bᵀ and `certain` (M, M), with eigenvalues of at least their standard errors. The eigenvalues
+    are those in units in which the diagonal is 1. The columns of a and b (M, N) are independent samples.
+
+    The noise of a small eigenvalue is larger than the eigenvalue. It may be negative, so that a step ignores its
+    direction, or so small that a step is too long.
+    """
+    H = _symmetric(a @ b.T) + certain
+    size = np.maximum(np.diag(H), np.sqrt(np.square(a * b).sum(axis=1)))
+    root = np.sqrt(np.where(size > 0, size, 1.0))[:, None]
+    values, vectors = np.linalg.eigh(H / (root @ root.T))
+    errors = np.sqrt(np.square((vectors.T @ (a / root)) * (vectors.T @ (b / root))).sum(axis=1))
+    return np.asarray((vectors * np.maximum(values, errors)) @ vectors.T * (root @ root.T))
 
 
 def _sure_share(terms: Array) -> Array:
