@@ -66,7 +66,7 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 PATHS_PER_OUTLINE = 4
 #: Distance between an edge and the rays beside it, in units of Mitsuba's ray offset. A ray that grazes a face hits it
 #: far from the edge, so the distance is as small as rounding allows.
-BESIDE = 0.05
+BESIDE = 0.1
 #: Distance along a ray within which a surface counts as being at the edge, in units of Mitsuba's ray offset.
 AROUND = 30.0
 #: Streams of random numbers, mixed into the seed.
