@@ -30,6 +30,7 @@ from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.camera import Radiance
 from reslrb_cli.estimators.edges import AROUND, Contribution, edge_samples, for_camera, moved_by
 from reslrb_cli.estimators.stack import Ring, StackState, differentiate_frames
+from reslrb_cli.scene.rays import ray_offset
 from reslrb_cli.transport.bsdf import EventNumbers, evaluate, scatter
 from reslrb_cli.transport.camera import FilmRay, camera_walk
 from reslrb_cli.transport.chains import MOST_VERTICES, Chain, Chains, LampChains, SensorChains
@@ -37,7 +38,6 @@ from reslrb_cli.transport.edges import pick
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.factors import MAY_LACK, Product, showing
 from reslrb_cli.transport.jumps import ChainEdge, random_interval, random_lines, sample_edge
-from reslrb_cli.transport.masks import ray_offset
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.sobol import unit

@@ -52,13 +52,13 @@ import mitsuba as mi
 
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.scene.graph import interpolates_normals
+from reslrb_cli.scene.rays import ray_offset
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.connection import Connection, shading_correction
 from reslrb_cli.transport.edges import Chances, Outline, sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.emission import Emission
 from reslrb_cli.transport.factors import MAY_LACK, Product, showing
-from reslrb_cli.transport.masks import ray_offset
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 

@@ -57,6 +57,29 @@ def brightness(value: mi.Spectrum, wavelengths: mi.Wavelength) -> mi.Float:
     return mi.luminance(value) if mi.is_rgb else mi.Float(value.x)
 
 
+def shadow_ray(si: mi.Interaction3f, target: mi.Point3f, has_edges: bool) -> mi.Ray3f:
+    """Return the ray from the vertex `si` to `target`.
+
+    Mitsuba starts the ray above the surface. Over a surface that the ray grazes, a ray from there passes edges that
+    hide the vertex. The derivatives of edges would then lack a share of this surface. With `has_edges`, the ray starts
+    on the line to the target.
+    """
+    if not has_edges:
+        return si.spawn_ray_to(target)
+    there = target - si.p
+    distance = dr.norm(there)
+    d = there / distance
+    offset = ray_offset(si.p)
+    ray = mi.Ray3f(si.p + d * offset, d, si.time, si.wavelengths)
+    ray.maxt = (distance - offset) * (1 - mi.math.ShadowEpsilon)
+    return ray
+
+
+def ray_offset(p: mi.Point3f) -> mi.Float:
+    """Return Mitsuba's ray offset at `p`."""
+    return mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
+
+
 def sensor_rays(
     sensor: mi.Sensor, time: float | mi.Float, place: mi.Point2f, aperture: mi.Point2f,
     wavelength: float | mi.Float = 0.5,

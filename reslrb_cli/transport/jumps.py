@@ -22,10 +22,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.scene.rays import shadow_ray
 from reslrb_cli.transport.bsdf import Hit
 from reslrb_cli.transport.chains import Chain, Chains, Target, surface_code, vertex_at
 from reslrb_cli.transport.edges import pick
-from reslrb_cli.transport.masks import shadow_ray
 from reslrb_cli.transport.sobol import evenly, unit
 
 #: Length of an interval that is tested for a jump, in cells of the plane.
@@ -240,7 +240,7 @@ def _edge_point(chains: Chains, chain: Chain, shadow: mi.Bool, active: mi.Bool) 
     """
     end = chain.vertex(active)
     target = chains.target(end, chain.count, active & shadow)
-    to_target = shadow_ray(chains.samples.plan, end.si, target.y)
+    to_target = shadow_ray(end.si, target.y, chains.samples.plan.has_edges)
     pi = chains.samples.scene.ray_intersect_preliminary(to_target, coherent=False, active=active & shadow)
     ray = dr.select(shadow, mi.Ray3f(to_target), mi.Ray3f(chain.ray))
     return EdgePoint(dr.detach(ray), dr.select(shadow, pi, chain.pi), end, target)

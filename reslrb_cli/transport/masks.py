@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.scene.rays import shadow_ray
 from reslrb_cli.transport.plan import Plan
 
 
@@ -37,29 +38,6 @@ class Passage:
     crossings: mi.UInt32
     reached: mi.Bool
     tangent: list[mi.Spectrum] = field(default_factory=list)
-
-
-def shadow_ray(plan: Plan, si: mi.Interaction3f, target: mi.Point3f) -> mi.Ray3f:
-    """Return the ray from the vertex `si` to `target`.
-
-    Mitsuba starts the ray above the surface. Over a surface that the ray grazes, a ray from there passes edges that
-    hide the vertex. The derivatives of edges would then lack a share of this surface, so that the ray starts on the
-    line to the target if there are any.
-    """
-    if not plan.has_edges:
-        return si.spawn_ray_to(target)
-    there = target - si.p
-    distance = dr.norm(there)
-    d = there / distance
-    offset = ray_offset(si.p)
-    ray = mi.Ray3f(si.p + d * offset, d, si.time, si.wavelengths)
-    ray.maxt = (distance - offset) * (1 - mi.math.ShadowEpsilon)
-    return ray
-
-
-def ray_offset(p: mi.Point3f) -> mi.Float:
-    """Return Mitsuba's ray offset at `p`."""
-    return mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
 
 
 def transmittance(
@@ -110,7 +88,7 @@ def transmittance(
         mi.Bool(active), mi.Spectrum(1), mi.UInt32(0), mi.Bool(False), [mi.Spectrum(0)] if tangents else []
     )
     passage, _ = dr.while_loop(
-        state=(passage, shadow_ray(plan, start, target)),
+        state=(passage, shadow_ray(start, target, plan.has_edges)),
         cond=lambda passage, ray: passage.active,
         body=body,
         label="null surfaces",
