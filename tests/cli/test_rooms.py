@@ -248,3 +248,21 @@ def test_errors_of_a_box_are_as_large_as_their_spreads(tmp_path: Path) -> None:
     square = float(np.sqrt(np.mean(np.square(ratios))))
     print(f"errors over spreads: root mean square {square:.2f}, mean {np.mean(ratios):.2f}")
     assert 0.7 < square < 1.4
+
+
+def test_a_lamp_out_of_view_is_told_from_the_colours(tmp_path: Path) -> None:
+    """The lamp starts at a quarter of its radiance. `init` has a line for the lamp, in comments."""
+    colours = write_box(tmp_path, 5)
+    text = (tmp_path / "box.xml").read_text()
+    lamp, dark = area("12, 11, 10"), area("3, 3, 3")
+    assert lamp in text
+    (tmp_path / "box.xml").write_text(text.replace(lamp, dark))
+    tiny.done("init", tmp_path / "box.xml", "--target", tmp_path / "box.exr", "-o", tmp_path / "box.yaml")
+    written = (tmp_path / "box.yaml").read_text()
+    (tmp_path / "box.yaml").write_text(written.replace("  # - {key: lamp.emitter", "  - {key: lamp.emitter"))
+    tiny.done("optimize", tmp_path / "box.yaml")
+    values = np.load(tmp_path / "runs/box/parameters/parameters.npz")
+    for part, colour in colours.items():
+        [key] = [key for key in values.files if key.startswith(f"{part}.")]
+        np.testing.assert_allclose(values[key], colour, atol=0.02)
+    np.testing.assert_allclose(values["lamp.emitter.radiance.value"], [12, 11, 10], rtol=0.03)
