@@ -95,9 +95,7 @@ def _entry(proposal: Proposal) -> str:
     parts = [f"key: {_text(proposal.info.key)}"]
     parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
     parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
-    value = proposal.info.value
-    if proposal.bounds is not None and "inf" in proposal.bounds and value is not None and value.low > 0:
-        parts.append("transform: log")  # a lamp makes up for colours by a factor
+    parts += ["transform: log"] if proposal.has_logarithm else []  # a lamp makes up for colours by a factor
     return "{" + ", ".join(parts) + "}"
 
 

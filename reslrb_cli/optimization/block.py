@@ -24,8 +24,7 @@ The images hardly change if an exposure E rises and all colours c fall. A step d
 
 Beside an exposure, the logarithm of each channel's mean of a texture of colours is a coordinate too. The step of this
 coordinate multiplies all texels, and the texture's own step (`newton.py`) moves the texels against each other.
-Otherwise, each step of the exposure would wait for the texture's next steps, and exposure and texture would creep along
-the valley.
+Separate steps would converge slowly, because exposure and texture make up for each other.
 """
 
 from __future__ import annotations

@@ -168,12 +168,11 @@ def measure_block(problem: Problem, iteration: int) -> None:
         return
     curvature = LossCurvature(problem, part, of_target=False)
     directions, *_ = curvature.along(changes, lambda: True)
-    H = curvature.for_steps(directions)
     # A texture has no entries, but channels.
     at = np.array([block.at[each.key].start + (each.entry or each.channel or 0) for each in directions])
     slopes = np.concatenate([optimizer.slopes(key) for key in block.at])
     whole = np.zeros((len(slopes), len(slopes)))
-    whole[np.ix_(at, at)] = H * np.outer(slopes[at], slopes[at])
+    whole[np.ix_(at, at)] = curvature.for_steps(directions) * np.outer(slopes[at], slopes[at])
     block.bend(np.nan_to_num(whole))
     problem.apply()
 

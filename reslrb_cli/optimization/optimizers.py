@@ -194,8 +194,8 @@ class Optimizer:
         return overflowed
 
     def _joint_steps(self, skip: Collection[str]) -> dict[str, Array]:
-        """Return the new values of the variables of small parameters, for `auto`. For a texture, return the changes of
-        the logarithms of its channels' means.
+        """Return the changes of the variables of small parameters, for `auto`, and of the logarithms of the channels'
+        means of `textures`.
         """
         block, M = self.block, len(self.block.rows)
         known, exposure = np.ones(M, bool), np.full(M, -1)
@@ -222,13 +222,13 @@ class Optimizer:
                 own = np.arange(place.start, place.stop)
                 exposure[at] = own if len(own) in (1, at.stop - at.start) else -1
         change = block.steps(JointState(value, gradient, longest, low, high, known, exposure))
-        new = {key: value[at] + change[at] for key, at in block.at.items() if key not in skip}
-        return new | {key: change[block.at[key]] for key in self.textures if key not in skip}
+        return {key: change[at] for key, at in block.at.items() if key not in skip}
 
-    def _move_variable(self, key: str, row: Array) -> None:
-        """Set the optimiser's variable of a small parameter to `row`, within its bounds."""
+    def _move_variable(self, key: str, change: Array) -> None:
+        """Add `change` to the optimiser's variable of a small parameter, within its bounds."""
         own, variable = self._own[key], self.variable(key)
         old = dr.detach(own[key])
+        row = np.array(old, dtype=np.float64).ravel() + change
         # A list is copied, but NumPy's memory is not, and kernels depend on its alignment.
         entries = type(flat(old))(row.tolist())
         new = type(old)(entries, dr.shape(old)) if dr.is_tensor_v(old) else dr.unravel(type(old), entries)

@@ -60,9 +60,8 @@ def brightness(value: mi.Spectrum, wavelengths: mi.Wavelength) -> mi.Float:
 def shadow_ray(si: mi.Interaction3f, target: mi.Point3f, has_edges: bool) -> mi.Ray3f:
     """Return the ray from the vertex `si` to `target`.
 
-    Mitsuba starts the ray above the surface. Over a surface that the ray grazes, a ray from there passes edges that
-    hide the vertex. The derivatives of edges would then lack a share of this surface. With `has_edges`, the ray starts
-    on the line to the target.
+    Mitsuba's ray starts above the surface. At a grazing angle, it can pass an edge that hides the vertex, so the
+    derivatives of edges would lack a part of the surface. With `has_edges`, the ray starts on the line to the target.
     """
     if not has_edges:
         return si.spawn_ray_to(target)

@@ -157,9 +157,8 @@ class Chains(ABC):
         smooth = mi.has_flag(hit.bsdf.flags(), mi.BSDFFlags.Smooth)
         target = self.target(hit, count, active & (count > 0) & smooth & (count + 2 <= self.samples.plan.max_depth))
         target.active &= dr.any(target.weight > 0)
-        return target, self.samples.scene.ray_test(
-            shadow_ray(hit.si, target.y, self.samples.plan.has_edges), target.active
-        )
+        ray = shadow_ray(hit.si, target.y, self.samples.plan.has_edges)
+        return target, self.samples.scene.ray_test(ray, target.active)
 
     def follow(self, u: mi.Point2f, active: mi.Bool | bool = True, end: mi.UInt32 | int = MOST_VERTICES) -> Chain:
         """Return the chain from place `u`, up to vertex number `end` or its first vertex that is not specular."""

@@ -6,16 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kit import area, diffuse, scene, sensor, shape
-from optimization.test_projective import CORNERS, FACES
+from kit import area, scene, sensor, shape
+from optimization.test_projective import BOX, FLOOR, LAMP, write_mesh
 
 import reslrb_cli as rl
 
 SIZE, AWAY = 0.6, 0.25
 LIGHTS = {
-    "area": shape(
-        "rectangle", "lamp", area("20, 18, 16"),
-        place='<scale value="0.3"/> <rotate x="1" angle="180"/> <translate x="-1" y="0.5" z="3"/>'),
+    "area": LAMP,
     "sphere": shape(
         "sphere", "lamp", '<float name="radius" value="0.3"/> <point name="center" x="-1" y="0.5" z="3"/>',
         area("12, 11, 10")),
@@ -40,15 +38,9 @@ run: {iterations: 80, spp: 16, certainty: false}
 
 
 def write_experiment(folder: Path, light: str) -> Path:
-    text = scene(
-        sensor("0, -2.6, 2.6", "0, 0, 0.1", up="0, 0, 1", size=96, fov=45, id="camera", rfilter="gaussian"),
-        shape("rectangle", "floor", diffuse("0.8, 0.7, 0.5"), place='<scale value="3"/>'),
-        shape("obj", "box", '<string name="filename" value="box.obj"/> <boolean name="face_normals" value="true"/>',
-              diffuse("0.2, 0.3, 0.6"), place='<scale value="0.3"/> <translate z="0.3"/>'),
-        LIGHTS[light],
-    )  # fmt: skip
-    (folder / "scene.xml").write_text(text)
-    (folder / "box.obj").write_text("\n".join([*CORNERS, *(f"f {face}" for face in FACES)]))
+    camera = sensor("0, -2.6, 2.6", "0, 0, 0.1", up="0, 0, 1", size=96, fov=45, id="camera", rfilter="gaussian")
+    (folder / "scene.xml").write_text(scene(camera, FLOOR, BOX, LIGHTS[light]))
+    write_mesh(folder)
     (folder / "box.yaml").write_text(CONFIG)
     return folder / "box.yaml"
 

@@ -26,16 +26,15 @@ SPOT = """<emitter type="spot" id="spot">
         <rgb name="intensity" value="0.001"/>
         <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="1, 0, 0"/></transform>
     </emitter>"""
+FLOOR = shape("rectangle", "floor", diffuse("0.8, 0.7, 0.5"), place='<scale value="3"/>')
+BOX = shape("obj", "box", '<string name="filename" value="box.obj"/> <boolean name="face_normals" value="true"/>',
+            diffuse("0.2, 0.3, 0.6"), place='<scale value="0.3"/> <translate z="0.3"/>')  # fmt: skip
+LAMP = shape("rectangle", "lamp", area("20, 18, 16"),
+             place='<scale value="0.3"/> <rotate x="1" angle="180"/> <translate x="-1" y="0.5" z="3"/>')  # fmt: skip
 CAMERA = sensor("0, -2.6, 2.6", "0, 0, 0.1", up="0, 0, 1", size=16, fov=45, id="camera", rfilter="gaussian")
 SCENE = scene(
-    '<default name="sensor" value="perspective"/>', CAMERA.replace('"perspective"', '"$sensor"'),
-    shape("rectangle", "floor", diffuse("0.8, 0.7, 0.5"), place='<scale value="3"/>'),
-    shape("obj", "box", '<string name="filename" value="box.obj"/> <boolean name="face_normals" value="true"/>',
-          diffuse("0.2, 0.3, 0.6"), place='<scale value="0.3"/> <translate z="0.3"/>'),
-    shape("rectangle", "lamp", area("20, 18, 16"),
-          place='<scale value="0.3"/> <rotate x="1" angle="180"/> <translate x="-1" y="0.5" z="3"/>'),
-    SPOT,
-)  # fmt: skip
+    '<default name="sensor" value="perspective"/>', CAMERA.replace('"perspective"', '"$sensor"'), FLOOR, BOX, LAMP, SPOT
+)
 FACES = ("1 3 2", "1 4 3", "5 6 7", "5 7 8", "1 2 6", "1 6 5", "2 3 7", "2 7 6", "3 4 8", "3 8 7", "4 1 5", "4 5 8")
 CORNERS = [f"v {x} {y} {z}" for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
 CONFIG = """
@@ -51,9 +50,13 @@ run: {iterations: 6, spp: 16, final_spp: 16}
 MOVED = "box.translation"
 
 
+def write_mesh(folder: Path) -> None:
+    (folder / "box.obj").write_text("\n".join([*CORNERS, *(f"f {face}" for face in FACES)]))
+
+
 def write_experiment(folder: Path, spot: bool = False) -> Path:
     (folder / "scene.xml").write_text(SCENE if spot else SCENE.replace(SPOT, ""))
-    (folder / "box.obj").write_text("\n".join([*CORNERS, *(f"f {face}" for face in FACES)]))
+    write_mesh(folder)
     (folder / "box.yaml").write_text(CONFIG)
     return folder / "box.yaml"
 

@@ -481,8 +481,8 @@ def raise_eigenvalues(a: Array, b: Array, certain: Array) -> Array:
     """Return the sum of a bᵀ and `certain` (M, M), with eigenvalues of at least their standard errors. The eigenvalues
     are those in units in which the diagonal is 1. The columns of a and b (M, N) are independent samples.
 
-    The noise of a small eigenvalue is larger than the eigenvalue. It may be negative, so that a step ignores its
-    direction, or so small that a step is too long.
+    Noise may exceed a small eigenvalue. Steps in its direction would be too long if the result is small, and would stop
+    if it is negative.
     """
     H = _symmetric(a @ b.T) + certain
     size = np.maximum(np.diag(H), np.sqrt(np.square(a * b).sum(axis=1)))
