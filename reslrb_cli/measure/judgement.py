@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from reslrb_cli.measure.comparison import (
     ROUNDING,
@@ -71,7 +71,7 @@ class JackknifeEstimate:
 
     def interval(self) -> Range:
         """Return the interval by Student's t."""
-        half = float(stats.t.isf((1 - CONFIDENCE) / 2, self.freedom)) * self.error
+        half = float(special.stdtrit(min(self.freedom, 1e6), (1 + CONFIDENCE) / 2)) * self.error
         return Range(self.value, self.value - half, self.value + half)
 
     def exponential(self) -> Range:
