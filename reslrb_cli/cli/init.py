@@ -95,7 +95,6 @@ def _entry(proposal: Proposal) -> str:
     parts = [f"key: {_text(proposal.info.key)}"]
     parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
     parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
-    parts += ["transform: log"] if proposal.has_logarithm else []  # a lamp makes up for colours by a factor
     return "{" + ", ".join(parts) + "}"
 
 

@@ -316,7 +316,7 @@ class ParameterSpec(Section):
     transform: _AnyTransform = "none"
     """Variable that the optimizer moves instead of the value x. `sigmoid`: the logit of x between its `bounds`, which x
     never reaches. `log`: log(x), for positive values that are known to an order of magnitude at best. Learning rates
-    are in units of this variable."""
+    are in units of this variable. `optimizer: auto` takes `log` for a lamp's emission that has no upper bound."""
     learning_rate: _AnyRate | None = None
     """Step size of this parameter, in the units of `optimizer.learning_rate`. null: `optimizer.learning_rate`."""
     resolution: Annotated[Size, few("texels")] | None = None

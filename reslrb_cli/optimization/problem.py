@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import Thickness
+from reslrb_cli.config.parameters import Thickness, TransformName
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
@@ -21,7 +22,7 @@ from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
 from reslrb_cli.optimization.variables import Smoother, make_transform
 from reslrb_cli.optimization.views import SHARED, View, slope, to_tensor
 from reslrb_cli.records.decisions import Decision
-from reslrb_cli.scene.catalog import COLOUR
+from reslrb_cli.scene.catalog import COLOUR, EMISSION
 from reslrb_cli.scene.deformation import Moves
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
@@ -291,7 +292,7 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
         values={key: selection.value(key) for key in selection.keys},
         rates={key: spec.learning_rate for key, spec in specs.items()},
         bounds={key: spec.bounds for key, spec in specs.items()},
-        transforms={key: make_transform(spec.transform, spec.bounds) for key, spec in specs.items()},
+        transforms={key: make_transform(_transform(config, selection, key), specs[key].bounds) for key in specs},
         smoothers={
             key: Smoother(selection.array(key).shape, spec.smoothing)
             for key, spec in specs.items()
@@ -304,6 +305,17 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
     if is_shared and SHARED in selection.factors and config.optimizer.type != "sgd":
         optimizer.balance(SHARED, [key for key in selection.keys if COLOUR.search(key)])
     return optimizer
+
+
+def _transform(config: Config, selection: Selection, key: str) -> TransformName:
+    """Return the transform of a parameter. `auto` moves the emission of a lamp by its logarithm if the emission is
+    positive and has no upper bound, because a lamp makes up for colours by a factor.
+    """
+    spec = selection.specs[key]
+    if spec.transform != "none" or config.optimizer.type != "auto" or not EMISSION.search(key):
+        return spec.transform
+    is_open = spec.bounds is None or spec.bounds[1] == math.inf
+    return "log" if is_open and (selection.array(key) > 0).all() else "none"
 
 
 def _handed(value: Any, array: Array) -> Any:

@@ -137,12 +137,6 @@ class Proposal:
     resolution: tuple[int, int] | None
     first: bool
 
-    @property
-    def has_logarithm(self) -> bool:
-        """True for positive values without an upper bound, such as the radiance of a lamp."""
-        value = self.info.value
-        return self.bounds is not None and "inf" in self.bounds and value is not None and value.low > 0
-
 
 def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]:
     """Return the recoverable parameters of `scene`, seen through the sensor with this index. Mesh vertices are

@@ -55,7 +55,7 @@ def test_a_scene_alone_gets_a_configuration_without_a_photograph(folder: Path) -
     assert [spec.keys for spec in config.parameters] == [[tiny.KEY]]
     assert config.parameters[0].bounds == (0, 1)
     assert (config.loss.type, config.optimizer.type, config.integrator.max_depth) == ("relative_l2", "auto", 8)
-    lamp = "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf], transform: log}"
+    lamp = "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf]}"
     assert lamp in (folder / "room.yaml").read_text()
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2

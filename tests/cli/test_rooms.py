@@ -257,7 +257,7 @@ def test_errors_of_a_box_are_as_large_as_their_spreads(tmp_path: Path) -> None:
 
 
 def test_a_lamp_out_of_view_is_told_from_the_colours(tmp_path: Path) -> None:
-    """The lamp starts at a quarter of its radiance. `init` has a line for the lamp, in comments."""
+    """The lamp starts at a quarter of its radiance, without bounds."""
     colours = write_box(tmp_path, 5)
     text = (tmp_path / "box.xml").read_text()
     lamp, dark = area("12, 11, 10"), area("3, 3, 3")
@@ -265,7 +265,9 @@ def test_a_lamp_out_of_view_is_told_from_the_colours(tmp_path: Path) -> None:
     (tmp_path / "box.xml").write_text(text.replace(lamp, dark))
     tiny.done("init", tmp_path / "box.xml", "--target", tmp_path / "box.exr", "-o", tmp_path / "box.yaml")
     written = (tmp_path / "box.yaml").read_text()
-    (tmp_path / "box.yaml").write_text(written.replace("  # - {key: lamp.emitter", "  - {key: lamp.emitter"))
+    line = "  # - {key: lamp.emitter.radiance.value, bounds: [0, .inf]}"
+    assert line in written
+    (tmp_path / "box.yaml").write_text(written.replace(line, "  - {key: lamp.emitter.radiance.value}"))
     tiny.done("optimize", tmp_path / "box.yaml")
     values = np.load(tmp_path / "runs/box/parameters/parameters.npz")
     for part, colour in colours.items():

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from cli.tiny import manifest
+from cli.tiny import manifest, write_experiment
 from optimization.toy import make_problem
 from runs.going_on import begin_alone, optimize
 
@@ -17,7 +17,7 @@ from reslrb_cli.backend.memory import flat
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.newton import LONGEST, SHORTER, _steepness
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import standing
@@ -240,6 +240,25 @@ def test_a_texture_and_an_exposure_that_compensate_for_each_other_move_together(
     assert float(np.array(optimizer["exposure"])[0]) == pytest.approx(0.6, rel=0.01)
     np.testing.assert_allclose(np.array(optimizer["floor"]).ravel(), DARK, rtol=0.05)
     assert optimizer.to_go("floor") * optimizer.extent("floor") < 0.02
+
+
+@pytest.mark.parametrize(
+    ("settings", "has_transform"),
+    [
+        ("", True),
+        (", bounds: [0, .inf]", True),
+        (", bounds: [0, 30]", False),
+        (", initial: [8, 8, 0]", False),
+        (", transform: sigmoid, bounds: [0, 9]", True),
+    ],
+)
+def test_a_lamp_without_an_upper_bound_moves_by_its_logarithm(tmp_path, settings, has_transform):
+    """A value of 0 has no logarithm."""
+    write_experiment(tmp_path)
+    lamp = f"parameters=[{{key: lamp.emitter.radiance.value{settings}}}]"
+    for kind, expected in ((AUTO, has_transform), ("optimizer={type: adam}", "sigmoid" in settings)):
+        [key] = (optimizer := assemble_scene(load(tmp_path / "tiny.yaml", [lamp, kind])).optimizer).keys()
+        assert (optimizer.variable(key).transform is not None) == expected
 
 
 def test_noise_shortens_the_steps_and_a_steady_pull_does_not():
