@@ -61,7 +61,7 @@ CLASSES, OCTAVE, SHARE = 128, 4, 0.02
 #: Displacement d of a measurement as a share of the extent, and the weight of the newest measurement.
 DISPLACEMENT, NEWEST = 0.05, 0.75
 #: L as a share of the extent, and q.
-LONGEST, SHORTER = 0.13, 0.3
+LONGEST, SHORTER = 0.13, 0.4
 #: The limit of the distance uses this many iterations, and exceeds the largest of them by this factor.
 RECENT, SURE = 4, 1.5
 #: A mean square distance that is not known. A state on file has only finite numbers.
