@@ -69,6 +69,9 @@ PATHS_PER_OUTLINE = 4
 BESIDE = 0.1
 #: Distance along a ray within which a surface counts as being at the edge, in units of Mitsuba's ray offset.
 AROUND = 30.0
+#: Distance before an edge at which the ray that hits the shape starts, in the same units. From far away, rounding
+#: decides what a ray hits so near to an edge.
+NEAR = 300.0
 #: Streams of random numbers, mixed into the seed.
 LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
 
@@ -151,6 +154,11 @@ def both_sides(
         return with_wavelengths(mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d), outline)
 
     over, past = ray(-BESIDE), ray(BESIDE)
+    # A parallel ray would hit a round side far from p. This ray is tilted towards p, and is as deep in the shape.
+    tilt = dr.minimum(dr.sqrt(2 * BESIDE * offset / dr.maximum(outline.radius, 1e-30)), 0.5)
+    is_round, start = outline.radius > 0, over(back)
+    over.d = dr.select(is_round, dr.normalize(d - outline.normal * tilt), d)
+    over.o = dr.select(is_round, outline.p, start) - over.d * dr.minimum(back, NEAR * offset)
     pi = scene.ray_intersect_preliminary(over, coherent=False, active=active)
     active = active & pi.is_valid() & (pi.shape == outline.shape)
     before = mi.Ray3f(past)
