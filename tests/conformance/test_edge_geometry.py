@@ -11,8 +11,9 @@ from conformance.edge_cases import OCCLUDERS, SHAPES, EdgeCase, split_box
 from reslrb_cli.estimators import edges
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import integrator
+from reslrb_cli.measure.scenes.small import load, transform
 from reslrb_cli.scene.edges import welded_edges
-from reslrb_cli.scene.rays import ray_offset
+from reslrb_cli.scene.rays import is_hidden, ray_offset
 from reslrb_cli.transport.edges import sample_outline, view_from_lamps
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -103,3 +104,16 @@ def test_rays_pass_an_outline_nearby(shape: str, size: float):
     far, hits = rays_beside_outlines(shape, size)
     assert np.percentile(far, 90) < 1
     assert shape == "cylinder" or not hits.any()
+
+
+@pytest.mark.parametrize("has_edges", [False, True])
+def test_no_light_passes_a_corner_of_two_sheets(has_edges: bool):
+    """Points of the floor lie nearer to the wall than the start of a shadow ray. The wall hides a target behind it."""
+    floor, wall = {"type": "rectangle"}, {"type": "rectangle"}
+    wall["to_world"] = transform(translate=[0, 0, 1], rotate=([1, 0, 0], 90))
+    scene = load({"type": "scene", "floor": floor, "wall": wall})
+    point = dr.zeros(mi.SurfaceInteraction3f, 64)
+    point.p, point.n = mi.Point3f(dr.linspace(mi.Float, -0.9, 0.9, 64), 0, 0), mi.Normal3f(0, 0, 1)
+    point.p.y = -edges.BESIDE * ray_offset(point.p)
+    assert dr.all(is_hidden(scene, point, mi.Point3f(0, 3, 1), has_edges, mi.Bool(True)))
+    assert dr.none(is_hidden(scene, point, mi.Point3f(0, -3, 1), has_edges, mi.Bool(True)))
