@@ -72,6 +72,8 @@ AROUND = 30.0
 #: Distance before an edge at which the ray that hits the shape starts, in the same units. From far away, rounding
 #: decides what a ray hits so near to an edge.
 NEAR = 300.0
+#: Distance from an edge at which a ray to another surface starts, in the same units.
+ABOVE = 3.0
 #: Streams of random numbers, mixed into the seed.
 LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
 
@@ -514,12 +516,15 @@ def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
     offset = ray_offset(outline.p)
-    back = with_wavelengths(mi.Ray3f(outline.p + outline.normal * (BESIDE * offset), outline.view.to_y), outline)
+    # If the shape stands on a surface, the point beside the edge may lie below this surface. The ray starts above it.
+    start = outline.p + outline.normal * (BESIDE * offset) + outline.view.to_y * (ABOVE * offset)
+    back = with_wavelengths(mi.Ray3f(start, outline.view.to_y), outline)
     y = samples.scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
     outline.active = outline.active & y.is_valid()
-    outline.view.distance = y.t
+    distance = y.t + ABOVE * offset
+    outline.view.distance = distance
     beside = both_sides(samples, outline)
-    s = y.t / (y.t + beside.x.t - AROUND * offset)
+    s = distance / (distance + beside.x.t - AROUND * offset)
     return Between(outline, beside, back, y, s, beside.active & beside.x.is_valid())
 
 

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.edge_cases import OCCLUDERS, SHAPES, EdgeCase, split_box
+from conformance.moving import Moving
 
 from reslrb_cli.estimators import edges
 from reslrb_cli.integrators.protocol import Job
@@ -15,6 +16,7 @@ from reslrb_cli.measure.scenes.small import load, transform
 from reslrb_cli.scene.edges import welded_edges
 from reslrb_cli.scene.rays import is_hidden, ray_offset
 from reslrb_cli.transport.edges import sample_outline, view_from_lamps
+from reslrb_cli.transport.samples import Samples
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -73,6 +75,15 @@ def test_a_face_without_area_adds_no_edge_of_its_own(face: tuple[int, int, int])
 # ---- Rays beside an outline ----
 
 
+def outline_samples(moving: Moving, key: str, depth: int) -> Samples:
+    """Return samples of outlines in a step that differentiates the parameter `key`."""
+    dr.enable_grad(moving.params[key])
+    moving.params.update()
+    job = Job(moving.loaded, moving.loaded.sensors()[0], dr.opaque(mi.UInt32, 1), 16, moving.params)
+    tracer = integrator("reslrb", depth, estimator="stack", edges="on")
+    return edges.edge_samples(tracer.passes(job)[0], edges.LAMP_EDGES)
+
+
 def rays_beside_outlines(shape: str, size: float) -> tuple[np.ndarray, np.ndarray]:
     """Return two arrays for outlines of a shape in the light of a directional lamp. The first has the distances between
     an outline and the place beside it where the shape is hit, in ray offsets. The second is true where the ray that
@@ -81,11 +92,7 @@ def rays_beside_outlines(shape: str, size: float) -> tuple[np.ndarray, np.ndarra
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(OCCLUDERS, "shape", lambda: {"shape": SHAPES[shape](0.1, -0.1, 0.9, size)})
         moving = EdgeCase("shape", "directional").moving()
-    dr.enable_grad(moving.params["shape.to_world"])
-    moving.params.update()
-    job = Job(moving.loaded, moving.loaded.sensors()[0], dr.opaque(mi.UInt32, 1), 16, moving.params)
-    tracer = integrator("reslrb", 2, estimator="stack", edges="on")
-    samples = edges.edge_samples(tracer.passes(job)[0], edges.LAMP_EDGES)
+    samples = outline_samples(moving, "shape.to_world", 2)
     chances = edges.chances_of(samples, samples.stream(edges.LAMP_EDGES))
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.lamp, view_from_lamps(samples, chances.viewpoint), chances)
@@ -117,3 +124,12 @@ def test_no_light_passes_a_corner_of_two_sheets(has_edges: bool):
     point.p.y = -edges.BESIDE * ray_offset(point.p)
     assert dr.all(is_hidden(scene, point, mi.Point3f(0, 3, 1), has_edges, mi.Bool(True)))
     assert dr.none(is_hidden(scene, point, mi.Point3f(0, -3, 1), has_edges, mi.Bool(True)))
+
+
+def test_light_from_other_surfaces_reaches_a_contact():
+    """A box stands on the floor. Light from the room passes its lower edges, and arrives at the floor next to them."""
+    moving = EdgeCase("standing", "room", 3).moving()
+    samples = outline_samples(moving, "shape.vertex_positions", 3)
+    between = edges.sample_between(samples, samples.stream(edges.OTHER_EDGES))
+    from_above = np.array((between.outline.p.z < 1e-4) & (between.outline.view.to_y.z > 0))
+    assert np.mean(np.array(between.active)[from_above]) > 0.6
