@@ -69,6 +69,11 @@ PATHS_PER_OUTLINE = 4
 BESIDE = 0.1
 #: Distance along a ray within which a surface counts as being at the edge, in units of Mitsuba's ray offset.
 AROUND = 30.0
+#: Distance before an edge at which the ray that hits the shape starts, in the same units. From far away, rounding
+#: decides what a ray hits so near to an edge.
+NEAR = 300.0
+#: Distance from an edge at which a ray to another surface starts, in the same units.
+ABOVE = 3.0
 #: Streams of random numbers, mixed into the seed.
 LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
 
@@ -151,6 +156,11 @@ def both_sides(
         return with_wavelengths(mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d), outline)
 
     over, past = ray(-BESIDE), ray(BESIDE)
+    # A parallel ray would hit a round side far from p. This ray is tilted towards p, and is as deep in the shape.
+    tilt = dr.minimum(dr.sqrt(2 * BESIDE * offset / dr.maximum(outline.radius, 1e-30)), 0.5)
+    is_round, start = outline.radius > 0, over(back)
+    over.d = dr.select(is_round, dr.normalize(d - outline.normal * tilt), d)
+    over.o = dr.select(is_round, outline.p, start) - over.d * dr.minimum(back, NEAR * offset)
     pi = scene.ray_intersect_preliminary(over, coherent=False, active=active)
     active = active & pi.is_valid() & (pi.shape == outline.shape)
     before = mi.Ray3f(past)
@@ -506,12 +516,15 @@ def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
     offset = ray_offset(outline.p)
-    back = with_wavelengths(mi.Ray3f(outline.p + outline.normal * (BESIDE * offset), outline.view.to_y), outline)
+    # If the shape stands on a surface, the point beside the edge may lie below this surface. The ray starts above it.
+    start = outline.p + outline.normal * (BESIDE * offset) + outline.view.to_y * (ABOVE * offset)
+    back = with_wavelengths(mi.Ray3f(start, outline.view.to_y), outline)
     y = samples.scene.ray_intersect_preliminary(back, coherent=False, active=outline.active)
     outline.active = outline.active & y.is_valid()
-    outline.view.distance = y.t
+    distance = y.t + ABOVE * offset
+    outline.view.distance = distance
     beside = both_sides(samples, outline)
-    s = y.t / (y.t + beside.x.t - AROUND * offset)
+    s = distance / (distance + beside.x.t - AROUND * offset)
     return Between(outline, beside, back, y, s, beside.active & beside.x.is_valid())
 
 

@@ -24,8 +24,9 @@ from reslrb_cli.scene.graph import interpolates_normals
 Array = np.ndarray[Any, Any]
 
 SEGMENT, SPHERE, TUBE = range(3)
-#: Number of chords that approximate a circle. The distance between a chord and its arc is at most 2e-5 of the radius.
-CHORDS = 512
+#: Number of chords that approximate a circle. The distance between a chord and its arc is at most 1.2e-6 of the radius.
+#: It must be smaller than the distance between an edge and the rays beside it (`BESIDE` in `estimators/edges.py`).
+CHORDS = 2048
 #: Vertices count as one vertex if their distance, divided by the size of the mesh, is below this value.
 WELD = 1e-6
 #: Number of random rays that test whether light passes an edge, and maximum number of edges that are tested.

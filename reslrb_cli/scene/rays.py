@@ -74,6 +74,19 @@ def shadow_ray(si: mi.Interaction3f, target: mi.Point3f, has_edges: bool) -> mi.
     return ray
 
 
+def is_hidden(
+    scene: mi.Scene, si: mi.Interaction3f, target: mi.Point3f, has_edges: bool, active: mi.Bool
+) -> mi.Bool:  # fmt: skip
+    """True if a surface lies between the vertex `si` and `target`.
+
+    With `has_edges`, the shadow ray starts on the line to the target. A second ray finds surfaces between the vertex
+    and this start, for example at a corner in which two sheets meet.
+    """
+    ray = shadow_ray(si, target, has_edges)
+    hidden = scene.ray_test(ray, active)
+    return hidden | scene.ray_test(si.spawn_ray_to(ray.o), active & ~hidden) if has_edges else hidden
+
+
 def ray_offset(p: mi.Point3f) -> mi.Float:
     """Return Mitsuba's ray offset at `p`."""
     return mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))

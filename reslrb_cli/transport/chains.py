@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.rays import sensor_rays, shadow_ray
+from reslrb_cli.scene.rays import is_hidden, sensor_rays
 from reslrb_cli.transport.bsdf import EventNumbers, Hit, Scattering, scatter
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import connect
@@ -157,8 +157,8 @@ class Chains(ABC):
         smooth = mi.has_flag(hit.bsdf.flags(), mi.BSDFFlags.Smooth)
         target = self.target(hit, count, active & (count > 0) & smooth & (count + 2 <= self.samples.plan.max_depth))
         target.active &= dr.any(target.weight > 0)
-        ray = shadow_ray(hit.si, target.y, self.samples.plan.has_edges)
-        return target, self.samples.scene.ray_test(ray, target.active)
+        samples = self.samples
+        return target, is_hidden(samples.scene, hit.si, target.y, samples.plan.has_edges, target.active)
 
     def follow(self, u: mi.Point2f, active: mi.Bool | bool = True, end: mi.UInt32 | int = MOST_VERTICES) -> Chain:
         """Return the chain from place `u`, up to vertex number `end` or its first vertex that is not specular."""

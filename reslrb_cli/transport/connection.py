@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.rays import shadow_ray
+from reslrb_cli.scene.rays import is_hidden
 from reslrb_cli.transport.masks import transmittance
 from reslrb_cli.transport.plan import Plan
 
@@ -170,9 +170,9 @@ def passage(
         through = transmittance(plan, scene, si, depth, connection.target, active, loop_mode=loop_mode)
         return through.reached, through.value
     if known is None:
-        return active & ~scene.ray_test(shadow_ray(si, connection.target, plan.has_edges), active), one
+        return active & ~is_hidden(scene, si, connection.target, plan.has_edges, active), one
     if known.known is None:
         return active & known.visible, one
     unknown = active & ~known.known
-    traced = unknown & ~scene.ray_test(shadow_ray(si, connection.target, plan.has_edges), unknown)
+    traced = unknown & ~is_hidden(scene, si, connection.target, plan.has_edges, unknown)
     return traced | (active & known.known & known.visible), one

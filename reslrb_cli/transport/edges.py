@@ -58,8 +58,8 @@ class Outline:
     `normal` is perpendicular to the edge and to the ray from the viewpoint, and points away from the shape. `weight`
     (C,) is the light or the importance that the edge covers per unit of its velocity along the normal, divided by the
     density of the sample. Occlusion is not included. In `crease` lanes, the edge is a crease and not an outline, and
-    `normal` points away from its first face. `is_round` lanes lie on a sphere or on the side of a
-    cylinder.
+    `normal` points away from its first face. `radius` is the radius of the sphere or the cylinder whose round side has
+    the outline, otherwise 0.
     """
 
     p: mi.Point3f
@@ -69,7 +69,7 @@ class Outline:
     shape: mi.ShapePtr
     active: mi.Bool
     crease: mi.Bool
-    is_round: mi.Bool
+    radius: mi.Float
     wavelengths: mi.Wavelength
 
 
@@ -173,7 +173,7 @@ def sample_outline(
         if only_hide:
             view = _towards_balls(table, row, view, chances)
     seen = view(p, active)
-    normal = mi.Vector3f(0)
+    normal, radius = mi.Vector3f(0), mi.Float(0)
     if SPHERE in kinds or TUBE in kinds:
         radius, y = dr.gather(mi.Float, table.radius, row), seen.y
         if SPHERE in kinds:
@@ -219,7 +219,7 @@ def sample_outline(
     if mi.is_spectral:
         weight *= chances.inverse
     shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, table.shape, row, active))
-    return Outline(p, normal, seen, weight, shape, active, is_crease, is_round, chances.wavelengths)
+    return Outline(p, normal, seen, weight, shape, active, is_crease, radius, chances.wavelengths)
 
 
 def _from(first: EdgeView, p: mi.Point3f, again: EdgeView, moved: mi.Bool) -> EdgeView:

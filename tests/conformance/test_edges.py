@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import Agreement, compare
-from conformance.edge_cases import CASES, RECORDED, SIZE, EdgeCase, recorded, split_box, standing
+from conformance.edge_cases import CASES, RECORDED, SIZE, EdgeCase, recorded, standing
 from conformance.moving import Moving
 from conformance.test_kernels import Kernels
 from measure.faults import Fault, assert_found, plant, planted
@@ -33,7 +33,7 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.step import StepResult, gradient_step
 from reslrb_cli.measure.gradients import integrator, relative, seeds
-from reslrb_cli.scene.edges import EdgeSet, welded_edges
+from reslrb_cli.scene.edges import EdgeSet
 from reslrb_cli.transport.edges import Chances, sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.samples import Samples
 
@@ -100,7 +100,8 @@ def test_gradient_of_camera_paths(case: EdgeCase):
 def test_gradient_with_new_differences(case: EdgeCase):
     """The differences on file agree with new ones of the scenes as they are now."""
     differences = case.differences(block=2)
-    agreement = check(case, differences)
+    noisy = case.occluder in ("glazed", "slab")  # light through glass has more noise
+    agreement = check(replace(case, spp=case.spp * (2 if noisy else 1)), differences)
     assert agreement, agreement
     if case in RECORDED:
         on_file = compare(recorded(case), differences, block=None)
@@ -235,58 +236,6 @@ EXACT: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "depth": check_depth, "grazing": lambda monkeypatch: check_grazing(),
     "points": lambda monkeypatch: check_points("sensor", False),
 }  # fmt: skip
-
-
-# ---- Edges of a mesh ----
-
-SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-HALVES = np.array([[0, 1, 2], [0, 2, 3]])
-
-
-def ends(found: np.ndarray) -> set[tuple[int, ...]]:
-    """Return the ends of edges, in ascending order."""
-    return {tuple(sorted(edge)) for edge in found[:, :2].tolist()}
-
-
-def test_a_box_of_split_vertices_has_18_edges():
-    """A box has 12 edges, and a diagonal on each of its six sides."""
-    points, faces = split_box((0.3, 0, 1), (0.5, 0.4, 0.3))
-    found = welded_edges(points, faces)
-    assert (len(points), found.shape) == (24, (18, 6))
-    a, b, c, d = (points[column] for column in found[:, :4].T)
-    first, second = (np.cross(b - a, corner - a) for corner in (c, d))
-    cos = np.sum(first * second, 1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1))
-    # The faces of a diagonal lie in one plane, on different sides of it.
-    assert np.sort(cos.round(6)).tolist() == [-1.0] * 6 + [0.0] * 12
-    assert np.sum(np.linalg.norm(b - a, axis=1)[np.abs(cos) < 0.5]) == pytest.approx(4 * (1.0 + 0.8 + 0.6))
-
-
-def test_an_open_sheet_has_edges_with_one_face():
-    found = welded_edges(SQUARE, HALVES)
-    single = found[:, 2] == found[:, 3]
-    assert ends(found[single]) == {(0, 1), (1, 2), (2, 3), (0, 3)}
-    assert ends(found[~single]) == {(0, 2)}
-    assert set(found[~single][0, 2:4].tolist()) == {1, 3}
-
-
-def test_an_edge_of_three_faces_has_a_row_for_each_pair():
-    points = np.concatenate([SQUARE, [[0.5, 0.5, 1]]])
-    found = welded_edges(points, np.concatenate([HALVES, [[0, 2, 4]]]))
-    shared = found[[tuple(sorted(edge)) == (0, 2) for edge in found[:, :2].tolist()]]
-    assert len(shared) == 2
-    assert set(shared[:, 2:4].ravel().tolist()) == {1, 3, 4}
-
-
-def test_a_mesh_without_faces_has_no_edges():
-    assert welded_edges(SQUARE, np.zeros((0, 3), int)).shape == (0, 6)
-
-
-@pytest.mark.parametrize("face", [(1, 1, 2), (1, 1, 1), (1, 4, 2)])
-def test_a_face_without_area_adds_no_edge_of_its_own(face: tuple[int, int, int]):
-    """Vertex 4 is at the place of vertex 1. The edge from 1 to 2 remains an edge of the sheet."""
-    points = np.concatenate([SQUARE, SQUARE[1:2]])
-    found = welded_edges(points, np.concatenate([HALVES, [face]]))
-    assert ends(found) == ends(welded_edges(SQUARE, HALVES))
 
 
 # ---- Points of outlines ----

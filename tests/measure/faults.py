@@ -266,7 +266,7 @@ FAULTS = [
     Fault("one_visibility_bit_late", "cornell", "estimators.gather:Visibility.of",
           "index = depth - 1", "index = depth", by("gather stack", *GRADIENT)),
     Fault("beyond_visibility_bits_all_seen", "deep", "transport.connection:passage",
-          "traced = unknown & ~scene.ray_test(shadow_ray(si, connection.target, plan.has_edges), unknown)",
+          "traced = unknown & ~is_hidden(scene, si, connection.target, plan.has_edges, unknown)",
           "traced = unknown", by("gather", "walk_ad")),
     Fault("visibility_inverted", "cornell", "estimators.gather:Visibility.of",
           "& 1) != 0", "& 1) == 0", by("gather stack", *GRADIENT)),

@@ -1,0 +1,135 @@
+"""Edges of meshes, and rays beside outlines."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conformance.edge_cases import OCCLUDERS, SHAPES, EdgeCase, split_box
+from conformance.moving import Moving
+
+from reslrb_cli.estimators import edges
+from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.measure.gradients import integrator
+from reslrb_cli.measure.scenes.small import load, transform
+from reslrb_cli.scene.edges import welded_edges
+from reslrb_cli.scene.rays import is_hidden, ray_offset
+from reslrb_cli.transport.edges import sample_outline, view_from_lamps
+from reslrb_cli.transport.samples import Samples
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+# ---- Edges of a mesh ----
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+HALVES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def ends(found: np.ndarray) -> set[tuple[int, ...]]:
+    """Return the ends of edges, in ascending order."""
+    return {tuple(sorted(edge)) for edge in found[:, :2].tolist()}
+
+
+def test_a_box_of_split_vertices_has_18_edges():
+    """A box has 12 edges, and a diagonal on each of its six sides."""
+    points, faces = split_box((0.3, 0, 1), (0.5, 0.4, 0.3))
+    found = welded_edges(points, faces)
+    assert (len(points), found.shape) == (24, (18, 6))
+    a, b, c, d = (points[column] for column in found[:, :4].T)
+    first, second = (np.cross(b - a, corner - a) for corner in (c, d))
+    cos = np.sum(first * second, 1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1))
+    # The faces of a diagonal lie in one plane, on different sides of it.
+    assert np.sort(cos.round(6)).tolist() == [-1.0] * 6 + [0.0] * 12
+    assert np.sum(np.linalg.norm(b - a, axis=1)[np.abs(cos) < 0.5]) == pytest.approx(4 * (1.0 + 0.8 + 0.6))
+
+
+def test_an_open_sheet_has_edges_with_one_face():
+    found = welded_edges(SQUARE, HALVES)
+    single = found[:, 2] == found[:, 3]
+    assert ends(found[single]) == {(0, 1), (1, 2), (2, 3), (0, 3)}
+    assert ends(found[~single]) == {(0, 2)}
+    assert set(found[~single][0, 2:4].tolist()) == {1, 3}
+
+
+def test_an_edge_of_three_faces_has_a_row_for_each_pair():
+    points = np.concatenate([SQUARE, [[0.5, 0.5, 1]]])
+    found = welded_edges(points, np.concatenate([HALVES, [[0, 2, 4]]]))
+    shared = found[[tuple(sorted(edge)) == (0, 2) for edge in found[:, :2].tolist()]]
+    assert len(shared) == 2
+    assert set(shared[:, 2:4].ravel().tolist()) == {1, 3, 4}
+
+
+def test_a_mesh_without_faces_has_no_edges():
+    assert welded_edges(SQUARE, np.zeros((0, 3), int)).shape == (0, 6)
+
+
+@pytest.mark.parametrize("face", [(1, 1, 2), (1, 1, 1), (1, 4, 2)])
+def test_a_face_without_area_adds_no_edge_of_its_own(face: tuple[int, int, int]):
+    """Vertex 4 is at the place of vertex 1. The edge from 1 to 2 remains an edge of the sheet."""
+    points = np.concatenate([SQUARE, SQUARE[1:2]])
+    found = welded_edges(points, np.concatenate([HALVES, [face]]))
+    assert ends(found) == ends(welded_edges(SQUARE, HALVES))
+
+
+# ---- Rays beside an outline ----
+
+
+def outline_samples(moving: Moving, key: str, depth: int) -> Samples:
+    """Return samples of outlines in a step that differentiates the parameter `key`."""
+    dr.enable_grad(moving.params[key])
+    moving.params.update()
+    job = Job(moving.loaded, moving.loaded.sensors()[0], dr.opaque(mi.UInt32, 1), 16, moving.params)
+    tracer = integrator("reslrb", depth, estimator="stack", edges="on")
+    return edges.edge_samples(tracer.passes(job)[0], edges.LAMP_EDGES)
+
+
+def rays_beside_outlines(shape: str, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return two arrays for outlines of a shape in the light of a directional lamp. The first has the distances between
+    an outline and the place beside it where the shape is hit, in ray offsets. The second is true where the ray that
+    should miss the shape hits it.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(OCCLUDERS, "shape", lambda: {"shape": SHAPES[shape](0.1, -0.1, 0.9, size)})
+        moving = EdgeCase("shape", "directional").moving()
+    samples = outline_samples(moving, "shape.to_world", 2)
+    chances = edges.chances_of(samples, samples.stream(edges.LAMP_EDGES))
+    assert samples.edges is not None
+    outline = sample_outline(samples, samples.edges.lamp, view_from_lamps(samples, chances.viewpoint), chances)
+    beside = edges.both_sides(samples, outline)
+    far = dr.norm(beside.over(beside.pi.t) - outline.p) / ray_offset(outline.p)
+    active = np.array(beside.active)
+    assert active.mean() > 0.7
+    return np.array(far)[active], np.array(beside.x.is_valid() & (beside.x.shape == outline.shape))[active]
+
+
+@pytest.mark.parametrize(("shape", "size"), [("disk", 8.0), ("sphere", 1.0), ("cylinder", 1.0)])
+def test_rays_pass_an_outline_nearby(shape: str, size: float):
+    """One of the two rays hits the shape near the outline, and the other ray misses the shape. If the outline is the
+    rim of a cylinder, the other ray may hit the inside.
+    """
+    far, hits = rays_beside_outlines(shape, size)
+    assert np.percentile(far, 90) < 1
+    assert shape == "cylinder" or not hits.any()
+
+
+@pytest.mark.parametrize("has_edges", [False, True])
+def test_no_light_passes_a_corner_of_two_sheets(has_edges: bool):
+    """Points of the floor lie nearer to the wall than the start of a shadow ray. The wall hides a target behind it."""
+    floor, wall = {"type": "rectangle"}, {"type": "rectangle"}
+    wall["to_world"] = transform(translate=[0, 0, 1], rotate=([1, 0, 0], 90))
+    scene = load({"type": "scene", "floor": floor, "wall": wall})
+    point = dr.zeros(mi.SurfaceInteraction3f, 64)
+    point.p, point.n = mi.Point3f(dr.linspace(mi.Float, -0.9, 0.9, 64), 0, 0), mi.Normal3f(0, 0, 1)
+    point.p.y = -edges.BESIDE * ray_offset(point.p)
+    assert dr.all(is_hidden(scene, point, mi.Point3f(0, 3, 1), has_edges, mi.Bool(True)))
+    assert dr.none(is_hidden(scene, point, mi.Point3f(0, -3, 1), has_edges, mi.Bool(True)))
+
+
+def test_light_from_other_surfaces_reaches_a_contact():
+    """A box stands on the floor. Light from the room passes its lower edges, and arrives at the floor next to them."""
+    moving = EdgeCase("standing", "room", 3).moving()
+    samples = outline_samples(moving, "shape.vertex_positions", 3)
+    between = edges.sample_between(samples, samples.stream(edges.OTHER_EDGES))
+    from_above = np.array((between.outline.p.z < 1e-4) & (between.outline.view.to_y.z > 0))
+    assert np.mean(np.array(between.active)[from_above]) > 0.6
