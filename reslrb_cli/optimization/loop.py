@@ -100,7 +100,7 @@ def out_of_time(limit_s: float | None, state: State) -> str:
 #: Fewest iterations of a run with `auto`. Distance to the optimum at which such a run ends: a share of a value's root
 #: mean square, or of this share of its extent if that is larger. It is a quarter of the tolerance of a verdict. Until
 #: steps are means of `AVERAGED` gradients, the error still falls fast, and the distance must be smaller by this factor.
-LEAST_ITERATIONS, CLOSE, LEAST_SHARE, AVERAGED = 20, 0.025, 0.2, 12
+LEAST_ITERATIONS, CLOSE, LEAST_SHARE, AVERAGED = 20, 0.025, 0.2, 15
 
 
 def close_enough(problem: Problem, iteration: int) -> str:
