@@ -31,8 +31,7 @@ _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
 #: Colours of materials, in which a photograph usually differs most from a scene.
 COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
-
-#: Key of the emission of a lamp.
+#: Uniform emission of lamps.
 EMISSION = re.compile(r"\b(radiance|irradiance|intensity)(\.values?)?$")
 #: Maximum number of printed values; larger arrays show mean and range.
 _FEW = 4
