@@ -18,6 +18,7 @@ import numpy as np
 from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters
+from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.dispersion import COEFFICIENT
 from reslrb_cli.scene.export import LOBES
 from reslrb_cli.scene.graph import SceneGraph
@@ -164,7 +165,8 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     seen = {info.key for info in shown if _is_foremost(params, info)}
     if lamps:
         seen |= {info.key for info, share in found if share >= LEAST_LAMP and _RADIANCE.search(info.key)}
-    emitters = [info.key for info, _ in found if info.kind == "emitter"]
+    placed = {moved.key for moved in where_moved(params, keys)}  # `auto` cannot move light
+    emitters = [info.key for info, _ in found if info.kind == "emitter" and info.key not in placed]
     first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
     return [Proposal(info, share, _bounds(info), _resolution(info), info.key in first) for info, share in found]
 

@@ -10,6 +10,7 @@ import pytest
 from cli import tiny
 from cli.tiny import reslrb, settings
 from click.testing import Result
+from kit import scene, sensor, shape
 
 from reslrb_cli.cli.init import PIXELS
 from reslrb_cli.config.loader import load
@@ -63,6 +64,17 @@ def test_a_scene_alone_gets_a_configuration_without_a_photograph(folder: Path) -
     write_noise(folder / "photo.png", 8, 8)
     tiny.done("optimize", "room.yaml", "--set", "run.iterations=2", "--set", "integrator.estimator=stack")
     assert read_manifest(folder / "runs/room")["status"] == "finished"
+
+
+def test_the_brightness_of_a_lamp_is_proposed_and_not_its_place(folder: Path) -> None:
+    """`auto` refuses places. The floor is smooth glass, so no material is proposed."""
+    lamp = '<emitter type="point" id="lamp"><point name="position" value="0, 0, 3"/></emitter>'
+    text = scene(sensor("0, 0, 4"), shape("rectangle", "floor", '<bsdf type="dielectric"/>'), lamp)
+    (folder / "room/scene.xml").write_text(text)
+    tiny.done("init", "room/scene.xml")
+    config = load(folder / "room.yaml")
+    assert [spec.keys for spec in config.parameters] == [["lamp.intensity.value"]]
+    assert config.optimizer.type == "auto"
 
 
 def test_commented_settings_are_valid(folder: Path) -> None:
