@@ -32,13 +32,13 @@ SEED_END = 2**32
 class Section(BaseModel):
     """A mapping of the file. Unknown keys are errors, values are not converted, and NaN and infinity are refused.
 
-    A setting's `description`, or the docstring below the setting, explains the meaning.
+    A setting's `description`, or the docstring below the setting, explains the meaning. `scripts/make_reference.py`
+    reads the docstrings.
     """
 
     model_config = ConfigDict(
-        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True,
-        ser_json_inf_nan="constants",
-    )  # fmt: skip
+        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, ser_json_inf_nan="constants"
+    )
 
     def idle(self) -> set[str]:
         """Return the settings that have no effect beside the others. They are not written, so that the configuration
