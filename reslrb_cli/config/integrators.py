@@ -285,7 +285,7 @@ class WalkAdConfig(AttachingTracer, json_schema_extra=NEEDS_TYPE):
     paths: Literal["light", "camera", "both"] = "light"
     """Where paths start, as for `reslrb`."""
     #: Fraction of the samples that are light paths, with `paths: both`.
-    light_share: ClassVar[float] = 0.5
+    light_share: ClassVar[float] = PLAIN["light_share"]
 
 
 class TrajectoryConfig(LightTracerOptions, json_schema_extra=NEEDS_TYPE):

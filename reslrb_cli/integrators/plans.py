@@ -158,7 +158,7 @@ class SamplingOptions:
     """
 
     paths: str = "light"
-    light_share: float = 0.5
+    light_share: float = PLAIN["light_share"]
     chosen: Mapping[str, str] = field(default_factory=dict)
     whole: bool = False
     given: dict[int, NDArray[np.float32]] = field(default_factory=dict)

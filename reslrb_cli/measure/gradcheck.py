@@ -315,7 +315,7 @@ class Gradcheck:
         kind, _, estimator = row.label.partition(":") if row.label.startswith("reslrb") else (row.label, "", "")
         return GradcheckRecord(
             str(self.settings.config.source), row.key, kind, estimator or None, row.reference, row.kind, seeds,
-            **vars(figures), **records_of(row.way.paths, row.way.light_share),
+            **vars(figures), **records_of(row.way.options),
         )  # fmt: skip
 
     def _without_reference(self) -> Iterator[GradcheckRecord]:

@@ -7,7 +7,7 @@ A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -38,18 +38,20 @@ SHARED = (
 PATHS_OPTIONS = ("paths", "light_share")
 
 
-def records_of(paths: str, light_share: float) -> dict[str, Any]:
-    """Return `paths` and `light_share` for records. `light_share` is None unless `paths` is `both`."""
-    return {"paths": paths, "light_share": float(light_share) if paths == "both" else None}
+def records_of(options: Mapping[str, Any], usual: str = "light") -> dict[str, Any]:
+    """Return `paths` and `light_share` of an integrator's options for records. `usual` are the paths without such an
+    option. `light_share` is None unless `paths` is `both`.
+    """
+    paths, share = str(options.get("paths", usual)), float(options.get("light_share", PLAIN["light_share"]))
+    return {"paths": paths, "light_share": share if paths == "both" else None}
 
 
 def paths_in_records(config: Config) -> dict[str, Any]:
     """Return an integrator's `paths` and `light_share` for records. `paths` is `auto` if the run chooses the kinds of
     paths by measurement.
     """
-    options = config.integrator.options()
     usual = "light" if isinstance(config.integrator, LightTracerOptions) else "camera"
-    return records_of(str(options.get("paths", usual)), options.get("light_share", PLAIN["light_share"]))
+    return records_of(config.integrator.options(), usual)
 
 
 #: The estimator of a case that names none, as in the plugin.

@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.integrators import traced_paths
+from reslrb_cli.config.integrators import PLAIN, traced_paths
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ATTACHED
@@ -144,13 +144,13 @@ class Way:
     """
 
     paths: str = "light"
-    light_share: float = 0.5
+    light_share: float = PLAIN["light_share"]
 
     @classmethod
     def of(cls, config: Config) -> Way:
         """Return the paths of an integrator. Integrators without the option `paths` use light paths."""
         options = config.integrator.options()
-        share = options.get("light_share", 0.5)
+        share = options.get("light_share", cls.light_share)
         paths = traced_paths(options.get("paths", "light"), share)
         return cls(paths, share) if paths == "both" else cls(paths)
 
@@ -303,7 +303,7 @@ class Participants:
                 made[label] = own
                 continue
             if self._situation.moved:  # as in the run
-                options |= {"paths": "light", "light_share": 0.5}
+                options |= {"paths": "light", "light_share": PLAIN["light_share"]}
             if kind == "reslrb":  # as in a run
                 options["freeze"] = True
                 if (place := getattr(config.integrator, "file", None)) is not None:

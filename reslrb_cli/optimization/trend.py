@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from reslrb_cli.statistics import Array
 
@@ -90,7 +91,7 @@ def find_trend(values: Sequence[float]) -> Trend | None:
     half_trend = find_trend(series[count // 2 :].tolist())
     late = None if half_trend is None else half_trend.change
     start, end = _level(series[:width]), _level(series[-width:])
-    leap = _quantile(width - 1, 1 - CONFIDENCE) * end.error * math.sqrt(width + 1)
+    leap = float(stdtrit(width - 1, CONFIDENCE)) * end.error * math.sqrt(width + 1)
     if series[0] < min(series[1:].min(), end.mean - leap):
         return Trend(Level(float(series[0]), end.error * math.sqrt(width)), end, Change.ROSE, late)
     ranks = _ranks(series)
@@ -123,7 +124,7 @@ def window(iterations: int) -> int:
 
 def _rises(values: Array, at: Array | None = None, chance: float = (1 - CONFIDENCE) / 2) -> bool:
     slope, error = line(values, at)
-    return bool(slope > _quantile(values.size - 2, chance) * error)
+    return bool(slope > -stdtrit(values.size - 2, chance) * error)
 
 
 def _apart(first: Array, last: Array, chance: float = (1 - CONFIDENCE) / 2) -> int:
@@ -150,10 +151,3 @@ def _level(values: Array) -> Level:
     return Level(
         float(order[cut : values.size - cut].mean()), float(np.std(kept, ddof=1)) / share / math.sqrt(len(values))
     )
-
-
-def _quantile(freedom: int, chance: float) -> float:
-    """Return the value that Student's t exceeds with probability `chance`."""
-    from scipy.special import stdtrit  # late, because the command line must start fast
-
-    return -float(stdtrit(freedom, chance))

@@ -312,8 +312,7 @@ def _run_way(case: ExtremeCase, setup: Case, members: Mapping[str, str]) -> Iter
 def _record(
     case: ExtremeCase, label: str, parameter: str | None, other: Reference, kind: Kind, found: Comparison
 ) -> GradcheckRecord:
-    options = split(label)[1]
-    way = records_of(options.get("paths", "light"), options.get("light_share", 0.5))
+    way = records_of(split(label)[1])
     return GradcheckRecord(case.name, parameter, "reslrb", label, other, kind, case.seeds, **vars(found), **way)
 
 

@@ -28,6 +28,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.special import stdtrit
 
 from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
 from reslrb_cli.integrators.protocol import Job
@@ -114,8 +115,6 @@ def compare(
              for gradients in (own, other)]  # fmt: skip
     if known[0] is None or known[1] is None:
         return None
-    from scipy.special import stdtrit  # late: every run imports this module, and few need SciPy
-
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
     advantage = math.exp(known[0][0] - known[1][0]) * times
     variance = sum(float(jackknife_variance(each[1])) for each in known if each is not None)

@@ -32,6 +32,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.special import stdtrit
 
 from reslrb_cli.statistics import Array
 
@@ -212,7 +213,7 @@ def joint(gradients: Array, offsets: Array, scale: Array, curvature: Array, fixe
         of_target * scale,
         alone * scale,
         C * units,
-        _quantile(len(blocks) - 1),
+        float(stdtrit(len(blocks) - 1, CONFIDENCE)),
     )
 
 
@@ -247,13 +248,6 @@ def pooled(offsets: Array) -> tuple[float, float]:
     products = (offsets.sum(axis=0) ** 2 - np.square(offsets).sum(axis=0)) / (count * (count - 1))
     error = products.std(ddof=1) / np.sqrt(products.size) if products.size > 1 else np.inf
     return float(products.mean()), float(error)
-
-
-def _quantile(freedom: int) -> float:
-    """Return the quantile of Student's t at `CONFIDENCE`."""
-    from scipy.special import stdtrit  # late, because the command line must start fast
-
-    return float(stdtrit(freedom, CONFIDENCE))
 
 
 def positive(matrix: Array) -> Array:
