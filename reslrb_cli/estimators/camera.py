@@ -115,7 +115,7 @@ class CameraSweep(CameraHooks):
             if event is not None:
                 assert event.f is not None
                 towards = dr.detach(event.f * event.through * event.scale)
-                radiance = event.radiance(self.p.samples.scene, vertex.si)
+                radiance = event.radiance(vertex.si)
                 objective += dr.select(event.active, weight * towards * radiance, 0)
             dr.backward_from(objective, flags=MAY_LACK)
 

@@ -117,17 +117,19 @@ class NextEvent(Connection):
     scale: mi.Float
     ds: mi.DirectionSample3f
     through: mi.Spectrum
-    unseen: frozenset[mi.Emitter]  # emitters without next event estimation
 
-    def radiance(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
-        """Return the arriving radiance, with its derivative if it has one."""
-        if not self.unseen:
-            return scene.eval_emitter_direction(si, self.ds, self.active)
+    def radiance(self, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
+        """Return the arriving radiance, with its derivative if it has one.
+
+        Dr.Jit records the call for the emitters of all scenes of the process. Mitsuba's own call fails if one of them
+        is a `directionalarea`.
+        """
 
         def radiance(
             emitter: mi.Emitter, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool
         ) -> mi.Spectrum:
-            return mi.Spectrum(0) if emitter in self.unseen else emitter.eval_direction(si, ds, active)
+            parallel = emitter.class_name() == "DirectionalArea"
+            return mi.Spectrum(0) if parallel else emitter.eval_direction(si, ds, active)
 
         return dr.dispatch(self.ds.emitter, radiance, si, self.ds, self.active)
 
@@ -277,7 +279,7 @@ def camera_walk(
             weight = event.rest
             if hooks.tracked:
                 event.f = evaluate(plan, si, bsdf, event.wo, event.active)
-                weight = event.radiance(scene, si) * event.scale
+                weight = event.radiance(si) * event.scale
             else:
                 event.f = dr.select(event.active, event.f, 0)
             event.c = dr.select(event.active, event.f * event.through * weight, 0)
@@ -388,7 +390,7 @@ def _next_event(
     return NextEvent(
         weight, mi.Point2f(0), ds.p, si.to_local(ds.d), active, numbers,
         Le=dr.select(active, weight * ds.pdf, 0), scale=dr.select(active, dr.rcp(ds.pdf), 0), ds=ds,
-        through=mi.Spectrum(1), unseen=_unseen(samples),
+        through=mi.Spectrum(1),
     )  # fmt: skip
 
 
@@ -412,9 +414,9 @@ def next_event_again(
     on_surface = active & ~distant & ~ds.delta & (measure > 0)
     event = NextEvent(
         mi.Spectrum(0), mi.Point2f(0), ds.p, si.to_local(ds.d), active, numbers,
-        Le=mi.Spectrum(0), scale=mi.Float(0), ds=ds, through=mi.Spectrum(1), unseen=_unseen(samples),
+        Le=mi.Spectrum(0), scale=mi.Float(0), ds=ds, through=mi.Spectrum(1),
     )  # fmt: skip
-    event.rest = event.radiance(samples.scene, si) * dr.select(on_surface, measure / dr.detach(measure), 1)
+    event.rest = event.radiance(si) * dr.select(on_surface, measure / dr.detach(measure), 1)
     return event
 
 

@@ -342,6 +342,17 @@ def test_forward_mode_equals_naive_ad(name: str, paths: str):
     assert relative(tangent, naive) < 1e-5
 
 
+def test_a_parallel_lamp_of_another_scene_does_not_matter():
+    """Dr.Jit records calls for the emitters of all scenes. Mitsuba evaluates no `directionalarea`."""
+    by_name = {case.name: case for case in CASES}
+    case = by_name["area"]
+    scene = Case(case.scene(), case.keys)
+    alone = scene.gradient(plugin("reslrb", **options_of(case, "camera")), 3, 4)
+    other = mi.load_dict(by_name["directionalarea"].scene(), optimize=False)
+    assert np.array_equal(scene.gradient(plugin("reslrb", **options_of(case, "camera")), 3, 4), alone)
+    assert other.emitters()
+
+
 def test_forward_mode_sees_no_light_from_hidden_lamps():
     """Camera rays start behind a white lamp, in front of which a mask hangs. Light paths that end on the lamp do not
     count. Forward mode counted them.
