@@ -207,7 +207,7 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     """Return the visible share of the picture for each BSDF, shape and emitter.
 
     An object's share is the fraction of the sensor's rays that meet this object first. Rays also pass mirrors and clear
-    glass.
+    glass. A material does not count where it is seen from its black back.
     """
     sensor = scene.sensors()[index]
     # One for each ray: an irradiance meter would give one direction for a single ray, which Dr.Jit fails to compile.
@@ -219,7 +219,9 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
         active = reached & ~smooth  # a mask counts, but nothing behind it
         emitter = si.emitter(scene, active)  # an area light has a back
         shining = dr.select(dr.any(emitter.eval(si, active) > 0), emitter, dr.zeros(mi.EmitterPtr))
-        bsdf = dr.select(active, si.bsdf(), dr.zeros(mi.BSDFPtr))
+        flags = si.bsdf().flags()
+        lit = active & ((mi.Frame3f.cos_theta(si.wi) > 0) | mi.has_flag(flags, mi.BSDFFlags.BackSide))
+        bsdf = dr.select(lit, si.bsdf(), dr.zeros(mi.BSDFPtr))
         for pointers, kind, items in (
             (bsdf, mi.BSDFPtr, graph.surface_bsdfs()),
             (dr.select(active, si.shape, dr.zeros(mi.ShapePtr)), mi.ShapePtr, graph.shapes()),
@@ -230,7 +232,7 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
                 own = int(np.array(dr.reinterpret_array(mi.UInt32, kind(item)))[0])
                 more = float(numbers[own]) / _RAYS**2 if own < len(numbers) else 0.0
                 shares[item] = min(shares.get(item, 0.0) + more, 1.0)
-        smooth = smooth | (active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+        smooth = smooth | (active & mi.has_flag(flags, mi.BSDFFlags.Smooth))
         dr.schedule(smooth)
     for bsdf in graph.of_type(mi.BSDF):  # nested BSDFs are visible together with their parent
         shares[bsdf] = max((shares.get(owner, 0.0) for owner in graph.owning_bsdfs(bsdf)), default=0.0)

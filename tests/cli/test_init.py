@@ -264,17 +264,17 @@ def test_lamps_of_a_clipped_photograph_are_left_out(tmp_path: Path, monkeypatch:
 
 
 def test_only_the_front_of_a_lamp_is_in_view(tmp_path: Path) -> None:
-    """The back of an area light is dark at any radiance."""
+    """The back of an area light is dark at any radiance and reflectance."""
     shares = []
     for angle in (0, 180):
         lamp = '<shape type="rectangle" id="panel"><transform name="to_world"><scale value="0.5"/>'
         lamp += f'<rotate x="1" angle="{angle}"/><translate x="-1" z="2"/></transform><emitter type="area"/></shape>'
         text = BULB.format(plate=PAINT.format("0.5"), radiance=WRONG).replace("</scene>", f"{lamp}</scene>")
         (tmp_path / "scene.xml").write_text(text)
-        found = propose(load_scene(tmp_path / "scene.xml"), 0, lamps=True)
-        panel = next(item for item in found if item.info.key == "panel.emitter.radiance.value")
-        shares.append((panel.share > 0, panel.first))
-    assert shares == [(True, True), (False, False)]
+        found = {item.info.key: item for item in propose(load_scene(tmp_path / "scene.xml"), 0, lamps=True)}
+        light, paint = found["panel.emitter.radiance.value"], found["panel.bsdf.reflectance.value"]
+        shares.append((light.share > 0, light.first, paint.share > 0))
+    assert shares == [(True, True, True), (False, False, False)]
 
 
 # `init` with choices: the sensor, and values that a scene file leaves open.
