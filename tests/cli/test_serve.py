@@ -245,15 +245,18 @@ def test_the_pages_in_a_browser(served, runs, chromium, monkeypatch):
         make_run(runs / f"more-{number}", iterations=1)
     address = f"http://127.0.0.1:{served}/"
     chromium.open(address, 1280)
-    chromium.evaluate("scrollTo(0, 500); window.seen = 1; document.scrollingElement.scrollTop")
+    chromium.evaluate("scrollTo(0, 500)")
+    loaded = "document.readyState == 'complete'"
     for _ in range(2):
-        assert chromium.wait_for("window.seen != 1", 10)
-        assert chromium.evaluate("window.seen = 1; scrollY") == 500
+        chromium.evaluate("window.seen = 1")
+        assert chromium.wait_for(f"window.seen != 1 && {loaded} && scrollY == 500", 10)
+    monkeypatch.setattr(page_module, "REFRESH_SECONDS", 3600)  # no page reloads while its links are clicked
+    assert chromium.wait_for(f"document.querySelector('meta[http-equiv=refresh]')?.content == 3600 && {loaded}", 10)
     click = "[...document.querySelectorAll('a')].find(a => decodeURI(a.href).includes('%s')).click()"
     chromium.evaluate(click % "with=b")
-    assert chromium.wait_for("document.body?.textContent.includes('to compare with b')", 10)
+    assert chromium.wait_for(f"document.body?.textContent.includes('to compare with b') && {loaded}", 10)
     chromium.evaluate(click % "run=a")
-    assert chromium.wait_for("document.querySelectorAll('svg').length == 2", 10)
+    assert chromium.wait_for(f"document.querySelectorAll('svg').length == 2 && {loaded}", 10)
     assert chromium.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
     assert chromium.evaluate("document.images.length") >= 4
     assert chromium.evaluate("document.documentElement.scrollWidth") <= 1280
