@@ -106,8 +106,23 @@ def test_paths_of_a_mapping_are_relative_to_base(folder: Path, monkeypatch: pyte
             "integrators own.py:A: would run with all your rights; allow_code=True permits it",
         ),
         (lambda: rl.load("."), ".: is no run's folder"),
+        (lambda: rl.render("tiny.yaml", spp=0), "spp: is 0; it must be at least 1"),
+        (lambda: rl.render("tiny.yaml", values={"poster": 1}),
+         f"values: poster: is not a parameter of this experiment; did you mean {KEY}?"),
+        (lambda: rl.render("tiny.yaml", values={KEY: np.zeros((3, 4, 3))}),
+         f"values: {KEY}: is of shape (3, 4, 3); it must have the parameter's shape (4, 4, 3) and contain numbers"),
+        (lambda: rl.render("tiny.yaml", values={KEY: "grey"}),
+         f"values: {KEY}: is no array; it must have the parameter's shape"),
+        (lambda: rl.gradient("tiny.yaml", values={KEY: np.nan}), f"values: {KEY}: has a value that is not finite"),
+        (lambda: rl.render("tiny.yaml", values={KEY: 1}, initial=False), "values: are those of parameters; leave out"),
+        (lambda: rl.gradient("tiny.yaml", spp=0), "overrides: run.spp: must be at least 1"),
+        (lambda: rl.gradcheck("tiny.yaml", "reslrb:stick"), "integrators reslrb:stick: integrator.estimator: must be"),
+        (lambda: rl.convergence("tiny.yaml", "prb,nothing"), "integrators nothing: integrator.type: must be one of"),
+        (lambda: rl.convergence("tiny.yaml", reference="prb,ptracer"), "reference: errors are relative to one method"),
+        (lambda: rl.convergence("tiny.yaml", objective="mean"), "objective: is 'mean'; there are fixed, loss, image"),
+        (lambda: rl.convergence("tiny.yaml", rounds=0), "rounds: is 0; at least 1 is needed"),
     ],
-)
+)  # fmt: skip
 def test_errors_are_located(folder: Path, call: Callable[[], Any], line: str) -> None:
     with pytest.raises(rl.ConfigError) as error:
         call()
@@ -217,32 +232,6 @@ def test_the_gradient_belongs_to_the_loss(folder: Path) -> None:
         step = 0.02
         sides = [rl.gradient(smooth, at | {key: at[key] + sign * step * along})[0] for sign in (1, -1)]
         assert (sides[0] - sides[1]) / (2 * step) == pytest.approx(float((gradient[key] * along).sum()), rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("call", "line"),
-    [
-        (lambda: rl.render("tiny.yaml", spp=0), "spp: is 0; it must be at least 1"),
-        (lambda: rl.render("tiny.yaml", values={"poster": 1}),
-         f"values: poster: is not a parameter of this experiment; did you mean {KEY}?"),
-        (lambda: rl.render("tiny.yaml", values={KEY: np.zeros((3, 4, 3))}),
-         f"values: {KEY}: is of shape (3, 4, 3); it must have the parameter's shape (4, 4, 3) and contain numbers"),
-        (lambda: rl.render("tiny.yaml", values={KEY: "grey"}),
-         f"values: {KEY}: is no array; it must have the parameter's shape"),
-        (lambda: rl.gradient("tiny.yaml", values={KEY: np.nan}), f"values: {KEY}: has a value that is not finite"),
-        (lambda: rl.render("tiny.yaml", values={KEY: 1}, initial=False), "values: are those of parameters; leave out"),
-        (lambda: rl.gradient("tiny.yaml", spp=0), "overrides: run.spp: must be at least 1"),
-        (lambda: rl.gradcheck("tiny.yaml", "reslrb:stick"), "integrators reslrb:stick: integrator.estimator: must be"),
-        (lambda: rl.convergence("tiny.yaml", "prb,nothing"), "integrators nothing: integrator.type: must be one of"),
-        (lambda: rl.convergence("tiny.yaml", reference="prb,ptracer"), "reference: errors are relative to one method"),
-        (lambda: rl.convergence("tiny.yaml", objective="mean"), "objective: is 'mean'; there are fixed, loss, image"),
-        (lambda: rl.convergence("tiny.yaml", rounds=0), "rounds: is 0; at least 1 is needed"),
-    ],
-)  # fmt: skip
-def test_arguments_are_named_in_errors(folder: Path, call: Callable[[], Any], line: str) -> None:
-    with pytest.raises(rl.ConfigError) as error:
-        call()
-    assert str(error.value).startswith(line)
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------

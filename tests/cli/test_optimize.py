@@ -196,16 +196,19 @@ BAD = [
 ]
 
 
+def refused(setting):
+    """Return the only line of a run that is refused and makes no folder."""
+    code, out, err = outcome("optimize", "box.yaml", "--set", setting, "--quiet")
+    lines = [line for line in err.splitlines() if not line.startswith("variant ")]
+    assert (code, out, len(lines)) == (2, "", 1), err
+    assert not Path("runs").exists()
+    return lines[0]
+
+
 @pytest.mark.parametrize(("setting", "where"), BAD)
 def test_bad_input_is_one_located_line_and_no_run_folder(experiment, setting, where):
     Path("blocked").write_text("a file, not a folder")
-    code, out, err = outcome("optimize", "box.yaml", "--set", setting, "--quiet")
-    lines = [line for line in err.splitlines() if not line.startswith("variant ")]
-    assert code == 2
-    assert len(lines) == 1, err
-    assert where in lines[0]
-    assert out == ""
-    assert not Path("runs").exists()
+    assert where in refused(setting)
     assert Path("blocked").is_file()
 
 
@@ -230,13 +233,9 @@ def test_scenes_that_cannot_work_are_refused_before_rendering(experiment, name):
     part, other, setting, reason = BAD_SCENES[name]
     assert part in SCENE
     Path("scene.xml").write_text(SCENE.replace(part, other))
-    code, _, err = outcome("optimize", "box.yaml", "--set", f"integrator={setting}", "--quiet")
-    lines = [line for line in err.splitlines() if not line.startswith("variant ")]
-    assert code == 2
-    assert len(lines) == 1, err
-    assert lines[0].startswith("box.yaml: scene.file: ") or "/scene.xml: " in lines[0]
-    assert reason in lines[0]
-    assert not Path("runs").exists()
+    line = refused(f"integrator={setting}")
+    assert line.startswith("box.yaml: scene.file: ") or "/scene.xml: " in line
+    assert reason in line
 
 
 @pytest.mark.parametrize("name", a_few(["orthographic", "glass alone"], ["orthographic"]))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from config.test_config_bad_input import PARAMETER, changed
+from config.test_config_bad_input import GOOD, PARAMETER, changed
 from make_reference import DOCS, EXAMPLE
 
 from reslrb_cli.config.integrators import AUTO_VALUES, ESTIMATOR_OPTIONS, PLAIN, Prb, ReslrbConfig
@@ -23,13 +23,6 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS, options_of
 
 # Valid values of a configuration, its defaults, its paths, and its conversion back to YAML.
-
-GOOD = """\
-scene: {file: scene.xml}
-target: {render: {}}
-parameters:
-  - {key: floor.reflectance.data}
-"""
 
 FULL = """\
 variant: llvm_ad_rgb

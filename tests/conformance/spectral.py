@@ -218,24 +218,29 @@ SCENE = """<scene version="3.0.0">
 """
 
 
+def recover_and_export(folder: Path, text: str, config: dict[str, Any]) -> tuple[rl.Run, list[rl.Record], Any]:
+    """Run an experiment with this scene. Return the run, its records, and the parameters of the exported scene."""
+    (folder / "scene.xml").write_text(text)
+    config |= {"variant": mi.variant(), "scene": {"file": str(folder / "scene.xml")}}
+    config["run"]["output"] = str(folder)
+    run = rl.optimize(rl.load(config), folder=str(folder / "run"))
+    records = list(run)
+    result = CliRunner().invoke(main, ["export", str(folder / "run"), "-o", str(folder / "made")])
+    assert result.exit_code == 0, result.output
+    return run, records, mi.traverse(mi.load_file(str(folder / "made" / "scene.xml"), optimize=False))
+
+
 def test_a_run_recovers_spectra_and_exports_them(tmp_path: Path) -> None:
-    (tmp_path / "scene.xml").write_text(SCENE)
     keys = ["wall.bsdf.reflectance.values", "wall.emitter.radiance.values"]
     config = {
-        "variant": mi.variant(),
-        "scene": {"file": str(tmp_path / "scene.xml")},
         "target": {"render": {"spp": 16384, "parameters": {keys[0]: [0.3, 0.5, 0.4], keys[1]: [1.5, 2.5, 1.0]}}},
         "parameters": [{"key": keys[0], "bounds": [0, 1]}, {"key": keys[1], "bounds": [0.1, 5]}],
         "integrator": {"type": "reslrb", "max_depth": 4, "paths": "light"},
         "optimizer": {"type": "adam", "learning_rate": 0.05},
-        "run": {"iterations": 30, "spp": 1024, "output": str(tmp_path)},
+        "run": {"iterations": 30, "spp": 1024},
     }
-    run = rl.optimize(rl.load(config), folder=str(tmp_path / "run"))
-    records = list(run)
+    run, records, made = recover_and_export(tmp_path, SCENE, config)
     assert records[-1].loss < 0.5 * records[0].loss
-    result = CliRunner().invoke(main, ["export", str(tmp_path / "run"), "-o", str(tmp_path / "made")])
-    assert result.exit_code == 0, result.output
-    made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
     for key in keys:
         np.testing.assert_allclose(np.ravel(made[key]), np.ravel(run.parameters[key]), rtol=1e-5)
 
@@ -279,7 +284,7 @@ def test_a_black_body_becomes_a_regular_spectrum() -> None:
 def test_spectra_get_bounds_and_black_lamps_are_not_proposed() -> None:
     """Mitsuba's coefficients of black belong to a reflectance of 4e-9."""
     black = {"type": "diffuse", "reflectance": rgb(0, 0, 0)}
-    before = mi.ScalarTransform4f().translate([0, 0, 0.8]).scale(0.2)
+    before = mi.ScalarTransform4f().translate([0, 0, 0.8]).rotate([1, 0, 0], 180).scale(0.2)
     panel = {"type": "rectangle", "to_world": before, "bsdf": black,
              "emitter": {"type": "area", "radiance": rgb(2, 2, 2)}}  # fmt: skip
     metal = {"type": "sphere", "radius": 0.2, "center": [1, 0, 0],
@@ -304,21 +309,14 @@ def test_a_recovered_colour_of_a_lamp_is_exported(tmp_path: Path) -> None:
     start = SCENE.index('<spectrum type="regular" name="radiance">')
     end = SCENE.index("</spectrum></emitter>")
     lit = f'{SCENE[:start]}<rgb name="radiance" value="1, 2, 1"/>{SCENE[end + len("</spectrum>") :]}'
-    (tmp_path / "scene.xml").write_text(lit)
     key = "wall.emitter.radiance.value"
     config = {
-        "variant": mi.variant(),
-        "scene": {"file": str(tmp_path / "scene.xml")},
         "target": {"render": {"spp": 16}},
         "parameters": [{"key": key, "initial": [3.0, 1.0, 0.5]}],
         "integrator": {"type": "reslrb", "max_depth": 3, "paths": "light"},
-        "run": {"iterations": 1, "spp": 16, "output": str(tmp_path), "measuring": 0},
+        "run": {"iterations": 1, "spp": 16, "measuring": 0},
     }
-    run = rl.optimize(rl.load(config), folder=str(tmp_path / "run"))
-    list(run)
-    result = CliRunner().invoke(main, ["export", str(tmp_path / "run"), "-o", str(tmp_path / "made")])
-    assert result.exit_code == 0, result.output
-    made = mi.traverse(mi.load_file(str(tmp_path / "made" / "scene.xml"), optimize=False))
+    run, _, made = recover_and_export(tmp_path, lit, config)
     np.testing.assert_allclose(colour_in_scene(made, key), np.ravel(run.parameters[key]), rtol=0.01)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 from typing import Any
 
 import drjit as dr
@@ -13,6 +12,7 @@ import pytest
 from agreement import compare
 from conformance import sequence_faults
 from conformance.drawing import BY_NAME, LOW_DISCREPANCY, both, samples
+from conformance.test_guiding import histogram
 from conformance.test_kernels import steps_compile_nothing
 from scipy.stats import qmc
 
@@ -84,19 +84,9 @@ def evenly(guiding: str) -> Any:
             numbers += [*first, direction.x, direction.y, place.x, place.y, *early]
         dr.eval(numbers)
         assert len(numbers) == 20 + (guiding == "off")
-        rows.append(counts(numbers))
+        rows.append(histogram(numbers, np.ones(dr.width(numbers[0]))))
     found = np.stack(rows)
     return compare(found, np.tile(expected(len(numbers)), (2, 1)), block=None)
-
-
-def counts(numbers: list[Any]) -> np.ndarray:
-    """Return how many numbers are in each eighth, and how many pairs of numbers are in each quarter of the square."""
-    values = np.stack([np.array(number, np.float64) for number in numbers])
-    assert values.min() >= 0
-    assert values.max() < 1
-    halves = (values * 2).astype(int)
-    single = [np.bincount((row * 8).astype(int), minlength=8) for row in values]
-    return np.concatenate([*single, *(np.bincount(2 * a + b, minlength=4) for a, b in combinations(halves, 2))])
 
 
 def expected(numbers: int) -> np.ndarray:
