@@ -111,34 +111,34 @@ def test_a_blur_is_a_reflected_gaussian(sigma):
     assert found.sum() == pytest.approx(image.sum(), rel=1e-5)
 
 
+def blurred_view(image, target, weights=None):
+    """Return the loss of an image that a blurred view sees, and its derivative."""
+    view = View(0, make_loss("l2"), blur=3.0)
+    view.see(target, weights)
+    attached = mi.TensorXf(image.astype(np.float32))
+    dr.enable_grad(attached)
+    loss = view.compare(attached)
+    dr.backward(loss)
+    return float(loss[0]), np.array(attached.grad)
+
+
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_blurred_view_has_the_plain_loss_and_the_derivative_of_blurred_images(masked):
     image, target = images((23, 18, 3))
     weights = np.ones((23, 18))
     weights[:4] = 1 - masked
-    view = View(0, make_loss("l2"), blur=3.0)
-    view.see(target, weights.astype(np.float32))
-    attached = mi.TensorXf(image.astype(np.float32))
-    dr.enable_grad(attached)
-    loss = view.compare(attached)
-    dr.backward(loss)
+    loss, derivative = blurred_view(image, target, weights.astype(np.float32))
     difference, factor = (image - target) * (weights > 0)[..., None], (weights / weights.mean())[..., None]
-    assert float(loss[0]) == pytest.approx((factor * difference**2).mean(), rel=1e-5)
+    assert loss == pytest.approx((factor * difference**2).mean(), rel=1e-5)
     expected = blurred(factor * blurred(difference, 3.0), 3.0) * (weights > 0)[..., None] * 2 / image.size
-    np.testing.assert_allclose(np.array(attached.grad), expected, atol=1e-4 * abs(expected).max())
+    np.testing.assert_allclose(derivative, expected, atol=1e-4 * abs(expected).max())
 
 
 def test_a_blur_does_not_spread_a_nan():
     image, target = images((23, 18, 3))
     image[11, 9, 1] = np.nan
-    view = View(0, make_loss("l2"), blur=3.0)
-    view.see(target)
-    attached = mi.TensorXf(image.astype(np.float32))
-    dr.enable_grad(attached)
-    loss = view.compare(attached)
-    dr.backward(loss)
-    derivative = np.array(attached.grad)
-    assert np.isnan(loss[0])
+    loss, derivative = blurred_view(image, target)
+    assert np.isnan(loss)
     assert np.isfinite(derivative).all()
     assert (derivative != 0).sum() == derivative.size - 1
 
