@@ -6,8 +6,9 @@ iteration, the entries i move as follows.
 
     s_i, v_i                                                  means of |g_i| and g_i²
     h_i   =  c_i s_i,   c_i = sum_j H_j s_j / sum_j s_j²      curvature; the sums are over all j with s_j <= s_i
+    r_i                                                       mean of (g_i - g_i' - h_i (x_i - x_i'))² / 2
     L_i   =  L s_i² / v_i                                     longest step
-    d_i   =  h_i (1 + q n_i) / 0.3                            divisor of a step
+    d_i   =  h_i (1 + q n_i) / 0.3 + 0.5 r_i / (h_i P²)       divisor of a step
     m_i  <-  0.5 m_i + clip(g_i, ±0.5 L_i d_i)                momentum
     x_i  <-  x_i - clip(m_i / d_i, ±L_i)                      step
 
@@ -25,6 +26,10 @@ L is a share of the parameter's extent. s_i² / v_i is about the share of the it
 It is between 0.6 and 1 for entries with a gradient in each iteration. One gradient moves an entry by at most L_i in all
 later steps together. Otherwise, one path would move a texel that few paths reach by many times L. Clipped gradients
 have a bias where their noise is skewed. The limit rises as the steps become shorter, so the bias disappears.
+
+r_i is the variance of the noise of a gradient. It comes from the last gradient g' at x'. P is a share of the extent. If
+noise would move an entry by much more than P, steps are shorter from the start. Otherwise, the first steps would move
+dim entries far from the optimum, and later steps would be too short to correct them.
 
 Steps of 0.3 are a compromise. Larger steps keep more noise of the first, large gradients in directions that the images
 do not determine, such as differences of texels in one pixel. n_i counts the iterations in which g_i and m_i have
@@ -60,8 +65,8 @@ GAIN, MOMENTUM, MEMORY = 0.3, 0.5, 0.99
 CLASSES, OCTAVE, SHARE = 128, 4, 0.02
 #: Displacement d of a measurement as a share of the extent, and the weight of the newest measurement.
 DISPLACEMENT, NEWEST = 0.05, 0.75
-#: L as a share of the extent, and q.
-LONGEST, SHORTER = 0.13, 0.4
+#: L and P as shares of the extent, and q.
+LONGEST, NEAR, SHORTER = 0.13, 0.05, 0.4
 #: The limit of the distance uses this many iterations, and exceeds the largest of them by this factor.
 RECENT, SURE = 4, 1.5
 #: A mean square distance that is not known. A state on file has only finite numbers.
@@ -137,34 +142,37 @@ class Joint(Rule, dropt.SGD):
 class Newton(Rule, dropt.Optimizer[Any]):
     """The update of `optimizer: auto` for one large parameter. The learning rate is the longest step L.
 
-    Data: m, s, n, H, the variable at the last measurement of H, the root of v, and arrays of width 1: the sum of the
-    weights in s and v, and the mean square distances of the last iterations, newest first.
+    Data: m, s, n, H, the variable at the last measurement of H, the roots of v and r, g', x', and arrays of width
+    1: the sum of the weights in s and v, P, and the mean square distances of the last iterations, newest first.
     """
 
     longest = LONGEST
 
     def _step(self, cache: Any, value: Any, grad: Any, lr: Any, extra: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
-        velocity, size, turns, bent, earlier, spread, weights, *squares = extra
-        weights = dr.lerp(1, weights, MEMORY)
+        velocity, size, turns, bent, earlier, spread, noise, last, before, weights, _, *squares = extra
         size, spread = dr.lerp(dr.abs(grad), size, MEMORY), _root_mean(grad, spread)
         steepness = _steepness(size, bent)
+        surprise = grad - last - steepness * (value - before)
+        noise = dr.select(weights > 0, _root_mean(surprise * math.sqrt(0.5), noise), 0)
+        weights = dr.lerp(1, weights, MEMORY)
         known = steepness > 0
         weight = total(dr.select(known, steepness, 0))
         offsets = dr.select(known, grad * ((1 - MOMENTUM) * velocity / steepness), 0)
         square = dr.select(weight > 0, total(offsets) / weight, UNKNOWN)
         turns = turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
-        longest = dr.opaque(dr.leaf_t(grad), lr) * dr.select(known, dr.square(size / spread) / weights, 1)
-        divisor = steepness * (1 + SHORTER * turns) / GAIN
+        most = dr.opaque(dr.leaf_t(grad), lr)
+        near, longest = NEAR / LONGEST * most, most * dr.select(known, dr.square(size / spread) / weights, 1)
+        divisor = _divisor(steepness, turns, noise, weights, near)
         reach = (1 - MOMENTUM) * longest * divisor
         velocity = MOMENTUM * velocity + dr.clip(grad, -reach, reach)
-        step = dr.clip(velocity / divisor, -longest, longest)
-        kept = velocity, size, turns, bent, earlier, spread, weights, square, *squares[:-1]
-        return value - dr.select(known, step, 0), kept
+        step = dr.select(known, dr.clip(velocity / divisor, -longest, longest), 0)
+        kept = velocity, size, turns, bent, earlier, spread, noise, grad, value, weights, near, square, *squares[:-1]
+        return value - step, kept
 
     def _reset(self, key: str, value: Any, promoted: bool) -> None:
         array = value.array
-        zeros = [dr.opaque(type(array), 0, array.shape) for _ in range(6)]
-        single = [dr.opaque(dr.leaf_t(array), each) for each in (0, *RECENT * [UNKNOWN])]
+        zeros = [dr.opaque(type(array), 0, array.shape) for _ in range(9)]
+        single = [dr.opaque(dr.leaf_t(array), each) for each in (0, 1, *RECENT * [UNKNOWN])]
         self.state[key] = value, promoted, None, (*zeros, *single)
 
     def forget(self) -> None:
@@ -185,10 +193,10 @@ class Newton(Rule, dropt.Optimizer[Any]):
         self.state[key] = value, promoted, lr, (velocity, size, turns, bent, dr.detach(value).array, *others)
 
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
-        _, size, turns, bent, *_ = self.state[key][3]
-        steepness = np.array(_steepness(size, bent), dtype=np.float64).ravel()
-        shorter = 1 + SHORTER * np.array(turns, dtype=np.float64).ravel()
-        return np.asarray(np.where(steepness > 0, steepness * shorter * (1 - MOMENTUM) / GAIN, np.inf))
+        _, size, turns, bent, _, _, noise, _, _, weights, near, *_ = self.state[key][3]
+        steepness = _steepness(size, bent)
+        total = (1 - MOMENTUM) * _divisor(steepness, turns, noise, weights, near)
+        return np.array(dr.select(steepness > 0, total, math.inf), dtype=np.float64).ravel()
 
     def averaged(self, key: str) -> float:
         _, size, turns, bent, *_ = self.state[key][3]
@@ -197,7 +205,8 @@ class Newton(Rule, dropt.Optimizer[Any]):
         return float((1 + SHORTER * mean) * (1 - MOMENTUM) / GAIN)
 
     def to_go(self, key: str) -> float:
-        value, _, _, (_, size, _, bent, earlier, _, _, *squares) = self.state[key]
+        value, _, _, (_, size, _, bent, earlier, *others) = self.state[key]
+        squares = others[-RECENT:]
         left = np.abs([float(np.array(each).ravel()[0]) for each in squares])
         steepness = np.array(_steepness(size, bent), dtype=np.float64).ravel()
         moved = np.array(dr.detach(value).array - earlier, dtype=np.float64).ravel()
@@ -222,6 +231,15 @@ def _steepness(size: Any, bent: Any) -> Any:
     number = dr.maximum(number, dr.sum(dr.select(sums[2] < least, dr.uint32_array_t(sums[2])(1), 0)))
     squares = dr.gather(type(unit), sums[1], number)
     return dr.select(squares > 0, dr.abs(dr.gather(type(unit), sums[0], number)) / squares * unit, 0)
+
+
+def _divisor(steepness: Any, turns: Any, noise: Any, weights: Any, near: Any) -> Any:
+    """Return d of each entry from h, n, the root of r, the sum of the weights in v, and P."""
+    # The weights in r are those in v one iteration earlier.
+    known = (steepness > 0) & (weights > 1.5 * (1 - MEMORY))
+    before = dr.select(known, (weights - 1 + MEMORY) / MEMORY, 1)
+    noisy = dr.select(known, dr.square(noise / (steepness * near)) / before, 0)  # squares of gradients would underflow
+    return steepness * ((1 + SHORTER * turns) / GAIN + (1 - MOMENTUM) * noisy)
 
 
 def _root_mean(grad: Any, spread: Any) -> Any:

@@ -18,7 +18,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
-from reslrb_cli.optimization.newton import LONGEST, SHORTER, _steepness
+from reslrb_cli.optimization.newton import LONGEST, NEAR, SHORTER, _steepness
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.uncertainty.curvature import raise_eigenvalues
@@ -66,7 +66,8 @@ def curvature_by_size(size, measured):
 def test_updates_follow_the_formula():
     curvature, best = loss = MANY
     optimizer = make({"p": np.full(best.shape, 0.5)})
-    x, m, s, v, n, random = np.full(best.shape, 0.5), 0.0, 0.0, 0.0, np.zeros(best.shape), np.random.default_rng(2)
+    x, m, s, v, r = np.full(best.shape, 0.5), 0.0, 0.0, 0.0, 0.0
+    n, last, before, random = np.zeros(best.shape), 0.0, x, np.random.default_rng(2)
     for iteration in range(30):
         pull(optimizer, {"p": loss})
         if iteration == 0:
@@ -80,9 +81,13 @@ def test_updates_follow_the_formula():
         n = n + (g * m < 0)
         longest = LONGEST * s**2 / v / (1 - 0.99 ** (iteration + 1))
         divisor = h * (1 + SHORTER * n) / 0.3
+        if iteration > 0:
+            r = 0.99 * r + 0.01 * (g - last - h * (x - before)) ** 2 / 2
+            divisor += 0.5 * r / (1 - 0.99**iteration) / h / NEAR**2
         reach = 0.5 * longest * divisor
         m = 0.5 * m + np.clip(g, -reach, reach)
-        x = np.clip(x - np.clip(m / divisor, -longest, longest), 0, 1)
+        step = np.clip(m / divisor, -longest, longest)
+        last, before, x = g, x, np.clip(x - step, 0, 1)
         np.testing.assert_allclose(np.array(optimizer["p"]), x, atol=1e-4)
     assert n.max() > 5
     assert longest.min() < 0.7 * LONGEST
