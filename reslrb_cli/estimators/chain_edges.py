@@ -223,7 +223,10 @@ def differentiate_edges_behind_chains(own: Pass) -> None:
     # If the edge touches the surface in its shadow, the chain itself meets it.
     touches = shadow & (edge.here.pi.t < 2 * AROUND * ray_offset(edge.here.p))
     size = dr.select(edge.active & ~touches, 2 * _light(p, edge, lane % 2 == 0), 0)
-    active = size != 0
+    # Rarely, the chain from the middle of the jump misses a surface, and has fewer vertices on the stack. The others
+    # are undefined: reading them can end the process.
+    form, stack = SpecularFrame.blank(own.plan), _stack_of(own, chains, edge, ring)
+    active = (size != 0) & (stack.count == edge.over.count)
     at_p = size * edge.n
     with dr.resume_grad(), dr.isolate_grad():
         dr.backward_from(moved_by(edge.here.pi, edge.here.ray, at_p, active), flags=MAY_LACK)
@@ -241,5 +244,4 @@ def differentiate_edges_behind_chains(own: Pass) -> None:
     )
     vertices = dr.select(active, edge.over.count, 0)
     own = replace(own, colours=own.samples.film.colours(edge.over.ray.wavelengths))
-    form, stack = SpecularFrame.blank(own.plan), _stack_of(own, chains, edge, ring)
     differentiate_frames(own, form, ring, stack, vertices, mi.UInt32(0), adjoint)

@@ -240,6 +240,8 @@ def _edge_point(chains: Chains, chain: Chain, shadow: mi.Bool, active: mi.Bool) 
     """
     end = chain.vertex(active)
     target = chains.target(end, chain.count, active & shadow)
+    # A surface between the vertex and the start of this ray touches the vertex. Such an edge would not count anyway, so
+    # the second ray of `is_hidden` is not needed.
     to_target = shadow_ray(end.si, target.y, chains.samples.plan.has_edges)
     pi = chains.samples.scene.ray_intersect_preliminary(to_target, coherent=False, active=active & shadow)
     ray = dr.select(shadow, mi.Ray3f(to_target), mi.Ray3f(chain.ray))

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.edge_cases import OCCLUDERS, SHAPES, EdgeCase, split_box
+from conformance.edge_cases import BOTH, OCCLUDERS, SHAPES, EdgeCase, split_box
 from conformance.moving import Moving
 
-from reslrb_cli.estimators import edges
+from reslrb_cli.estimators import chain_edges, edges
+from reslrb_cli.estimators.stack import StackState
+from reslrb_cli.integrators import reslrb
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load, transform
@@ -133,3 +138,25 @@ def test_light_from_other_surfaces_reaches_a_contact():
     between = edges.sample_between(samples, samples.stream(edges.OTHER_EDGES))
     from_above = np.array((between.outline.p.z < 1e-4) & (between.outline.view.to_y.z > 0))
     assert np.mean(np.array(between.active)[from_above]) > 0.6
+
+
+# ---- Edges behind chains ----
+
+
+def test_edges_whose_chain_ends_early_do_not_count(monkeypatch: pytest.MonkeyPatch):
+    """The chain from the middle of a jump may have fewer vertices than the chain beside the jump. Its stack then lacks
+    vertices, whose memory is undefined.
+    """
+    case, stack_of = EdgeCase("slab", "area", 4, spp=64, options=BOTH), chain_edges._stack_of
+    whole = case.gradients(1)
+
+    def ends_at_once(p: Any, chains: Any, edge: Any, ring: Any) -> StackState:
+        return stack_of(p, chains, replace(edge, active=edge.active & False), ring)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(chain_edges, "_stack_of", ends_at_once)
+        found = case.gradients(1)
+    monkeypatch.setattr(reslrb, "has_edges_behind_chains", lambda plan: False)
+    without = case.gradients(1)
+    np.testing.assert_allclose(found, without, rtol=1e-4, atol=1e-5)
+    assert np.abs(whole - without).max() > 0.01
