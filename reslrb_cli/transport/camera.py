@@ -119,11 +119,8 @@ class NextEvent(Connection):
     through: mi.Spectrum
 
     def radiance(self, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
-        """Return the arriving radiance, with its derivative if it has one.
-
-        Dr.Jit records the call for the emitters of all scenes of the process. Mitsuba's own call fails if one of them
-        is a `directionalarea`.
-        """
+        """Return the arriving radiance, with its derivative if it has one."""
+        # Mitsuba's own call fails beside a `directionalarea` in any scene, because Dr.Jit records all emitters.
 
         def radiance(
             emitter: mi.Emitter, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool

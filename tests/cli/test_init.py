@@ -233,15 +233,15 @@ def write_bulb(folder: Path, name: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", RECOVERED)
 def test_the_generated_configuration_recovers_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """The unedited configuration is accurate within 5 %. The lamp must become far brighter. No learning rate can
-    anticipate the lamp's unit.
+    """The unedited configuration is accurate within 5 %. The lamp must become far brighter, and no learning
+    rate can anticipate the unit of the lamp.
     """
     monkeypatch.chdir(tmp_path)
     write_bulb(tmp_path, name)
     tiny.done("init", "bulb.xml", "--target", "bulb.exr")
     config = load(tmp_path / "bulb.yaml")
     assert {spec.keys[0] for spec in config.parameters} == set(RECOVERED[name][2])
-    assert config.optimizer.scale == "auto"
+    assert config.optimizer.type == "auto"
     # The configuration decides neither the estimator nor the measurements of the result, so the test sets both.
     done = tiny.done("optimize", "bulb.yaml", *settings("integrator.estimator=stack", "run.final_spp=16"))
     values = np.load(tmp_path / "runs/bulb/parameters/parameters.npz")

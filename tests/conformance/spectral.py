@@ -394,7 +394,7 @@ def test_a_colour_is_recovered_from_a_raw_photograph(tmp_path: Path, monkeypatch
     assert "color_space: linear" in Path("plate.yaml").read_text()
     done("optimize", "plate.yaml", *settings(
         "target.white_balance={scene: A}", "target.exposure=0.8", "parameters[0].initial=0.5", "integrator.max_depth=2",
-        "integrator.paths=camera", "run.iterations=120", "run.spp=128", "optimizer.learning_rate=0.05", "run.name=it",
+        "integrator.paths=camera", "run.iterations=120", "run.spp=128", "run.name=it",
     ))  # fmt: skip
     found = read_value(Path("runs/it"), "plate.bsdf.reflectance.value")
     np.testing.assert_allclose(found, [0.6, 0.3, 0.2], atol=0.01)
