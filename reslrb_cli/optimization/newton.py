@@ -58,15 +58,15 @@ import numpy as np
 from reslrb_cli.backend.memory import flat
 from reslrb_cli.optimization.block import Block
 
-#: Step as a share of Newton's, decay of the momentum, and decay of the means s and v. docs/optimizers.md has
-#: measurements.
-GAIN, MOMENTUM, MEMORY = 0.3, 0.5, 0.99
+#: Step as a share of Newton's, decay of the momentum, decay of the means s and v, and decay of the mean r.
+#: docs/optimizers.md has measurements.
+GAIN, MOMENTUM, MEMORY, FORGETTING = 0.3, 0.5, 0.99, 0.9
 #: Classes of gradients by size, classes for a factor of two, and the smallest share of the entries that c uses.
 CLASSES, OCTAVE, SHARE = 128, 4, 0.02
 #: Displacement d of a measurement as a share of the extent, and the weight of the newest measurement.
 DISPLACEMENT, NEWEST = 0.05, 0.75
 #: L and P as shares of the extent, and q.
-LONGEST, NEAR, SHORTER = 0.13, 0.05, 0.4
+LONGEST, NEAR, SHORTER = 0.13, 0.07, 0.4
 #: The limit of the distance uses this many iterations, and exceeds the largest of them by this factor.
 RECENT, SURE = 4, 1.5
 #: A mean square distance that is not known. A state on file has only finite numbers.
@@ -150,10 +150,11 @@ class Newton(Rule, dropt.Optimizer[Any]):
 
     def _step(self, cache: Any, value: Any, grad: Any, lr: Any, extra: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
         velocity, size, turns, bent, earlier, spread, noise, last, before, weights, _, *squares = extra
-        size, spread = dr.lerp(dr.abs(grad), size, MEMORY), _root_mean(grad, spread)
+        size, spread = dr.lerp(dr.abs(grad), size, MEMORY), _root_mean(grad, spread, MEMORY)
         steepness = _steepness(size, bent)
-        surprise = grad - last - steepness * (value - before)
-        noise = dr.select(weights > 0, _root_mean(surprise * math.sqrt(0.5), noise), 0)
+        surprise = math.sqrt(0.5) * (grad - last - steepness * (value - before))
+        mean = dr.select(weights > 1.5 * (1 - MEMORY), _root_mean(surprise, noise, FORGETTING), dr.abs(surprise))
+        noise = dr.select(weights > 0, mean, 0)  # the first gradient has no predecessor
         weights = dr.lerp(1, weights, MEMORY)
         known = steepness > 0
         weight = total(dr.select(known, steepness, 0))
@@ -162,7 +163,7 @@ class Newton(Rule, dropt.Optimizer[Any]):
         turns = turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
         most = dr.opaque(dr.leaf_t(grad), lr)
         near, longest = NEAR / LONGEST * most, most * dr.select(known, dr.square(size / spread) / weights, 1)
-        divisor = _divisor(steepness, turns, noise, weights, near)
+        divisor = _divisor(steepness, turns, noise, near)
         reach = (1 - MOMENTUM) * longest * divisor
         velocity = MOMENTUM * velocity + dr.clip(grad, -reach, reach)
         step = dr.select(known, dr.clip(velocity / divisor, -longest, longest), 0)
@@ -193,9 +194,9 @@ class Newton(Rule, dropt.Optimizer[Any]):
         self.state[key] = value, promoted, lr, (velocity, size, turns, bent, dr.detach(value).array, *others)
 
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
-        _, size, turns, bent, _, _, noise, _, _, weights, near, *_ = self.state[key][3]
+        _, size, turns, bent, _, _, noise, _, _, _, near, *_ = self.state[key][3]
         steepness = _steepness(size, bent)
-        total = (1 - MOMENTUM) * _divisor(steepness, turns, noise, weights, near)
+        total = (1 - MOMENTUM) * _divisor(steepness, turns, noise, near)
         return np.array(dr.select(steepness > 0, total, math.inf), dtype=np.float64).ravel()
 
     def averaged(self, key: str) -> float:
@@ -233,19 +234,16 @@ def _steepness(size: Any, bent: Any) -> Any:
     return dr.select(squares > 0, dr.abs(dr.gather(type(unit), sums[0], number)) / squares * unit, 0)
 
 
-def _divisor(steepness: Any, turns: Any, noise: Any, weights: Any, near: Any) -> Any:
-    """Return d of each entry from h, n, the root of r, the sum of the weights in v, and P."""
-    # The weights in r are those in v one iteration earlier.
-    known = (steepness > 0) & (weights > 1.5 * (1 - MEMORY))
-    before = dr.select(known, (weights - 1 + MEMORY) / MEMORY, 1)
-    noisy = dr.select(known, dr.square(noise / (steepness * near)) / before, 0)  # squares of gradients would underflow
+def _divisor(steepness: Any, turns: Any, noise: Any, near: Any) -> Any:
+    """Return d of each entry from h, n, the root of r, and P."""
+    noisy = dr.select(steepness > 0, dr.square(noise / (steepness * near)), 0)  # squares of gradients would underflow
     return steepness * ((1 + SHORTER * turns) / GAIN + (1 - MOMENTUM) * noisy)
 
 
-def _root_mean(grad: Any, spread: Any) -> Any:
+def _root_mean(grad: Any, spread: Any, memory: float) -> Any:
     """Return the root of the running mean of squares with one more gradient. Squares of gradients would underflow."""
     largest = dr.maximum(dr.abs(grad), spread)
-    root = largest * dr.sqrt(dr.lerp(dr.square(grad / largest), dr.square(spread / largest), MEMORY))
+    root = largest * dr.sqrt(dr.lerp(dr.square(grad / largest), dr.square(spread / largest), memory))
     return dr.select(largest > 0, root, 0)
 
 

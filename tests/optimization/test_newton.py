@@ -82,8 +82,9 @@ def test_updates_follow_the_formula():
         longest = LONGEST * s**2 / v / (1 - 0.99 ** (iteration + 1))
         divisor = h * (1 + SHORTER * n) / 0.3
         if iteration > 0:
-            r = 0.99 * r + 0.01 * (g - last - h * (x - before)) ** 2 / 2
-            divisor += 0.5 * r / (1 - 0.99**iteration) / h / NEAR**2
+            newest = (g - last - h * (x - before)) ** 2 / 2
+            r = newest if iteration == 1 else 0.9 * r + 0.1 * newest
+            divisor += 0.5 * r / h / NEAR**2
         reach = 0.5 * longest * divisor
         m = 0.5 * m + np.clip(g, -reach, reach)
         step = np.clip(m / divisor, -longest, longest)
