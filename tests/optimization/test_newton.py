@@ -428,7 +428,7 @@ def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
 
 def test_a_finished_run_says_why_it_ended(llvm, tmp_path, monkeypatch, capsys):
     begin_alone(tmp_path, monkeypatch)
-    monkeypatch.setattr(loop, "CLOSE", 100.0)
+    monkeypatch.setattr(loop, "CLOSE", 1e6)
     sets = ("--set", AUTO, "--set", "run.iterations=50", "--set", "run.certainty=false", "--set", "run.measuring=0")
     assert optimize("tiny.yaml", *sets) == 0
     assert "stopped after 21 iterations: every parameter is within" in "".join(capsys.readouterr())
