@@ -101,7 +101,7 @@ def test_gradient_with_new_differences(case: EdgeCase):
     """The differences on file agree with new ones of the scenes as they are now."""
     differences = case.differences(block=2)
     noisy = case.occluder in ("glazed", "slab")  # light through glass has more noise
-    agreement = check(replace(case, spp=case.spp * (2 if noisy else 1)), differences)
+    agreement = check(replace(case, spp=case.spp * (4 if noisy else 1)), differences)
     assert agreement, agreement
     if case in RECORDED:
         on_file = compare(recorded(case), differences, block=None)
