@@ -196,8 +196,8 @@ class Newton(Rule, dropt.Optimizer[Any]):
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
         _, size, turns, bent, _, _, noise, _, _, _, near, *_ = self.state[key][3]
         steepness = _steepness(size, bent)
-        total = (1 - MOMENTUM) * _divisor(steepness, turns, noise, near)
-        return np.array(dr.select(steepness > 0, total, math.inf), dtype=np.float64).ravel()
+        summed = (1 - MOMENTUM) * _divisor(steepness, turns, noise, near)
+        return np.array(dr.select(steepness > 0, summed, math.inf), dtype=np.float64).ravel()
 
     def averaged(self, key: str) -> float:
         _, size, turns, bent, *_ = self.state[key][3]
