@@ -7,13 +7,14 @@ gradient is g = H (x - x*) + noise. With the means of the last n gradients and o
     y = mean g - H (mean x - x),   x <- x - (n H² + s v C^-1)^-1 n H y
 
 in units in which the diagonal of H is 1. C is diagonal, with the squares of twice the longest steps L. v is the
-variance of the noise of a gradient, so noise limits the steps in directions that the images hardly determine.
-Consecutive gradients give v, because g - g' - H (x - x') has the variance 2 v. Where the loss is not quadratic, v is
-larger, and the steps are shorter.
+variance of the noise of a gradient, so noise limits the steps in directions that the images hardly determine. Half the
+square of g - g' - H (x - x') estimates v, where g' is the last gradient, and x' the last value. v is the mean of these
+estimates over n gradients. Where the loss is not quadratic, v is larger, and the steps are shorter.
 
-A rare bright sample makes a gradient many times as large, and would lead all values astray until the mean forgets it. A
-gradient that is longer than L is therefore shortened to this length, in the same units. Near the optimum, most
-gradients are shorter, and are not changed.
+A rare bright sample makes a gradient many times as large, and would lead all values astray until the mean forgets it.
+In the same units, a gradient is therefore at most as long as L, or as n^0.5 times the noise if this is longer. The same
+limit, squared, holds for an estimate of v. A fixed limit would leave a bias, because noise with rare bright samples is
+skewed.
 
 n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.
@@ -37,8 +38,8 @@ import numpy as np
 from reslrb_cli.optimization.uncertainty.posterior import positive
 from reslrb_cli.statistics import Array
 
-#: s, decay of v, and decrease of n.
-NOISE, MEMORY, SHRINK = 0.3, 0.8, 0.25
+#: s, and decrease of n.
+NOISE, SHRINK = 0.3, 0.25
 #: Standard errors from the estimate to a limit that holds with a probability of 85 %.
 SURE = 1.04
 #: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, and v.
@@ -113,14 +114,15 @@ class Block:
         K = positive(np.where(np.outer(use, use), H / np.outer(root, root), 0.0))
         mean_g, mean_x, last_g, last_x, last_step = rows[:, :5].T
         y, x = np.where(use, now.gradient / root, 0.0), now.value * root
-        y *= min(1.0, np.linalg.norm((root * now.longest)[use]) / max(float(np.linalg.norm(y)), 1e-300))
-        gradient = np.where(use, y * root, 0.0)
-        n, variance = rows[0, 6:FIELDS]
-        before = K @ (x - last_x * root) if n > 0 else np.zeros_like(x)
-        new = max(float(np.mean(np.square(y - last_g / root - before)[use])) / 2, 1e-300)
-        variance = variance**MEMORY * new ** (1 - MEMORY) if variance > 0 else new
-        n = n + 1 if now.gradient @ last_step > 0 else max(1.0, n - SHRINK)
-        mean_g = np.where(now.known, mean_g + (gradient - mean_g) / n, mean_g)
+        last, variance = rows[0, 6:FIELDS]
+        n = last + 1 if now.gradient @ last_step > 0 else max(1.0, last - SHRINK)
+        reach = float(np.mean(np.square(root * now.longest)[use]))
+        most = max(reach, n * variance)
+        before = K @ (x - last_x * root) if last > 0 else np.zeros_like(x)
+        new = max(min(float(np.mean(np.square(y - last_g / root - before)[use])) / 2, most), 1e-300)
+        variance = variance + (new - variance) / n if variance > 0 else new
+        y *= min(1.0, np.sqrt(most / max(float(np.mean(np.square(y[use]))), 1e-300)))
+        mean_g = np.where(now.known, mean_g + (y * root - mean_g) / n, mean_g)
         mean_x = mean_x + (now.value - mean_x) / n
         Y = np.where(use, mean_g / root, 0.0) - K @ (mean_x * root - x)
         free = use & ~((now.value <= now.low) & (Y > 0) | (now.value >= now.high) & (Y < 0))
@@ -130,7 +132,7 @@ class Block:
         step[free] = -(inverse @ A @ Y[free]) / root[free]
         error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
         distance = np.abs(step) + SURE * error
-        fields = [mean_g, mean_x, gradient, now.value, step, distance, n, variance]
+        fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0]
         rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
         change = np.clip(step, -now.longest, now.longest)
         if (tied := now.exposure >= 0).any():

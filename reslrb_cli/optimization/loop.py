@@ -98,7 +98,8 @@ def out_of_time(limit_s: float | None, state: State) -> str:
 
 
 #: Fewest iterations of a run with `auto`. Distance to the optimum at which such a run ends: a share of a value's root
-#: mean square, or of this share of its extent if that is larger. It is a quarter of the tolerance of a verdict. Until
+#: mean square, or of this share of its extent if that is larger. It is a quarter of the tolerance of a verdict. With a
+#: transform, the distance of the optimiser's variable counts. It is at least the relative distance of the value. Until
 #: steps are means of `AVERAGED` gradients, the error still falls fast, and the distance must be smaller by this factor.
 LEAST_ITERATIONS, CLOSE, LEAST_SHARE, AVERAGED = 20, 0.025, 0.2, 15
 
@@ -113,11 +114,11 @@ def close_enough(problem: Problem, iteration: int) -> str:
         return ""
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
         extent = optimizer.extent(key)
-        value = LEAST_SHARE if optimizer.variable(key).transform else rms(problem.selection.array(key)) / extent
+        value = 1.0 / extent if optimizer.variable(key).transform else rms(problem.selection.array(key)) / extent
         distance, limit = optimizer.to_go(key), CLOSE * max(value, LEAST_SHARE)
         if distance > limit or (AVERAGED * distance > limit and optimizer.averaged(key) < AVERAGED):
             return ""
-    return f"every parameter is within {100 * CLOSE:g} % of the optimum"
+    return f"every parameter is within about {100 * CLOSE:g} % of the optimum"
 
 
 #: Displacement of small parameters as a share of half their extent, the divisor of a step's samples for each of the two

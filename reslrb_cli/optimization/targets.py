@@ -79,7 +79,7 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
             weights = read_photo(mask.file, "linear", (width, height), are_upright(config))
             found.weights = weights.image.mean(axis=2)
         except ConfigError as error:
-            raise ConfigError(config.source, f"{view.mask_key}.file", error.message) from None
+            raise ConfigError(config.source, f"{view.mask_key}.file", str(error)) from None
         found.left_out["file"] = found.weights == 0
     return found
 
@@ -132,7 +132,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
                 channels=own_channels(film),
             )  # fmt: skip
         except ConfigError as error:
-            raise ConfigError(config.source, view.file_key, error.message) from None
+            raise ConfigError(config.source, view.file_key, str(error)) from None
         line = turned_line(view.file, upright)
         if line is not None:
             remarks.append(line)

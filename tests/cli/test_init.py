@@ -60,7 +60,7 @@ def test_a_scene_alone_gets_a_configuration_without_a_photograph(folder: Path) -
     assert lamp in (folder / "room.yaml").read_text()
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2
-    assert "target.file: no such file" in missing.output
+    assert f"room.yaml: target.file: {folder / 'photo.png'}: no such file" in missing.output
     write_noise(folder / "photo.png", 8, 8)
     tiny.done("optimize", "room.yaml", "--set", "run.iterations=2", "--set", "integrator.estimator=stack")
     assert read_manifest(folder / "runs/room")["status"] == "finished"

@@ -152,17 +152,19 @@ def test_the_curvature_of_texels_that_share_a_pixel_is_that_of_moving_together()
     np.testing.assert_allclose(np.array(optimizer.moments()["p"]["3"]).ravel(), 201, rtol=1e-3)
 
 
-def in_the_valley(start, noise=0.0, bounds=(-2.0, 2.0), size=1.0, iterations=30, bright=()):
+def in_the_valley(start, noise=0.0, bounds=(-2.0, 2.0), size=1.0, iterations=30, bright=(), rare=0.0, seed=5):
     """Move two parameters along `VALLEY`. The measured curvature is `size` times the true one. The gradients of the
-    iterations `bright` are 1,000 times as large. Returns the values and the limits of the distance by iteration.
+    iterations `bright` are 1,000 times as large. One gradient in 20 is larger by `rare`, and the others are smaller, so
+    that their mean is the same. Returns the values and the limits of the distance by iteration.
     """
-    optimizer, random = make({"p": start[:1], "q": start[1:]}, bounds), np.random.default_rng(5)
+    optimizer, random = make({"p": start[:1], "q": start[1:]}, bounds), np.random.default_rng(seed)
     optimizer.block.bend(size * VALLEY)
     values, limits = [], []
     for iteration in range(iterations):
         x = np.array([float(np.array(optimizer[key])[0]) for key in ("p", "q")])
         gradients = VALLEY @ (x - BEST) + noise * random.normal(size=2)
         gradients *= 1000.0 if iteration in bright else 1.0
+        gradients += rare * ((random.random() < 0.05) - 0.05) if rare else 0.0
         for key, gradient in zip(("p", "q"), gradients, strict=True):
             optimizer.clear_gradient(key)
             # As a literal, each gradient would compile a kernel.
@@ -195,10 +197,25 @@ def test_a_measured_curvature_that_is_wrong_does_not_stop_the_run(size):
 @pytest.mark.long
 def test_the_limit_of_the_distance_along_a_valley_holds_under_noise():
     """Most of the noise moves the values along the valley. The limit has a confidence of 85 %."""
-    values, limits = in_the_valley(np.array([0.9, 0.9]), noise=1.0, iterations=300)
-    errors = np.abs(values - BEST)[50:]
-    assert errors[-50:].max() < 0.5 * errors[:50].max()
-    assert np.mean(errors < limits[50:]) > 0.7
+    first, last, covered = [], [], []
+    for seed in range(8):
+        values, limits = in_the_valley(np.array([0.9, 0.9]), noise=1.0, iterations=300, seed=seed)
+        errors = np.abs(values - BEST)[50:]
+        first.append(errors[:50].max())
+        last.append(errors[-50:].max())
+        covered.append(np.mean(errors < limits[50:]))
+    assert np.mean(last) < 0.5 * np.mean(first)
+    assert np.mean(covered) > 0.75, covered
+
+
+@pytest.mark.parametrize("rare", [3.0, 60.0])
+def test_the_limit_of_the_distance_holds_if_few_gradients_have_most_of_the_noise(rare):
+    """The limit has a confidence of 85 %. A gradient of 60 is longer than the longest step."""
+    covered = []
+    for seed in range(4):
+        values, limits = in_the_valley(np.array([0.9, 0.9]), noise=0.02, rare=rare, iterations=300, seed=seed)
+        covered.append(np.mean(np.abs(values - BEST)[100:] < limits[100:]))
+    assert np.mean(covered) > 0.75, covered
 
 
 def test_a_value_at_its_bound_does_not_lead_the_others_astray():
@@ -349,7 +366,7 @@ def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):
     problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=500"])
     *_, (state, record) = loop.iterate(problem, standing(problem))
     assert loop.LEAST_ITERATIONS < state.iteration < 60
-    assert state.stopped == "every parameter is within 2.5 % of the optimum"
+    assert state.stopped == "every parameter is within about 2.5 % of the optimum"
     assert np.abs(np.array(problem.optimizer["albedo"]) - 0.8).max() < 0.02
     assert record.lr == 1
 
