@@ -32,7 +32,7 @@ which light slides. With derivatives of edges, the light between two vertices is
 part near^2 / (r^2 + near^2) is differentiated with fixed directions, the other part with `stay` (`Plan.near`). Neither
 form has the derivative of visibility, which `edges.py` adds for the edges of moving shapes. Camera paths use the fixed
 directions only where the first of both vertices slides behind a specular vertex. Elsewhere, the part with fixed
-directions is wrong for a box that stands on a floor.
+directions is wrong for a box that stands on a floor, because `camera_edges.py` lacks the edges of this part.
 
 The stack starts with the first vertex that moves or whose BSDF has a parameter. Earlier vertices depend only on
 parameters of the emitter. The stack works as in `stack.py`. Here, T behind the last pushed vertex equals the roulette

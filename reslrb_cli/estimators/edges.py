@@ -16,7 +16,7 @@ Creases need this term, too. A crease is an edge between two flat-shaded faces t
 the light jumps there, because the faces have different normals. At a crease, x is a point on the second face.
 
 At the end of a light path, y is a place on the sensor, and x moves with the light that reaches it. L_x is the radiance
-from x. A camera walk estimates L_x. Light that reaches x from a lamp over a specular chain does not count here. This
+from x. A camera walk selects one contribution to L_x. Light that reaches x from a lamp over a specular chain does not count here. This
 light moves x in another way, and `chain_edges.py` has its edges.
 
     dL/dtheta  -=  w delta(u) L_x <v_p - s v_x, n>,    s = |p - y| / |x - y|
@@ -33,6 +33,16 @@ Other points move with their surface. v is the velocity of the surface, and n_x 
     v_x = u_x + l <v - u_x, n_x> / <l, n_x>   if light arrives directly from a lamp,   otherwise   v_x = v
 
 v_y is defined in the same way. x in the last formula always moves with its surface.
+
+A share h of the light between two near surfaces is differentiated with fixed directions (`Plan.near`). A fixed ray from
+y jumps between p and x, and moves with y. The last formula then becomes
+
+    dL/dtheta  +=  w h_p W_p <v_p - v_y, n>  -  w W_x <v_p - s (1 - h_x) v_x - (1 - s (1 - h_x)) v_y, n>
+
+At a crease, W_p and W_x have the factor h_p, and s is 0. A point x or y that this light reaches from a point z slides
+along the direction d of the light.
+
+    v_x = (1 - h) v  +  h (v_z + d <v - v_z, n_x> / <d, n_x>)
 
 If a shape touches the surface behind it, lamps and the sensor lose x at the same time. This light counts once, as seen
 from the lamps. If both surfaces end there, as at the corner of a room, each has an edge, and each edge counts half.
@@ -320,35 +330,33 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
 
 @dataclass
 class Pick:
-    """One contribution to the radiance from y, selected in proportion to its size (the largest channel).
+    """One contribution to the radiance from a point a, selected in proportion to its size (the largest channel).
 
     `L` (C,) is the radiance of the contribution divided by its size, and `total` is the sum of all sizes. `segments` is
-    the number of segments from the lamp to y. `direct` is 1 if the light arrives at y directly from a lamp; its
-    direction is then `towards`, and its lamp `emitter`. `n_y` is the normal at y. `counts` is 0 if y is specular.
+    the number of segments from the lamp `emitter` to a. `towards` is the direction to the lamp at the vertex next to
+    it. `n` is the normal at a, and `counts` is 0 if a is specular. z is the surface point from which other light
+    arrives at a: intersection `pi_z` of `ray_z`, with the normal `n_z`. `near` is the share of the light between z and
+    a that is differentiated with fixed directions (`Plan.near`). If `excludes`, light that arrives over a specular
+    chain does not count. `chain` is then 1 at a and behind a specular chain that begins at a.
     """
 
     L: mi.Spectrum
     total: mi.Float
     segments: mi.UInt32
-    direct: mi.Float
     towards: mi.Vector3f
     emitter: mi.EmitterPtr
-    n_y: mi.Vector3f
+    n: mi.Vector3f
     counts: mi.Float
     numbers: mi.PCG32
-
-    @staticmethod
-    def start(numbers: mi.PCG32) -> Pick:
-        """Return a selection among no contributions."""
-        return Pick(
-            L=mi.Spectrum(0), total=mi.Float(0), segments=mi.UInt32(0), direct=mi.Float(0), towards=mi.Vector3f(0),
-            emitter=dr.zeros(mi.EmitterPtr), n_y=mi.Vector3f(0), counts=mi.Float(1), numbers=numbers,
-        )  # fmt: skip
+    ray_z: mi.Ray3f
+    pi_z: mi.PreliminaryIntersection3f
+    n_z: mi.Vector3f
+    near: mi.Float
+    chain: list[mi.UInt32]
 
     def offered(
-        self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, direct: mi.Bool, towards: mi.Vector3f,
-        emitter: mi.EmitterPtr,
-    ) -> Pick:  # fmt: skip
+        self, L: mi.Spectrum, active: mi.Bool, segments: mi.UInt32, towards: mi.Vector3f, emitter: mi.EmitterPtr
+    ) -> Pick:
         """Return the selection after another contribution."""
         size = dr.select(active, dr.max(L), 0)
         total, number = self.total + size, self.numbers.next_float32()
@@ -358,88 +366,89 @@ class Pick:
             L=dr.select(takes, L / size, self.L),
             total=total,
             segments=dr.select(takes, segments, self.segments),
-            direct=dr.select(takes, dr.select(direct, mi.Float(1), 0), self.direct),
             towards=dr.select(takes, towards, self.towards),
             emitter=dr.select(takes, emitter, self.emitter),
         )
 
 
-def _carried_to(
-    samples: Samples, light: Pick, p: mi.Point3f, n: mi.Vector3f, adjoint: mi.Vector3f, active: mi.Bool
-) -> mi.Float:  # fmt: skip
-    """Return <p, `adjoint`>. p is the point where `light` arrives at a surface with the normal `n`. p moves with the
-    light's ray. It also slides along the ray, so that it stays in the surface.
-    """
-    towards = light.towards
-    offset = ray_offset(p)
-    cos = dr.dot(n, towards)
-    adjoint = adjoint - n * dr.select(cos != 0, dr.dot(adjoint, towards) / cos, 0)
-    return _carried(samples, light.emitter, mi.Ray3f(p + dr.mulsign(n, cos) * offset, towards), adjoint, active)
-
-
-@dataclass
-class Arrived:
-    """Radiance from x (C,), in three sums.
-
-    `all` is the whole radiance. `slid` is the radiance of light that arrives at x directly from a lamp, times
-    <v_x, n> / <v, n_x>. `rest` is the radiance of other light. `counts` is 0 if x is specular, because light paths do
-    not connect from specular surfaces. `n_x` is the normal at x. If a lamp moves, `direct` is one contribution of light
-    that arrives at x directly. `chain` is 1 at x and behind a specular chain that begins at x, and 0 elsewhere. It is
-    empty without mirrors and glass.
+class PickLight(CameraHooks):
+    """Hooks that select one contribution to the radiance from the first point. Emission of a lamp there counts if
+    `emits` is true. `near` is that of the plan of the paths whose derivative lacks the edges.
     """
 
-    all: mi.Spectrum
-    slid: mi.Spectrum
-    rest: mi.Spectrum
-    counts: mi.Float
-    n_x: mi.Vector3f
-    direct: list[Pick]
-    chain: list[mi.UInt32]
+    def __init__(self, numbers: mi.PCG32, near: float = 0, emits: bool = False, excludes: bool = False) -> None:
+        self.numbers, self.near, self.emits, self.excludes = numbers, near, emits, excludes
 
-
-class Behind(CameraHooks):
-    """Hooks that sum the radiance from x. `normal` is the normal of the outline. `numbers` is None if no lamp moves. If
-    `excludes` is true, light that arrives at x over a specular chain does not count.
-    """
-
-    def __init__(self, normal: mi.Vector3f, numbers: mi.PCG32 | None, excludes: bool) -> None:
-        self.normal, self.numbers, self.excludes = normal, numbers, excludes
-
-    def start(self, first: FilmRay) -> Arrived:
-        direct = [] if self.numbers is None else [Pick.start(self.numbers)]
-        chain = [mi.UInt32(1)] if self.excludes else []
-        return Arrived(mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Vector3f(0), direct, chain)
+    def start(self, first: FilmRay) -> Pick:
+        return Pick(
+            L=mi.Spectrum(0), total=mi.Float(0), segments=mi.UInt32(0), towards=mi.Vector3f(0),
+            emitter=dr.zeros(mi.EmitterPtr), n=mi.Vector3f(0), counts=mi.Float(1), numbers=self.numbers,
+            ray_z=dr.zeros(mi.Ray3f), pi_z=dr.zeros(mi.PreliminaryIntersection3f), n_z=mi.Vector3f(0),
+            near=mi.Float(0), chain=[mi.UInt32(1)] if self.excludes else [],
+        )  # fmt: skip
 
     def vertex(
-        self, state: Arrived, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
-    ) -> Arrived:  # fmt: skip
+        self, state: Pick, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
+    ) -> Pick:  # fmt: skip
         P, first = vertex.product.value() * state.counts, vertex.depth == 1
-        n_x = dr.select(first, mi.Vector3f(vertex.si.n), state.n_x)
-        total, slid, rest, picked = state.all, state.slid, state.rest, state.direct
-
-        def slope(towards: mi.Vector3f) -> mi.Float:
-            cos = dr.dot(n_x, towards)
-            return dr.select(cos != 0, dr.dot(self.normal, towards) / cos, 0)  # no surface: 0
-
+        n = mi.Vector3f(vertex.si.n)
         if met is not None:
-            L = dr.select(met.active, P * met.Le * met.weight, 0)
-            direct = vertex.depth == 2
+            L, active = P * met.Le * met.weight, met.active
+            if not self.emits:
+                active &= ~first
             for behind in state.chain:
-                L = dr.select((behind != 0) & (vertex.depth > 2), 0, L)
-            total = total + L
-            slid = slid + dr.select(direct, L * slope(vertex.ray.d), 0)
-            rest = rest + dr.select(direct, 0, L)
-            picked = [one.offered(L, direct, vertex.depth, direct, vertex.ray.d, met.emitter) for one in picked]
+                active &= (behind == 0) | (vertex.depth <= 2)
+            state = state.offered(L, active, vertex.depth - 1, vertex.ray.d, met.emitter)
+        state = replace(state, n=dr.select(first, n, state.n))
+        if self.near > 0:
+            z, square = vertex.depth == 2, self.near**2
+            share = square / (dr.squared_norm(vertex.si.p - vertex.ray.o) + square)
+            state = replace(
+                state,
+                ray_z=dr.select(z, vertex.ray, state.ray_z),
+                pi_z=dr.select(z, vertex.pi, state.pi_z),
+                n_z=dr.select(z, n, state.n_z),
+                near=dr.select(z, share, state.near),
+            )
         if event is not None:
-            L = dr.select(event.active, P * event.c, 0)
-            total = total + L
-            slid = slid + dr.select(first, L * slope(event.ds.d), 0)
-            rest = rest + dr.select(first, 0, L)
-            emitter = event.ds.emitter
-            picked = [one.offered(L, first, vertex.depth, first, event.ds.d, emitter) for one in picked]
-        counts = dr.select(first & scattering.is_delta, 0, state.counts)
+            state = state.offered(P * event.c, event.active, vertex.depth, event.ds.d, event.ds.emitter)
         chain = [dr.select(first | (behind != 0) & scattering.is_delta, behind, 0) for behind in state.chain]
-        return Arrived(total, slid, rest, counts, n_x, picked, chain)
+        return replace(state, counts=dr.select(first & scattering.is_delta, 0, state.counts), chain=chain)
+
+
+def _along(adjoint: mi.Vector3f, n: mi.Vector3f, towards: mi.Vector3f) -> mi.Vector3f:
+    """Return the adjoint of the surface below a point. The point slides along `towards` and has this `adjoint`. `n` is
+    the normal of the surface.
+    """
+    cos = dr.dot(n, towards)
+    return n * dr.select(cos != 0, dr.dot(adjoint, towards) / cos, 0)
+
+
+def _moved_by_light(
+    samples: Samples, light: Pick, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, adjoint: mi.Vector3f,
+    active: mi.Bool,
+) -> mi.Float:  # fmt: skip
+    """Return <a, `adjoint`> with the derivative of the point a, the intersection `pi` of `ray`. a moves as light paths
+    move it with the contribution `light`. Call the function under `dr.resume_grad()`.
+    """
+    at_a, direct = adjoint, light.segments == 1
+    place, n, arriving = ray(pi.t), light.n, adjoint
+    moved = mi.Float(0)
+    if samples.plan.near > 0:
+        follows = light.segments > 1
+        at_z = dr.select(follows, light.near * (adjoint - _along(adjoint, light.n, light.ray_z.d)), 0)
+        at_a, near = adjoint - at_z, follows & (light.segments == 2)
+        place, n = dr.select(near, light.ray_z(light.pi_z.t), place), dr.select(near, light.n_z, n)
+        arriving, direct = dr.select(near, at_z, adjoint), direct | near
+        at_z = dr.select(near, _along(at_z, n, light.towards), at_z)
+        moved += moved_by(light.pi_z, light.ray_z, at_z, active & follows & light.pi_z.is_valid())
+    at_a = dr.select(light.segments == 1, _along(adjoint, light.n, light.towards), at_a)
+    moved += moved_by(pi, ray, at_a, active)
+    if samples.plan.moving_emission:
+        there = mi.Ray3f(place + dr.mulsign(n, dr.dot(n, light.towards)) * ray_offset(place), light.towards)
+        carried = arriving - _along(arriving, n, light.towards)
+        moved += _carried(samples, light.emitter, there, carried, active & direct)
+    return moved
 
 
 def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
@@ -454,47 +463,23 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     # once, as seen from the lamps.
     touches = touches_behind(outline, beside)
     beside.active = beside.active & ~touches
-    moves, needs = samples.plan.moving_emission, samples.plan.needs
-    behind = Behind(n, numbers if moves else None, excludes=needs.has_delta_lobes and not moves)
-    _, L = camera_walk(samples, behind, beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
-    weight = p.delta(outline.view.u, beside.active, behind.colours) * outline.weight * p.scale
-    still, slid, rest = (showing(dr.dot(weight, part)) for part in (L.all, L.slid, L.rest))
-    active = beside.active & (still != 0)
+    plan = samples.plan
+    excludes = bool(plan.needs.has_delta_lobes) and not plan.moving_emission
+    hooks = PickLight(numbers, p.plan.near, emits=True, excludes=excludes)
+    _, light = camera_walk(samples, hooks, beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
+    weight = p.delta(outline.view.u, beside.active, hooks.colours) * outline.weight * p.scale
+    size = showing(dr.dot(weight, light.L) * light.total)
+    active = beside.active & (size != 0)
     s = outline.view.distance / dr.norm(beside.past.o + beside.past.d * x.t - outline.view.y)
-    moves = active & x.is_valid()
-    at_x = dr.select(moves, s * (slid * L.n_x + rest * n), 0)  # s is NaN if the ray leaves the scene
+    behind = active & x.is_valid()
+    at_x = dr.select(behind, (s * size) * n, 0)  # s is NaN if the ray leaves the scene
     with dr.resume_grad(), dr.isolate_grad():
-        moved = moved_by(beside.pi, beside.over, -still * n, active) + moved_by(x, beside.past, at_x, moves)
-        for one in L.direct:
-            size = dr.select(moves, s * showing(dr.dot(weight, one.L) * one.total), 0)
-            moved += _carried_to(samples, one, beside.past(x.t), L.n_x, size * n, moves)
+        moved = moved_by(beside.pi, beside.over, -size * n, active)
+        moved += _moved_by_light(samples, light, x, beside.past, at_x, behind)
         dr.backward_from(moved, flags=MAY_LACK)
 
 
 # ---- Between two surfaces ----
-
-
-class PickLight(CameraHooks):
-    """Hooks that select one contribution to the radiance from y. Emission of a lamp at y is left out."""
-
-    def __init__(self, numbers: mi.PCG32) -> None:
-        self.numbers = numbers
-
-    def start(self, first: FilmRay) -> Pick:
-        return Pick.start(self.numbers)
-
-    def vertex(
-        self, state: Pick, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
-    ) -> Pick:  # fmt: skip
-        P, first = vertex.product.value() * state.counts, vertex.depth == 1
-        state = replace(state, n_y=dr.select(first, mi.Vector3f(vertex.si.n), state.n_y))
-        if met is not None:
-            L, active = P * met.Le * met.weight, met.active & ~first
-            direct = vertex.depth == 2
-            state = state.offered(L, active, vertex.depth - 1, direct, vertex.ray.d, met.emitter)
-        if event is not None:
-            state = state.offered(P * event.c, event.active, vertex.depth, first, event.ds.d, event.ds.emitter)
-        return replace(state, counts=dr.select(first & scattering.is_delta, 0, state.counts))
 
 
 @dataclass
@@ -511,10 +496,10 @@ class Between:
     active: mi.Bool
 
 
-def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
-    """Return a random outline for each lane, seen from a random direction."""
+def sample_between(samples: Samples, numbers: mi.PCG32, creases: bool = False) -> Between:
+    """Return a random outline for each lane, seen from a random direction. With `creases`, creases count, too."""
     assert samples.edges is not None
-    outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers))
+    outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers), creases)
     offset = ray_offset(outline.p)
     # If the shape stands on a surface, the point beside the edge may lie below this surface. The ray starts above it.
     start = outline.p + outline.normal * (BESIDE * offset) + outline.view.to_y * (ABOVE * offset)
@@ -523,32 +508,39 @@ def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
     outline.active = outline.active & y.is_valid()
     distance = y.t + ABOVE * offset
     outline.view.distance = distance
-    beside = both_sides(samples, outline)
+    beside = both_sides(samples, outline, creases, everywhere=True)
     s = distance / (distance + beside.x.t - AROUND * offset)
     return Between(outline, beside, back, y, s, beside.active & beside.x.is_valid())
 
 
 def _between(p: Pass, numbers: mi.PCG32) -> None:
-    """Add the derivatives of outlines on segments between two surfaces. The first surface is not specular."""
-    samples = p.samples
-    between = sample_between(samples, numbers)
+    """Add the derivatives of outlines and creases on segments between two surfaces. The first surface is not specular.
+
+    Light continues from p or from x. At an outline, all light of x is lost, and light of p has the share `at_p`. At a
+    crease, the light of both has this share.
+    """
+    samples, near = p.samples, p.plan.near
+    between = sample_between(samples, numbers, creases=near > 0)
     outline, beside, back, y = between.outline, between.beside, between.back, between.y
-    n, x, s, active = outline.normal, beside.x, between.s, between.active
-    _, found = camera_walk(
-        for_camera(samples), PickLight(numbers), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
+    n, x, s, active, crease = outline.normal, beside.x, between.s, between.active, outline.crease
+    _, light = camera_walk(
+        for_camera(samples), PickLight(numbers, near), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
     )
-    total = showing(found.total)
-    weight = outline.weight * found.L * (total * share_of(samples, outline, beside))
-    emission = Emission(beside.past, weight, dr.zeros(mi.EmitterPtr))
-    W = showing(walk(samples, Contribution(p), active & (total > 0), emission, found.segments + 1)[0] * p.scale)
+    weight = outline.weight * light.L * (light.total * share_of(samples, outline, beside))
+    start, over = beside.past, mi.Bool(False)
+    if near > 0:
+        r = outline.view.distance
+        share, share_x = near**2 / (dr.square(r) + near**2), near**2 / (dr.square(r / s) + near**2)
+        both = share + dr.select(crease, share, 1)
+        over = numbers.next_float32() * both < share
+        weight, start = weight * both, dr.select(over, beside.over, beside.past)
+        s = dr.select(over | crease, 0, s * (1 - share_x))
+    emission = Emission(start, weight, dr.zeros(mi.EmitterPtr))
+    walked = walk(samples, Contribution(p), active & (light.total > 0), emission, light.segments + 1)
+    W = showing(walked[0] * p.scale) * dr.select(over, -1, 1)
     active = active & (W != 0)
-    slope = dr.select(found.direct != 0, dr.dot(n, found.towards) / dr.dot(found.n_y, found.towards), 0)
-    at_y = dr.select(active, (W * (1 - s)) * dr.select(found.direct != 0, slope * found.n_y, n), 0)
-    at_x = dr.select(active, (W * s) * n, 0)
+    at_x, at_y = (dr.select(active, (W * part) * n, 0) for part in (s, 1 - s))
     with dr.resume_grad(), dr.isolate_grad():
-        moved = moved_by(beside.pi, beside.over, -W * n, active)
-        moved += moved_by(x, beside.past, at_x, active) + moved_by(y, back, at_y, active)
-        if samples.plan.moving_emission:
-            direct = active & (found.direct != 0)
-            moved += _carried_to(samples, found, back(y.t), found.n_y, (W * (1 - s)) * n, direct)
+        moved = moved_by(beside.pi, beside.over, -W * n, active) + moved_by(x, beside.past, at_x, active)
+        moved += _moved_by_light(samples, light, y, back, at_y, active)
         dr.backward_from(moved, flags=MAY_LACK)

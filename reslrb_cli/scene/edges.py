@@ -318,21 +318,26 @@ def angle_between(first: mi.Vector3f, second: mi.Vector3f) -> mi.Float:
 
 
 def outline_direction(
-    along: mi.Vector3f, c: mi.Vector3f, d: mi.Vector3f, numbers: mi.Point2f
+    along: mi.Vector3f, c: mi.Vector3f, d: mi.Vector3f, numbers: mi.Point2f, creases: Any = 0
 ) -> tuple[mi.Vector3f, mi.Float]:  # fmt: skip
-    """Return a random direction that sees a point of a segment as an outline, and its density per solid angle.
+    """Return a random direction from a point of a segment, and its density per solid angle.
 
+    The share `creases` of the directions sees both faces of the segment, or none. The others see it as an outline.
     `along` is the direction of the segment. `c` and `d` lead from the point to the third corners of the two faces.
     """
     angle, x = turned(along, c, d), across(along, c)
     y = dr.cross(along, x)
     y = dr.mulsign(y, dr.dot(y, d))  # the second face is on this side
-    rest = dr.pi - angle
-    turn = 2 * rest * numbers.y
-    turn += dr.select(turn < rest, angle, 2 * angle)
+    outlines = numbers.y >= creases
+    share = dr.select(outlines, 1 - creases, creases)
+    number = 2 * (numbers.y - dr.select(outlines, creases, 0)) / share
+    # The four ranges end at the faces' directions 0 and `angle`, and at the opposite ones.
+    opposite, first = number >= 1, dr.select(outlines, angle, 0)
+    width = dr.select(outlines, dr.pi - angle, angle)
+    turn = first + dr.select(opposite, dr.pi, 0) + width * (number - dr.select(opposite, 1, 0))
     cos = 2 * numbers.x - 1
     sin, (s, t) = dr.safe_sqrt(1 - dr.square(cos)), dr.sincos(turn)
-    return along * cos + sin * (x * t + y * s), dr.rcp(4 * rest)
+    return along * cos + sin * (x * t + y * s), share / (4 * width)
 
 
 def welded_edges(positions: Array, faces: Array) -> Array:

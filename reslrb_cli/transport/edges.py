@@ -23,6 +23,8 @@ from reslrb_cli.transport.sobol import evenly, unit
 
 #: Sampling weight of an edge that no probe sees as an outline, relative to an outline of the same length.
 UNLIKELY = 0.02
+#: Share of random directions that see an edge as a crease, if it can be one.
+CREASES = 0.2
 #: Number of points on the lamps that probe whether an edge is an outline.
 PROBES = 4
 #: Stream of random numbers, mixed into the seed.
@@ -153,7 +155,8 @@ def sample_outline(
     if there are any.
     """
     table, only_hide = samples.edges, _occluders_only_hide(samples)
-    kinds = edge_kinds(samples.plan.edged + (() if creases and only_hide else samples.plan.occluders))
+    first = creases and view is not None  # rays that start a path
+    kinds = edge_kinds(samples.plan.edged + (() if first and only_hide else samples.plan.occluders))
     assert table is not None
     (row, probability), place = pick(weights, chances.edge), chances.place
     kind = dr.gather(mi.UInt32, table.kind, row)
@@ -169,7 +172,7 @@ def sample_outline(
         is_round = kind != SEGMENT
         p = dr.select(kind == SPHERE, a, dr.select(kind == TUBE, dr.lerp(a, b, 0.5), p))
     if view is None:
-        view = _view_from_anywhere(table, kinds, row, kind, along, p, chances)
+        view = _view_from_anywhere(table, kinds, row, kind, along, p, chances, creases)
         if only_hide:
             view = _towards_balls(table, row, view, chances)
     seen = view(p, active)
@@ -309,15 +312,18 @@ def _hides_ball(samples: Samples, table: EdgeTable, middle: mi.Point3f, viewer: 
 
 def _view_from_anywhere(
     table: EdgeTable, kinds: frozenset[int], row: mi.UInt32, kind: mi.UInt32, along: mi.Vector3f, p: mi.Point3f,
-    chances: Chances,
+    chances: Chances, creases: bool,
 ) -> Viewer:  # fmt: skip
     """Return the view of an edge from a random direction, uniform in solid angle. For a segment, the directions are
-    limited to those that see the segment as an outline.
+    limited to those that see the segment as an outline, and with `creases` to those that see it as a crease.
     """
     to_y, density = mi.warp.square_to_uniform_sphere(chances.viewpoint), mi.Float(dr.inv_four_pi)
     if SEGMENT in kinds:
         c, d = dr.gather(mi.Point3f, table.c, row) - p, dr.gather(mi.Point3f, table.d, row) - p
-        own_to_y, own_density = outline_direction(along, c, d, chances.viewpoint)
+        own_to_y, own_density = outline_direction(
+            along, c, d, chances.viewpoint,
+            dr.select(dr.gather(mi.Float, table.crease, row) > 0, mi.Float(CREASES), 0) if creases else mi.Float(0),
+        )  # fmt: skip
         here = kind == SEGMENT
         to_y, density = dr.select(here, own_to_y, to_y), dr.select(here, own_density, density)
 

@@ -327,7 +327,7 @@ BOTH = {"paths": "both"}
 RECORDED = [
     EdgeCase("flat", "area"), EdgeCase("sphere", "near"), EdgeCase("box", "sphere_lamp"),
     EdgeCase("sphere", "point", spp=512), EdgeCase("rectangle", "spot"), EdgeCase("cylinder", "directional", spp=2048),
-    standing("front", 2, spp=512), standing("room", 3, spp=1024), EdgeCase("two", "area", 3),
+    standing("front", 2, spp=512), standing("room", 3, spp=1024, reference_spp=16384), EdgeCase("two", "area", 3),
     EdgeCase("box", "indirect", 3, spp=512, reference_spp=8192), EdgeCase("sphere", "room", 5),
     EdgeCase("hidden", "point", spp=1024, reference_spp=8192, step=SMALLEST),
     EdgeCase("reflector", "upward", 3, spp=512, reference_spp=8192),
