@@ -16,8 +16,8 @@ Creases need this term, too. A crease is an edge between two flat-shaded faces t
 the light jumps there, because the faces have different normals. At a crease, x is a point on the second face.
 
 At the end of a light path, y is a place on the sensor, and x moves with the light that reaches it. L_x is the radiance
-from x. A camera walk selects one contribution to L_x. Light that reaches x from a lamp over a specular chain does not count here. This
-light moves x in another way, and `chain_edges.py` has its edges.
+from x. A camera walk selects one contribution to L_x. Light that reaches x from a lamp over a specular chain does not
+count here. This light moves x in another way, and `chain_edges.py` has its edges.
 
     dL/dtheta  -=  w delta(u) L_x <v_p - s v_x, n>,    s = |p - y| / |x - y|
 
