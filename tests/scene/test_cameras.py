@@ -104,7 +104,7 @@ def test_images_of_the_cameras_are_the_targets(folder):
     problem = make(folder, "transforms.json", "held_out: [b], ")
     assert [view.sensor for view in problem.trained] == [0]
     (folder / "b.exr").unlink()
-    with pytest.raises(ConfigError, match=r"tiny.yaml: scene.cameras: no such file"):
+    with pytest.raises(ConfigError, match=r"tiny.yaml: scene.cameras: .*b\.exr: no such file"):
         make(folder, "transforms.json")
 
 
