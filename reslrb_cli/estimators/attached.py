@@ -120,6 +120,13 @@ def find_following_vertex(
     return si, reaching, dr.select(active & (measure > 0), measure / dr.detach(measure), 1)
 
 
+def near_share(near: Any, squared_distance: mi.Float) -> mi.Float:
+    """Return the share of the light between two vertices that is differentiated with fixed directions. `near` is the
+    square of `Plan.near`.
+    """
+    return near / (squared_distance + near)
+
+
 def reach(
     plan: Plan, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool,
     parameters: bool = True,
@@ -143,7 +150,7 @@ def reach(
     changed = mi.Spectrum(dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1)) * factor
     if plan.near > 0:
         near = dr.select(before[0].stays == 2, plan.near**2, 0) if plan.camera else plan.near**2
-        shares = [near / (dr.squared_norm(place - ray.o) + near) for place in (stayed.p, slid.p)]
+        shares = [near_share(near, dr.squared_norm(place - ray.o)) for place in (stayed.p, slid.p)]
         share = dr.detach(shares[0])
         changed = 1 + (changed - 1) * (1 - share) + (shares[1] - shares[0])
         stayed = _blend(stayed, slid, share)

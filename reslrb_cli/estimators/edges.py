@@ -60,6 +60,7 @@ from operator import or_
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.estimators.attached import near_share
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.scene.rays import ray_offset
@@ -401,8 +402,7 @@ class PickLight(CameraHooks):
             state = state.offered(L, active, vertex.depth - 1, vertex.ray.d, met.emitter)
         state = replace(state, n=dr.select(first, n, state.n))
         if self.near > 0:
-            z, square = vertex.depth == 2, self.near**2
-            share = square / (dr.squared_norm(vertex.si.p - vertex.ray.o) + square)
+            z, share = vertex.depth == 2, near_share(self.near**2, dr.squared_norm(vertex.si.p - vertex.ray.o))
             state = replace(
                 state,
                 ray_z=dr.select(z, vertex.ray, state.ray_z),
@@ -530,7 +530,7 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     start, over = beside.past, mi.Bool(False)
     if near > 0:
         r = outline.view.distance
-        share, share_x = near**2 / (dr.square(r) + near**2), near**2 / (dr.square(r / s) + near**2)
+        share, share_x = (near_share(near**2, dr.square(distance)) for distance in (r, r / s))
         both = share + dr.select(crease, share, 1)
         over = numbers.next_float32() * both < share
         weight, start = weight * both, dr.select(over, beside.over, beside.past)

@@ -132,6 +132,7 @@ class Block:
         step[free] = -(inverse @ A @ Y[free]) / root[free]
         error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
         distance = np.abs(step) + SURE * error
+        # The first gradient has no predecessor, so it says nothing about the noise.
         fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0]
         rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
         change = np.clip(step, -now.longest, now.longest)

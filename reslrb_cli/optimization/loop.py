@@ -114,7 +114,7 @@ def close_enough(problem: Problem, iteration: int) -> str:
         return ""
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
         extent = optimizer.extent(key)
-        value = 1.0 / extent if optimizer.variable(key).transform else rms(problem.selection.array(key)) / extent
+        value = (1.0 if optimizer.variable(key).transform else rms(problem.selection.array(key))) / extent
         distance, limit = optimizer.to_go(key), CLOSE * max(value, LEAST_SHARE)
         if distance > limit or (AVERAGED * distance > limit and optimizer.averaged(key) < AVERAGED):
             return ""
