@@ -1,4 +1,4 @@
-"""Statistics that several modules share."""
+"""Statistics and transforms of arrays that several modules share."""
 
 from __future__ import annotations
 
@@ -19,9 +19,27 @@ def jackknife_variance(without: Array) -> Array:
     return np.asarray((count - 1) / count * np.sum(np.square(without - without.mean(axis=0)), axis=0))
 
 
+def special() -> Any:
+    """Return `scipy.special`. Its import takes 0.2 s, and most runs need it only at their end."""
+    import scipy.special
+
+    return scipy.special
+
+
 def rms(values: Array) -> float:
     """Return the root mean square of all entries, in double precision."""
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+
+
+def scale_frequencies(values: Array, factors: Array) -> Array:
+    """Return images (..., H, W, C) with their cosine series over rows and columns multiplied by `factors`.
+
+    A cosine series is even at the borders.
+    """
+    from scipy.fft import dctn, idctn  # imported here, because it imports `scipy.special`
+
+    spectrum = dctn(values, axes=(-3, -2), norm="ortho")
+    return np.asarray(idctn(spectrum * factors, axes=(-3, -2), norm="ortho"))
 
 
 def sum_of_squares(values: Array) -> float:

@@ -180,10 +180,11 @@ def test_a_planted_violation_is_found(tmp_path: Path, file: str, source: str, se
     assert bool(violations(tmp_path)) is seen
 
 
-def test_importing_the_package_and_the_configuration_loads_no_mitsuba() -> None:
+def test_packages_are_imported_where_they_are_needed() -> None:
     heavy = "{'mitsuba', 'drjit', 'matplotlib', 'numpy'}"
     script = f"import sys, reslrb_cli\nassert not ({heavy} | {{'click', 'pydantic'}}) & set(sys.modules)\n"
     script += f"import reslrb_cli.config.loader\nassert not {heavy} & set(sys.modules)"
+    script += "\nimport reslrb_cli.runs.recorder\nassert not {'matplotlib', 'scipy.special'} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

@@ -38,9 +38,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 from reslrb_cli.records.measurements import Comparison, Verdict
+from reslrb_cli.statistics import special
 
 #: Probability that a comparison of two equal expectations fails, for each of its two criteria. Seeds are fixed, so a
 #: test that passes once always passes.
@@ -90,14 +90,14 @@ def _smaller_scores(mean: np.ndarray, var: np.ndarray, spread: np.ndarray, floor
 
 def _normal_scores(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Return the standard normal z that has the same probability as Student's t."""
-    z = -np.sign(t) * special.ndtri(special.stdtr(np.minimum(freedom, 1e6), -np.abs(t)))
+    z = -np.sign(t) * special().ndtri(special().stdtr(np.minimum(freedom, 1e6), -np.abs(t)))
     # Beyond the resolution of doubles, the t distribution decides.
     return np.where(np.isfinite(z), z, t)
 
 
 def sidak(count: int, alpha: float = ALPHA) -> float:
     """Return the |z| that the largest of `count` independent normal deviates exceeds with probability `alpha`."""
-    return float(-special.ndtri(-np.expm1(np.log1p(-alpha) / count) / 2))
+    return float(-special().ndtri(-np.expm1(np.log1p(-alpha) / count) / 2))
 
 
 def combined_z_rms(z: np.ndarray) -> float:
@@ -109,7 +109,7 @@ def z_rms_limit(count: float, alpha: float = ALPHA) -> float:
     """Return a limit for the root mean square of `count` independent normal deviates. They exceed it with probability
     `alpha`.
     """
-    return float(np.sqrt(special.chdtri(count, alpha) / count))
+    return float(np.sqrt(special().chdtri(count, alpha) / count))
 
 
 def effective_entries(samples: np.ndarray) -> float:
@@ -353,7 +353,7 @@ def _detectable(standard_error: np.ndarray, bias: Any, expected: np.ndarray, fam
     seen = np.abs(expected) > 0
     if not seen.any():
         return np.inf
-    needed = (family.z_max_limit + float(special.ndtri(POWER))) * standard_error + bias
+    needed = (family.z_max_limit + float(special().ndtri(POWER))) * standard_error + bias
     return float((needed[seen] / np.abs(expected[seen])).min())
 
 

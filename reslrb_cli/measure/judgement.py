@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import special
 
 from reslrb_cli.measure.comparison import (
     ROUNDING,
@@ -45,7 +44,7 @@ from reslrb_cli.records.measurements import (
     ReferenceRecord,
     Verdict,
 )
-from reslrb_cli.statistics import jackknife_variance
+from reslrb_cli.statistics import jackknife_variance, special
 
 #: Remark on noise with heavy tails.
 HEAVY = "single steps dominate the variance: the intervals are too narrow; take more steps"
@@ -71,7 +70,7 @@ class JackknifeEstimate:
 
     def interval(self) -> Range:
         """Return the interval by Student's t."""
-        half = float(special.stdtrit(min(self.freedom, 1e6), (1 + CONFIDENCE) / 2)) * self.error
+        half = float(special().stdtrit(min(self.freedom, 1e6), (1 + CONFIDENCE) / 2)) * self.error
         return Range(self.value, self.value - half, self.value + half)
 
     def exponential(self) -> Range:

@@ -21,13 +21,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.fft import dctn, idctn
 
 from reslrb_cli.config.code import guarded, load_named
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.optimizers import Custom
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.statistics import scale_frequencies
 
 #: A loss with bound options, as a function of an image, its target, and optional weights.
 Loss = Callable[..., "mi.Float"]
@@ -127,11 +127,9 @@ class _Blur(dr.CustomOp):
         return self._blurred(image)
 
     def _blurred(self, image: mi.TensorXf) -> mi.TensorXf:
-        # A cosine series is even at the borders, and each of its terms decays by itself.
         decay = [np.exp(-0.5 * np.square(np.pi * self.sigma / size * np.arange(size))) for size in image.shape[:2]]
         factors = np.multiply.outer(*decay)[:, :, None].astype(np.float32)
-        series = dctn(np.array(image), axes=(0, 1), norm="ortho") * factors
-        return mi.TensorXf(np.ascontiguousarray(idctn(series, axes=(0, 1), norm="ortho")))
+        return mi.TensorXf(np.ascontiguousarray(scale_frequencies(np.array(image), factors)))
 
     def backward(self) -> None:
         self.set_grad_in("image", self._blurred(self.grad_out()))

@@ -24,9 +24,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
-from reslrb_cli.statistics import Array
+from reslrb_cli.statistics import Array, special
 
 #: Shorter series are not judged, and this is the minimum number of losses for a level at the start or the end.
 LEAST_ITERATIONS, LEAST_WINDOW = 20, 5
@@ -91,7 +90,7 @@ def find_trend(values: Sequence[float]) -> Trend | None:
     half_trend = find_trend(series[count // 2 :].tolist())
     late = None if half_trend is None else half_trend.change
     start, end = _level(series[:width]), _level(series[-width:])
-    leap = float(stdtrit(width - 1, CONFIDENCE)) * end.error * math.sqrt(width + 1)
+    leap = float(special().stdtrit(width - 1, CONFIDENCE)) * end.error * math.sqrt(width + 1)
     if series[0] < min(series[1:].min(), end.mean - leap):
         return Trend(Level(float(series[0]), end.error * math.sqrt(width)), end, Change.ROSE, late)
     ranks = _ranks(series)
@@ -124,7 +123,7 @@ def window(iterations: int) -> int:
 
 def _rises(values: Array, at: Array | None = None, chance: float = (1 - CONFIDENCE) / 2) -> bool:
     slope, error = line(values, at)
-    return bool(slope > -stdtrit(values.size - 2, chance) * error)
+    return bool(slope > -special().stdtrit(values.size - 2, chance) * error)
 
 
 def _apart(first: Array, last: Array, chance: float = (1 - CONFIDENCE) / 2) -> int:

@@ -28,10 +28,9 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-import scipy.fft
 
 from reslrb_cli.backend.memory import flat
-from reslrb_cli.statistics import Array, rms
+from reslrb_cli.statistics import Array, rms, scale_frequencies
 
 Bounds = tuple[float, float] | None
 
@@ -102,8 +101,7 @@ class Smoother:
 
     def _scaled(self, value: Any, factors: Array) -> Any:
         array = np.array(dr.detach(value), dtype=np.float64)
-        spectrum = scipy.fft.dctn(array.reshape(self._shape), axes=(0, 1), norm="ortho")
-        result = np.asarray(scipy.fft.idctn(spectrum * factors, axes=(0, 1), norm="ortho"))
+        result = scale_frequencies(array.reshape(self._shape), factors)
         return type(value)(result.reshape(array.shape).astype(np.float32))
 
 

@@ -28,7 +28,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.special import stdtrit
 
 from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
 from reslrb_cli.integrators.protocol import Job
@@ -40,7 +39,7 @@ from reslrb_cli.optimization.sensitivity import finite, sample_gradient, take_gr
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes
 from reslrb_cli.seeds import seed
-from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
+from reslrb_cli.statistics import Array, jackknife_variance, special, sum_of_squares
 
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
@@ -118,7 +117,7 @@ def compare(
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
     advantage = math.exp(known[0][0] - known[1][0]) * times
     variance = sum(float(jackknife_variance(each[1])) for each in known if each is not None)
-    half = float(stdtrit(min(len(own), len(other)) - 1, (1 + confidence) / 2)) * math.sqrt(variance)
+    half = float(special().stdtrit(min(len(own), len(other)) - 1, (1 + confidence) / 2)) * math.sqrt(variance)
     factor = math.exp(min(half, 50.0)) * TIMING_NOISE
     return advantage, advantage / factor, advantage * factor
 

@@ -43,7 +43,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import scipy.fft
 
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.optimization.loading import make_configured, paths_of, render_in_passes
@@ -51,7 +50,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import see_images, take_gradient, unrecorded
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.seeds import seed
-from reslrb_cli.statistics import Array, rms
+from reslrb_cli.statistics import Array, rms, scale_frequencies
 
 _PURPOSE = "curvature"
 #: Largest number of entries that are examined one by one.
@@ -222,9 +221,8 @@ class EntryCurvature:
         eigenvalues = self._eigenvalues(root)
         kept = eigenvalues > LEAST_EIGENVALUE
         images = (gradients * root).reshape(-1, *self.shape)
-        spectrum = scipy.fft.dctn(images, axes=(1, 2), norm="ortho")
-        spectrum *= (kept / np.maximum(eigenvalues, LEAST_EIGENVALUE))[:, :, None]
-        offsets = scipy.fft.idctn(spectrum, axes=(1, 2), norm="ortho").reshape(gradients.shape) * root
+        factors = (kept / np.maximum(eigenvalues, LEAST_EIGENVALUE))[:, :, None]
+        offsets = scale_frequencies(images, factors).reshape(gradients.shape) * root
         return offsets, h, 1 - float(kept.mean())
 
     def _eigenvalues(self, root: Array) -> Array:

@@ -32,9 +32,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import stdtrit
 
-from reslrb_cli.statistics import Array
+from reslrb_cli.statistics import Array, special
 
 #: A distance of this many standard errors is significant; the same for gradients.
 SURE = 2.0
@@ -213,7 +212,7 @@ def joint(gradients: Array, offsets: Array, scale: Array, curvature: Array, fixe
         of_target * scale,
         alone * scale,
         C * units,
-        float(stdtrit(len(blocks) - 1, CONFIDENCE)),
+        float(special().stdtrit(len(blocks) - 1, CONFIDENCE)),
     )
 
 
