@@ -18,10 +18,20 @@ the radiance from x:
 
     dL/dtheta  -=  w W_y L_x <v_p - s v_x - (1 - s) v_y, n>
 
+A share h of the light between two near surfaces is differentiated with fixed directions (`Plan.near`). A fixed ray from
+y jumps between p and x, and moves with y. The formula then becomes the following one. At a crease, L_p and L_x have the
+factor h_p, and s is 0.
+
+    dL/dtheta  +=  w W_y h_p L_p <v_p - v_y, n>  -  w W_y L_x <v_p - s (1 - h_x) v_x - (1 - s (1 - h_x)) v_y, n>
+
 A point that the sensor sees directly slides along the direction d of the film's ray, and does not move with its
 surface. v is the velocity of the surface, and m its normal at x. v_y is defined in the same way.
 
     v_x = d <v, m> / <d, m>
+
+A point that is seen from a surface point z slides in part along the direction d from z to the point.
+
+    v_x = (1 - h) v  +  h (v_z + d <v - v_z, m> / <d, m>)
 
 If a shape touches the surface behind it, the sensor's ray and the light's ray lose the same point at the same time. The
 light of this point counts once, as seen from the sensor's side. If the shape moves into the surface, the surface hides

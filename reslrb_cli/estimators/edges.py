@@ -39,8 +39,8 @@ y jumps between p and x, and moves with y. The last formula then becomes
 
     dL/dtheta  +=  w h_p W_p <v_p - v_y, n>  -  w W_x <v_p - s (1 - h_x) v_x - (1 - s (1 - h_x)) v_y, n>
 
-At a crease, W_p and W_x have the factor h_p, and s is 0. A point x or y that this light reaches from a point z slides
-along the direction d of the light.
+The light of p also counts if the ray past p leaves the scene. At a crease, W_p and W_x have the factor h_p, and s is 0.
+A point x or y that this light reaches from a point z slides along the direction d of the light.
 
     v_x = (1 - h) v  +  h (v_z + d <v - v_z, n_x> / <d, n_x>)
 

@@ -45,8 +45,6 @@ def write_experiment(folder: Path, light: str) -> Path:
     return folder / "box.yaml"
 
 
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("light", LIGHTS)
 def test_a_box_is_found_from_eight_directions(llvm: str, tmp_path: Path, light: str) -> None:
