@@ -30,9 +30,7 @@ surface-integral form, edges that do not move contribute no error. The derivativ
 vertices at a distance r. Its variance is infinite where a moving shape touches another surface, and in the corners over
 which light slides. With derivatives of edges, the light between two vertices is therefore the sum of two parts. The
 part near^2 / (r^2 + near^2) is differentiated with fixed directions, the other part with `stay` (`Plan.near`). Neither
-form has the derivative of visibility, which `edges.py` adds for the edges of moving shapes. Camera paths use the fixed
-directions only where the first of both vertices slides behind a specular vertex. Elsewhere, the part with fixed
-directions is wrong for a box that stands on a floor, because `camera_edges.py` lacks the edges of this part.
+form has the derivative of visibility, which `edges.py` adds for the edges of moving shapes.
 
 The stack starts with the first vertex that moves or whose BSDF has a parameter. Earlier vertices depend only on
 parameters of the emitter. The stack works as in `stack.py`. Here, T behind the last pushed vertex equals the roulette
@@ -68,9 +66,8 @@ from reslrb_cli.transport.walk import (
 
 @dataclass
 class Before:
-    """Vertex before the current one. `stays` is 0 if the previous vertex is specular. Otherwise, the current vertex
-    stays at its place on its surface. `stays` is then 2 if the previous vertex slides over its surface behind a
-    specular vertex, and 1 if not.
+    """Vertex before the current one. `stays` is 1 if the current vertex stays at its place on its surface. It is 0 if
+    the previous vertex is specular.
     """
 
     point: SurfacePoint
@@ -82,15 +79,12 @@ class Before:
         return [Before(SurfacePoint.blank(plan), mi.UInt32(0))] if plan.stays else []
 
     @staticmethod
-    def of(plan: Plan, vertex: Vertex, scattering: Scattering, before: Sequence[Before] = ()) -> list[Before]:
-        """Return the state that a vertex passes to the next one. On camera paths, `before` is the state that it
-        received.
-        """
+    def of(plan: Plan, vertex: Vertex, scattering: Scattering) -> list[Before]:
+        """Return the state that a vertex passes to the next one."""
         if not plan.stays:
             return []
         stays = stays_behind(plan, vertex.bsdf, scattering.is_delta)
-        slides = (vertex.depth > 1) & ~is_staying(before) if plan.camera else mi.Bool(False)
-        return [Before(SurfacePoint.of(plan, vertex), dr.select(stays, dr.select(slides, mi.UInt32(2), 1), 0))]
+        return [Before(SurfacePoint.of(plan, vertex), dr.select(stays, mi.UInt32(1), 0))]
 
 
 def is_staying(before: Sequence[Before]) -> mi.Bool:
@@ -129,12 +123,13 @@ def near_share(near: Any, squared_distance: mi.Float) -> mi.Float:
 
 def reach(
     plan: Plan, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool,
-    parameters: bool = True,
+    parameters: bool = True, lit: mi.Bool | None = None,
 ) -> tuple[Hit, mi.Spectrum]:  # fmt: skip
     """Return the vertex at the intersection `pi` of `ray`, and a factor (C,) of value 1.
 
     The factor carries the derivatives of s_{i-1} that belong to this vertex. Call the function under `dr.resume_grad()`
-    with a differentiable ray. Set `parameters` to False if only gradients of the ray are resumed.
+    with a differentiable ray. Set `parameters` to False if only gradients of the ray are resumed. In the lanes `lit`,
+    directions are not fixed.
     """
     if not before:
         return find_vertex(ray, pi, active), mi.Spectrum(1)
@@ -149,7 +144,7 @@ def reach(
         f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
     changed = mi.Spectrum(dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1)) * factor
     if plan.near > 0:
-        near = dr.select(before[0].stays == 2, plan.near**2, 0) if plan.camera else plan.near**2
+        near = plan.near**2 if lit is None else dr.select(lit, 0, mi.Float(plan.near**2))
         shares = [near_share(near, dr.squared_norm(place - ray.o)) for place in (stayed.p, slid.p)]
         share = dr.detach(shares[0])
         changed = 1 + (changed - 1) * (1 - share) + (shares[1] - shares[0])

@@ -4,7 +4,8 @@ The ray through a film position is fixed. The first vertex slides along this ray
 vertex, the next vertex slides along the ray that the vertex reflects or refracts. Behind all other vertices, the next
 vertex and the points on emitters stay at their places on their surfaces (`stay` in `attached.py`). Both ways to find
 light, by hitting an emitter and by next event estimation, then differentiate the same integral over places. The weights
-of the two ways therefore need no derivative, because their sum at each place is 1.
+of the two ways therefore need no derivative, because their sum at each place is 1. For this reason, light of an emitter
+that a path hits has no share with fixed directions (`Plan.near`).
 
 delta is one number per channel for each path, and is a factor of P_i. e_i is the emission of an emitter that the path
 hits at vertex i, times its weight. c_i is the next event. m_i is the factor that `reach` returns, and r_i is the
@@ -76,7 +77,7 @@ class AttachedCameraFrame:
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
-            hit, factor = reach(plan, self.before, ray, pi, (connected | scattered | lit) & ~leaves)
+            hit, factor = reach(plan, self.before, ray, pi, (connected | scattered | lit) & ~leaves, lit=lit)
             event, own = None, mi.Spectrum(0)
             if self.scale:
                 event = next_event_again(samples, hit.si, self.place[0], connected)
@@ -157,7 +158,7 @@ class AttachedCameraSweep(CameraHooks):
             before=state.before,
         )
         stack = state.stack.push(frame, self.ring, here, contributes)
-        return AttachedCameraState(stack, Before.of(plan, vertex, scattering, state.before), L)
+        return AttachedCameraState(stack, Before.of(plan, vertex, scattering), L)
 
     def survived(self, state: AttachedCameraState, factor: mi.Float) -> AttachedCameraState:
         return AttachedCameraState(state.stack.with_factor(factor), state.before, state.L)

@@ -18,10 +18,20 @@ the radiance from x:
 
     dL/dtheta  -=  w W_y L_x <v_p - s v_x - (1 - s) v_y, n>
 
+A share h of the light between two near surfaces is differentiated with fixed directions (`Plan.near`). A fixed ray from
+y jumps between p and x, and moves with y. The formula then becomes the following one. At a crease, L_p and L_x have the
+factor h_p, and s is 0.
+
+    dL/dtheta  +=  w W_y h_p L_p <v_p - v_y, n>  -  w W_y L_x <v_p - s (1 - h_x) v_x - (1 - s (1 - h_x)) v_y, n>
+
 A point that the sensor sees directly slides along the direction d of the film's ray, and does not move with its
 surface. v is the velocity of the surface, and m its normal at x. v_y is defined in the same way.
 
     v_x = d <v, m> / <d, m>
+
+A point that is seen from a surface point z slides in part along the direction d from z to the point.
+
+    v_x = (1 - h) v  +  h (v_z + d <v - v_z, m> / <d, m>)
 
 If a shape touches the surface behind it, the sensor's ray and the light's ray lose the same point at the same time. The
 light of this point counts once, as seen from the sensor's side. If the shape moves into the surface, the surface hides
@@ -38,6 +48,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.estimators.attached import near_share
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.camera import Radiance
 from reslrb_cli.estimators.edges import (
@@ -55,6 +66,7 @@ from reslrb_cli.estimators.edges import (
     moved_by,
     sample_between,
     share_of,
+    slid,
     touches_behind,
 )
 from reslrb_cli.transport.bsdf import Scattering, begins_caustic
@@ -124,35 +136,60 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
 
 @dataclass
 class Importance:
-    """Contribution to the objective of light that continues from a point, in two sums.
+    """Contribution to the objective of light that continues from a point a, in three sums.
 
-    `slid` is the contribution of light that goes from the point directly to the sensor, times <v, n> / <v, m> for the
-    point's velocity v. m is the normal `normal`. `rest` is the contribution of other light, and `all` is the sum
-    of both contributions. `counts` is 0 behind a specular point.
+    `seen` is the contribution of light that goes from a directly to the sensor, in the direction `to_sensor`. `via` is
+    that of light that goes from a to a surface point z, and from there to the sensor, in the direction `z_to_sensor`.
+    `later` is that of other light. `ray_z` leads from a to z, and has the intersection `pi_z`. `n` and `n_z` are the
+    normals at a and z. `near` is the share of the light between both points that is differentiated with fixed
+    directions (`Plan.near`). `counts` is 0 behind a specular point.
     """
 
-    all: mi.Float
-    slid: mi.Float
-    rest: mi.Float
-    normal: mi.Vector3f
+    seen: mi.Float
+    via: mi.Float
+    later: mi.Float
     counts: mi.Float
+    n: mi.Vector3f
+    to_sensor: mi.Vector3f
+    ray_z: mi.Ray3f
+    pi_z: mi.PreliminaryIntersection3f
+    n_z: mi.Vector3f
+    z_to_sensor: mi.Vector3f
+    near: mi.Float
 
-    def motion(self, outline: mi.Vector3f, part: mi.Float) -> mi.Vector3f:
-        """Return the adjoint of the position of the point. The point counts with the factor `part`."""
-        return part * (showing(self.slid) * self.normal + showing(self.rest) * outline)
+    def all(self) -> mi.Float:
+        """Return the sum."""
+        return self.seen + self.via + self.later
+
+    def moved(
+        self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, adjoint: mi.Vector3f, active: mi.Bool
+    ) -> mi.Float:  # fmt: skip
+        """Return <a, `adjoint`> times the contribution, with the derivative of a, the intersection `pi` of `ray`. Call
+        the function under `dr.resume_grad()`.
+        """
+        seen, via, later = (showing(each) for each in (self.seen, self.via, self.later))
+        by_z = slid(adjoint, self.n, self.ray_z.d)
+        at_a = seen * slid(adjoint, self.n, self.to_sensor) + (via + later) * dr.lerp(adjoint, by_z, self.near)
+        at_z = self.near * (adjoint - by_z)
+        at_z = via * slid(at_z, self.n_z, self.z_to_sensor) + later * at_z
+        return moved_by(pi, ray, at_a, active) + moved_by(self.pi_z, self.ray_z, at_z, active & self.pi_z.is_valid())
 
 
 class ImportanceHooks(Hooks):
-    """Hooks of a light path that starts with a ray to the point. `outline` is the normal n of the outline. `first` is
-    the number of the path's first vertex. `direct` is true if the light comes directly from a lamp.
+    """Hooks of a light path that starts with a ray to the point. `first` is the number of the path's first vertex.
+    `direct` is true if the light comes directly from a lamp.
     """
 
-    def __init__(self, p: Pass, outline: mi.Vector3f, first: mi.UInt32, direct: bool) -> None:
-        self.p, self.outline, self.first = p, outline, first
+    def __init__(self, p: Pass, first: mi.UInt32, direct: bool) -> None:
+        self.p, self.first = p, first
         self.ends_class = direct and p.plan.by_class
 
     def start(self, product: Product) -> Importance:
-        return Importance(mi.Float(0), mi.Float(0), mi.Float(0), mi.Vector3f(0), mi.Float(1))
+        return Importance(
+            seen=mi.Float(0), via=mi.Float(0), later=mi.Float(0), counts=mi.Float(1), n=mi.Vector3f(0),
+            to_sensor=mi.Vector3f(0), ray_z=dr.zeros(mi.Ray3f), pi_z=dr.zeros(mi.PreliminaryIntersection3f),
+            n_z=mi.Vector3f(0), z_to_sensor=mi.Vector3f(0), near=mi.Float(0),
+        )  # fmt: skip
 
     def vertex(
         self, state: Importance, vertex: Vertex, connection: Connection, scattering: Scattering,
@@ -161,19 +198,23 @@ class ImportanceHooks(Hooks):
         C = vertex.product.times(connection.c, vertex.depth).value()
         own = dr.dot(C, self.p.delta(connection.u, connection.active, self.colours)) * state.counts
         own = dr.select(connection.active, own, 0)
-        first, si = vertex.depth == self.first, vertex.si
+        a, z, si = vertex.depth == self.first, vertex.depth == self.first + 1, vertex.si
         # Behind a caustic's first surface, the light belongs to light paths.
         ends = begins_caustic(vertex.bsdf, scattering.is_delta) if self.ends_class else scattering.is_delta
-        normal = dr.select(first, mi.Vector3f(si.n), state.normal)
-        to_sensor = si.to_world(connection.wo)
-        cos = dr.dot(normal, to_sensor)
-        slope = dr.select(cos != 0, dr.dot(self.outline, to_sensor) / cos, 0)
+        n, to_sensor = mi.Vector3f(si.n), si.to_world(connection.wo)
+        share = near_share(self.p.plan.near**2, dr.squared_norm(si.p - vertex.ray.o))
         return Importance(
-            all=state.all + own,
-            slid=state.slid + dr.select(first, own * slope, 0),
-            rest=state.rest + dr.select(first, 0, own),
-            normal=normal,
-            counts=dr.select(first & ends, 0, state.counts),
+            seen=dr.select(a, own, state.seen),
+            via=dr.select(z, own, state.via),
+            later=state.later + dr.select(a | z, 0, own),
+            counts=dr.select(a & ends, 0, state.counts),
+            n=dr.select(a, n, state.n),
+            to_sensor=dr.select(a, to_sensor, state.to_sensor),
+            ray_z=dr.select(z, vertex.ray, state.ray_z),
+            pi_z=dr.select(z, vertex.pi, state.pi_z),
+            n_z=dr.select(z, n, state.n_z),
+            z_to_sensor=dr.select(z, to_sensor, state.z_to_sensor),
+            near=dr.select(z, share, state.near),
         )
 
 
@@ -188,36 +229,40 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     beside = both_sides(samples, outline)
     x, active = beside.x, beside.active & beside.x.is_valid() & ~touches_behind(outline, beside)
     emission = Emission(beside.past, outline.weight * share_of(samples, outline, beside), dr.zeros(mi.EmitterPtr))
-    W = walk(_of_all_classes(samples), ImportanceHooks(p, n, mi.UInt32(1), direct=True), active, emission)
-    size = showing(W.all) * p.scale
+    W = walk(_of_all_classes(samples), ImportanceHooks(p, mi.UInt32(1), direct=True), active, emission)
+    size = showing(W.all()) * p.scale
     active = active & (size != 0)
     behind = dr.norm(beside.past(x.t) - view.y)
     s = dr.select(view.parallel, 1, view.distance / behind)
     with dr.resume_grad(), dr.isolate_grad():
         moved = moved_by(beside.pi, beside.over, -size * n, active)
-        moved += moved_by(x, beside.past, W.motion(n, s * p.scale), active)
+        moved += W.moved(x, beside.past, (s * p.scale) * n, active)
         dr.backward_from(moved, flags=MAY_LACK)
 
 
 def _between(p: Pass, numbers: mi.PCG32) -> None:
-    """Add the derivatives of outlines on segments between two surfaces. Both surfaces are not specular."""
+    """Add the derivatives of outlines and creases on segments between two surfaces. Both surfaces are not specular.
+    The radiance is that of p or x.
+    """
     samples = p.samples
     between = sample_between(samples, numbers)
     outline, beside, back, y = between.outline, between.beside, between.back, between.y
-    n, x, s, active = outline.normal, beside.x, between.s, between.active
-    first = FilmRay(beside.past, mi.Point2f(0), mi.Spectrum(1), continues=True)
+    n, x, active, side = outline.normal, beside.x, between.active, between.side(p.plan.near, numbers)
+    first = FilmRay(side.ray, mi.Point2f(0), mi.Spectrum(1), continues=True)
     _, found = camera_walk(for_camera(samples), PickLight(numbers), active, first)
     total = showing(found.total)
-    weight = outline.weight * found.L * (total * share_of(samples, outline, beside))
+    weight = outline.weight * found.L * (total * share_of(samples, outline, beside) * side.weight)
     emission = Emission(back, weight, dr.zeros(mi.EmitterPtr))
     depth = found.segments + 1
-    hooks = ImportanceHooks(p, n, depth, direct=False)
+    hooks = ImportanceHooks(p, depth, direct=False)
     W = walk(_of_all_classes(samples), hooks, active & (total > 0), emission, depth)
-    size = showing(W.all) * p.scale
+    sign = dr.select(side.over, -p.scale, p.scale)
+    size = showing(W.all()) * sign
     active = active & (size != 0)
-    at_p, at_x = _at_contact(beside, -size * n, active & touches_behind(outline, beside))
+    at_p, at_x = _at_contact(beside, -size * n, active & touches_behind(outline, beside) & ~outline.crease)
+    at_x += dr.select(active, (size * side.s) * n, 0)
     with dr.resume_grad(), dr.isolate_grad():
         moved = moved_by(beside.pi, beside.over, at_p, active)
-        moved += moved_by(x, beside.past, (size * s) * n + at_x, active)
-        moved += moved_by(y, back, W.motion(n, (1 - s) * p.scale), active)
+        moved += moved_by(x, beside.past, at_x, active & x.is_valid())
+        moved += W.moved(y, back, ((1 - side.s) * sign) * n, active)
         dr.backward_from(moved, flags=MAY_LACK)

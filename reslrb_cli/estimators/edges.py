@@ -39,8 +39,8 @@ y jumps between p and x, and moves with y. The last formula then becomes
 
     dL/dtheta  +=  w h_p W_p <v_p - v_y, n>  -  w W_x <v_p - s (1 - h_x) v_x - (1 - s (1 - h_x)) v_y, n>
 
-At a crease, W_p and W_x have the factor h_p, and s is 0. A point x or y that this light reaches from a point z slides
-along the direction d of the light.
+The light of p also counts if the ray past p leaves the scene. At a crease, W_p and W_x have the factor h_p, and s is 0.
+A point x or y that this light reaches from a point z slides along the direction d of the light.
 
     v_x = (1 - h) v  +  h (v_z + d <v - v_z, n_x> / <d, n_x>)
 
@@ -416,7 +416,7 @@ class PickLight(CameraHooks):
         return replace(state, counts=dr.select(first & scattering.is_delta, 0, state.counts), chain=chain)
 
 
-def _along(adjoint: mi.Vector3f, n: mi.Vector3f, towards: mi.Vector3f) -> mi.Vector3f:
+def slid(adjoint: mi.Vector3f, n: mi.Vector3f, towards: mi.Vector3f) -> mi.Vector3f:
     """Return the adjoint of the surface below a point. The point slides along `towards` and has this `adjoint`. `n` is
     the normal of the surface.
     """
@@ -436,17 +436,17 @@ def _moved_by_light(
     moved = mi.Float(0)
     if samples.plan.near > 0:
         follows = light.segments > 1
-        at_z = dr.select(follows, light.near * (adjoint - _along(adjoint, light.n, light.ray_z.d)), 0)
+        at_z = dr.select(follows, light.near * (adjoint - slid(adjoint, light.n, light.ray_z.d)), 0)
         at_a, near = adjoint - at_z, follows & (light.segments == 2)
         place, n = dr.select(near, light.ray_z(light.pi_z.t), place), dr.select(near, light.n_z, n)
         arriving, direct = dr.select(near, at_z, adjoint), direct | near
-        at_z = dr.select(near, _along(at_z, n, light.towards), at_z)
+        at_z = dr.select(near, slid(at_z, n, light.towards), at_z)
         moved += moved_by(light.pi_z, light.ray_z, at_z, active & follows & light.pi_z.is_valid())
-    at_a = dr.select(light.segments == 1, _along(adjoint, light.n, light.towards), at_a)
+    at_a = dr.select(light.segments == 1, slid(adjoint, light.n, light.towards), at_a)
     moved += moved_by(pi, ray, at_a, active)
     if samples.plan.moving_emission:
         there = mi.Ray3f(place + dr.mulsign(n, dr.dot(n, light.towards)) * ray_offset(place), light.towards)
-        carried = arriving - _along(arriving, n, light.towards)
+        carried = arriving - slid(arriving, n, light.towards)
         moved += _carried(samples, light.emitter, there, carried, active & direct)
     return moved
 
@@ -485,7 +485,8 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
 @dataclass
 class Between:
     """An outline on a segment between two surfaces. The ray `back` leads from the outline to y. `y` is the intersection
-    there, and `beside.x` the intersection behind the outline. p divides the segment from y to x in the ratio `s`.
+    there, and `beside.x` the intersection behind the outline, if there is one. p divides the segment from y to x in the
+    ratio `s`.
     """
 
     outline: Outline
@@ -495,11 +496,36 @@ class Between:
     s: mi.Float
     active: mi.Bool
 
+    def side(self, near: float, numbers: mi.PCG32) -> Side:
+        """Return a side, chosen at random by the shares of the light that the edge moves there. At an outline, all
+        light of x is lost, and light of p has the share with fixed directions. At a crease, the light of both has this
+        share.
+        """
+        beside, crease, distance = self.beside, self.outline.crease, self.outline.view.distance
+        share, share_x = (near_share(near**2, dr.square(each)) for each in (distance, distance / self.s))
+        both = share + dr.select(beside.x.is_valid(), dr.select(crease, share, 1), 0)
+        over = numbers.next_float32() * both < share
+        ray = dr.select(over, beside.over, beside.past)
+        return Side(over, ray, both, dr.select(over | crease, 0, self.s * (1 - share_x)))
 
-def sample_between(samples: Samples, numbers: mi.PCG32, creases: bool = False) -> Between:
-    """Return a random outline for each lane, seen from a random direction. With `creases`, creases count, too."""
+
+@dataclass
+class Side:
+    """Side of an edge on which a path goes on: p in the lanes `over`, otherwise x. `ray` leads there, and `weight` is
+    the share of the light divided by the probability of the side. x moves the edge with the factor `s`, and y with the
+    factor 1 - s.
+    """
+
+    over: mi.Bool
+    ray: mi.Ray3f
+    weight: mi.Float
+    s: mi.Float
+
+
+def sample_between(samples: Samples, numbers: mi.PCG32) -> Between:
+    """Return a random outline or crease for each lane, seen from a random direction."""
     assert samples.edges is not None
-    outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers), creases)
+    outline = sample_outline(samples, samples.edges.anywhere, None, chances_of(samples, numbers), creases=True)
     offset = ray_offset(outline.p)
     # If the shape stands on a surface, the point beside the edge may lie below this surface. The ray starts above it.
     start = outline.p + outline.normal * (BESIDE * offset) + outline.view.to_y * (ABOVE * offset)
@@ -508,39 +534,31 @@ def sample_between(samples: Samples, numbers: mi.PCG32, creases: bool = False) -
     outline.active = outline.active & y.is_valid()
     distance = y.t + ABOVE * offset
     outline.view.distance = distance
-    beside = both_sides(samples, outline, creases, everywhere=True)
+    beside = both_sides(samples, outline, creases=True, everywhere=True)
     s = distance / (distance + beside.x.t - AROUND * offset)
-    return Between(outline, beside, back, y, s, beside.active & beside.x.is_valid())
+    return Between(outline, beside, back, y, s, beside.active)
 
 
 def _between(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines and creases on segments between two surfaces. The first surface is not specular.
-
-    Light continues from p or from x. At an outline, all light of x is lost, and light of p has the share `at_p`. At a
-    crease, the light of both has this share.
+    Light continues from p or from x.
     """
     samples, near = p.samples, p.plan.near
-    between = sample_between(samples, numbers, creases=near > 0)
+    between = sample_between(samples, numbers)
     outline, beside, back, y = between.outline, between.beside, between.back, between.y
-    n, x, s, active, crease = outline.normal, beside.x, between.s, between.active, outline.crease
+    n, x, active = outline.normal, beside.x, between.active
     _, light = camera_walk(
         for_camera(samples), PickLight(numbers, near), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
     )
-    weight = outline.weight * light.L * (light.total * share_of(samples, outline, beside))
-    start, over = beside.past, mi.Bool(False)
-    if near > 0:
-        r = outline.view.distance
-        share, share_x = (near_share(near**2, dr.square(distance)) for distance in (r, r / s))
-        both = share + dr.select(crease, share, 1)
-        over = numbers.next_float32() * both < share
-        weight, start = weight * both, dr.select(over, beside.over, beside.past)
-        s = dr.select(over | crease, 0, s * (1 - share_x))
-    emission = Emission(start, weight, dr.zeros(mi.EmitterPtr))
+    side = between.side(near, numbers)
+    weight = outline.weight * light.L * (light.total * share_of(samples, outline, beside)) * side.weight
+    emission = Emission(side.ray, weight, dr.zeros(mi.EmitterPtr))
     walked = walk(samples, Contribution(p), active & (light.total > 0), emission, light.segments + 1)
-    W = showing(walked[0] * p.scale) * dr.select(over, -1, 1)
+    W = showing(walked[0] * p.scale) * dr.select(side.over, -1, 1)
     active = active & (W != 0)
-    at_x, at_y = (dr.select(active, (W * part) * n, 0) for part in (s, 1 - s))
+    at_x, at_y = (dr.select(active, (W * part) * n, 0) for part in (side.s, 1 - side.s))
     with dr.resume_grad(), dr.isolate_grad():
-        moved = moved_by(beside.pi, beside.over, -W * n, active) + moved_by(x, beside.past, at_x, active)
+        moved = moved_by(beside.pi, beside.over, -W * n, active)
+        moved += moved_by(x, beside.past, at_x, active & x.is_valid())
         moved += _moved_by_light(samples, light, y, back, at_y, active)
         dr.backward_from(moved, flags=MAY_LACK)

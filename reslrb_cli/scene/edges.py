@@ -58,6 +58,10 @@ class Ball:
         ratio = dr.square(self.radius) / dr.squared_norm(self.center - p)
         return dr.select(ratio < 1, dr.sqrt(1 - ratio), -1)
 
+    def frame(self, p: mi.Point3f) -> mi.Frame3f:
+        """Return a frame whose normal leads from `p` to the centre of the ball."""
+        return mi.Frame3f(dr.normalize(self.center - p))
+
 
 @dataclass
 class _Rows:
@@ -199,8 +203,9 @@ def _ball(parts: list[_Rows]) -> Ball:
     return Ball.around(_points(ends), dr.concat([rows.radius, rows.radius]))
 
 
-def _are_open(rows: _Rows, scene: mi.Scene) -> mi.Bool:
-    """True if an edge can hide a surface from another surface, from a lamp, or from a sensor.
+def _are_open(rows: _Rows, scene: mi.Scene, balls: list[Ball]) -> mi.Bool:
+    """True if an edge can hide a surface from another surface, from a lamp, or from a sensor, or one of the `balls`
+    from the sky.
 
     At a corner of a room, for example, all rays beside the edge of a wall soon hit the other wall. Rays in `RAYS`
     random directions decide.
@@ -218,14 +223,25 @@ def _are_open(rows: _Rows, scene: mi.Scene) -> mi.Bool:
     here.p = p
     views = [sensor.sample_direction(here, mi.Point2f(0.5))[0] for sensor in scene.sensors()]
     for emitter in scene.emitters():
-        if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):  # lamps with a surface count as surfaces
-            views.append(emitter.sample_direction(here, mi.Point2f(numbers.next_float32(), numbers.next_float32()))[0])
+        sample = mi.Point2f(numbers.next_float32(), numbers.next_float32())
+        if emitter.is_environment():
+            views += [_sky_before(ball, here, sample) for ball in balls]
+        elif not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):  # lamps with a surface count as surfaces
+            views.append(emitter.sample_direction(here, sample)[0])
     for ds in views:
         raw = dr.cross(along, ds.d)
         seen = (ds.pdf > 0) & (dr.dot(raw, c - p) * dr.dot(raw, d - p) > 0)
         passes |= seen & _passes(scene, p, along, c - p, ds.d, ds.dist)
     found = dr.block_reduce(dr.ReduceOp.Max, dr.select(passes, mi.UInt32(1), 0), RAYS) != 0
     return found | (rows.kind != SEGMENT)
+
+
+def _sky_before(ball: Ball, si: mi.SurfaceInteraction3f, sample: mi.Point2f) -> mi.DirectionSample3f:
+    """Return a direction from `si` to the sky. The opposite direction leads to the ball."""
+    ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
+    cone = mi.warp.square_to_uniform_cone(sample, ball.cosine(si.p))
+    ds.d, ds.dist, ds.pdf = -ball.frame(si.p).to_world(cone), mi.Float(1e30), mi.Float(1)
+    return ds
 
 
 def _passes(
@@ -270,7 +286,8 @@ class EdgeSet:
             return
         with dr.suspend_grad():
             rows = _joined([part.rows() for shape in still for part in _edges_of(shape)])
-            wanted = mi.Bool(True) if lamps_move else _are_open(rows, scene)
+            balls = [_ball([part.rows() for part in parts]) for parts in self._moving]
+            wanted = mi.Bool(True) if lamps_move else _are_open(rows, scene, balls)
             parallel = turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a) > dr.pi * (1 - FLAT)
             kept = dr.compress(wanted & ((rows.kind != SEGMENT) | ~parallel))
             if dr.width(kept) > 0:

@@ -175,6 +175,8 @@ def sample_outline(
         view = _view_from_anywhere(table, kinds, row, kind, along, p, chances, creases)
         if only_hide:
             view = _towards_balls(table, row, view, chances)
+    elif only_hide and samples.plan.needs.environment is not None:
+        view = _past_balls(samples, table, row, view, chances)
     seen = view(p, active)
     normal, radius = mi.Vector3f(0), mi.Float(0)
     if SPHERE in kinds or TUBE in kinds:
@@ -276,7 +278,7 @@ def weigh_edges(samples: Samples, table: EdgeTable) -> EdgeTable:
                 hides = dr.zeros(mi.Bool, dr.width(table.moves))
                 for numbers in _probes():
                     hides |= _hides_ball(samples, table, middle, view_from_lamps(samples, numbers))
-                lamp *= dr.select(table.moves | hides, 1, UNLIKELY)
+                lamp *= dr.select(table.moves | hides, 1, dr.maximum(UNLIKELY, towards / (4 * dr.pi)))
                 sensor = dr.select(table.moves, sensor, 0)
             else:
                 hides = _hides_ball(samples, table, middle, view_from_sensor(samples, mi.Point2f(0.5)))
@@ -363,6 +365,37 @@ def _towards_balls(table: EdgeTable, row: mi.UInt32, other: Viewer, chances: Cha
         return replace(
             first, to_y=dr.select(moves, first.to_y, to_y), weight=weight, active=active & (first.active | ~moves)
         )
+
+    return view
+
+
+def _past_balls(samples: Samples, table: EdgeTable, row: mi.UInt32, other: Viewer, chances: Chances) -> Viewer:
+    """Return the `other` view. If it is that of the sky from a segment of a shape that does not move, its direction is
+    replaced by one whose opposite leads to a moving shape.
+    """
+    moves = dr.gather(mi.Bool, table.moves, row) | (dr.gather(mi.UInt32, table.kind, row) != SEGMENT)
+
+    def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
+        first, scene = other(p, active), samples.scene
+        _, chosen, number = scene.sample_emitter(chances.viewpoint.x, active)
+        number = number * len(table.balls)
+        place = mi.Point2f(number - dr.floor(number), chances.viewpoint.y)
+        away, density = mi.Vector3f(0), mi.Float(0)
+        cones = [(ball.frame(p), ball.cosine(p)) for ball in table.balls]
+        for index, (frame, cos) in enumerate(cones):
+            drawn = frame.to_world(mi.warp.square_to_uniform_cone(place, cos))
+            away = dr.select(mi.UInt32(number) == index, drawn, away)
+        for frame, cos in cones:
+            density += dr.select(dr.dot(frame.n, away) >= cos, dr.rcp(dr.two_pi * (1 - cos) * len(cones)), 0)
+        sky = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+        sky.wi, sky.wavelengths = away, chances.wavelengths
+        environment = scene.environment()
+        here = active & ~moves & (first.emitter == mi.EmitterPtr(environment)) & (density > 0)
+        weight = environment.eval(sky, here) * (chosen / density)
+        return replace(
+            first, to_y=dr.select(here, -away, first.to_y), weight=dr.select(here, weight, first.weight),
+            active=first.active | here,
+        )  # fmt: skip
 
     return view
 

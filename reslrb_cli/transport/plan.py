@@ -298,8 +298,7 @@ class Plan:
         """Return the plan of the camera paths of a pass. Their vertices stay behind all surfaces that are not
         specular.
         """
-        near = self.near if self.needs.has_delta_lobes else 0.0
-        return replace(self, camera=True, stays=self.attached, glossy_follows=False, near=near)
+        return replace(self, camera=True, stays=self.attached, glossy_follows=False)
 
     def differentiating(
         self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[mi.BSDF, ...] = ()

@@ -97,11 +97,12 @@ class EdgeCase:
         moving.weigh(smooth_weights(SIZE, SIZE))
         return moving
 
-    def gradients(self, count: int = 8, **options: Any) -> np.ndarray:
-        """Return the gradients (N, K) of `reslrb` at `count` seeds."""
+    def gradients(self, count: int = 8, block: int = 0, **options: Any) -> np.ndarray:
+        """Return the gradients (N, K) of `reslrb` at `count` seeds. `block` chooses the seeds."""
         tracer = integrator("reslrb", self.depth, **{"estimator": "stack", "edges": "on"} | self.options | options)
         moving = self.moving()
-        return np.array([np.concatenate([*moving.gradient(tracer, seed, self.spp).values()]) for seed in seeds(count)])
+        chosen = seeds(count, block)
+        return np.array([np.concatenate([*moving.gradient(tracer, seed, self.spp).values()]) for seed in chosen])
 
     def differences(self, count: int = 8, block: int = 1) -> np.ndarray:
         """Return finite differences (N, K) of images by `path` at `count` other seeds. `block` chooses the seeds."""
@@ -322,7 +323,7 @@ def standing(lamp: str, depth: int, **options: Any) -> EdgeCase:
     return EdgeCase("standing", lamp, depth, ("x", "y", "turn"), (0, 0, 1), **options)
 
 
-BOTH = {"paths": "both"}
+BOTH, CAMERA = {"paths": "both"}, {"paths": "camera"}
 #: Cases of which finite differences are on file.
 RECORDED = [
     EdgeCase("flat", "area"), EdgeCase("sphere", "near"), EdgeCase("box", "sphere_lamp"),
@@ -339,6 +340,9 @@ RECORDED = [
     EdgeCase("mirror", "constant", 3, reference_spp=8192, options=BOTH),
     EdgeCase("glazed", "area", 4, ("x", "z"), spp=1280, reference_spp=8192, options={"paths": "light"}),
     EdgeCase("slab", "area", 4, spp=768, reference_spp=16384, step=0.02, options=BOTH),
+    standing("area", 3, spp=768, reference_spp=8192),
+    # The box hides the sky from the floor, and the edge of the floor hides it from the box. Light paths are noisy here.
+    standing("constant", 3, spp=768, reference_spp=16384, options=CAMERA),
 ]  # fmt: skip
 CASES = [
     *RECORDED,

@@ -45,12 +45,8 @@ def write_experiment(folder: Path, light: str) -> Path:
     return folder / "box.yaml"
 
 
-#: Light between the box and the floor has a noisy derivative. Under a sky, some starts end along the line of sight.
-NOISY = pytest.mark.xfail(reason="noise of light between box and floor, see geometry.md")
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("light", [pytest.param(each, marks=NOISY if each == "constant" else ()) for each in LIGHTS])
+@pytest.mark.parametrize("light", LIGHTS)
 def test_a_box_is_found_from_eight_directions(llvm: str, tmp_path: Path, light: str) -> None:
     path, far = write_experiment(tmp_path, light), []
     for angle in 2 * np.pi * np.arange(8) / 8:
