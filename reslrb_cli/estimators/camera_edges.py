@@ -51,13 +51,10 @@ import mitsuba as mi
 from reslrb_cli.estimators.attached import near_share
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.camera import Radiance
-from reslrb_cli.estimators.edges import (
-    LAMP_EDGES,
-    OTHER_EDGES,
+from reslrb_cli.estimators.edges import LAMP_EDGES, OTHER_EDGES, SENSOR_EDGES, PickLight
+from reslrb_cli.estimators.outline_rays import (
     PATHS_PER_OUTLINE,
-    SENSOR_EDGES,
     Beside,
-    PickLight,
     both_sides,
     chances_of,
     edge_samples,

@@ -28,7 +28,8 @@ import mitsuba as mi
 from reslrb_cli.estimators.attached import Adjoint
 from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.camera import Radiance
-from reslrb_cli.estimators.edges import AROUND, Contribution, edge_samples, for_camera, moved_by
+from reslrb_cli.estimators.edges import Contribution
+from reslrb_cli.estimators.outline_rays import AROUND, edge_samples, for_camera, moved_by
 from reslrb_cli.estimators.stack import Ring, StackState, differentiate_frames
 from reslrb_cli.scene.rays import ray_offset
 from reslrb_cli.transport.bsdf import EventNumbers, evaluate, scatter

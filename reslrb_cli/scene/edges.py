@@ -25,7 +25,7 @@ Array = np.ndarray[Any, Any]
 
 SEGMENT, SPHERE, TUBE = range(3)
 #: Number of chords that approximate a circle. The distance between a chord and its arc is at most 1.2e-6 of the radius.
-#: It must be smaller than the distance between an edge and the rays beside it (`BESIDE` in `estimators/edges.py`).
+#: This must be smaller than `BESIDE` in `estimators/outline_rays.py`, the distance of the rays beside an edge.
 CHORDS = 2048
 #: Vertices count as one vertex if their distance, divided by the size of the mesh, is below this value.
 WELD = 1e-6

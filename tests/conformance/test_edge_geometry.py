@@ -12,7 +12,7 @@ import pytest
 from conformance.edge_cases import BOTH, OCCLUDERS, SHAPES, EdgeCase, split_box
 from conformance.moving import Moving
 
-from reslrb_cli.estimators import chain_edges, edges
+from reslrb_cli.estimators import chain_edges, edges, outline_rays
 from reslrb_cli.estimators.stack import StackState
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.integrators.protocol import Job
@@ -86,7 +86,7 @@ def outline_samples(moving: Moving, key: str, depth: int) -> Samples:
     moving.params.update()
     job = Job(moving.loaded, moving.loaded.sensors()[0], dr.opaque(mi.UInt32, 1), 16, moving.params)
     tracer = integrator("reslrb", depth, estimator="stack", edges="on")
-    return edges.edge_samples(tracer.passes(job)[0], edges.LAMP_EDGES)
+    return outline_rays.edge_samples(tracer.passes(job)[0], edges.LAMP_EDGES)
 
 
 def rays_beside_outlines(shape: str, size: float) -> tuple[np.ndarray, np.ndarray]:
@@ -98,10 +98,10 @@ def rays_beside_outlines(shape: str, size: float) -> tuple[np.ndarray, np.ndarra
         patch.setitem(OCCLUDERS, "shape", lambda: {"shape": SHAPES[shape](0.1, -0.1, 0.9, size)})
         moving = EdgeCase("shape", "directional").moving()
     samples = outline_samples(moving, "shape.to_world", 2)
-    chances = edges.chances_of(samples, samples.stream(edges.LAMP_EDGES))
+    chances = outline_rays.chances_of(samples, samples.stream(edges.LAMP_EDGES))
     assert samples.edges is not None
     outline = sample_outline(samples, samples.edges.lamp, view_from_lamps(samples, chances.viewpoint), chances)
-    beside = edges.both_sides(samples, outline)
+    beside = outline_rays.both_sides(samples, outline)
     far = dr.norm(beside.over(beside.pi.t) - outline.p) / ray_offset(outline.p)
     active = np.array(beside.active)
     assert active.mean() > 0.7
@@ -126,7 +126,7 @@ def test_no_light_passes_a_corner_of_two_sheets(has_edges: bool):
     scene = load({"type": "scene", "floor": floor, "wall": wall})
     point = dr.zeros(mi.SurfaceInteraction3f, 64)
     point.p, point.n = mi.Point3f(dr.linspace(mi.Float, -0.9, 0.9, 64), 0, 0), mi.Normal3f(0, 0, 1)
-    point.p.y = -edges.BESIDE * ray_offset(point.p)
+    point.p.y = -outline_rays.BESIDE * ray_offset(point.p)
     assert dr.all(is_hidden(scene, point, mi.Point3f(0, 3, 1), has_edges, mi.Bool(True)))
     assert dr.none(is_hidden(scene, point, mi.Point3f(0, -3, 1), has_edges, mi.Bool(True)))
 
@@ -135,7 +135,7 @@ def test_light_from_other_surfaces_reaches_a_contact():
     """A box stands on the floor. Light from the room passes its lower edges, and arrives at the floor next to them."""
     moving = EdgeCase("standing", "room", 3).moving()
     samples = outline_samples(moving, "shape.vertex_positions", 3)
-    between = edges.sample_between(samples, samples.stream(edges.OTHER_EDGES))
+    between = outline_rays.sample_between(samples, samples.stream(edges.OTHER_EDGES))
     from_above = np.array((between.outline.p.z < 1e-4) & (between.outline.view.to_y.z > 0))
     assert np.mean(np.array(between.active)[from_above]) > 0.6
 

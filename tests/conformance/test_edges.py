@@ -26,7 +26,7 @@ from turns import a_few
 
 from reslrb_cli import register
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.estimators import edges
+from reslrb_cli.estimators import edges, outline_rays
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.integrators import context, reslrb
 from reslrb_cli.integrators.plugin import make_integrator
@@ -132,13 +132,13 @@ FAULTS = [
           "light.near * (adjoint", "0 * (adjoint"),
     Fault("near_light_slides_only_at_its_end", "contact", "estimators.edges:_moved_by_light",
           "active & follows & light.pi_z.is_valid()", "active & False"),
-    Fault("fixed_directions_see_no_edge", "contact", "estimators.edges:Between.side",
+    Fault("fixed_directions_see_no_edge", "contact", "estimators.outline_rays:Between.side",
           "numbers.next_float32() * both < share", "mi.Bool(False)"),
-    Fault("fixed_directions_see_no_crease", "contact", "estimators.edges:sample_between",
+    Fault("fixed_directions_see_no_crease", "contact", "estimators.outline_rays:sample_between",
           "chances_of(samples, numbers), creases=True", "chances_of(samples, numbers), creases=False"),
     Fault("light_is_seen_by_a_point_at_rest", "camera_contact", "estimators.camera_edges:Importance.moved",
           "active & self.pi_z.is_valid()", "active & False"),
-    Fault("fixed_directions_see_no_edge_before_the_sky", "camera_contact", "estimators.edges:sample_between",
+    Fault("fixed_directions_see_no_edge_before_the_sky", "camera_contact", "estimators.outline_rays:sample_between",
           "y, s, beside.active)", "y, s, beside.active & beside.x.is_valid())"),
     Fault("directions_of_camera_paths_are_not_fixed", "camera_contact", "estimators.camera_edges:_between",
           "dr.select(side.over, -p.scale, p.scale)", "dr.select(side.over, 0, p.scale)"),
@@ -150,7 +150,7 @@ FAULTS = [
           "moved -= _carried(", "_carried("),
     Fault("light_does_not_slide_with_a_lamp", "box-moving_spot-2", "estimators.edges:_moved_by_light",
           "if samples.plan.moving_emission:", "if False:"),
-    Fault("corners_counted_twice", "none-moving_room-3", "estimators.edges:share_of",
+    Fault("corners_counted_twice", "none-moving_room-3", "estimators.outline_rays:share_of",
           "touches & ~(", "mi.Bool(False) & ~("),
     Fault("share_of_near_light_is_constant", "none-moving_room-3", "estimators.attached:reach",
           " + (shares[1] - shares[0])", ""),
@@ -176,7 +176,7 @@ FAULTS = [
 
 
 FAULTS_OF_CAMERA_PATHS = [
-    Fault("rays_far_from_the_edge", "bumpy-area-2", "estimators.edges:both_sides",
+    Fault("rays_far_from_the_edge", "bumpy-area-2", "estimators.outline_rays:both_sides",
           "ray(-BESIDE), ray(BESIDE)", "ray(-1), ray(1)"),
     Fault("sides_exchanged", "box-sphere_lamp-2", "estimators.camera_edges:_from_sensor",
           "dr.select(over, beside.over, beside.past)", "dr.select(over, beside.past, beside.over)"),
@@ -220,7 +220,7 @@ def check_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     """Assert that light past an edge between two surfaces has three segments at least."""
 
     def between(p: Pass) -> None:
-        samples = edges.edge_samples(p.samples, edges.OTHER_EDGES)
+        samples = outline_rays.edge_samples(p.samples, edges.OTHER_EDGES)
         edges._between(Pass(samples, None, p.adjoint), samples.stream(edges.OTHER_EDGES))
 
     monkeypatch.setattr(reslrb, "differentiate_edges", between)
