@@ -286,8 +286,9 @@ class EdgeSet:
             return
         with dr.suspend_grad():
             rows = _joined([part.rows() for shape in still for part in _edges_of(shape)])
-            balls = [_ball([part.rows() for part in parts]) for parts in self._moving]
-            wanted = mi.Bool(True) if lamps_move else _are_open(rows, scene, balls)
+            wanted = mi.Bool(True)
+            if not lamps_move:
+                wanted = _are_open(rows, scene, [_ball([part.rows() for part in parts]) for parts in self._moving])
             parallel = turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a) > dr.pi * (1 - FLAT)
             kept = dr.compress(wanted & ((rows.kind != SEGMENT) | ~parallel))
             if dr.width(kept) > 0:
