@@ -71,7 +71,7 @@ class Before:
     """
 
     point: SurfacePoint
-    stays: mi.UInt32
+    stays: mi.UInt32  # not a Bool, which crashes the process when a stack holds it
 
     @staticmethod
     def start(plan: Plan) -> list[Before]:
