@@ -52,7 +52,7 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import as_decided, is_auto
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
-from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES
+from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
@@ -351,7 +351,7 @@ class _Short:
         """
         case = self._cases[0]
         size, value = case.initial[key].size, case.values.value(key)
-        if size > MOST_ENTRIES:
+        if size > SMALL:
             rows = smooth_rows(key, value, self._extent, 2)
         else:
             rows = list((UNITS.get(key.rpartition(".")[2]) or REACH * self._extent) * np.eye(size))

@@ -198,7 +198,7 @@ def assemble_scene(config: Config, scene: Any = None) -> Problem:
     if isinstance(problem.integrator, LightTracer):
         problem.integrator.expect(pass_spp(config))
     problem.apply()
-    if config.optimizer.type == "auto" and moves:
+    if config.optimizer.type == "auto" and moves and not motions:
         reason = "auto has no steps for parameters that move light; use adam, with a learning_rate and a schedule"
         raise ConfigError(config.source, "optimizer.type", reason)
     _check_moving(problem)

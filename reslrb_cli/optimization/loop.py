@@ -64,8 +64,9 @@ def _progress(iteration: int, iterations: int, least: float) -> float:
     return max(iteration / max(iterations - 1, 1), least)
 
 
-#: The part of a run after which images are no longer blurred.
-BLURRED = 0.5
+#: The part of a run after which images are no longer blurred. With `auto`, runs are as long as their last step needs, and
+#: a number of iterations takes its place.
+BLURRED, BLURRED_ITERATIONS = 0.5, 20
 
 
 def set_blur(problem: Problem, iteration: int, least: float) -> None:
@@ -73,7 +74,10 @@ def set_blur(problem: Problem, iteration: int, least: float) -> None:
 
     `least` (0 to 1) is the minimum progress of a run that ends before its last iteration.
     """
-    factor = max(1.0 - _progress(iteration, problem.config.run.iterations, least) / BLURRED, 0.0)
+    iterations = problem.config.run.iterations
+    if problem.optimizer.measures_curvature:
+        iterations = min(iterations, round(BLURRED_ITERATIONS / BLURRED))
+    factor = max(1.0 - _progress(iteration, iterations, least) / BLURRED, 0.0)
     for view in problem.trained:
         view.blur = factor * problem.first_blur(view)
 
@@ -115,6 +119,8 @@ def close_enough(problem: Problem, iteration: int) -> str:
     for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
         extent = optimizer.extent(key)
         value = (1.0 if optimizer.variable(key).transform else rms(problem.selection.array(key))) / extent
+        if key in optimizer.extents:
+            value = 0.0  # the origin of a motion is arbitrary
         distance, limit = optimizer.to_go(key), CLOSE * max(value, LEAST_SHARE)
         if distance > limit or (AVERAGED * distance > limit and optimizer.averaged(key) < AVERAGED):
             return ""
@@ -160,14 +166,15 @@ def is_due(iteration: int, cost: float = 0.0) -> bool:
 def measure_block(problem: Problem, iteration: int) -> None:
     """Measure the joint curvature of all small parameters for `auto` by differences of images, if its samples fit."""
     optimizer, block, unit = problem.optimizer, problem.optimizer.block, problem.samples_per_pass or 1
-    scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
+    part = max(problem.config.run.spp // PART // unit, 1) * unit
+    curvature = LossCurvature(problem, part, of_target=False)
+    scales = {key: optimizer.ahead(key, curvature.loss) / DISPLACEMENT if key in optimizer.extents
+              else 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
               else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
     changes, spp = plan_changes(problem, scales, DISPLACEMENT), problem.config.run.spp
-    part = max(spp // PART // unit, 1) * unit
     views = len(problem.trained) / len(problem.drawn(iteration))
     if not is_due(iteration, views * 2 * (len(changes) + 1) * part / spp):
         return
-    curvature = LossCurvature(problem, part, of_target=False)
     directions, *_ = curvature.along(changes, lambda: True)
     # A texture has no entries, but channels.
     at = np.array([block.at[each.key].start + (each.entry or each.channel or 0) for each in directions])

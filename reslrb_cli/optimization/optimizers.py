@@ -45,6 +45,11 @@ EXTENT_OF_TRANSFORM = 2.0
 #: Largest number of entries of a parameter that `auto` moves together with others, and their longest step as a share of
 #: the extent, or in the unit of a transform.
 SMALL, LONGEST_OF_SMALL, LONGEST_OF_TRANSFORM = 4, 0.25, 0.3
+LONGEST_OF_MOTION = 0.1
+#: Largest number of texels of a heightmap that moves like a small parameter.
+SMALL_HEIGHTMAP = 32
+#: Smallest displacement of a motion for a measurement of the curvature, as a share of the longest step.
+LEAST_AHEAD = 0.25
 
 
 class Optimizer:
@@ -78,6 +83,8 @@ class Optimizer:
             for key in values
         }
         self._measures = type == "auto"
+        #: Extents of motions and heightmaps, by key (`displace`).
+        self.extents: Mapping[str, float] = {}
         #: Textures whose brightness is part of the joint steps of `auto` (`balance`).
         self.textures: list[str] = []
         self._variables: dict[str, Variable] = {}
@@ -119,6 +126,18 @@ class Optimizer:
         self.stands_at, value = None, dr.detach(self[key])
         self._variables[key], self._scene[key] = variable, _leaf(value)
         self._own[key][key] = variable.from_scene(value)
+
+    def displace(self, extents: Mapping[str, float]) -> None:
+        """Set the extents of motions and heightmaps. `auto` moves small heightmaps together with other small
+        parameters. Call this before the first step.
+        """
+        self.extents = extents
+        for key in extents if self._measures else ():
+            value, size = self._own[key][key], np.array(dr.detach(self._own[key][key])).size
+            if key not in self.block.at and size <= SMALL_HEIGHTMAP:
+                self._own[key] = Joint(self.block)
+                self._own[key][key] = value
+                self.block.add({key: size})
 
     def balance(self, exposure: str, colours: Sequence[str]) -> None:
         """From now on, divide `colours` by the change of `exposure` in each step. The arguments are keys. Entries
@@ -215,7 +234,7 @@ class Optimizer:
             value[at] = np.array(v).ravel()
             if key not in skip:
                 gradient[at] = np.array(variable.chain(v, self.gradient(key))).ravel()
-            longest[at] = LONGEST_OF_TRANSFORM if variable.transform else LONGEST_OF_SMALL * self.extent(key)
+            longest[at] = self._longest(key)
             low[at], high[at] = variable.ends or (-math.inf, math.inf)
             if key in colours and variable.transform is None:
                 place = block.at[balanced]
@@ -252,12 +271,26 @@ class Optimizer:
 
     def extent(self, key: str) -> float:
         """Return the size of the values that the optimiser's variable may have: the distance of the bounds, or twice
-        the root mean square of the current values.
+        the root mean square of the current values. A motion has its own extent, if the bounds are not closer.
         """
         low, high = self._bounds[key] or (-math.inf, math.inf)
         if self.variable(key).transform is not None:
             return EXTENT_OF_TRANSFORM
+        if key in self.extents:
+            return min(self.extents[key], high - low)
         return high - low if math.isfinite(high - low) else 2 * rms(np.array(dr.detach(self[key]))) or 1.0
+
+    def _longest(self, key: str) -> float:
+        if self.variable(key).transform is not None:
+            return LONGEST_OF_TRANSFORM
+        return (LONGEST_OF_MOTION if key in self.extents else LONGEST_OF_SMALL) * self.extent(key)
+
+    def ahead(self, key: str, loss: float) -> float:
+        """Return the displacement of a motion for a measurement of the curvature: the distance at which the motion
+        would explain its share of the `loss`, within limits.
+        """
+        longest = self._longest(key)
+        return float(np.clip(self.block.distance(key, loss), LEAST_AHEAD * longest, longest))
 
     @contextmanager
     def displaced(self, random: np.random.Generator) -> Iterator[None]:

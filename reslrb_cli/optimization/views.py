@@ -236,6 +236,10 @@ class View:
         """Return an image of the target's shape with excluded pixels set to 0."""
         return image if self.weights is None else np.where(np.array(self.weights) > 0, image, 0)
 
+    def blurred(self, image: Array) -> Array:
+        """Return an image (H, W, C) with the blur of this iteration."""
+        return np.array(blur(to_tensor(image), self.blur), dtype=np.float64) if self.blur else image
+
     def objective(self, image: mi.TensorXf) -> mi.Float:
         """Return the view's term in the loss of all views."""
         return self.compare(image) * self.share

@@ -336,6 +336,9 @@ class Deformation:
     values: dict[str, Any] = field(default_factory=dict)
     #: `length`, `degrees` or `scale`, by name: values of the same unit can be added.
     quantities: dict[str, str] = field(default_factory=dict)
+    #: Extent of each value of a motion: the size of what moves, a quarter turn, or a scale of 1. A quarter of the size
+    #: for a heightmap.
+    extents: dict[str, float] = field(default_factory=dict)
     _moved: dict[str, _Moved] = field(default_factory=dict)
     _corners: dict[tuple[str, int, int], tuple[list[mi.UInt32], list[mi.Float]]] = field(default_factory=dict)
 
@@ -361,6 +364,7 @@ class Deformation:
             self.values[name] = _opaque(start)
             is_angle = word == "rotation" or word in ANGLES
             self.quantities[name] = "degrees" if is_angle else "scale" if word == "scale" else "length"
+            self.extents[name] = 90.0 if is_angle else 1.0 if word == "scale" else _size(self.params, items)
 
     def add_heightmap(self, items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
         """Add a heightmap to the meshes `items`. They must not have one yet."""
@@ -373,6 +377,7 @@ class Deformation:
             moved.texcoords = _opaque(dr.unravel(mi.Point2f, mesh.vertex_texcoords_buffer()))
         self.values[name] = _opaque(dr.zeros(mi.TensorXf, (*resolution[::-1], 1)))
         self.quantities[name] = "length"
+        self.extents[name] = _size(self.params, items) / 4
 
     def laid_over(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (N, 3) and texture coordinates (N, 2) of the first mesh with the heightmap `name`, without
@@ -481,6 +486,17 @@ def _centre(params: mi.SceneParameters, items: tuple[Movable, ...]) -> tuple[flo
         return 0.0, 0.0, 0.0
     x, y, z = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
     return float(x), float(y), float(z)
+
+
+def _size(params: mi.SceneParameters, items: tuple[Movable, ...]) -> float:
+    """Return the longest side of the bounding box of `items`. Emitters without a surface have a quarter of the size of
+    all shapes.
+    """
+    nodes = [item.node for item in items if item.is_shape]
+    every = [node for _, _, node, *_ in params.properties.values() if isinstance(node, mi.Shape)]
+    corners = [corner for node in nodes or every for corner in bounds(node)]
+    size = float(np.ptp(corners, axis=0).max()) if corners else 0.0
+    return (size if nodes else size / 4) or 1.0
 
 
 def _opaque(value: Any) -> Any:

@@ -53,8 +53,6 @@ from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms, scale_frequencies
 
 _PURPOSE = "curvature"
-#: Largest number of entries that are examined one by one.
-MOST_ENTRIES = 4
 #: Parts of keys of textures that mix channels into one number.
 MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metallic", "anisotropic")
 #: Maximum distance of two texels that are coupled, along each axis, and the smallest eigenvalue of their coupling that
@@ -126,7 +124,7 @@ def plan_changes(
     directions.
     """
     keys = [key for key in problem.selection.keys if key in scales]
-    small = [key for key in keys if problem.selection.array(key).size <= MOST_ENTRIES]
+    small = [key for key in keys if problem.one_by_one(key)]
     textures = [key for key in keys if problem.selection.array(key).ndim == 3]
     changes: list[ParameterChange] = []
     for key in (*small, *(key for key in textures if key not in small)):
@@ -267,6 +265,16 @@ class LossCurvature:
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises() if of_target else []
 
+    @property
+    def loss(self) -> float:
+        """The loss without the noise of the images: half the sum of W (I_a - T) (I_b - T)."""
+        total = 0.0
+        for place, view in enumerate(self.problem.trained):
+            true = view.kept(np.array(view.target, dtype=np.float64))
+            a, b = (view.blurred(self._base[half][place] - true) for half in (0, 1))
+            total += 0.5 * float(np.sum(np.nan_to_num(self._weights[place] * a * b)))
+        return max(total, 0.0)
+
     def along(
         self, changes: Sequence[ParameterChange], go_on: Callable[[], bool]
     ) -> tuple[list[ParameterDirection], Array, Array]:
@@ -287,8 +295,8 @@ class LossCurvature:
                 directions.append(direction)
                 even.append(0.0)
                 for half in (0, 1):
-                    pairs = zip(images[half], self._base[half], strict=True)
-                    slopes = [_of_channel((a - b) / change.amount, direction.channel) for a, b in pairs]
+                    both = zip(self.problem.trained, images[half], self._base[half], strict=True)
+                    slopes = [_of_channel(view.blurred(a - b) / change.amount, direction.channel) for view, a, b in both]
                     columns[half].append(self._in_a_row(slopes))
                     pulls = [(n, each) for views in self.noises for n, each in zip(views, slopes, strict=True)]
                     if pulls:

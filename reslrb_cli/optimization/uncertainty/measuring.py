@@ -14,7 +14,6 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.uncertainty.curvature import (
-    MOST_ENTRIES,
     LossCurvature,
     ParameterDirection,
     plan_changes,
@@ -68,12 +67,12 @@ class Certainty:
     def see(self, before: State, state: State) -> None:
         """Record data of the iteration that leads from `before` to `state`. This costs almost nothing."""
         for key, initial in self._initial.items():
-            shape = self.problem.selection.array(key).shape
-            if initial.size > MOST_ENTRIES and (len(shape) != 3 or initial.size > MOST_RECORDED):
+            shape, one_by_one = self.problem.selection.array(key).shape, self.problem.one_by_one(key)
+            if not one_by_one and (len(shape) != 3 or initial.size > MOST_RECORDED):
                 continue
             both = (state.gradients, before.values)
             gradient, value = (to_array(each[key]).astype(np.float64).ravel() for each in both)
-            if initial.size > MOST_ENTRIES:
+            if not one_by_one:
                 gradient, value = brightness(gradient, value, shape[2])
             if np.isfinite(gradient).all():
                 earlier = self.last.get(key, np.zeros((0, 2, gradient.size)))
@@ -201,7 +200,7 @@ class Certainty:
                 scale=self.scale(key),
                 gradients=rows,
                 step=np.nan_to_num(optimizer.response(key) * optimizer.rate(key) * self.rates[-1]),
-                is_small=value.size <= MOST_ENTRIES,
+                is_small=self.problem.one_by_one(key),
                 start=self._initial[key],
                 last=None if last is None else last[-(iterations // 2) :],
                 seen=self._seen_entries(key, rows),
