@@ -50,9 +50,9 @@ from reslrb_cli.measure.participants import MOVING_DIRECTIONS, PATHS
 from reslrb_cli.measure.references import ends
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import as_decided, is_auto
+from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
-from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.measurements import NOTHING, MissingRecord

@@ -31,6 +31,7 @@ from reslrb_cli.optimization.loading import (
     what_moves,
 )
 from reslrb_cli.optimization.memory import check_described, check_films, check_step, plans
+from reslrb_cli.optimization.optimizers import SMALL_HEIGHTMAP
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
@@ -198,11 +199,26 @@ def assemble_scene(config: Config, scene: Any = None) -> Problem:
     if isinstance(problem.integrator, LightTracer):
         problem.integrator.expect(pass_spp(config))
     problem.apply()
-    if config.optimizer.type == "auto" and moves and not motions:
-        reason = "auto has no steps for parameters that move light; use adam, with a learning_rate and a schedule"
-        raise ConfigError(config.source, "optimizer.type", reason)
+    if config.optimizer.type == "auto":
+        _check_steps(problem)
     _check_moving(problem)
     return problem
+
+
+def _check_steps(problem: Problem) -> None:
+    """Raise ConfigError if `auto` has no steps for a parameter."""
+    selection = problem.selection
+    for key in selection.keys:
+        if key in selection.deformation.extents:
+            lacks = "" if problem.one_by_one(key) else f"a heightmap of more than {SMALL_HEIGHTMAP} texels"
+        else:
+            in_scene = [key] if key in selection.params.properties else []
+            bends = any(bends_light(selection.params, each) for each in in_scene)
+            moves = bool(where_moved(selection.params, in_scene))
+            lacks = "the refraction of a glass" if bends else "places outside of a motion" if moves else ""
+        if lacks:
+            reason = f"auto has no steps for {lacks}, such as `{key}`; use adam, with a learning_rate and a schedule"
+            raise ConfigError(problem.config.source, "optimizer.type", reason)
 
 
 def _check_moving(problem: Problem) -> None:

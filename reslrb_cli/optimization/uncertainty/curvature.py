@@ -295,8 +295,9 @@ class LossCurvature:
                 directions.append(direction)
                 even.append(0.0)
                 for half in (0, 1):
-                    both = zip(self.problem.trained, images[half], self._base[half], strict=True)
-                    slopes = [_of_channel(view.blurred(a - b) / change.amount, direction.channel) for view, a, b in both]
+                    views = zip(self.problem.trained, images[half], self._base[half], strict=True)
+                    changed = [view.blurred(a - b) / change.amount for view, a, b in views]
+                    slopes = [_of_channel(each, direction.channel) for each in changed]
                     columns[half].append(self._in_a_row(slopes))
                     pulls = [(n, each) for views in self.noises for n, each in zip(views, slopes, strict=True)]
                     if pulls:
