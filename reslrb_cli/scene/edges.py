@@ -72,8 +72,8 @@ class _Rows:
     - `c` and `d` are the third corners of the two faces at a segment. They are equal if the segment has one face.
     - `radius` is the radius of a sphere or a cylinder, otherwise 0.
     - `shape` is the index of the shape's pointer.
-    - `crease` is the angle between the normals of the two faces, divided by pi. It is 0 if it would be below `FLAT`, if
-        the edge has only one face, or if the shape interpolates its normals across the edge.
+    - `crease` is the angle between the normals of the two faces, divided by pi. It is negative if the shape interpolates
+        its normals across the edge. It is 0 if it would be below `FLAT`, or if the edge has only one face.
     """
 
     kind: mi.UInt32
@@ -87,6 +87,21 @@ class _Rows:
 
 
 @dataclass
+class FaceTable:
+    """Faces of meshes with interpolated normals (`transport/faces.py`).
+
+    The corners `p` have the normals `n`. `shape` is the index of the shape's pointer. `rims` are cumulative sampling
+    weights of the faces for rims. `folds` are those of the table's edges for folds.
+    """
+
+    p: list[mi.Point3f]
+    n: list[mi.Vector3f]
+    shape: mi.UInt32
+    rims: mi.Float
+    folds: mi.Float
+
+
+@dataclass
 class EdgeTable(_Rows):
     """Current edges with sampling weights. A recording takes the arrays as inputs.
 
@@ -95,7 +110,8 @@ class EdgeTable(_Rows):
         outlines seen from the sensor and from all directions.
 
     `balls` contain the moving shapes. If the scene has mirrors or glass, `chains` has cumulative sampling weights of
-    specular chains (`estimators/chain_edges.py`).
+    specular chains (`estimators/chain_edges.py`). `faces` has the faces of moving meshes with interpolated normals, if
+    there are any.
     """
 
     moves: mi.Bool
@@ -104,6 +120,7 @@ class EdgeTable(_Rows):
     anywhere: mi.Float
     balls: list[Ball]
     chains: list[mi.Float]
+    faces: list[FaceTable]
 
 
 def _number(shape: mi.Shape) -> int:
@@ -132,16 +149,17 @@ class _Mesh:
 
     def creases(self, corners: list[mi.Point3f]) -> mi.Float:
         """Return the angle between the normals of the two faces at each edge, divided by pi. If normals are
-        interpolated, it is the angle between the shading normals.
+        interpolated, it is the angle between the shading normals, or, if there is none, minus that of the faces.
         """
         a, b, c, d = corners
         angle = dr.pi - turned(b - a, c - a, d - a)
         if interpolates_normals(self.shape):
             buffer = dr.detach(self.shape.vertex_normals_buffer())
             i, j, _, _, i_2, j_2 = (dr.normalize(dr.gather(mi.Vector3f, buffer, index)) for index in self.corners)
-            angle = dr.maximum(angle_between(i, i_2), angle_between(j, j_2))
+            shading = dr.maximum(angle_between(i, i_2), angle_between(j, j_2))
+            angle = dr.select(shading > FLAT * dr.pi, shading, -angle)
         single = self.corners[2] == self.corners[3]
-        return dr.select(single | ~(angle > FLAT * dr.pi), 0, angle * dr.inv_pi)
+        return dr.select(single | ~(dr.abs(angle) > FLAT * dr.pi), 0, angle * dr.inv_pi)
 
 
 @dataclass
@@ -317,7 +335,7 @@ class EdgeSet:
             free = 4 * (dr.pi - turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a))
             free = dr.select(rows.kind == SEGMENT, dr.select(dr.isfinite(free), free, 0), 4 * dr.pi)
             return EdgeTable(**vars(rows), moves=dr.concat(moves), lamp=length, sensor=length, anywhere=length * free,
-                             balls=balls, chains=[])  # fmt: skip
+                             balls=balls, chains=[], faces=[])  # fmt: skip
 
 
 def across(along: mi.Vector3f, corner: mi.Vector3f) -> mi.Vector3f:
