@@ -1,26 +1,25 @@
-"""Derivatives of the light at the horizons of faces with interpolated normals, for camera paths.
+"""Derivatives of light at the horizons of faces with interpolated normals, for camera paths.
 
 Light from below the plane of a face does not reach the face, because other faces of its mesh are in the way. With
-interpolated normals, f and the cosine of the shading normal need not vanish in the directions d in this plane. The light
-that leaves the face therefore jumps as the plane passes a lamp. Three terms follow from this, and from the interpolated
-normals themselves. The symbols are those of `camera_edges.py`.
+interpolated normals, f = bsdf * cos need not vanish in the directions d of this plane, so the light that leaves the
+face jumps as the plane passes a lamp. There are three terms. Their symbols are those of `camera_edges.py`.
 
-Horizons: p is a point of a camera path on a face with the normal n. y is the point that a ray from p in the direction d
-reaches, at the distance r. d has a uniform angle in the plane. L_above and L_below are the radiances along rays just
-above and just below the plane. P is the adjoint of the light that leaves p towards the sensor, divided by the density
-of d, 1 / (2 pi). The light of the sky has a fixed direction, and so has the share h of the light from other surfaces
-(`Plan.near`). Lamps have h = 0.
+Horizons: p is a point of a camera path on a face with the normal n. d is a direction in the plane of the face, with a
+uniform angle. y is the point that the ray from p reaches, at the distance r. L_above and L_below are the radiances
+along rays just above and just below the plane. P is the adjoint of the light that leaves p. Light of the sky has a
+fixed direction, and so has the share h of the light from other surfaces (`Plan.near`). For lamps, h is 0.
 
-    dL/dtheta  +=  P f(d) (L_above - L_below) ( <dn/dtheta, d> + (1 - h) <v_y - v_p, n> / r )
+    dL/dtheta  +=  2 pi P f (L_above - L_below) (<dn/dtheta, d> + (1 - h) <v_y - v_p, n> / r)
 
-Folds: two faces with a common edge receive light from different half-spaces. The light that leaves them jumps at the
-edge. The directions d are uniform in the two wedges between the planes, which have the solid angle 4 alpha. alpha is the
-angle between the planes. L_1 and L_2 are the radiances along rays that start at the first and the second face.
+Folds: two faces with a common edge receive light from different directions, so the light that leaves them jumps at the
+edge. d is a direction in the two wedges between both planes. alpha is the angle between the planes, so the wedges have
+the solid angle 4 alpha. L_1 and L_2 are the radiances along rays that start on the first and on the second face.
 
-    dL/dtheta  +=  4 alpha w delta(u) f(d) (L_1 - L_2) <v_p, n>
+    dL/dtheta  +=  4 alpha w delta(u) f (L_1 - L_2) <v_p, n>
 
-Rims (`transport/faces.py`): the cosine c between the shading normal and the direction to the sensor is 0. L_p is the
-radiance from the side with c > 0, and L_x from the other side. The ray through the film position is fixed.
+Rims (`transport/faces.py`): c is the cosine between the shading normal and the direction to the sensor. It is 0 on a
+rim. L_p is the radiance from the side with c > 0, and L_x from the other side. The derivative of c is that at a fixed
+film position.
 
     dL/dtheta  +=  w delta(u) (L_p - L_x) dc/dtheta
 """
@@ -43,8 +42,8 @@ from reslrb_cli.scene.rays import ray_offset
 from reslrb_cli.transport.bsdf import Scattering, evaluate
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
 from reslrb_cli.transport.edges import sample_outline, view_from_sensor
-from reslrb_cli.transport.factors import MAY_LACK, showing
 from reslrb_cli.transport.faces import sample_rim, smooth_meshes
+from reslrb_cli.transport.factors import MAY_LACK, showing
 from reslrb_cli.transport.film import Colours
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex

@@ -38,8 +38,8 @@ from reslrb_cli.integrators.plans import AttachedOptions, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.edges import weigh_edges
-from reslrb_cli.transport.faces import weigh_faces
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
+from reslrb_cli.transport.faces import weigh_faces
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.pixel_shares import PixelShares
 from reslrb_cli.transport.plan import Plan

@@ -72,8 +72,9 @@ class _Rows:
     - `c` and `d` are the third corners of the two faces at a segment. They are equal if the segment has one face.
     - `radius` is the radius of a sphere or a cylinder, otherwise 0.
     - `shape` is the index of the shape's pointer.
-    - `crease` is the angle between the normals of the two faces, divided by pi. It is negative if the shape interpolates
-        its normals across the edge. It is 0 if it would be below `FLAT`, or if the edge has only one face.
+    - `crease` is the angle between the normals of the two faces, divided by pi. It is negative if the shape
+        interpolates its normals across the edge. It is 0 if it would be below `FLAT`, or if the edge has only one
+        face.
     """
 
     kind: mi.UInt32
@@ -123,13 +124,14 @@ class EdgeTable(_Rows):
     faces: list[FaceTable]
 
 
-def _number(shape: mi.Shape) -> int:
+def number_of(shape: mi.Shape) -> int:
+    """Return the index of the shape's pointer."""
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def _rows(shape: mi.Shape, corners: list[mi.Point3f], kind: int = SEGMENT, radius: Any = 0, crease: Any = 0) -> _Rows:
     n, wide = dr.width(corners[0]), dr.zeros(mi.Float, dr.width(corners[0]))
-    shapes = dr.full(mi.UInt32, _number(shape), n)
+    shapes = dr.full(mi.UInt32, number_of(shape), n)
     a, b, c, d = corners
     return _Rows(dr.full(mi.UInt32, kind, n), a, b, c, d, wide + radius, shapes, wide + crease)
 
@@ -205,20 +207,20 @@ def _edges_of(shape: mi.Shape) -> list[_Mesh | _Curves | _Round]:
     return [_Mesh(shape, [own_memory(mi.UInt32, np.ascontiguousarray(column)) for column in edges.T])]
 
 
-def _points(arrays: list[mi.Point3f]) -> mi.Point3f:
+def joined_points(arrays: Iterable[mi.Point3f]) -> mi.Point3f:
     """Return the points of all arrays in one array."""
-    return mi.Point3f(*(dr.concat([points[axis] for points in arrays]) for axis in range(3)))
+    return mi.Point3f(*(dr.concat([*axis]) for axis in zip(*arrays, strict=True)))
 
 
 def _joined(parts: list[_Rows]) -> _Rows:
     columns = {name: [getattr(part, name) for part in parts] for name in vars(parts[0])}
-    return _Rows(**{name: _points(each) if name in "abcd" else dr.concat(each) for name, each in columns.items()})
+    return _Rows(**{name: joined_points(each) if name in "abcd" else dr.concat(each) for name, each in columns.items()})
 
 
 def _ball(parts: list[_Rows]) -> Ball:
     rows = _joined(parts)
     ends = [rows.a, dr.select(rows.kind == SPHERE, rows.a, rows.b)]
-    return Ball.around(_points(ends), dr.concat([rows.radius, rows.radius]))
+    return Ball.around(joined_points(ends), dr.concat([rows.radius, rows.radius]))
 
 
 def _are_open(rows: _Rows, scene: mi.Scene, balls: list[Ball]) -> mi.Bool:
@@ -314,7 +316,7 @@ class EdgeSet:
                 dr.make_opaque(rows)
                 self._still = [rows]
                 present = set(np.array(rows.shape).tolist())
-                self.occluders = tuple(shape for shape in still if _number(shape) in present)
+                self.occluders = tuple(shape for shape in still if number_of(shape) in present)
 
     def now(self) -> EdgeTable:
         """Return the current edges. The sampling weights are not cumulative yet. They are lengths for lamps and sensor.
@@ -324,7 +326,7 @@ class EdgeSet:
             moving = [[part.rows() for part in parts] for parts in self._moving]
             balls = [_ball(rows) for rows in moving]
             if len(balls) > MOST_BALLS:
-                centers = _points([ball.center for ball in balls])
+                centers = joined_points([ball.center for ball in balls])
                 balls = [Ball.around(centers, dr.concat([ball.radius for ball in balls]))]
             parts = [rows for each in moving for rows in each]
             moves = [dr.full(mi.Bool, True, dr.width(rows.a)) for rows in parts]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.edges import EdgeTable, FaceTable
+from reslrb_cli.scene.edges import EdgeTable, FaceTable, joined_points, number_of
 from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.transport.edges import UNLIKELY, Chances, Outline, Viewer, is_outline, pick, view_from_sensor
 from reslrb_cli.transport.plan import Plan
@@ -37,13 +37,11 @@ def weigh_faces(samples: Samples, table: EdgeTable) -> list[FaceTable]:
         return []
     with dr.suspend_grad():
         view = view_from_sensor(samples, mi.Point2f(0.5))
-        rows = [_corners(shape) for shape in shapes]
-        p, n = ([type(each[0])(*(dr.concat([*axis]) for axis in zip(*each, strict=True))) for each in zip(*parts, strict=True)]
-                for parts in zip(*rows, strict=True))  # fmt: skip
-        numbers = [mi.UInt32(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))) for shape in shapes]
-        numbers = [dr.repeat(each, shape.face_count()) for each, shape in zip(numbers, shapes, strict=True)]
-        faces = [dr.dot(normal, view(corner, mi.Bool(True)).to_y) > 0 for corner, normal in zip(p, n, strict=True)]
-        has_rim = (faces[0] != faces[1]) | (faces[1] != faces[2])
+        corners = [joined_points(each) for each in zip(*(_corners(shape) for shape in shapes), strict=True)]
+        p, n = corners[:3], [mi.Vector3f(each) for each in corners[3:]]
+        numbers = [dr.full(mi.UInt32, number_of(shape), shape.face_count()) for shape in shapes]
+        cosines = [dr.dot(normal, view(corner, mi.Bool(True)).to_y) for corner, normal in zip(p, n, strict=True)]
+        has_rim = (cosines[0] * cosines[1] < 0) | (cosines[1] * cosines[2] < 0)
         size = dr.sqrt(dr.norm(dr.cross(p[1] - p[0], p[2] - p[0])))
         outlines = is_outline(table, view(dr.lerp(table.a, table.b, 0.5), mi.Bool(True)))
         folds = dr.select(table.moves, dr.maximum(-table.crease, 0), 0) * table.sensor
@@ -55,13 +53,12 @@ def weigh_faces(samples: Samples, table: EdgeTable) -> list[FaceTable]:
     return [result]
 
 
-def _corners(shape: mi.Shape) -> tuple[list[mi.Point3f], list[mi.Vector3f]]:
-    """Return the corners of the faces, and the normals there."""
+def _corners(shape: mi.Shape) -> list[mi.Point3f]:
+    """Return the three corners of all faces, and the three normals there."""
     first = 3 * dr.arange(mi.UInt32, shape.face_count())
     corners = [dr.gather(mi.UInt32, shape.faces_buffer(), first + k) for k in range(3)]
-    positions, normals = dr.detach(shape.vertex_positions_buffer()), dr.detach(shape.vertex_normals_buffer())
-    return ([dr.gather(mi.Point3f, positions, each) for each in corners],
-            [dr.gather(mi.Vector3f, normals, each) for each in corners])  # fmt: skip
+    buffers = dr.detach(shape.vertex_positions_buffer()), dr.detach(shape.vertex_normals_buffer())
+    return [dr.gather(mi.Point3f, buffer, each) for buffer in buffers for each in corners]
 
 
 def sample_rim(table: FaceTable, viewer: Viewer, chances: Chances) -> Outline:
