@@ -9,6 +9,9 @@ each line through a face. `sample_rim` finds a root of this function. The line i
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import or_
+
 import drjit as dr
 import mitsuba as mi
 
@@ -44,7 +47,8 @@ def weigh_faces(samples: Samples, table: EdgeTable) -> list[FaceTable]:
         has_rim = (cosines[0] * cosines[1] < 0) | (cosines[1] * cosines[2] < 0)
         size = dr.sqrt(dr.norm(dr.cross(p[1] - p[0], p[2] - p[0])))
         outlines = is_outline(table, view(dr.lerp(table.a, table.b, 0.5), mi.Bool(True)))
-        folds = dr.select(table.moves, dr.maximum(-table.crease, 0), 0) * table.sensor
+        folded = reduce(or_, (table.shape == number_of(shape) for shape in shapes))
+        folds = dr.select(folded, dr.maximum(-table.crease, 0), 0) * table.sensor
         result = FaceTable(
             p, n, dr.concat(numbers), rims=dr.cumsum(size * dr.select(has_rim, 1, UNLIKELY)),
             folds=dr.cumsum(folds * dr.select(outlines, UNLIKELY, 1)),
