@@ -52,6 +52,7 @@ from reslrb_cli.estimators.attached import near_share
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.camera import Radiance
 from reslrb_cli.estimators.edges import LAMP_EDGES, OTHER_EDGES, SENSOR_EDGES, PickLight
+from reslrb_cli.estimators.horizons import TERMS as HORIZON_TERMS
 from reslrb_cli.estimators.outline_rays import (
     PATHS_PER_OUTLINE,
     Beside,
@@ -82,6 +83,9 @@ def differentiate_edges_of_camera_paths(p: Pass) -> None:
     terms = [(SENSOR_EDGES, _from_sensor, 1), (LAMP_EDGES, _from_lamps, PATHS_PER_OUTLINE)]
     if p.plan.max_depth > 2:
         terms.append((OTHER_EDGES, _between, PATHS_PER_OUTLINE))
+    assert p.samples.edges is not None
+    if p.samples.edges.faces:
+        terms += [(stream, term, 1) for stream, term in HORIZON_TERMS]
     for stream, side, each in terms:
         samples = edge_samples(p.samples, stream, each)
         samples.plan = replace(samples.plan, camera=False, paths="light")

@@ -39,6 +39,7 @@ from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.edges import weigh_edges
 from reslrb_cli.transport.emission import differentiate_visible_emission, splat_visible_emission
+from reslrb_cli.transport.faces import weigh_faces
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.pixel_shares import PixelShares
 from reslrb_cli.transport.plan import Plan
@@ -160,7 +161,10 @@ class LightTracer(StepIntegrator):
         if not plan.has_edges or purpose is Purpose.IMAGE:
             return parts
         now = self.preparation.edges(plan).now()
-        tables = [replace(weigh_edges(side, now), chains=weigh_cells(side)) for side in parts[0].sides()]
+        tables = [
+            replace(weigh_edges(side, now), chains=weigh_cells(side), faces=weigh_faces(side, now))
+            for side in parts[0].sides()
+        ]
 
         def with_edges(part: Samples) -> Samples:
             sides = zip(part.sides(), tables, strict=True)

@@ -72,8 +72,9 @@ class _Rows:
     - `c` and `d` are the third corners of the two faces at a segment. They are equal if the segment has one face.
     - `radius` is the radius of a sphere or a cylinder, otherwise 0.
     - `shape` is the index of the shape's pointer.
-    - `crease` is the angle between the normals of the two faces, divided by pi. It is 0 if it would be below `FLAT`, if
-        the edge has only one face, or if the shape interpolates its normals across the edge.
+    - `crease` is the angle between the normals of the two faces, divided by pi. It is negative if the shape
+        interpolates its normals across the edge. It is 0 if it would be below `FLAT`, or if the edge has only one
+        face.
     """
 
     kind: mi.UInt32
@@ -87,6 +88,21 @@ class _Rows:
 
 
 @dataclass
+class FaceTable:
+    """Faces of meshes with interpolated normals (`transport/faces.py`).
+
+    The corners `p` have the normals `n`. `shape` is the index of the shape's pointer. `rims` are cumulative sampling
+    weights of the faces for rims. `folds` are those of the table's edges for folds.
+    """
+
+    p: list[mi.Point3f]
+    n: list[mi.Vector3f]
+    shape: mi.UInt32
+    rims: mi.Float
+    folds: mi.Float
+
+
+@dataclass
 class EdgeTable(_Rows):
     """Current edges with sampling weights. A recording takes the arrays as inputs.
 
@@ -95,7 +111,8 @@ class EdgeTable(_Rows):
         outlines seen from the sensor and from all directions.
 
     `balls` contain the moving shapes. If the scene has mirrors or glass, `chains` has cumulative sampling weights of
-    specular chains (`estimators/chain_edges.py`).
+    specular chains (`estimators/chain_edges.py`). `faces` has the faces of moving meshes with interpolated normals, if
+    there are any.
     """
 
     moves: mi.Bool
@@ -104,15 +121,17 @@ class EdgeTable(_Rows):
     anywhere: mi.Float
     balls: list[Ball]
     chains: list[mi.Float]
+    faces: list[FaceTable]
 
 
-def _number(shape: mi.Shape) -> int:
+def number_of(shape: mi.Shape) -> int:
+    """Return the index of the shape's pointer."""
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def _rows(shape: mi.Shape, corners: list[mi.Point3f], kind: int = SEGMENT, radius: Any = 0, crease: Any = 0) -> _Rows:
     n, wide = dr.width(corners[0]), dr.zeros(mi.Float, dr.width(corners[0]))
-    shapes = dr.full(mi.UInt32, _number(shape), n)
+    shapes = dr.full(mi.UInt32, number_of(shape), n)
     a, b, c, d = corners
     return _Rows(dr.full(mi.UInt32, kind, n), a, b, c, d, wide + radius, shapes, wide + crease)
 
@@ -132,16 +151,17 @@ class _Mesh:
 
     def creases(self, corners: list[mi.Point3f]) -> mi.Float:
         """Return the angle between the normals of the two faces at each edge, divided by pi. If normals are
-        interpolated, it is the angle between the shading normals.
+        interpolated, it is the angle between the shading normals, or, if there is none, minus that of the faces.
         """
         a, b, c, d = corners
         angle = dr.pi - turned(b - a, c - a, d - a)
         if interpolates_normals(self.shape):
             buffer = dr.detach(self.shape.vertex_normals_buffer())
             i, j, _, _, i_2, j_2 = (dr.normalize(dr.gather(mi.Vector3f, buffer, index)) for index in self.corners)
-            angle = dr.maximum(angle_between(i, i_2), angle_between(j, j_2))
+            shading = dr.maximum(angle_between(i, i_2), angle_between(j, j_2))
+            angle = dr.select(shading > FLAT * dr.pi, shading, -angle)
         single = self.corners[2] == self.corners[3]
-        return dr.select(single | ~(angle > FLAT * dr.pi), 0, angle * dr.inv_pi)
+        return dr.select(single | ~(dr.abs(angle) > FLAT * dr.pi), 0, angle * dr.inv_pi)
 
 
 @dataclass
@@ -187,20 +207,20 @@ def _edges_of(shape: mi.Shape) -> list[_Mesh | _Curves | _Round]:
     return [_Mesh(shape, [own_memory(mi.UInt32, np.ascontiguousarray(column)) for column in edges.T])]
 
 
-def _points(arrays: list[mi.Point3f]) -> mi.Point3f:
+def joined_points(arrays: Iterable[mi.Point3f]) -> mi.Point3f:
     """Return the points of all arrays in one array."""
-    return mi.Point3f(*(dr.concat([points[axis] for points in arrays]) for axis in range(3)))
+    return mi.Point3f(*(dr.concat([*axis]) for axis in zip(*arrays, strict=True)))
 
 
 def _joined(parts: list[_Rows]) -> _Rows:
     columns = {name: [getattr(part, name) for part in parts] for name in vars(parts[0])}
-    return _Rows(**{name: _points(each) if name in "abcd" else dr.concat(each) for name, each in columns.items()})
+    return _Rows(**{name: joined_points(each) if name in "abcd" else dr.concat(each) for name, each in columns.items()})
 
 
 def _ball(parts: list[_Rows]) -> Ball:
     rows = _joined(parts)
     ends = [rows.a, dr.select(rows.kind == SPHERE, rows.a, rows.b)]
-    return Ball.around(_points(ends), dr.concat([rows.radius, rows.radius]))
+    return Ball.around(joined_points(ends), dr.concat([rows.radius, rows.radius]))
 
 
 def _are_open(rows: _Rows, scene: mi.Scene, balls: list[Ball]) -> mi.Bool:
@@ -296,7 +316,7 @@ class EdgeSet:
                 dr.make_opaque(rows)
                 self._still = [rows]
                 present = set(np.array(rows.shape).tolist())
-                self.occluders = tuple(shape for shape in still if _number(shape) in present)
+                self.occluders = tuple(shape for shape in still if number_of(shape) in present)
 
     def now(self) -> EdgeTable:
         """Return the current edges. The sampling weights are not cumulative yet. They are lengths for lamps and sensor.
@@ -306,7 +326,7 @@ class EdgeSet:
             moving = [[part.rows() for part in parts] for parts in self._moving]
             balls = [_ball(rows) for rows in moving]
             if len(balls) > MOST_BALLS:
-                centers = _points([ball.center for ball in balls])
+                centers = joined_points([ball.center for ball in balls])
                 balls = [Ball.around(centers, dr.concat([ball.radius for ball in balls]))]
             parts = [rows for each in moving for rows in each]
             moves = [dr.full(mi.Bool, True, dr.width(rows.a)) for rows in parts]
@@ -317,7 +337,7 @@ class EdgeSet:
             free = 4 * (dr.pi - turned(rows.b - rows.a, rows.c - rows.a, rows.d - rows.a))
             free = dr.select(rows.kind == SEGMENT, dr.select(dr.isfinite(free), free, 0), 4 * dr.pi)
             return EdgeTable(**vars(rows), moves=dr.concat(moves), lamp=length, sensor=length, anywhere=length * free,
-                             balls=balls, chains=[])  # fmt: skip
+                             balls=balls, chains=[], faces=[])  # fmt: skip
 
 
 def across(along: mi.Vector3f, corner: mi.Vector3f) -> mi.Vector3f:

@@ -409,13 +409,13 @@ def _seen_from_lamps(samples: Samples, table: EdgeTable, creases: bool) -> mi.Fl
     found = mi.Bool(False)
     for numbers in _probes():
         view = view_from_lamps(samples, numbers)(dr.lerp(table.a, table.b, 0.5), mi.Bool(True))
-        found |= _is_outline(table, view) & view.active
+        found |= is_outline(table, view) & view.active
     return _likely(table, found, creases)
 
 
 def _seen_from_sensor(samples: Samples, table: EdgeTable, creases: bool) -> mi.Float:
     view = view_from_sensor(samples, mi.Point2f(0.5))(dr.lerp(table.a, table.b, 0.5), mi.Bool(True))
-    return _likely(table, _is_outline(table, view), creases)
+    return _likely(table, is_outline(table, view), creases)
 
 
 def _likely(table: EdgeTable, found: mi.Bool, creases: bool) -> mi.Float:
@@ -424,6 +424,7 @@ def _likely(table: EdgeTable, found: mi.Bool, creases: bool) -> mi.Float:
     return dr.select(found | (table.kind != SEGMENT), 1.0, other)
 
 
-def _is_outline(table: EdgeTable, view: EdgeView) -> mi.Bool:
+def is_outline(table: EdgeTable, view: EdgeView) -> mi.Bool:
+    """True if the middle of an edge lies on the outline in the `view` of this point."""
     raw = dr.cross(table.b - table.a, view.to_y)
     return dr.dot(raw, table.c - table.a) * dr.dot(raw, table.d - table.a) > 0

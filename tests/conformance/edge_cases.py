@@ -223,6 +223,8 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
                                                             scale=0.7))},
     "reflected": lambda: {"shape": _sphere(0.1, 0, 0.6)},
     "bumpy": lambda: {"shape": mesh(*bumpy()[:2], TWO_SIDED)},
+    # A coarse ball with interpolated normals.
+    "smooth": lambda: {"shape": mesh(*ball((0.1, -0.1, 0.9), 0.4), OWN, normals=True)},
     "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
                      for n, name in enumerate(FLAT)},
 }  # fmt: skip
@@ -341,6 +343,8 @@ RECORDED = [
     EdgeCase("glazed", "area", 4, ("x", "z"), spp=1280, reference_spp=8192, options={"paths": "light"}),
     EdgeCase("slab", "area", 4, spp=768, reference_spp=16384, step=0.02, options=BOTH),
     standing("area", 3, spp=768, reference_spp=8192),
+    EdgeCase("smooth", "area", spp=2048, reference_spp=65536, step=0.015, options=CAMERA),
+    EdgeCase("smooth", "front", spp=1024, reference_spp=8192, step=SMALLER, options=CAMERA),
     # The box hides the sky from the floor, and the edge of the floor hides it from the box. Light paths are noisy here.
     standing("constant", 3, spp=768, reference_spp=16384, options=CAMERA),
 ]  # fmt: skip
@@ -354,6 +358,7 @@ CASES = [
     EdgeCase("hidden", "directional", motion=("turn",), lamp_moves=True, spp=1024, step=SMALLER),
     EdgeCase("box", "room", 3, lamp_moves=True, spp=1024, reference_spp=8192),
     *(EdgeCase("cylinder", lamp, spp=2048) for lamp in ("area", "sphere_lamp")), EdgeCase("box", "room", 3, spp=1024),
+    *(EdgeCase("smooth", lamp, 3, spp=2048, reference_spp=8192, options=CAMERA) for lamp in ("area", "constant")),
 ]  # fmt: skip
 
 

@@ -71,6 +71,7 @@ SIMILAR = (
     "box-indirect-3",
     "reflected-area-3",  # the slab has edges and shadows of both kinds of chains
     "mirror-constant-3",
+    "smooth-front-2",
 )
 
 
@@ -194,6 +195,18 @@ FAULTS_OF_CAMERA_PATHS = [
           "-size * n", "0 * size * n"),
     Fault("no_sky_behind_resting_shapes", "standing-constant-3", "scene.edges:_sky_before",
           "-ball.frame", "ball.frame"),
+    Fault("density_on_a_horizon_left_out", "smooth-area-2", "estimators.horizons:_horizons",
+          "(side * 2 * dr.two_pi)", "side"),
+    Fault("planes_of_faces_turn_the_wrong_way", "smooth-area-2", "estimators.horizons:_horizons",
+          "dr.dot(face.n, d) * size", "-dr.dot(face.n, d) * size"),
+    Fault("planes_of_faces_do_not_move", "smooth-area-2", "estimators.horizons:_horizons",
+          "(1 - share) * size / y.t", "mi.Float(0)"),
+    Fault("wedge_has_half_its_size", "smooth-area-2", "estimators.horizons:_folds", "4 * angle", "2 * angle"),
+    Fault("faces_of_a_fold_exchanged", "smooth-area-2", "estimators.horizons:_folds",
+          "dr.select(over, one, other)", "dr.select(over, other, one)"),
+    Fault("sides_of_rims_exchanged", "smooth-area-2", "estimators.horizons:_rims",
+          "dr.select(over, beside.over, beside.past)", "dr.select(over, beside.past, beside.over)"),
+    Fault("rims_have_another_density", "smooth-area-2", "transport.faces:sample_rim", "count * share", "count"),
     Fault("sky_has_another_density", "standing-constant-3", "transport.edges:_past_balls",
           "dr.rcp(dr.two_pi", "dr.rcp(dr.pi"),
 ]  # fmt: skip
