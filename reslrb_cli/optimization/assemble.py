@@ -215,7 +215,7 @@ def _check_steps(problem: Problem) -> None:
             in_scene = [key] if key in selection.params.properties else []
             bends = any(bends_light(selection.params, each) for each in in_scene)
             moves = bool(where_moved(selection.params, in_scene))
-            lacks = "the refraction of a glass" if bends else "places outside of a motion" if moves else ""
+            lacks = "the refraction of a glass" if bends else "the vertices of a mesh" if moves else ""
         if lacks:
             reason = f"auto has no steps for {lacks}, such as `{key}`; use adam, with a learning_rate and a schedule"
             raise ConfigError(problem.config.source, "optimizer.type", reason)

@@ -1,8 +1,9 @@
-"""A box on a floor is found from eight places around its own, under five lights."""
+"""A box on a floor is found by `optimizer: auto`, under five lights."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,10 +30,9 @@ scene: {file: scene.xml}
 target: {render: {spp: 4096, integrator: {type: prb, max_depth: 4}, parameters: {box.translation: [0, 0, 0]}}}
 parameters:
   - motion: {of: box, free: [translation]}
-    learning_rate: 0.02
 integrator: {type: reslrb, max_depth: 4}
 loss: {type: l2}
-optimizer: {type: adam, schedule: cosine}
+optimizer: {type: auto}
 run: {iterations: 80, spp: 16, certainty: false}
 """
 
@@ -45,15 +45,29 @@ def write_experiment(folder: Path, light: str) -> Path:
     return folder / "box.yaml"
 
 
+def find_box(path: Path, *sets: tuple[str, Any]) -> list[float]:
+    """Recover the box, and return its distance from its place after each iteration, as a share of its size."""
+    run = rl.optimize(path, overrides={"run.output": str(path.parent / "runs"), **dict(sets)})
+    return [record.parameter_errors["box.translation"] * 3**0.5 / SIZE for record in run]
+
+
+def test_auto_finds_a_box_within_a_few_steps(llvm: str, tmp_path: Path) -> None:
+    """The box is AWAY from its place, and 7 pixels wide."""
+    path = write_experiment(tmp_path, "area")
+    sets = [("parameters[0].initial", [AWAY, 0, 0]), ("scene.size", [32, 32]), ("run.spp", 64)]
+    far = find_box(path, *sets, ("target.render.spp", 512))
+    print(far)
+    assert far[0] == pytest.approx(AWAY / SIZE)
+    assert max(far[10:]) < 0.01
+    assert len(far) < 80
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("light", LIGHTS)
 def test_a_box_is_found_from_eight_directions(llvm: str, tmp_path: Path, light: str) -> None:
     path, far = write_experiment(tmp_path, light), []
     for angle in 2 * np.pi * np.arange(8) / 8:
         start = [round(AWAY * float(np.cos(angle)), 6), round(AWAY * float(np.sin(angle)), 6), 0]
-        run = rl.optimize(path, overrides={"parameters[0].initial": start, "run.output": str(tmp_path / "runs")})
-        for _ in run:
-            pass
-        far.append(float(np.linalg.norm(run.parameters["box.translation"])) / SIZE)
+        far.append(find_box(path, ("parameters[0].initial", start))[-1])
     print(f"{light}: distance from the true place over the size of the box:", " ".join(f"{each:.4f}" for each in far))
     assert np.sum(np.array(far) < 0.01) >= 7

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +26,7 @@ from reslrb_cli.optimization.uncertainty.curvature import raise_eigenvalues
 from reslrb_cli.optimization.variables import make_transform
 
 AUTO = "optimizer={type: auto}"
+CONFIGS = Path(__file__).parents[2] / "configs"
 #: The loss sum of a_i / 2 (p_i - b_i)^2.
 MANY = np.array([3.0, 0.5, 20.0, 1.0, 8.0, 2.0]), np.array([0.9, 0.1, 0.4, 0.7, 0.2, 0.6])
 #: A loss that bends 20 times more along p + q than along p - q: its curvature, and the optimum.
@@ -438,9 +440,16 @@ def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
         with pytest.raises(ConfigError) as error:
             load(tmp_path / "tiny.yaml", sets)
         assert where in str(error.value)
-    motion = "parameters=[{motion: {of: wall, free: [x]}}]"
-    with pytest.raises(ConfigError, match="auto has no steps for parameters that move"):
-        assemble(load(tmp_path / "tiny.yaml", [AUTO, motion]))
+    for parameter, lacking in (
+        ("{heightmap: {mesh: face, resolution: [6, 6]}}", "a heightmap of more than 32 texels, such as `face.heightmap`"),
+        ("{key: face.vertex_positions}", "the vertices of a mesh, such as `face.vertex_positions`"),
+    ):
+        sets = [AUTO, f"parameters=[{parameter}]", "target={file: none.exr}"]
+        with pytest.raises(ConfigError, match=f"auto has no steps for {lacking}"):
+            assemble_scene(load(CONFIGS / "caustic_heightmap.yaml", sets))
+    sets = [AUTO, "parameters=[{key: glass.nd}]", "variant=llvm_ad_rgb"]
+    with pytest.raises(ConfigError, match="auto has no steps for the refraction of a glass, such as `glass.nd`"):
+        assemble_scene(load(CONFIGS / "prism.yaml", sets))
 
 
 def test_a_finished_run_says_why_it_ended(llvm, tmp_path, monkeypatch, capsys):
