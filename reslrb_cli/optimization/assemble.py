@@ -209,13 +209,14 @@ def _check_steps(problem: Problem) -> None:
     """Raise ConfigError if `auto` has no steps for a parameter."""
     selection = problem.selection
     for key in selection.keys:
-        if key in selection.deformation.extents:
-            lacks = "" if problem.one_by_one(key) else f"a heightmap of more than {SMALL_HEIGHTMAP} texels"
+        if key in selection.deformation.extents and not problem.one_by_one(key):
+            lacks = f"a heightmap of more than {SMALL_HEIGHTMAP} texels"
+        elif bends_light(selection.params, key):
+            lacks = "the refraction of a glass"
+        elif key.endswith(".vertex_positions"):
+            lacks = "the vertices of a mesh"
         else:
-            in_scene = [key] if key in selection.params.properties else []
-            bends = any(bends_light(selection.params, each) for each in in_scene)
-            moves = bool(where_moved(selection.params, in_scene))
-            lacks = "the refraction of a glass" if bends else "the vertices of a mesh" if moves else ""
+            lacks = ""
         if lacks:
             reason = f"auto has no steps for {lacks}, such as `{key}`; use adam, with a learning_rate and a schedule"
             raise ConfigError(problem.config.source, "optimizer.type", reason)

@@ -30,7 +30,6 @@ Separate steps would converge slowly, because exposure and texture make up for e
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -95,14 +94,6 @@ class Block:
         """
         size = np.diag(self.rows[:, FIELDS:])[self.at[key]].astype(np.float64)
         return np.asarray(np.where(size > 0, size * np.maximum(self.rows[self.at[key], 6], 1), np.inf))
-
-    def distance(self, key: str, loss: float) -> float:
-        """Return the distance at which the entries of a parameter would explain their share of the `loss`, by the last
-        measurement of H, or 0 before the first.
-        """
-        H = np.diag(self.rows[:, FIELDS:])
-        mean = float(H[self.at[key]].mean())
-        return math.sqrt(2 * loss / np.count_nonzero(H) / mean) if mean > 0 else 0.0
 
     def to_go(self, key: str) -> float:
         """Return a limit of the root mean square distance to the optimum. It is infinite if it is not known."""

@@ -21,7 +21,6 @@ import numpy as np
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.integrators.step import Refused, gradient_step
 from reslrb_cli.optimization.losses import own_losses
-from reslrb_cli.optimization.newton import DISPLACEMENT
 from reslrb_cli.optimization.nonfinite import (
     Findings,
     count_nonfinite,
@@ -34,7 +33,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
 from reslrb_cli.optimization.state import State, put, standing
-from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterChange, plan_changes
+from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
@@ -127,9 +126,9 @@ def close_enough(problem: Problem, iteration: int) -> str:
     return f"every parameter is within about {100 * CLOSE:g} % of the optimum"
 
 
-#: Divisor of a step's samples for each of the two sets that measure the curvature of small parameters, and the largest
-#: ratio of the samples of these sets to those of the steps.
-PART, MOST = 4, 1.0
+#: Displacement of small parameters as a share of half their extent, the divisor of a step's samples for each of the two
+#: sets that measure their curvature, and the largest ratio of the samples of these sets to those of the steps.
+DISPLACEMENT, PART, MOST = 0.05, 4, 1.0
 
 
 def measure_curvature(problem: Problem, iteration: int) -> None:
@@ -166,18 +165,15 @@ def is_due(iteration: int, cost: float = 0.0) -> bool:
 def measure_block(problem: Problem, iteration: int) -> None:
     """Measure the joint curvature of all small parameters for `auto` by differences of images, if its samples fit."""
     optimizer, block, unit = problem.optimizer, problem.optimizer.block, problem.samples_per_pass or 1
-    spp = problem.config.run.spp
+    scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
+              else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
+    changes, spp = plan_changes(problem, scales, DISPLACEMENT), problem.config.run.spp
     part = max(spp // PART // unit, 1) * unit
-
-    def plan(loss: float) -> list[ParameterChange]:
-        scales = {key: optimizer.displacement(key, loss) / DISPLACEMENT for key in block.at}
-        return plan_changes(problem, scales, DISPLACEMENT)
-
     views = len(problem.trained) / len(problem.drawn(iteration))
-    if not is_due(iteration, views * 2 * (len(plan(0.0)) + 1) * part / spp):
+    if not is_due(iteration, views * 2 * (len(changes) + 1) * part / spp):
         return
     curvature = LossCurvature(problem, part, of_target=False)
-    directions, *_ = curvature.along(plan(curvature.loss), lambda: True)
+    directions, *_ = curvature.along(changes, lambda: True)
     # A texture has no entries, but channels.
     at = np.array([block.at[each.key].start + (each.entry or each.channel or 0) for each in directions])
     slopes = np.concatenate([optimizer.slopes(key) for key in block.at])

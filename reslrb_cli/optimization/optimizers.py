@@ -46,8 +46,6 @@ EXTENT_OF_TRANSFORM = 2.0
 SMALL, SMALL_HEIGHTMAP = 4, 32
 #: Longest step of these parameters and of motions as a share of the extent, and in the unit of a transform.
 LONGEST_OF_SMALL, LONGEST_OF_MOTION, LONGEST_OF_TRANSFORM = 0.25, 0.1, 0.3
-#: Smallest displacement of a motion for a measurement of the curvature, as a share of the longest step.
-LEAST_AHEAD = 0.25
 
 
 class Optimizer:
@@ -283,21 +281,6 @@ class Optimizer:
         if self.variable(key).transform is not None:
             return LONGEST_OF_TRANSFORM
         return (LONGEST_OF_MOTION if key in self.extents else LONGEST_OF_SMALL) * self.extent(key)
-
-    def displacement(self, key: str, loss: float) -> float:
-        """Return the displacement of a small parameter for a measurement of the curvature, in the unit of the scene.
-        `loss` is the loss without the noise of the images.
-
-        A motion moves by the distance that would explain its share of the loss. Images of a sharp edge change in
-        proportion to the root of a displacement, so a short displacement would overestimate the curvature of a long
-        one.
-        """
-        if self.variable(key).transform is not None:
-            return DISPLACEMENT * (rms(np.array(dr.detach(self[key]))) or 1.0)
-        if key in self.extents:
-            longest = self._longest(key)
-            return float(np.clip(self.block.distance(key, loss), LEAST_AHEAD * longest, longest))
-        return 0.5 * DISPLACEMENT * max(self.extent(key), 1e-30)
 
     @contextmanager
     def displaced(self, random: np.random.Generator) -> Iterator[None]:

@@ -56,8 +56,8 @@ def test_auto_finds_a_box_within_a_few_steps(llvm: str, tmp_path: Path) -> None:
     path = write_experiment(tmp_path, "area")
     sets = [("parameters[0].initial", [AWAY, 0, 0]), ("scene.size", [32, 32]), ("run.spp", 64)]
     far = find_box(path, *sets, ("target.render.spp", 512))
-    print(far)
     assert far[0] == pytest.approx(AWAY / SIZE)
+    assert max(far[6:]) < 0.02
     assert max(far[10:]) < 0.01
     assert len(far) < 80
 

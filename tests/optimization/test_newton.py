@@ -18,7 +18,7 @@ from reslrb_cli.backend.memory import flat
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.assemble import assemble, assemble_scene
+from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.newton import LONGEST, NEAR, SHORTER, _steepness
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import standing
@@ -441,14 +441,14 @@ def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
             load(tmp_path / "tiny.yaml", sets)
         assert where in str(error.value)
     for parameter, lacking in (
-        ("{heightmap: {mesh: face, resolution: [6, 6]}}", "a heightmap of more than 32 texels, such as `face.heightmap`"),
-        ("{key: face.vertex_positions}", "the vertices of a mesh, such as `face.vertex_positions`"),
+        ("{heightmap: {mesh: face, resolution: [6, 6]}}", "a heightmap of more than 32 texels"),
+        ("{key: face.vertex_positions}", "the vertices of a mesh"),
     ):
         sets = [AUTO, f"parameters=[{parameter}]", "target={file: none.exr}"]
-        with pytest.raises(ConfigError, match=f"auto has no steps for {lacking}"):
+        with pytest.raises(ConfigError, match=f"auto has no steps for {lacking}, such as `face"):
             assemble_scene(load(CONFIGS / "caustic_heightmap.yaml", sets))
     sets = [AUTO, "parameters=[{key: glass.nd}]", "variant=llvm_ad_rgb"]
-    with pytest.raises(ConfigError, match="auto has no steps for the refraction of a glass, such as `glass.nd`"):
+    with pytest.raises(ConfigError, match="auto has no steps for the refraction of a glass"):
         assemble_scene(load(CONFIGS / "prism.yaml", sets))
 
 

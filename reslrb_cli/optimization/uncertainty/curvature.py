@@ -265,16 +265,6 @@ class LossCurvature:
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises() if of_target else []
 
-    @property
-    def loss(self) -> float:
-        """The loss without the noise of the images: half the sum of W (I_a - T) (I_b - T)."""
-        total = 0.0
-        for place, view in enumerate(self.problem.trained):
-            true = view.kept(np.array(view.target, dtype=np.float64))
-            a, b = (view.blurred(self._base[half][place] - true) for half in (0, 1))
-            total += 0.5 * float(np.sum(np.nan_to_num(self._weights[place] * a * b)))
-        return max(total, 0.0)
-
     def along(
         self, changes: Sequence[ParameterChange], go_on: Callable[[], bool]
     ) -> tuple[list[ParameterDirection], Array, Array]:
