@@ -143,6 +143,13 @@ def test_a_blur_does_not_spread_a_nan():
     assert (derivative != 0).sum() == derivative.size - 1
 
 
+def test_with_auto_images_are_blurred_for_few_iterations(tmp_path):
+    problem = make_problem(tmp_path, sets=["run.iterations=1000", "run.blur=2", "optimizer={type: auto}"])
+    for iteration, blur_now in ((0, 2), (10, 2 - 10 / 39 * 4), (20, 0)):
+        set_blur(problem, iteration, 0.0)
+        assert [view.blur for view in problem.trained] == pytest.approx([blur_now])
+
+
 @pytest.mark.parametrize(
     ("settings", "first"),
     [
