@@ -202,8 +202,8 @@ class SGD(OptimizerSettings, json_schema_extra=NEEDS_TYPE):
 
 class Auto(OptimizerSettings, json_schema_extra=NEEDS_TYPE):
     """Steps from measured curvature ([Optimizers](optimizers.md)). Needs no learning rate and no schedule, and ends the
-    run when every parameter is close to the optimum. `run.iterations` is the limit. Not for motions, heightmaps and
-    `precondition`."""
+    run when every parameter is close to the optimum. `run.iterations` is the limit. Not for heightmaps of more than 32
+    texels, places outside of a `motion`, the refraction of a glass, and `precondition`."""
 
     type: Literal["auto"] = Field(default="auto", description="Steps from measured curvature, without a rate.")
     learning_rate: Positive = Field(default=1.0, description="Not with `auto`.")

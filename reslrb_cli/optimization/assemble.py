@@ -213,8 +213,8 @@ def _check_steps(problem: Problem) -> None:
             lacks = f"a heightmap of more than {SMALL_HEIGHTMAP} texels"
         elif bends_light(selection.params, key):
             lacks = "the refraction of a glass"
-        elif key.endswith(".vertex_positions"):
-            lacks = "the vertices of a mesh"
+        elif key.endswith((".vertex_positions", ".position")):
+            lacks = "places outside of a motion"
         else:
             lacks = ""
         if lacks:

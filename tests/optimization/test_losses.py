@@ -19,7 +19,7 @@ from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.identifiability import check_exposures, find_ambiguous
-from reslrb_cli.optimization.loop import optimize, step
+from reslrb_cli.optimization.loop import optimize, set_blur, step
 from reslrb_cli.optimization.losses import LOSSES, blur, weighted
 from reslrb_cli.optimization.sensitivity import measure_sensitivities, sample_gradient, see_images, take_gradient
 from reslrb_cli.optimization.shards import make_tasks

@@ -442,7 +442,7 @@ def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
         assert where in str(error.value)
     for parameter, lacking in (
         ("{heightmap: {mesh: face, resolution: [6, 6]}}", "a heightmap of more than 32 texels"),
-        ("{key: face.vertex_positions}", "the vertices of a mesh"),
+        ("{key: face.vertex_positions}", "places outside of a motion"),
     ):
         sets = [AUTO, f"parameters=[{parameter}]", "target={file: none.exr}"]
         with pytest.raises(ConfigError, match=f"auto has no steps for {lacking}, such as `face"):
