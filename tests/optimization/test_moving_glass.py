@@ -104,12 +104,12 @@ def test_a_glass_ball_is_found_by_its_caustic(llvm: str, tmp_path: Path) -> None
 
     Without the blur, the ball ends in local minima up to its own size away.
     """
-    sets = ["run.iterations=200", "run.spp=32", "optimizer.schedule=cosine", "scene.options.size=64"]
+    sets = ["run.iterations=200", "run.spp=32", "optimizer={type: auto}", "scene.options.size=64"]
     sets += ["target.render.integrator.max_depth=6", "integrator={max_depth: 6, edges: on}"]
     distances = []
     for start in STARTS:
         first = "[" + ", ".join(f"{value:.4f}" for value in start) + "]"
-        problem = make(tmp_path, *sets, f"parameters[0].initial={first}", "parameters[0].learning_rate=0.02")
+        problem = make(tmp_path, *sets, f"parameters[0].initial={first}", "parameters[0].learning_rate=null")
         list(optimize(find_reached(problem)))
         distances.append(float(np.linalg.norm(problem.selection.array(BALL))))
         print(first, distances[-1])

@@ -452,6 +452,19 @@ def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
         assemble_scene(load(CONFIGS / "prism.yaml", sets))
 
 
+def test_small_heightmaps_move_together_with_motions(llvm):
+    """The back is 2 wide and the face 1.61, and the bounds of the turn are closer than its extent."""
+    parameters = "parameters=[{motion: {of: [back, face], free: [x, rotation, scale]}, bounds: {rotation: [-5, 5]}}, "
+    parameters += "{heightmap: {mesh: face, resolution: [4, 4]}}]"
+    problem = assemble_scene(load(CONFIGS / "caustic_heightmap.yaml", [AUTO, parameters, "target={file: none.exr}"]))
+    optimizer = problem.optimizer
+    found = {key: (at.stop - at.start, optimizer.extent(key)) for key, at in optimizer.block.at.items()}
+    assert found == {
+        "back.x": (1, 2), "back.rotation": (3, 10), "back.scale": (1, 1), "face.heightmap": (16, pytest.approx(1.61 / 4))
+    }  # fmt: skip
+    assert not optimizer.has_large
+
+
 def test_a_finished_run_says_why_it_ended(llvm, tmp_path, monkeypatch, capsys):
     begin_alone(tmp_path, monkeypatch)
     monkeypatch.setattr(loop, "CLOSE", 1e6)
