@@ -55,13 +55,14 @@ def _first_config(
     sensors: Sequence[str],
     sensor: int,
     proposals: Sequence[Proposal],
+    movable: Sequence[tuple[str, float]],
     **known: Any,
 ) -> str:
     """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
 
     `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
-    as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `known` are other
-    template values.
+    as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `movable` has the
+    ids and the shares of the shapes in view that can be moved. `known` are other template values.
     """
     first = [proposal for proposal in proposals if proposal.first]
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
@@ -80,6 +81,7 @@ def _first_config(
         first=first,
         others=[proposal for proposal in proposals if not proposal.first],
         most_others=_MOST_OTHERS,
+        movable=[(_text(id), f"{100 * share:.0f}") for id, share in movable[:_MOST_OTHERS]],
         iterations=ITERATIONS,
         spp=SPP,
     )
@@ -168,7 +170,7 @@ def command(
     The configuration recovers the colours of the materials that are largest in view, the roughness of metals, and the
     brightness of visible lamps. Lamps are left out if the photograph has 8 or 16 bits, because such a photograph clips
     the lamps. All other recoverable parameters are listed as comments with bounds and current values. Remove the # of
-    those that you want.
+    those that you want. Shapes in view that can be moved are listed, too.
 
     With --target, the film gets the photograph's aspect ratio. The film's size is such that a run takes minutes. If the
     photograph has another size than the film, the command writes a resized copy beside the configuration. If there are
@@ -192,7 +194,7 @@ def command(
     from reslrb_cli.scene.images import turned_line
     from reslrb_cli.scene.load import load_scene
     from reslrb_cli.scene.parameters import select_parameters
-    from reslrb_cli.scene.proposal import open_photograph, propose, write_smaller
+    from reslrb_cli.scene.proposal import find_movable_in_view, open_photograph, propose, write_smaller
     from reslrb_cli.scene.visibility import find_depth
 
     photo = None if target is None else open_photograph(target)
@@ -220,7 +222,8 @@ def command(
     is_raw = bool(own_channels(film))
     depth, missing = find_depth(scene, index)
     text = _first_config(
-        path, options, description.variables, sensors, index, proposals, scene=scene_file, target=image,
+        path, options, description.variables, sensors, index, proposals, find_movable_in_view(scene, index),
+        scene=scene_file, target=image,
         variant=given.variant, is_raw=is_raw, is_integer=is_integer, size=size, film=own, reason=reason,
         hides_emitters=hides, depth=depth, missing=missing,
     )  # fmt: skip

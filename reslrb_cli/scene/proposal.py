@@ -18,7 +18,7 @@ import numpy as np
 from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters
-from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.deformation import list_movable, where_moved
 from reslrb_cli.scene.dispersion import COEFFICIENT
 from reslrb_cli.scene.export import LOBES
 from reslrb_cli.scene.graph import SceneGraph
@@ -119,6 +119,8 @@ _ULTRAVIOLET = "[0, 0.08]"
 _RAYS = 64
 #: Minimum share of the picture, and maximum number of parameters; the rest can be added later. A lamp needs few pixels.
 LEAST_SHARE, LEAST_LAMP, MOST_FIRST = 0.02, 0.002, 8
+#: A shape with a larger share of the picture is probably a floor or a wall.
+MOST_MOVED = 0.5
 #: Texels per axis of a recovered texture at the start.
 TEXELS = 64
 
@@ -165,10 +167,20 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     seen = {info.key for info in shown if _is_foremost(params, info)}
     if lamps:
         seen |= {info.key for info, share in found if share >= LEAST_LAMP and _RADIANCE.search(info.key)}
-    placed = {moved.key for moved in where_moved(params, keys)}  # `auto` cannot move light
+    placed = {moved.key for moved in where_moved(params, keys)}  # recovered by a motion
     emitters = [info.key for info, _ in found if info.kind == "emitter" and info.key not in placed]
     first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
     return [Proposal(info, share, _bounds(info), _resolution(info), info.key in first) for info, share in found]
+
+
+def find_movable_in_view(scene: mi.Scene, sensor: int) -> list[tuple[str, float]]:
+    """Return the ids of the shapes that can be moved, and their shares of the picture. Larger shares come first. Shapes
+    that fill most of the picture are left out, and so are shapes that enclose the scene.
+    """
+    params, shares = mi.traverse(scene), _shares(scene, sensor)
+    items = [item for item in list_movable(params) if item.casts_edges(scene)]
+    found = [(item.id, shares.get(item.node, 0.0)) for item in items]
+    return sorted(((id, share) for id, share in found if LEAST_SHARE <= share < MOST_MOVED), key=lambda pair: -pair[1])
 
 
 def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:

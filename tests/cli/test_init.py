@@ -20,7 +20,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.images import decode_srgb, image_size, orientation_of
 from reslrb_cli.scene.load import load_scene
-from reslrb_cli.scene.proposal import propose
+from reslrb_cli.scene.proposal import find_movable_in_view, propose
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -187,7 +187,9 @@ VIEW = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"
 @pytest.mark.usefixtures("combined")
 def test_large_visible_parameters_come_first(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(VIEW)
-    found = propose(load_scene(tmp_path / "scene.xml"), 0)
+    made = load_scene(tmp_path / "scene.xml")
+    assert [id for id, _ in find_movable_in_view(made, 0)] == ["Sphere_3", "Sphere_2", "Cube_1"]  # not the floor
+    found = propose(made, 0)
     tiles = [f"Rectangle_1.bsdf.brdf_0.reflectance.color{k}.value" for k in range(2)]
     assert [item.info.key for item in found[:2]] == tiles
     first = [item.info.key for item in found if item.first]

@@ -164,12 +164,14 @@ class Certainty:
 
         The scale is the largest root mean square among three arrays. The arrays are the initial values, the final
         values, and the difference of both. For parameters without a unit of light, the scale is at least half of the
-        range between the bounds. For the index of a glass, only the difference counts. If all are 0, it is 1.
+        range between the bounds, and for motions half of their extent. For the index of a glass, only the difference counts. If all are 0, it is 1.
         """
         first, last = self._initial[key], row_of(self.problem, key)
         sizes = [rms(first), rms(last), rms(last - first)]
         if bends_light(self.problem.selection.params, key):
             return sizes[-1] or 1.0  # a share of an index would move the light out of the picture
+        if key in self.problem.optimizer.extents:
+            sizes.append(0.5 * self.problem.optimizer.extent(key))
         low, high = self.problem.selection.specs[key].bounds or (-np.inf, np.inf)
         emits = self.problem.quantities.get(key, "") in ("radiance", "irradiance", "intensity")
         if np.isfinite(high - low) and (not emits or not any(sizes)):
