@@ -164,7 +164,8 @@ class Certainty:
 
         The scale is the largest root mean square among three arrays. The arrays are the initial values, the final
         values, and the difference of both. For parameters without a unit of light, the scale is at least half of the
-        range between the bounds, and for motions half of their extent. For the index of a glass, only the difference counts. If all are 0, it is 1.
+        range between the bounds, and for motions half of their extent. For the index of a glass, only the difference
+        counts. If all are 0, it is 1.
         """
         first, last = self._initial[key], row_of(self.problem, key)
         sizes = [rms(first), rms(last), rms(last - first)]

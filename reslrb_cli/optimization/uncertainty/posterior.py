@@ -164,7 +164,7 @@ class Posterior:
     @property
     def spread(self) -> Array:
         """Root mean square (M,) of the offset, which is one standard deviation of a final value around the optimum."""
-        return np.sqrt(self.to_go**2 + self.error**2 + self.of_target**2)
+        return spread(self.to_go, self.error, self.of_target)
 
     @property
     def limit(self) -> Array:
@@ -184,6 +184,13 @@ class Posterior:
     def _limit(self, of_target: Array) -> Array:
         parts = self.error**2 + (CURVATURE_ERROR * self.pulled) ** 2 + of_target**2
         return np.asarray(np.abs(self.to_go) + self.sure * np.sqrt(parts))
+
+
+def spread(to_go: Array, error: Array, of_target: Array) -> Array:
+    """Return the root mean square of offsets that were measured as `to_go`, with standard errors. The square of `to_go`
+    contains that of its `error` on average, so only the larger one counts.
+    """
+    return np.sqrt(np.maximum(to_go**2, error**2) + of_target**2)
 
 
 def joint(gradients: Array, offsets: Array, scale: Array, curvature: Array, fixed: Array) -> Posterior:
