@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.edge_cases import BOTH, OCCLUDERS, SHAPES, EdgeCase, split_box
+from conformance.edge_cases import BOTH, OCCLUDERS, SHAPES, STEP, EdgeCase, split_box
 from conformance.moving import Moving
 
 from reslrb_cli.estimators import chain_edges, edges, outline_rays
@@ -160,3 +160,29 @@ def test_edges_whose_chain_ends_early_do_not_count(monkeypatch: pytest.MonkeyPat
     without = case.gradients(1)
     np.testing.assert_allclose(found, without, rtol=1e-4, atol=1e-5)
     assert np.abs(whole - without).max() > 0.01
+
+
+# ---- Scenes of finite differences ----
+
+
+def faces_towards_the_sensor(moving: Moving, **shifts: float) -> np.ndarray:
+    """Return which faces of the shape have the sensor on their outer side, with some of the latents shifted."""
+    moving.set({name: mi.Float([float(value + shifts.get(name, 0))]) for name, value in moving.start.items()})
+    [shape] = [shape for shape in moving.loaded.shapes() if shape.id() == "shape"]
+    view = np.array(moving.loaded.sensors()[0].world_transform() @ mi.Point3f(0)).ravel()
+    corners = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)[np.array(shape.faces_buffer()).reshape(-1, 3)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.sum(normals * (view - corners[:, 0]), 1) > 0
+
+
+@pytest.mark.parametrize("occluder", ["ball", "smooth"])
+def test_no_face_turns_edge_on_in_a_step_of_the_differences(occluder: str):
+    """Where the sensor sees a face edge-on, the derivative jumps. It is that of one side, but central differences are
+    the mean of both sides.
+    """
+    moving = EdgeCase(occluder, "area").moving()
+    before = faces_towards_the_sensor(moving)
+    assert 0.2 < before.mean() < 0.6
+    for name in moving.start:
+        for step in (STEP, -STEP):
+            assert (faces_towards_the_sensor(moving, **{name: step}) == before).all(), (name, step)
