@@ -52,7 +52,7 @@ from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass
-class Place:
+class HorizonPoint:
     """Point of a camera path on a mesh with interpolated normals, selected in proportion to the adjoint of its light.
 
     `P` (C,) is this adjoint divided by its size, and `total` is the sum of the sizes of all points. `pi` is the
@@ -67,29 +67,29 @@ class Place:
     numbers: mi.PCG32
 
 
-class PickPlace(CameraHooks):
+class PickPoint(CameraHooks):
     """Hooks that select a point on a mesh with interpolated normals."""
 
     def __init__(self, p: Pass, numbers: mi.PCG32) -> None:
         self.p, self.numbers, self.shapes = p, numbers, smooth_meshes(p.plan)
         self.delta = mi.Spectrum(0)  # assigned at the start
 
-    def start(self, first: FilmRay) -> Place:
+    def start(self, first: FilmRay) -> HorizonPoint:
         self.delta = self.p.delta(first.u, mi.Bool(True), self.colours) * first.weight
-        return Place(
+        return HorizonPoint(
             mi.Spectrum(0), mi.Float(0), mi.UInt32(0), dr.zeros(mi.Ray3f), dr.zeros(mi.PreliminaryIntersection3f),
             self.numbers,
         )  # fmt: skip
 
     def vertex(
-        self, state: Place, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
-    ) -> Place:  # fmt: skip
+        self, state: HorizonPoint, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
+    ) -> HorizonPoint:  # fmt: skip
         here = reduce(or_, (vertex.si.shape == mi.ShapePtr(shape) for shape in self.shapes))
         P = self.delta * vertex.product.value()
         size = dr.select(vertex.active & here & (vertex.depth < self.p.plan.max_depth), dr.max(dr.abs(P)), 0)
         total, number = state.total + size, state.numbers.next_float32()
         takes = (size > 0) & (number * total < size)
-        return Place(
+        return HorizonPoint(
             P=dr.select(takes, P / size, state.P),
             total=total,
             depth=dr.select(takes, vertex.depth, state.depth),
@@ -115,7 +115,7 @@ def _horizons(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of the light at the horizons of moving faces."""
     samples = for_camera(p.samples)
     paths = replace(samples, seed=mi.sample_tea_32(samples.seed, mi.UInt32(1))[0])
-    _, place = camera_walk(paths, PickPlace(Pass(samples, None, p.adjoint), numbers))
+    _, place = camera_walk(paths, PickPoint(Pass(samples, None, p.adjoint), numbers))
     active = place.total > 0
     si = place.pi.compute_surface_interaction(place.ray, mi.RayFlags.All, active)
     n = mi.Vector3f(si.n)
