@@ -173,14 +173,21 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     return [Proposal(info, share, _bounds(info), _resolution(info), info.key in first) for info, share in found]
 
 
-def find_movable_in_view(scene: mi.Scene, sensor: int) -> list[tuple[str, float]]:
-    """Return the ids of the shapes that can be moved, and their shares of the picture. Larger shares come first. Shapes
-    that fill most of the picture are left out, and so are shapes that enclose the scene.
+def find_movable_in_view(scene: mi.Scene, sensor: int) -> list[tuple[str, float, str]]:
+    """Return the ids of the shapes that can be moved, their shares of the picture, and the names of their files, or "".
+    Larger shares come first. Shapes that fill most of the picture are left out, and so are shapes that enclose the
+    scene.
     """
     params, shares = mi.traverse(scene), _shares(scene, sensor)
     items = [item for item in list_movable(params) if item.casts_edges(scene)]
-    found = [(item.id, shares.get(item.node, 0.0)) for item in items]
-    return sorted(((id, share) for id, share in found if LEAST_SHARE <= share < MOST_MOVED), key=lambda pair: -pair[1])
+    found = [(item.id, shares.get(item.node, 0.0), _file_name(item.node)) for item in items]
+    return sorted((row for row in found if LEAST_SHARE <= row[1] < MOST_MOVED), key=lambda row: -row[1])
+
+
+def _file_name(shape: mi.Shape) -> str:
+    """Return the name of a mesh's file, or "". Mitsuba tells it only in the description of the shape."""
+    name = re.search(r'^  name = "(.+\.\w+)",$', str(shape), re.MULTILINE)
+    return name[1] if name else ""
 
 
 def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:

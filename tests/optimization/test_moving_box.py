@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cli import tiny
 from kit import area, scene, sensor, shape
 from optimization.test_projective import BOX, FLOOR, LAMP, write_mesh
 
@@ -60,6 +61,14 @@ def test_auto_finds_a_box_within_a_few_steps(llvm: str, tmp_path: Path) -> None:
     assert max(far[6:]) < 0.02
     assert max(far[10:]) < 0.01
     assert len(far) < 80
+
+
+def test_init_offers_to_move_the_box(llvm: str, tmp_path: Path) -> None:
+    write_experiment(tmp_path, "area")
+    tiny.done("init", tmp_path / "scene.xml", "-o", tmp_path / "first.yaml")
+    text = (tmp_path / "first.yaml").read_text()
+    assert "  # - motion: {of: box, free: [translation, rotation]}  # 7 % of the picture, box.obj\n" in text
+    assert "of: floor" not in text
 
 
 @pytest.mark.long

@@ -459,9 +459,8 @@ def test_small_heightmaps_move_together_with_motions(llvm):
     problem = assemble_scene(load(CONFIGS / "caustic_heightmap.yaml", [AUTO, parameters, "target={file: none.exr}"]))
     optimizer = problem.optimizer
     found = {key: (at.stop - at.start, optimizer.extent(key)) for key, at in optimizer.block.at.items()}
-    assert found == {
-        "back.x": (1, 2), "back.rotation": (3, 10), "back.scale": (1, 1), "face.heightmap": (16, pytest.approx(1.61 / 4))
-    }  # fmt: skip
+    heights = (16, pytest.approx(1.61 / 4))
+    assert found == {"back.x": (1, 2), "back.rotation": (3, 10), "back.scale": (1, 1), "face.heightmap": heights}
     assert not optimizer.has_large
 
 
