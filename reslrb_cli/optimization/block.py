@@ -1,8 +1,9 @@
 """Joint steps of the entries of all small parameters (`optimizer: auto`).
 
 Colours that light each other, a lamp and the surfaces that it lights, and an exposure compensate for each other. Their
-curvature H is therefore measured as a whole, by differences of images (`loop.measure_block`). Near the optimum x*, a
-gradient is g = H (x - x*) + noise. With the means of the last n gradients and of their values, a step is
+curvature H is therefore measured as a whole, by differences of images (`loop.measure_block`). Motions take part,
+because differences of images contain silhouettes and shadows. Near the optimum x*, a gradient is
+g = H (x - x*) + noise. With the means of the last n gradients and of their values, a step is
 
     y = mean g - H (mean x - x),   x <- x - (n H² + s v C^-1)^-1 n H y
 

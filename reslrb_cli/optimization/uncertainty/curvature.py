@@ -2,7 +2,8 @@
 
 Images are differentiated along the entries of small parameters, and along the brightness of whole textures
 (`plan_changes`). The curvature (`LossCurvature`) is H = J^T W J at the parameters' values. J is the derivative of the
-image, and W = d2L/dI2 has a second derivative for each pixel.
+image, and W = d2L/dI2 has a second derivative for each pixel. Differences of images have the blur of the iteration
+(`run.blur`). Sharp images of a moving shape would overestimate the curvature of a blurred loss.
 
     along directions    J by differences of images at common random numbers, from two independent sets of samples a, b:
                         H = (J_a^T W J_b + J_b^T W J_a) / 2, whose noise has no bias
