@@ -138,8 +138,9 @@ class RunConfig(Section):
     blur: _Blur = "auto"
     """Standard deviation, in pixels, of a Gaussian blur of image and target in the first iteration. The derivative of
     the loss is that of the blurred images, so that shapes and caustics also attract each other from a distance. The
-    blur falls linearly to 0 at half of the run. The recorded loss is that of images without blur. `auto`: a sixteenth
-    of the shorter side of the image if the run recovers a `motion`, otherwise 0. 0: no blur."""
+    blur falls linearly to 0 at half of the run, and with `optimizer: auto` after at most 20 iterations. The recorded
+    loss is that of images without blur. `auto`: a sixteenth of the shorter side of the image if the run recovers a
+    `motion`, otherwise 0. 0: no blur."""
     final_spp: Count = 256
     """Samples per pixel of the initial and the final image, rounded up to whole passes of `samples_per_pass`."""
     views_per_iteration: Count | None = None

@@ -31,6 +31,7 @@ from optimization.judged import SCENE as LIGHTS
 from optimization.toy import make_problem
 
 from reslrb_cli.optimization import targets
+from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.uncertainty import measuring
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS, Certainty
 from reslrb_cli.statistics import rms
@@ -395,6 +396,17 @@ def test_short_and_stopped_runs_have_no_verdicts(tmp_path, monkeypatch):
     assert certainty.measure(100, 1.0, lambda: len(asked) == 2) is None  # Ctrl-C during the measurement
     assert asked == [0, 1]
     np.testing.assert_array_equal(problem.values()["albedo"], before)
+
+
+def test_gradients_of_blurred_images_do_not_count(tmp_path):
+    problem = make_problem(tmp_path)
+    before = standing(problem)
+    state, certainty = replace(before, gradients=before.values), Certainty(problem)
+    for blur, count in ((1.0, 0), (0.0, 1)):
+        for view in problem.trained:
+            view.blur = blur
+        certainty.see(before, state)
+        assert [len(rows) for rows in certainty.last.values()] == [1] * count
 
 
 def test_a_failure_leaves_no_gradient(tmp_path, monkeypatch):

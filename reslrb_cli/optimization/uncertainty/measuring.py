@@ -65,7 +65,11 @@ class Certainty:
         self.rates: list[float] = []
 
     def see(self, before: State, state: State) -> None:
-        """Record data of the iteration that leads from `before` to `state`. This costs almost nothing."""
+        """Record data of the iteration that leads from `before` to `state`. This costs almost nothing. Gradients of
+        blurred images are left out, because their curvature is another one.
+        """
+        if any(view.blur for view in self.problem.trained):
+            return
         for key, initial in self._initial.items():
             shape, one_by_one = self.problem.selection.array(key).shape, self.problem.one_by_one(key)
             if not one_by_one and (len(shape) != 3 or initial.size > MOST_RECORDED):
