@@ -265,7 +265,7 @@ class Problem:
     def one_by_one(self, key: str) -> bool:
         """True if the entries of a parameter are examined one by one, because they are few."""
         size = self.selection.array(key).size
-        return size <= (SMALL_HEIGHTMAP if key in self.selection.deformation.extents else SMALL)
+        return size <= (SMALL_HEIGHTMAP if key in self.optimizer.extents else SMALL)
 
     def first_blur(self, view: View) -> float:
         """Return the blur of a view in the first iteration, in pixels (`run.blur`)."""
