@@ -209,7 +209,7 @@ def _check_steps(problem: Problem) -> None:
     """Raise ConfigError if `auto` has no steps for a parameter."""
     selection = problem.selection
     for key in selection.keys:
-        if key in problem.optimizer.extents and not problem.one_by_one(key):
+        if key in problem.optimizer.extents and not problem.optimizer.is_small(key):
             lacks = f"a heightmap of more than {SMALL_HEIGHTMAP} texels"
         elif bends_light(selection.params, key):
             lacks = "the refraction of a glass"

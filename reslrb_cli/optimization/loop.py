@@ -64,8 +64,8 @@ def _progress(iteration: int, iterations: int, least: float) -> float:
     return max(iteration / max(iterations - 1, 1), least)
 
 
-#: The part of a run after which images are no longer blurred, and the most iterations of this part with `auto`, which
-#: needs few.
+#: The part of a run after which images are no longer blurred. With `auto`, this part has at most `MOST_BLURRED`
+#: iterations, because `auto` needs few.
 BLURRED, MOST_BLURRED = 0.5, 20
 
 

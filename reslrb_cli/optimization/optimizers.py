@@ -129,11 +129,11 @@ class Optimizer:
         """
         self.extents = extents
         for key in extents if self._measures else ():
-            value, size = self._own[key][key], np.array(dr.detach(self._own[key][key])).size
-            if key not in self.block.at and size <= SMALL_HEIGHTMAP:
+            if key not in self.block.at and self.is_small(key):
+                value = self._own[key][key]
                 self._own[key] = Joint(self.block)
                 self._own[key][key] = value
-                self.block.add({key: size})
+                self.block.add({key: dr.prod(dr.shape(value))})
 
     def balance(self, exposure: str, colours: Sequence[str]) -> None:
         """From now on, divide `colours` by the change of `exposure` in each step. The arguments are keys. Entries
@@ -275,6 +275,10 @@ class Optimizer:
         if key in self.extents:
             return min(self.extents[key], high - low)
         return high - low if math.isfinite(high - low) else 2 * rms(np.array(dr.detach(self[key]))) or 1.0
+
+    def is_small(self, key: str) -> bool:
+        """Return whether the entries of a parameter are few, so that they are examined one by one."""
+        return bool(dr.prod(dr.shape(self[key])) <= (SMALL_HEIGHTMAP if key in self.extents else SMALL))
 
     def _longest(self, key: str) -> float:
         """Return the longest step of a small parameter, in the unit of the optimiser's variable."""

@@ -17,7 +17,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
-from reslrb_cli.optimization.optimizers import SMALL, SMALL_HEIGHTMAP, Optimizer
+from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
 from reslrb_cli.optimization.variables import Smoother, make_transform
 from reslrb_cli.optimization.views import SHARED, View, slope, to_tensor
@@ -261,11 +261,6 @@ class Problem:
     def values(self) -> dict[str, Array]:
         """Return the parameters' current values."""
         return {key: self.selection.array(key) for key in self.selection.keys}
-
-    def one_by_one(self, key: str) -> bool:
-        """True if the entries of a parameter are examined one by one, because they are few."""
-        size = self.selection.array(key).size
-        return size <= (SMALL_HEIGHTMAP if key in self.optimizer.extents else SMALL)
 
     def first_blur(self, view: View) -> float:
         """Return the blur of a view in the first iteration, in pixels (`run.blur`)."""

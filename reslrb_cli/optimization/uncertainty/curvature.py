@@ -125,7 +125,7 @@ def plan_changes(
     directions.
     """
     keys = [key for key in problem.selection.keys if key in scales]
-    small = [key for key in keys if problem.one_by_one(key)]
+    small = [key for key in keys if problem.optimizer.is_small(key)]
     textures = [key for key in keys if problem.selection.array(key).ndim == 3]
     changes: list[ParameterChange] = []
     for key in (*small, *(key for key in textures if key not in small)):

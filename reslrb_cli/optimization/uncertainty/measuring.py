@@ -71,12 +71,12 @@ class Certainty:
         if any(view.blur for view in self.problem.trained):
             return
         for key, initial in self._initial.items():
-            shape, one_by_one = self.problem.selection.array(key).shape, self.problem.one_by_one(key)
-            if not one_by_one and (len(shape) != 3 or initial.size > MOST_RECORDED):
+            shape, is_small = self.problem.selection.array(key).shape, self.problem.optimizer.is_small(key)
+            if not is_small and (len(shape) != 3 or initial.size > MOST_RECORDED):
                 continue
             both = (state.gradients, before.values)
             gradient, value = (to_array(each[key]).astype(np.float64).ravel() for each in both)
-            if not one_by_one:
+            if not is_small:
                 gradient, value = brightness(gradient, value, shape[2])
             if np.isfinite(gradient).all():
                 earlier = self.last.get(key, np.zeros((0, 2, gradient.size)))
@@ -207,7 +207,7 @@ class Certainty:
                 scale=self.scale(key),
                 gradients=rows,
                 step=np.nan_to_num(optimizer.response(key) * optimizer.rate(key) * self.rates[-1]),
-                is_small=self.problem.one_by_one(key),
+                is_small=optimizer.is_small(key),
                 start=self._initial[key],
                 last=None if last is None else last[-(iterations // 2) :],
                 seen=self._seen_entries(key, rows),

@@ -164,7 +164,7 @@ class Posterior:
     @property
     def spread(self) -> Array:
         """Root mean square (M,) of the offset, which is one standard deviation of a final value around the optimum."""
-        return spread(self.to_go, self.error, self.of_target)
+        return spread_of(self.to_go, self.error, self.of_target)
 
     @property
     def limit(self) -> Array:
@@ -186,7 +186,7 @@ class Posterior:
         return np.asarray(np.abs(self.to_go) + self.sure * np.sqrt(parts))
 
 
-def spread(to_go: Array, error: Array, of_target: Array) -> Array:
+def spread_of(to_go: Array, error: Array, of_target: Array) -> Array:
     """Return the root mean square of offsets that were measured as `to_go`, with standard errors. The square of `to_go`
     contains that of its `error` on average, so only the larger one counts.
     """

@@ -50,7 +50,7 @@ from reslrb_cli.optimization.uncertainty.posterior import (
     Posterior,
     joint,
     pooled,
-    spread,
+    spread_of,
 )
 from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.records.measurements import INCOMPLETE
@@ -289,16 +289,16 @@ def _small(own: Measured, at: Sequence[int], found: Judged) -> ParameterCertaint
         ])  # fmt: skip
 
     to_go, of_target = own.within(of("to_go", 0.0)), of("of_target", 0.0)
-    wide = spread(to_go, of("error", own.prior), of_target)  # bounds may have shortened the distance
+    spread = spread_of(to_go, of("error", own.prior), of_target)  # bounds may have shortened the distance
     alone = np.where([partner is None for partner in partners], np.inf, of("alone", np.inf))
-    estimate = Estimate(of("limit", np.inf), of("limit_of_run", np.inf), wide, alone, of("is_pulled", 0.0) > 0)
+    estimate = Estimate(of("limit", np.inf), of("limit_of_run", np.inf), spread, alone, of("is_pulled", 0.0) > 0)
     verdicts = judge(own, estimate, own.tolerance(own.value))
     verdict = summarise(shares(verdicts))
     named = [name for name, each in zip(partners, verdicts, strict=True) if name and each is verdict]
     partner = named[0] if named and verdict is ParameterVerdict.NOT_DETERMINED else None
     # A value at a bound may be as far from the optimum as the optimum is beyond the bound.
     known = [each not in (ParameterVerdict.AT_BOUND, *WITHOUT) for each in verdicts]
-    parts = (np.where(known, part, np.nan) for part in (wide, to_go, of_target))
+    parts = (np.where(known, part, np.nan) for part in (spread, to_go, of_target))
     return _certainty(verdict, verdicts, partner, *parts)
 
 
