@@ -128,7 +128,7 @@ def close_enough(problem: Problem, iteration: int) -> str:
 
 #: Displacement of small parameters as a share of half their extent, the divisor of a step's samples for each of the two
 #: sets that measure their curvature, and the largest ratio of the samples of these sets to those of the steps.
-DISPLACEMENT, PART, MOST = 0.05, 4, 1.0
+DISPLACEMENT, PART, MOST = 0.02, 4, 1.0
 
 
 def measure_curvature(problem: Problem, iteration: int) -> None:
