@@ -87,7 +87,7 @@ class _Main(click.Group):
         try:
             code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
         except BaseException as error:
-            told = tell(_explained(error))
+            told = tell(error)
             if told is None:
                 raise
             if self.debug:
@@ -96,16 +96,6 @@ class _Main(click.Group):
             with contextlib.suppress(OSError):  # the terminal may have gone
                 click.echo(one_line(line, LINE_LENGTH), err=True)
         sys.exit(code if isinstance(code, int) else ExitCode.DONE)
-
-
-def _explained(error: BaseException) -> BaseException:
-    """Return an error that names the replacement of a removed option; return other errors unchanged."""
-    if isinstance(error, click.NoSuchOption):
-        from reslrb_cli.cli.options import REMOVED
-
-        if advice := REMOVED.get(f"{error.ctx and error.ctx.info_name} {error.option_name}"):
-            return click.UsageError(f"{error.option_name} was removed; {advice}", error.ctx)
-    return error
 
 
 def _set_debug(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:

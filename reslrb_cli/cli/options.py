@@ -128,51 +128,6 @@ class Counts(click.ParamType):
         return tuple(counts)
 
 
-#: Advice for removed options, by command and option.
-REMOVED = {
-    f"{command} {option}": advice
-    for commands, option, advice in (
-        ("convergence", "--runs", "compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max_seconds=S "
-         "--vary 'integrator=[prb, reslrb:stack]'`"),
-        ("convergence", "--rates", "compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning_rate=[0.03, "
-         "0.1]'`"),
-        ("bench gradcheck convergence", "--markdown",
-         "`reslrb report FILE -o page.html` shows the table of results of --json FILE"),
-        ("bench gradcheck convergence", "--plot", "`reslrb report FILE -o page.html` plots results of --json FILE"),
-        ("bench", "--resume", "--values LIST measures the values that are missing"),
-        ("gradcheck convergence", "--resume", "a larger --budget, --seeds or --rounds takes more samples"),
-        ("bench convergence", "--memory-limit", "the shell's `ulimit -v KIB` limits every process of the command"),
-        ("bench", "--objective", "`reslrb convergence CONFIG --objective loss` measures steps of the loss"),
-        ("optimize", "--force", "remove the folder of the earlier run; without that, the new folder has a number"),
-        ("optimize", "--verbose", "`reslrb --debug optimize` prints details of the measurements"),
-        ("optimize", "-v", "`reslrb --debug optimize` prints details of the measurements"),
-        ("sweep", "--verbose", "the folder of each run has its warnings"),
-        ("sweep", "-v", "the folder of each run has its warnings"),
-        ("sweep", "--retry", "a sweep that continues repeats its failed runs"),
-        ("sweep", "--json", "results.jsonl in the folder of the sweep has the results"),
-        ("sweep", "--dry-run", "`reslrb optimize CONFIG --dry-run` measures one of the runs"),
-        ("sweep", "--quiet", "redirect the output, as in > sweep.log"),
-        ("gradcheck", "--cluster", "a check runs in one process; --budget limits its time"),
-        ("gradcheck", "--estimators", "name them by --integrators, such as reslrb:stack,reslrb:gather"),
-        ("gradcheck", "--case", "name the case after the suite, as in --suite extreme:furnace"),
-        ("gradcheck", "--images", "in Python, `rl.gradient` returns the gradients of each seed"),
-        ("gradcheck", "--directions", "each parameter has three directions"),
-        ("render", "--run", "name the folder of the run in place of CONFIG, as in `reslrb render RUN -o IMAGE`"),
-        ("render", "--spp", "use --set run.spp=N"),
-        ("init lens", "--force", "remove or rename the files that exist"),
-        ("init", "--recover", "all other parameters are comments of the file; remove the # of those that you want"),
-        ("inspect", "--nonfinite", "a run names the first pixel of dL/dI, and the parameters, that are not finite"),
-        ("inspect", "--conditioning", "`reslrb optimize CONFIG --set optimizer.scale=auto --set run.iterations=1` "
-         "measures it; the page of the run has the table"),
-        ("doctor", "--json", "the lines of `reslrb doctor` have the same content"),
-        ("lens", "--both", "the back is flat: a second free face made pictures worse"),
-        ("lens", "--margin", "the film sees an eighth of the picture's longer side around it"),
-        ("lens", "--incidence", "--mirror DEGREES gives the angle"),
-        ("lens", "--through", "exchange left and right of the picture, for a view from behind"),
-    )
-    for command in commands.split()
-}  # fmt: skip
-
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
     help=

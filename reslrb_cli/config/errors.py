@@ -36,63 +36,6 @@ _EXPECTED = {
 }
 
 
-#: Advice for removed settings, by the last two names of the key, with the value if other values remain.
-REMOVED = {
-    "heightmap.grid": "write the shape as a mesh with about one vertex for each texel, as `reslrb lens` does",
-    "fabrication.faces": "name the mesh by fabrication.face; the back is flat",
-    "fabrication.min_thickness": "`reslrb export` prints the smallest thickness of the solid; remove it",
-    "fabrication.receiver": "give the receiver the id `screen` in the scene file, and remove it",
-    "fabrication.tool_radius": "the sheet names the largest ball cutter and the smallest hollow; remove it",
-    "fabrication.size": "it is the size of the mesh; remove it",
-    "integrator.sppc": "each part has as many samples as the step; remove it",
-    "integrator.sppp": "each part has as many samples as the step; remove it",
-    "integrator.sppi": "each part has as many samples as the step; remove it",
-    "mask.specular": "list the kinds of pixels to leave out, such as mask: {kinds: [border, clipped, alpha]}",
-    "mask.border": "list the kinds of pixels to leave out, such as mask: {kinds: [specular, clipped, alpha]}",
-    "mask.clipped": "list the kinds of pixels to leave out, such as mask: {kinds: [specular, border, alpha]}",
-    "mask.alpha": "list the kinds of pixels to leave out, such as mask: {kinds: [specular, border, clipped]}",
-    "run.images_every": "a run saves its first and its last image; in Python, `Run.images` renders those between",
-    "scene.sensors": "list them in `views`, such as views: [{sensor: 0}, {sensor: 1}]; all of scene.cameras are used",
-    "views.loss": "all views have the loss that `loss` says",
-    "render.seed": "the target always has the same samples; remove it",
-    "integrator.freeze": "steps are always recorded; remove it",
-    "integrator.jacobian_damping": "it is always 0.1; remove it",
-    "integrator.stack_size": "64 vertices are stored, and longer paths are traced again; remove it",
-    "integrator.light_share: auto": "take 0.5, which is the default",
-    "integrator.type: direct_projective": "take prb_projective with max_depth: 2",
-    "loss.scale": "set target.exposure: auto, which recovers the factor with the parameters",
-    "loss.scales": "start from the values of a run with a smaller scene.size, by initial: {run: RUN}",
-    "loss.data_range": "it is always the target's largest value; remove it",
-    "loss.type: log_l2": "take relative_l2, or a loss of your own (type: custom)",
-    "loss.type: smape": "take relative_l2, or a loss of your own (type: custom)",
-    "optimizer.average": "let optimizer.schedule lower the rate; the last values then have as little noise",
-    "optimizer.clamp_gradient": "use more samples, or optimizer.type: adam with a larger beta_2",
-    "optimizer.schedule: plateau": "take cosine or exponential, and run.max_seconds to end early",
-    "optimizer.type: adamw": "take adam; `bounds` and `regularizers` hold values back",
-    "optimizer.type: rmsprop": "take adam with beta_1: 0",
-    "regularizers.type: curvature": "take total_variation, or a larger precondition; export prints the smallest hollow",
-    "regularizers.type: slope": "take total_variation",
-    "regularizers.type: laplacian": "take total_variation, or set `precondition`",
-    "regularizers.opposite": "only one face is free; the face on the other side is flat",
-    "parameters.transform: softplus": "take log, for positive values",
-    "run.adjoint: others": "take auto, which does the same",
-    "run.first_batch": "the first batch always gives an image alone; remove it",
-    "run.memory_budget": "set integrator.samples_per_pass; `reslrb optimize --dry-run` prints the memory of a step",
-    "run.reach_spp": "it is always 64; remove it",
-    "run.stop": "set run.max_seconds, or end the run by Ctrl-C: its folder is complete, and --resume continues it",
-    "run.stages": "start from the values of a coarser run, by initial: {run: RUN}",
-}
-
-
-def _removed(location: Location, value: Any = None) -> str | None:
-    """Return the replacement for a removed key, or for a removed `value` of a key. Return None if nothing was
-    removed.
-    """
-    names = ".".join([part for part in location if isinstance(part, str)][-2:])
-    advice = REMOVED.get(names if value is None else f"{names}: {value}")
-    return None if advice is None else f"was removed; {advice}"
-
-
 @dataclass(frozen=True)
 class SettingError:
     """One error: its location in the notation of `--set`, and its description. `explain` says what would be right.
@@ -129,8 +72,6 @@ def _problem(detail: ErrorDetails, data: Any) -> SettingError:
     if kind.startswith("union_tag"):
         if not isinstance(value, dict):
             return SettingError(key, _but_is("must be a mapping such as {type: NAME}", value))
-        if advice := _removed((*location, "type"), value.get("type")):
-            return SettingError(_join(key, "type"), f"{value['type']} {advice}")
         given, known = value.get("type"), [str(_type_name(section)) for section in _candidates(detail["loc"])[0]]
         return SettingError(_join(key, "type"), _but_is("must be " + _one_of(known, given), given))
     if kind == "missing" and isinstance(location[-1], str):
@@ -144,8 +85,6 @@ def _problem(detail: ErrorDetails, data: Any) -> SettingError:
         return SettingError(key, "must have at least one entry")
     if kind == "wrong":
         return SettingError(key, _but_is(context.get("message") or detail["msg"], value))
-    if isinstance(value, str) and (advice := _removed(location, value)):
-        return SettingError(key, f"{value} {advice}")
     if kind == "literal_error":
         return SettingError(
             key, _but_is("must be " + _one_of(re.findall(r"'([^']*)'", context["expected"]), value), value)
@@ -214,8 +153,6 @@ def _tag(section: type[Section]) -> str | None:
 
 def _unknown_key(loc: tuple[int | str, ...]) -> str:
     key = str(loc[-1])
-    if advice := _removed(tuple(part for part in loc if not _is_tag(part))):
-        return advice
     union, chosen = _candidates(loc[:-1])
     owners = list(dict.fromkeys(str(_type_name(each)) for each in union if key in each.model_fields))
     if owners:

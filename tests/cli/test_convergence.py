@@ -85,11 +85,6 @@ def test_a_too_small_budget_is_reported(folder: Path) -> None:
         (("--spp", "4,0"), "0 is not in the range"),
         (("--spp", "4,4"), "`4,4` has a number twice"),
         (("--spp", "3", "--set", "integrator.samples_per_pass=2"), "integrator.samples_per_pass: 2 does not divide"),
-        (("--runs", "3"), "--runs was removed; compare whole runs with `reslrb sweep CONFIG --seeds N --set run.max"),
-        (
-            ("--rates=1,3",),
-            "--rates was removed; compare rates with `reslrb sweep CONFIG --vary 'optimizer.learning",
-        ),
         (("--integrators", "reslrb:auto"), "`auto` is for whole runs; use `stack`"),
     ],
 )

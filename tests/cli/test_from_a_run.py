@@ -148,8 +148,6 @@ def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--run", "runs/tiny"), "--run was removed; name the folder of the run in place of CONFIG"),
-        (("tiny.yaml", "--spp", "4"), "--spp was removed; use --set run.spp=N"),
         (("runs/tiny", "--scene"), "remove --initial or --scene"),
         (("runs",), "has no manifest.json"),
     ],

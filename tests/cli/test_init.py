@@ -91,7 +91,6 @@ def test_nothing_is_replaced(folder: Path) -> None:
     assert refused.exit_code == 2
     assert "room.yaml: exists; remove or rename it" in refused.output
     assert (folder / "room.yaml").read_text() == "mine"
-    assert "--force was removed; remove or rename" in reslrb("init", "room/scene.xml", "--force").output
     copy = f"photo-{int(PIXELS**0.5)}x{int(PIXELS**0.5)}.png"
     (folder / copy).write_text("mine, too")
     target = write_noise(folder / "photo.png", 300, 300)
@@ -150,7 +149,6 @@ def test_an_8_bit_texture_is_offered_recovered_and_exported(folder: Path) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("room/scene.xml", "--recover", "lamp.*"), "--recover was removed; all other parameters are comments"),
         (("room/scene.xml", "--target", "wide.png"), "is 16x8 pixels, the scene's film 8x8, with another aspect ratio"),
         (("room/scene.xml", "--target", "wide.png"), "such as 8x8"),
         (("room/scene.xml", "--target", "none.png"), "none.png: no such file"),

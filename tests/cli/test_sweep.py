@@ -278,8 +278,6 @@ def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
     ends = {}
     result = reslrb("sweep", "--resume", "s")
     assert (result.exit_code, len(called)) == (0, 2)
-    for option in ("--retry", "--json=s.jsonl", "--dry-run", "--quiet", "-v"):
-        assert f"{option.partition('=')[0]} was removed; " in reslrb(*words, option).output
     assert "lowest median parameter RMSE: learning_rate=0.02" in result.output
 
 

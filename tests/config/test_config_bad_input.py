@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.config.errors import REMOVED
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError, ExitCode
 
@@ -233,23 +232,6 @@ def test_the_suggested_override_is_valid(tmp_path: Path) -> None:
     option, mended = shlex.split(line.partition("in quotes: ")[2])
     assert option == "--set"
     assert load(tmp_path / "x.yaml", [mended]).parameters[0].key == "*.data"
-
-
-@pytest.mark.parametrize("name", REMOVED)
-def test_removed_settings_are_refused_with_a_replacement(name: str, tmp_path: Path) -> None:
-    place, _, value = name.partition(": ")
-    lists = {
-        "views.": "views[0].", "render.": "target.render.", "mask.": "target.mask.",
-        "regularizers.": "parameters[0].regularizers[0].", "parameters.": "parameters[0].",
-        "heightmap.": "parameters[1].heightmap.",
-    }  # fmt: skip
-    for short, whole in lists.items():
-        place = whole + place.removeprefix(short) if place.startswith(short) else place
-    there = ("views=[{sensor: 0}]", "fabrication.thickness=9", "parameters[0].regularizers=[{type: total_variation}]",
-             "parameters[1]={heightmap: {mesh: face, resolution: [4, 4]}}")  # fmt: skip
-    line = line_of(tmp_path, GOOD, (*there, f"{place}={value or 1}"))
-    assert line.startswith(f"--set {place}={value or 1}: {place}: ")
-    assert line.endswith(f"was removed; {REMOVED[name]}")
 
 
 @pytest.mark.parametrize("override", OVERRIDES)

@@ -327,7 +327,6 @@ def test_invalid_files_are_refused_in_one_line(run: Path, tmp_path: Path, monkey
         ("a.stl", (), "a.stl is the name of a file; give a folder"),
         ("out", ("fabrication.thickness=1",), "fabrication.thickness: 1 mm: front and back overlap by"),
         ("out", ("fabrication.face=plate",), "fabrication.face: there is no mesh `plate` in the scene"),
-        ("out", ("fabrication.faces=[face]",), "fabrication.faces: was removed; name the mesh by fabrication.face"),
         ("out", ("fabrication.thickness=0",), "fabrication.thickness: must be"),
     ):
         options = [word for setting in settings for word in ("--set", setting)]

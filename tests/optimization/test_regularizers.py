@@ -177,7 +177,6 @@ REFUSED = {
     "a motion": ("motion: {of: face}", "[{type: total_variation}]", "has no surface"),
     "twice": (HEAD, "[{type: total_variation}, {type: total_variation}]", "regularizers[1].type: total_variation is"),
     "unknown": (HEAD, "[{type: smooth}]", "regularizers[0].type"),
-    "removed": (HEAD, "[{type: curvature, radius: 3}]", "was removed; take total_variation"),
     "through": (
         f"{HEAD}, initial: -3.0",
         "[{type: thickness, thickness: 2, least: 1}]",
