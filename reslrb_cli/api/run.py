@@ -27,6 +27,7 @@ from reslrb_cli.optimization.problem import progress_spp
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import check_output
+from reslrb_cli.report.run_summary import descriptions
 from reslrb_cli.runs.callbacks import Callback
 from reslrb_cli.runs.loggers import Callbacks, callbacks_of
 from reslrb_cli.runs.prepare import PreparedRun, begin
@@ -177,22 +178,16 @@ class Run:
                 self._status = Status.FAILED
                 raise
 
-    def live(self, figure: bool = True) -> Iterator[Record]:
-        """Iterate with a progress bar. In a notebook, `figure` also shows a live plot of the loss, the errors, and one
-        view beside its target.
+    def live(self) -> Iterator[Record]:
+        """Iterate with a progress bar of `tqdm.auto`, which is a widget in a notebook with `reslrb[notebook]`."""
+        from tqdm.auto import tqdm
 
-        The bar comes from `tqdm.auto`. In a notebook, the bar is a widget if the extra `reslrb[notebook]` is installed.
-        The figure is redrawn at intervals. Drawing takes only a small share of the run time.
-        """
-        from reslrb_cli.api.live import drawn, watched  # imports matplotlib
-
-        def draw() -> bytes:
-            (sensor, target), *_ = self.targets.items()
-            return drawn(self._records, self.truth, self.images[sensor], target)
-
-        problem = self._begun.course.problem
-        total = problem.config.run.iterations
-        return watched(iter(self), total, self.iteration, problem.meter, draw if figure else None)
+        total, meter = self.config.run.iterations, self._begun.course.problem.meter
+        with contextlib.closing(iter(self)) as records, tqdm(total=total, initial=self.iteration, unit="it") as bar:
+            for record in records:
+                bar.set_description_str(descriptions(record, meter)[-1], refresh=False)
+                bar.update()
+                yield record
 
     def close(self) -> None:
         """Stop the run and complete its folder. Does nothing if no loop is active.

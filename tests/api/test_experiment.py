@@ -348,7 +348,7 @@ with rl.optimize(config, folder="x") as run:
         loss: float = record.loss
         image: np.ndarray[tuple[int, ...], np.dtype[np.float32]] = run.images[0]
         kept: rl.Record = record
-    for kept in run.live(figure=False):
+    for kept in run.live():
         reveal_type(kept)
 one: rl.Run = run
 reveal_type((run.config, run.folder, run.status, run.iteration, run.records))

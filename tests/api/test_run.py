@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -350,30 +350,6 @@ def test_an_interrupt_from_outside_keeps_the_result(experiment: Path) -> None:
 
 
 def test_a_run_can_be_watched(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`live` shows a progress bar and draws a notebook's figure as a PNG."""
-    from reslrb_cli.api import live
-
     run = rl.optimize("tiny.yaml", overrides=SET)
     assert [record.iteration for record in run.live()] == [0, 1, 2, 3, 4, 5]
     assert "6/6" in capsys.readouterr().err
-    png = live.drawn(run.records, run.truth, run.images[0], run.targets[0])
-    assert png.startswith(b"\x89PNG")
-
-
-def test_the_figure_is_shown_from_time_to_time(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The figure appears at once and at the end. A failing figure does not end the run."""
-    from reslrb_cli.api import live
-
-    shown: list[bytes] = []
-    monkeypatch.setattr(live, "_notebook", lambda: shown.append)
-    list(rl.optimize("tiny.yaml", overrides=SET).live())
-    assert len(shown) == 2
-    list(rl.optimize("tiny.yaml", overrides=SET).live(figure=False))
-    assert len(shown) == 2
-
-    def none() -> Iterator[bytes]:
-        raise OSError("nothing is drawn")
-
-    monkeypatch.setattr(live, "drawn", lambda *_: none())
-    monkeypatch.setattr(live, "_notebook", lambda: lambda png: [*png])
-    assert len(list(rl.optimize("tiny.yaml", overrides=SET).live())) == 6
