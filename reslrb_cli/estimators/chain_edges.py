@@ -92,7 +92,9 @@ def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Float:
         found, lost = dr.dot(delta * edge.weight, L), dr.dot(delta, lost)
     else:
         emission = Emission(ray, edge.weight, dr.zeros(mi.EmitterPtr))
-        found = walk(samples, Contribution(p), continues, emission, depth)[0]
+        # p lies on an outline. Without interpolated normals, its correction is 1.
+        smooth = over if p.plan.needs.has_shading_normals else None
+        found = walk(samples, Contribution(p, smooth, depth), continues, emission, depth)[0]
         lost = dr.dot(p.delta(target.u, shadow, colours), lost)
     return showing(dr.select(edge.shadow, -0.5 * lost, dr.select(over, found, -found))) * p.scale
 

@@ -138,15 +138,15 @@ def _carried(
 
 
 class Contribution(Hooks):
-    """Contribution of a light path to the objective.
+    """Contribution of a light path to the objective. `first` is the number of the path's first vertex.
 
-    In the lanes `smooth`, the first vertex lies on the outline of a mesh with interpolated normals. The correction for
+    In the lanes `smooth`, this vertex lies on the outline of a mesh with interpolated normals. The correction for
     shading normals has no limit there, so it is left out at this vertex. The other estimators leave out its derivative
     (`shading_correction`).
     """
 
-    def __init__(self, p: Pass, smooth: mi.Bool | None = None) -> None:
-        self.p, self.smooth = p, smooth
+    def __init__(self, p: Pass, smooth: mi.Bool | None = None, first: mi.UInt32 | int = 1) -> None:
+        self.p, self.smooth, self.first = p, smooth, first
 
     def start(self, product: Product) -> list[mi.Float]:
         return [mi.Float(0)] if self.smooth is None else [mi.Float(0), mi.Float(1)]
@@ -159,7 +159,7 @@ class Contribution(Hooks):
         own = dr.select(connection.active, dr.dot(C, self.p.delta(connection.u, connection.active, self.colours)), 0)
         if self.smooth is None:
             return [state[0] + own]
-        here = self.smooth & (vertex.depth == 1)
+        here = self.smooth & (vertex.depth == self.first)
         si = vertex.si
         correction, _ = shading_correction(self.p.plan, si, -vertex.ray.d, si.to_world(connection.wo), connection.wo)
         own = own * dr.select(here, _inverse(correction), state[1])

@@ -229,6 +229,7 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
     "bumpy": lambda: {"shape": mesh(*bumpy()[:2], TWO_SIDED)},
     # A coarse ball with interpolated normals.
     "smooth": lambda: {"shape": mesh(*ball((0.1, -0.1, 0.9), 0.4, degrees=BALL_TURN), OWN, normals=True)},
+    "cleared": lambda: OCCLUDERS["smooth"](),
     "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
                      for n, name in enumerate(FLAT)},
 }  # fmt: skip
@@ -249,6 +250,9 @@ STILL: dict[str, Callable[[], dict[str, Any]]] = {
     "reflector": lambda: {"sheet": rectangle(TWO_SIDED, transform(translate=[0.1, 0.1, 1.2], scale=0.4))},
     # All light comes through a pane of glass that the camera does not see.
     "glazed": lambda: {"pane": mesh(*split_box((0.5, 0.1, 2.3), (1.2, 1.2, 0.05)), GLASS)},
+    # Light comes through a pane that neither refracts nor reflects it.
+    "cleared": lambda: {"pane": mesh(*split_box((0.5, 0.1, 2.3), (1.2, 1.2, 0.05)),
+                                     GLASS | {"int_ior": 1.0, "ext_ior": 1.0})},
     # The camera sees the sphere and its shadow in a mirror, too.
     "reflected": lambda: {"sheet": rectangle(MIRROR, transform(translate=[0.2, 1.6, 1], rotate=([1, 0, 0], 80),
                                                                scale=1.3))},
@@ -329,7 +333,7 @@ def standing(lamp: str, depth: int, **options: Any) -> EdgeCase:
     return EdgeCase("standing", lamp, depth, ("x", "y", "turn"), (0, 0, 1), **options)
 
 
-BOTH, CAMERA = {"paths": "both"}, {"paths": "camera"}
+BOTH, CAMERA, LIGHT = {"paths": "both"}, {"paths": "camera"}, {"paths": "light"}
 #: Cases of which finite differences are on file.
 RECORDED = [
     EdgeCase("flat", "area"), EdgeCase("sphere", "near"), EdgeCase("box", "sphere_lamp"),

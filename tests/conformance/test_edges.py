@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import Agreement, compare
-from conformance.edge_cases import CASES, RECORDED, SIZE, EdgeCase, recorded, standing
+from conformance.edge_cases import CASES, LIGHT, RECORDED, SIZE, EdgeCase, recorded, standing
 from conformance.moving import Moving
 from conformance.test_kernels import Kernels
 from measure.faults import Fault, assert_found, plant, planted
@@ -167,6 +167,8 @@ FAULTS = [
           "dr.select(hides, ~lit[1][1], lit[1][1])", "mi.Bool(False)"),
     Fault("chain_does_not_move", "slab-area-4", "estimators.chain_edges:differentiate_edges_behind_chains",
           "dr.select(shadow, origin, -at_p), 0)", "dr.select(shadow, origin, 0), 0)"),
+    Fault("grazing_light_behind_chains_is_corrected", "clear_pane", "estimators.chain_edges:_light",
+          "over if p.plan.needs.has_shading_normals else None", "None"),
     Fault("sides_exchanged_behind_chains", "reflected-area-3", "estimators.chain_edges:_light",
           "dr.select(over, edge.over.ray, edge.past.ray)", "dr.select(over, edge.past.ray, edge.over.ray)"),
     Fault("every_interval_counts_alike", "mirror-constant-3", "transport.jumps:sample_edge",
@@ -261,6 +263,21 @@ def test_light_that_leaves_a_surface_at_a_grazing_angle():
     check_grazing()
 
 
+def check_clear_pane(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Assert that edges of a smooth mesh behind a pane that does not change light are those without the pane."""
+
+    def terms(case: EdgeCase) -> np.ndarray:
+        return case.gradients(edges="on") - case.gradients(edges="off")
+
+    without, behind = (EdgeCase(name, "area", depth, options=LIGHT) for name, depth in (("smooth", 2), ("cleared", 4)))
+    agreement = compare(terms(behind), terms(without), block=None)
+    assert agreement, agreement
+
+
+def test_outlines_of_smooth_meshes_behind_glass(monkeypatch: pytest.MonkeyPatch):
+    check_clear_pane(monkeypatch)
+
+
 def check_contact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Assert that the derivative of a box that stands in a room is right. Here, fixed directions have a large share of
     the light between the box and the floor, so that a fault of their edges shows.
@@ -305,7 +322,7 @@ def test_contact_in_a_room():
 #: Checks of faults that hardly change an expectation, or that the test of a case has too much noise for.
 EXACT: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "depth": check_depth, "grazing": lambda monkeypatch: check_grazing(), "contact": check_contact,
-    "camera_contact": check_camera_contact,
+    "camera_contact": check_camera_contact, "clear_pane": check_clear_pane,
     "points": lambda monkeypatch: check_points("sensor", False),
 }  # fmt: skip
 
