@@ -126,9 +126,9 @@ def close_enough(problem: Problem, iteration: int) -> str:
     return f"every parameter is within about {100 * CLOSE:g} % of the optimum"
 
 
-#: Displacement of small parameters as a share of half their extent (a longer one smooths sharp caustics), the divisor of
-#: a step's samples for each of the two sets that measure their curvature, and the largest ratio of the samples of these
-#: sets to those of the steps.
+#: Displacement of small parameters as a share of half their extent, the divisor of a step's samples for each of the two
+#: sets that measure their curvature, and the largest ratio of the samples of these sets to those of the steps. A longer
+#: displacement would smooth sharp caustics.
 DISPLACEMENT, PART, MOST = 0.02, 4, 1.0
 
 
