@@ -28,7 +28,7 @@ import mitsuba as mi
 from reslrb_cli.estimators.attached import Adjoint
 from reslrb_cli.estimators.base import Pass, SurfacePoint
 from reslrb_cli.estimators.camera import Radiance
-from reslrb_cli.estimators.edges import Contribution
+from reslrb_cli.estimators.edges import Contribution, on_smooth
 from reslrb_cli.estimators.outline_rays import AROUND, edge_samples, for_camera, moved_by
 from reslrb_cli.estimators.stack import Ring, StackState, differentiate_frames
 from reslrb_cli.scene.rays import ray_offset
@@ -92,8 +92,7 @@ def _light(p: Pass, edge: ChainEdge, over: mi.Bool) -> mi.Float:
         found, lost = dr.dot(delta * edge.weight, L), dr.dot(delta, lost)
     else:
         emission = Emission(ray, edge.weight, dr.zeros(mi.EmitterPtr))
-        # p lies on an outline. Without interpolated normals, its correction is 1.
-        smooth = over if p.plan.needs.has_shading_normals else None
+        smooth = on_smooth(edge.over.pi.shape, p.plan.edged + p.plan.occluders, over)
         found = walk(samples, Contribution(p, smooth, depth), continues, emission, depth)[0]
         lost = dr.dot(p.delta(target.u, shadow, colours), lost)
     return showing(dr.select(edge.shadow, -0.5 * lost, dr.select(over, found, -found))) * p.scale

@@ -53,9 +53,8 @@ Tracing through Edge Sampling".
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
-from operator import or_
 
 import drjit as dr
 import mitsuba as mi
@@ -74,7 +73,7 @@ from reslrb_cli.estimators.outline_rays import (
     slid,
     touches_behind,
 )
-from reslrb_cli.scene.graph import interpolates_normals
+from reslrb_cli.scene.graph import interpolates_normals, is_one_of
 from reslrb_cli.scene.rays import ray_offset
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
@@ -170,6 +169,12 @@ def _inverse(correction: mi.Float) -> mi.Float:
     return dr.select(correction != 0, dr.rcp(correction), 0)
 
 
+def on_smooth(shape: mi.ShapePtr, shapes: Sequence[mi.Shape], over: mi.Bool) -> mi.Bool | None:
+    """Return the lanes `over` in which `shape`, one of `shapes`, interpolates normals. Return None if no shape does."""
+    smooth = [each for each in shapes if interpolates_normals(each)]
+    return is_one_of(shape, smooth) & over if smooth else None
+
+
 def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     """Add the derivatives of outlines and creases seen from lamps. Half of the lanes continue from p, the others from
     x.
@@ -185,9 +190,7 @@ def _from_lamps(p: Pass, numbers: mi.PCG32) -> None:
     emission = Emission(ray, (2 * share) * outline.weight, outline.view.emitter)
     moves = samples.plan.moving_emission
     shapes = samples.plan.edged + (samples.plan.occluders if moves else ())
-    smooth = [shape for shape in shapes if interpolates_normals(shape)]
-    on_smooth = reduce(or_, (outline.shape == mi.ShapePtr(shape) for shape in smooth)) & over if smooth else None
-    W = walk(samples, Contribution(p, on_smooth), beside.active, emission)[0] * p.scale
+    W = walk(samples, Contribution(p, on_smooth(outline.shape, shapes, over)), beside.active, emission)[0] * p.scale
     weight = showing(W) * dr.select(over, 1, -1)
     with dr.resume_grad(), dr.isolate_grad():
         adjoint, active = weight * outline.normal, beside.active & (weight != 0)

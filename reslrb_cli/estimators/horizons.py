@@ -27,8 +27,6 @@ film position.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import reduce
-from operator import or_
 
 import drjit as dr
 import mitsuba as mi
@@ -38,6 +36,7 @@ from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.camera import Radiance
 from reslrb_cli.estimators.outline_rays import both_sides, for_camera, halves, moved_by
 from reslrb_cli.scene.edges import angle_between
+from reslrb_cli.scene.graph import is_one_of
 from reslrb_cli.scene.rays import ray_offset
 from reslrb_cli.transport.bsdf import Scattering, evaluate
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, MetLight, NextEvent, camera_walk
@@ -84,7 +83,7 @@ class PickPoint(CameraHooks):
     def vertex(
         self, state: HorizonPoint, vertex: Vertex, met: MetLight | None, event: NextEvent | None, scattering: Scattering
     ) -> HorizonPoint:  # fmt: skip
-        here = reduce(or_, (vertex.si.shape == mi.ShapePtr(shape) for shape in self.shapes))
+        here = is_one_of(vertex.si.shape, self.shapes)
         P = self.delta * vertex.product.value()
         size = dr.select(vertex.active & here & (vertex.depth < self.p.plan.max_depth), dr.max(dr.abs(P)), 0)
         total, number = state.total + size, state.numbers.next_float32()

@@ -23,6 +23,7 @@ from reslrb_cli.glasses import Glass
 from reslrb_cli.lens.solid import Sheet
 from reslrb_cli.records.images import luminance
 from reslrb_cli.report.page.workshop import shown_ssim
+from reslrb_cli.scene.graph import is_one_of
 from reslrb_cli.scene.images import read_image
 from reslrb_cli.scene.rays import brightness
 
@@ -110,7 +111,7 @@ def _ends(
     dr.make_opaque(ray, light, left, active)  # so that each bounce launches one kernel
     for _ in range(BOUNCES):
         si = scene.ray_intersect(ray, active)
-        again = active & si.is_valid() & _is_any(si.shape, solid)
+        again = active & si.is_valid() & is_one_of(si.shape, solid)
         end = dr.select(active & ~again, si, end)
         # The largest number below 1 chooses refraction.
         lobe = mi.Float(1 - 2**-24) if refracted else sampler.next_1d(again)
@@ -132,13 +133,6 @@ def _from_lamps(scene: mi.Scene, count: int) -> tuple[mi.Sampler, mi.Ray3f, mi.F
     sampler.seed(0, count)
     ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
     return sampler, ray, brightness(weight, ray.wavelengths)
-
-
-def _is_any(shape: mi.ShapePtr, others: Sequence[mi.Shape]) -> mi.Bool:
-    found = mi.Bool(False)
-    for other in others:
-        found = found | (shape == mi.ShapePtr(other))
-    return found
 
 
 def shift_between(image: Array, reference: Array) -> Array:
@@ -524,7 +518,7 @@ def _light(scene: mi.Scene, solid: list[mi.Shape]) -> tuple[Array, Array] | None
     """
     _, ray, light = _from_lamps(scene, RAYS)
     si = scene.ray_intersect(ray, light > 0)
-    kept = np.ravel(np.array((light > 0) & si.is_valid() & _is_any(si.shape, solid))).astype(bool)
+    kept = np.ravel(np.array((light > 0) & si.is_valid() & is_one_of(si.shape, solid))).astype(bool)
     points, directions = (np.array(each, dtype=float).reshape(3, -1).T[kept] for each in (si.p, ray.d))
     return (points, directions) if len(points) > 8 else None
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import or_
 from typing import Any
 
 import drjit as dr
@@ -216,6 +217,11 @@ def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
         corners = triangles(item)
         low, high = corners.min((0, 1)), corners.max((0, 1))
     return low, high
+
+
+def is_one_of(shape: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
+    """Return the lanes in which the pointer `shape` is one of `shapes`."""
+    return reduce(or_, (shape == mi.ShapePtr(other) for other in shapes), mi.Bool(False))
 
 
 def interpolates_normals(shape: mi.Shape) -> bool:

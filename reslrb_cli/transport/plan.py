@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.scene.deformation import Horizon
-from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.scene.graph import Lamp, is_one_of
 from reslrb_cli.scene.needs import SceneNeeds
 from reslrb_cli.transport.sobol import Coordinates
 
@@ -289,10 +289,7 @@ class Plan:
 
     def moves(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return the lanes in which the shape itself moves."""
-        result = mi.Bool(False)
-        for other in self.moving_shapes:
-            result |= shape == mi.ShapePtr(other)
-        return result
+        return is_one_of(shape, self.moving_shapes)
 
     def for_camera(self) -> Plan:
         """Return the plan of the camera paths of a pass. Their vertices stay behind all surfaces that are not

@@ -168,7 +168,7 @@ FAULTS = [
     Fault("chain_does_not_move", "slab-area-4", "estimators.chain_edges:differentiate_edges_behind_chains",
           "dr.select(shadow, origin, -at_p), 0)", "dr.select(shadow, origin, 0), 0)"),
     Fault("grazing_light_behind_chains_is_corrected", "clear_pane", "estimators.chain_edges:_light",
-          "over if p.plan.needs.has_shading_normals else None", "None"),
+          "on_smooth(edge.over.pi.shape, p.plan.edged + p.plan.occluders, over)", "None"),
     Fault("sides_exchanged_behind_chains", "reflected-area-3", "estimators.chain_edges:_light",
           "dr.select(over, edge.over.ray, edge.past.ray)", "dr.select(over, edge.past.ray, edge.over.ray)"),
     Fault("every_interval_counts_alike", "mirror-constant-3", "transport.jumps:sample_edge",
