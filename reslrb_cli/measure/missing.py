@@ -15,7 +15,7 @@ to the squares is subtracted. The reported standard error is the error of the me
 of configs/lens_pose.yaml seems to lack 1.1 %.
 
 `check_missing` measures the missing share before a run's first iteration, and decides `edges: auto`. Each measurement
-is limited to a part of the run's samples, and uses one or two finite-difference steps.
+is limited to a part of the run's samples.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[
     without = [_ratio(np.delete(missing, i, 0), np.delete(whole, i, 0)) for i in range(len(whole))]
     variance = jackknife_variance(np.array(without))
     truncation = (np.square(part) @ left) / np.square(part).sum() / size
-    return found, float(np.sqrt(variance + truncation))
+    return found, float(np.sqrt(variance + truncation * max(found, 1.0) ** 2))
 
 
 def _ratio(missing: np.ndarray, whole: np.ndarray) -> float:
@@ -248,9 +248,9 @@ def _weigh(problem: Problem, views: Sequence[View], cases: Sequence[Case], spp: 
 
 # --- before a run's first iteration -----------------------------------------------------------------------------------
 
-#: Steps of the differences, in tenths of the size of the moving object. The longer step has less noise at edges. It is
-#: used if the shorter one is too noisy and both agree.
-SHORT, LONG = 0.01, 0.25
+#: Longest and shortest step of the differences, in tenths of the size of the moving object. A longer step has less
+#: noise at edges, and a larger truncation error.
+LONGEST, SHORTEST = 0.25, 0.01
 
 #: Maximum numbers of seeds and views.
 MOST_SEEDS, MOST_VIEWS = 64, 4
@@ -277,7 +277,9 @@ def check_missing(
         lacking = [record for record in found if record.is_incomplete]
         why = "no significant part of the derivative is missing without them"
         if lacking:
-            why = f"without them, the derivative of {lacking[0].parameter} lacks {lacking[0].percent()}"
+            worst = next((record for record in lacking if not record.is_unknown), lacking[0])
+            amount = "an unknown share" if worst.is_unknown else worst.percent()
+            why = f"without them, the derivative of {worst.parameter} lacks {amount}"
         decision = Decision(setting="edges", value="on" if lacking else "off", why=why)
         tracer = as_decided(tracer, [decision])
         problem = replace(problem, decisions=[*problem.decisions, decision], integrator=tracer)
@@ -358,52 +360,51 @@ class _Short:
         return [embed(case, key, row) for row in rows]
 
     def measure(self) -> list[MissingRecord]:
-        """Measure all parameters with the shorter step. If a parameter's share is too uncertain, use more seeds and try
-        the longer step.
+        """Measure all parameters in turn. Each one gets an equal part of the remaining samples.
 
-        If the remaining samples are too few, or if dL/dI is zero, all records have no share.
+        If the samples are too few, or if dL/dI is zero, all records have no share.
         """
-        image_spp, fewest = 2 * self.problem.config.run.spp, seeds(FEWEST)
+        image_spp = 2 * self.problem.config.run.spp
         if image_spp + FEWEST * self._spp_of_seed(*self.keys) > self._left:
-            return [self._record(key, None) for key in self.keys]
+            return [self._record(key, []) for key in self.keys]
         if not _weigh(self.problem, self._views, self._cases, image_spp):
-            return [self._record(key, None) for key in self.keys]
+            return [self._record(key, []) for key in self.keys]
         self._left -= image_spp
-        short = {key: [self._difference(key, SHORT, seed) for seed in fewest] for key in self.keys}
-        records = {key: self._record(key, short[key]) for key in self.keys}
-        for key, record in records.items():
-            if not record.is_known:
-                records[key] = self._look_longer(key, short[key])
-        return list(records.values())
+        return [self._measure(key, self._left * (1 - 1 / (len(self.keys) - place)))
+                for place, key in enumerate(self.keys)]  # fmt: skip
 
     def _spp_of_seed(self, *keys: str) -> int:
         """Return the maximum number of samples per pixel for one seed of these parameters."""
         return (1 + 2 * sum(len(self._rows[key]) for key in keys)) * self._spp
 
-    def _look_longer(self, key: str, samples: list[np.ndarray]) -> MissingRecord:
-        """Measure the share with more seeds than the `samples` of the short step. If the short and the long step agree,
-        use the long step.
-        """
-        step = SHORT
-        if FEWEST * self._spp_of_seed(key) <= self._left:
-            long = [self._difference(key, LONG, seed) for seed in seeds(FEWEST)]
-            change, noise = _mean(np.array(long) - np.array(samples))
-            if np.square(change).sum() <= NOTHING**2 * np.square(noise).sum():
-                samples, step = long, LONG
-        record = self._record(key, samples)
-        for seed in seeds(MOST_SEEDS)[FEWEST:]:
-            if record.is_known or self._spp_of_seed(key) > self._left:
-                break
-            samples.append(self._difference(key, step, seed))
-            record = self._record(key, samples)
-        return record
+    def _measure(self, key: str, kept: float) -> MissingRecord:
+        """Measure a parameter's share. `kept` samples per pixel remain for other parameters.
 
-    def _record(self, key: str, samples: list[np.ndarray] | None) -> MissingRecord:
-        """Return the parameter's record from samples (K,) of differences. If `samples` is None, the record has no
-        share.
+        A truncation error of the differences looks like a missing part. If a part seems to be missing, the step is
+        therefore halved. The change of the differences is then their error.
+        """
+        cost, step, before = self._spp_of_seed(key), LONGEST, np.zeros(len(self._rows[key]))
+        found = self._record(key, [])
+        while step > SHORTEST and self._left - FEWEST * cost >= kept and not found.is_decided:
+            samples = [self._difference(key, step, seed) for seed in seeds(FEWEST)]
+            found = self._record(key, samples)
+            for seed in seeds(MOST_SEEDS)[FEWEST:]:
+                if found.is_decided or self._left - cost < kept:
+                    break
+                samples.append(self._difference(key, step, seed))
+                found = self._record(key, samples)
+            if found.is_unknown or not found.is_incomplete:
+                break
+            mean = np.mean(samples, axis=0)
+            found, before, step = self._record(key, samples, np.square(mean - before)), mean, step / 2
+        return found
+
+    def _record(self, key: str, samples: list[np.ndarray], left: np.ndarray | float = 0.0) -> MissingRecord:
+        """Return the parameter's record from samples (K,) of differences. `left` has squared errors of their mean.
+        Without samples, the record has no share.
         """
         share = None
-        if samples is not None:
+        if samples:
             for seed in seeds(MOST_SEEDS)[len(self._ours) : len(samples)]:
                 self._left -= self._spp
                 gradient = sum(case.gradient(self._integrator, seed, self._spp, step=case.known_step)
@@ -411,10 +412,10 @@ class _Short:
                 self._ours.append(np.asarray(gradient))
             whole = np.array(samples)
             ours = np.array([[row @ gradient for row in self._rows[key]] for gradient in self._ours[: len(whole)]])
-            share = share_of(whole, whole - ours, np.zeros(whole.shape[1]))
+            share = share_of(whole, whole - ours, np.broadcast_to(left, whole.shape[1]))
         value, error = share or (None, None)
         source, along = str(self.problem.config.source), len(self._rows[key])
-        return MissingRecord(source, key, value, error, along, len(samples or ()))
+        return MissingRecord(source, key, value, error, along, len(samples))
 
     def _difference(self, key: str, step: float, seed: int) -> np.ndarray:
         """Return the differences of the loss along all directions of a parameter, (K,)."""

@@ -388,9 +388,11 @@ class MissingRecord(Line):
         return self.share is not None and self.share - 2 * (self.standard_error or 0) > HALF
 
     @property
-    def is_known(self) -> bool:
-        """True if the missing share is known so well that more seeds would hardly change the verdict."""
-        return self.standard_error is not None and (self.standard_error < KNOWN or self.is_for_the_most_part)
+    def is_decided(self) -> bool:
+        """True if more seeds would hardly change whether the derivative is incomplete."""
+        if self.share is None or self.standard_error is None:
+            return False
+        return self.standard_error < KNOWN or (self.is_incomplete and not self.is_unknown)
 
     def percent(self) -> str:
         """Return the share in words."""
