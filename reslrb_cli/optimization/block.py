@@ -19,7 +19,7 @@ skewed.
 
 The first curvatures may be much too low, for example if few samples hit a small highlight. A long step would then move
 a shape to a place where the images hardly change. The first step is at most L / 4. In the same units, each step is at
-most twice as long as the last one. H is a running mean of measurements, and each new one has half of the weight.
+most twice as long as the last one.
 
 n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.
@@ -88,9 +88,9 @@ class Block:
         self.rows[:, 5] = np.inf
 
     def bend(self, curvature: Array) -> None:
-        """Take a measurement of H (M, M). H is the mean of the measurement and the previous H."""
+        """Take a measurement of H (M, M)."""
         rows = self.rows.copy()
-        rows[:, FIELDS:] = curvature if not rows[:, FIELDS:].any() else (curvature + rows[:, FIELDS:]) / 2
+        rows[:, FIELDS:] = curvature
         self.rows = rows
 
     def steepness(self, key: str) -> Array:
