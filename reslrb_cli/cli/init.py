@@ -55,14 +55,14 @@ def _first_config(
     sensors: Sequence[str],
     sensor: int,
     proposals: Sequence[Proposal],
-    movable: Sequence[tuple[str, float, str]],
+    movable: Sequence[tuple[str, float, str, str]],
     **known: Any,
 ) -> str:
     """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
 
     `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
     as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `movable` has the
-    ids, the shares and the file names of the shapes in view that can be moved. `known` are other template values.
+    ids, shares, file names and free motions of the shapes in view that can be moved. `known` are other template values.
     """
     first = [proposal for proposal in proposals if proposal.first]
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
@@ -82,8 +82,8 @@ def _first_config(
         others=[proposal for proposal in proposals if not proposal.first],
         most_others=_MOST_OTHERS,
         movable=[
-            (_text(id), f"{100 * share:.0f} % of the picture" + (f", {printable(name)}" if name else ""))
-            for id, share, name in movable[:_MOST_OTHERS]
+            (_text(id), free, f"{100 * share:.0f} % of the picture" + (f", {printable(name)}" if name else ""))
+            for id, share, name, free in movable[:_MOST_OTHERS]
         ],
         iterations=ITERATIONS,
         spp=SPP,

@@ -173,14 +173,16 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     return [Proposal(info, share, _bounds(info), _resolution(info), info.key in first) for info, share in found]
 
 
-def find_movable_in_view(scene: mi.Scene, sensor: int) -> list[tuple[str, float, str]]:
-    """Return the ids of the shapes that can be moved, their shares of the picture, and the names of their files, or "".
-    Larger shares come first. Shapes that fill most of the picture are left out, and so are shapes that enclose the
-    scene.
+def find_movable_in_view(scene: mi.Scene, sensor: int) -> list[tuple[str, float, str, str]]:
+    """Return the ids of the shapes that can be moved, their shares of the picture, the names of their files, or "", and
+    their free motions. Only a texture would show how a sphere turns. Larger shares come first. Shapes that fill most of
+    the picture are left out, and so are shapes that enclose the scene.
     """
     params, shares = mi.traverse(scene), _shares(scene, sensor)
     items = [item for item in list_movable(params) if item.casts_edges(scene)]
-    found = [(item.id, shares.get(item.node, 0.0), _file_name(item.node)) for item in items]
+    found = [(item.id, shares.get(item.node, 0.0), _file_name(item.node),
+              "translation" if item.node.class_name() == "Sphere" else "translation, rotation")
+             for item in items]  # fmt: skip
     return sorted((row for row in found if LEAST_SHARE <= row[1] < MOST_MOVED), key=lambda row: -row[1])
 
 

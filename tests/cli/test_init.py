@@ -186,7 +186,9 @@ VIEW = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"
 def test_large_visible_parameters_come_first(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(VIEW)
     made = load_scene(tmp_path / "scene.xml")
-    assert [id for id, *_ in find_movable_in_view(made, 0)] == ["Sphere_3", "Sphere_2", "Cube_1"]  # not the floor
+    movable = find_movable_in_view(made, 0)  # not the floor
+    assert [id for id, *_ in movable] == ["Sphere_3", "Sphere_2", "Cube_1"]
+    assert [free for *_, free in movable] == ["translation", "translation", "translation, rotation"]
     found = propose(made, 0)
     tiles = [f"Rectangle_1.bsdf.brdf_0.reflectance.color{k}.value" for k in range(2)]
     assert [item.info.key for item in found[:2]] == tiles
