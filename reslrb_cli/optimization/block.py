@@ -17,9 +17,10 @@ In the same units, a gradient is therefore at most as long as L, or as n^0.5 tim
 limit, squared, holds for an estimate of v. A fixed limit would leave a bias, because noise with rare bright samples is
 skewed.
 
-The first curvatures may be much too low, for example if few samples hit a small highlight. A long step would then move
-a shape to a place where the images hardly change. The first step is at most L / 4. In the same units, each step is at
-most twice as long as the last one.
+The image of a shape changes with its place in no linear way, and the first curvatures may be much too low, for example
+if few samples hit a small highlight. A long step would then move a shape to a place where the images hardly change. If
+anything moves, the first step is therefore at most L / 4. In the same units, each step is at most twice as long as the
+last one.
 
 n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.
@@ -56,7 +57,7 @@ class JointState:
     """Values, gradients, longest steps and bounds of all coordinates (M,).
 
     `known` marks coordinates with a gradient. `exposure` has the place of the exposure that a colour compensates for,
-    or -1. The value of an exposure is its logarithm.
+    or -1. The value of an exposure is its logarithm. `moves` is true if any coordinate is one of a motion or heightmap.
     """
 
     value: Array
@@ -66,6 +67,7 @@ class JointState:
     high: Array
     known: Array
     exposure: Array
+    moves: bool
 
 
 class Block:
@@ -138,9 +140,9 @@ class Block:
         error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
         distance = np.abs(step) + SURE * error
         size, last_size = (float(np.linalg.norm(root * each)) for each in (step, last_step))
-        if last == 0:
+        if now.moves and last == 0:
             step = np.clip(step, -FIRST * now.longest, FIRST * now.longest)
-        elif 0 < GROWTH * last_size < size:
+        elif now.moves and 0 < GROWTH * last_size < size:
             step *= GROWTH * last_size / size
         # The first gradient has no predecessor, so it says nothing about the noise.
         fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0]
