@@ -53,7 +53,7 @@ def find_box(path: Path, *sets: tuple[str, Any]) -> list[float]:
 
 
 def test_auto_finds_a_box_within_a_few_steps(llvm: str, tmp_path: Path) -> None:
-    """The box is AWAY from its place, and 7 pixels wide. The first step is a quarter of the longest, the second a half."""
+    """The box is AWAY from its place, and 7 pixels wide. The first two steps are short."""
     path = write_experiment(tmp_path, "area")
     sets = [("parameters[0].initial", [AWAY, 0, 0]), ("scene.size", [32, 32]), ("run.spp", 64)]
     far = find_box(path, *sets, ("target.render.spp", 512))
