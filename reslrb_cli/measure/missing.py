@@ -365,9 +365,8 @@ class _Short:
         If the samples are too few, or if dL/dI is zero, all records have no share.
         """
         image_spp = 2 * self.problem.config.run.spp
-        if image_spp + FEWEST * self._spp_of_seed(*self.keys) > self._left:
-            return [self._record(key, []) for key in self.keys]
-        if not _weigh(self.problem, self._views, self._cases, image_spp):
+        too_few = image_spp + FEWEST * self._spp_of_seed(*self.keys) > self._left
+        if too_few or not _weigh(self.problem, self._views, self._cases, image_spp):
             return [self._record(key, []) for key in self.keys]
         self._left -= image_spp
         return [self._measure(key, self._left * (1 - 1 / (len(self.keys) - place)))
