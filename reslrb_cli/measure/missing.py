@@ -128,6 +128,7 @@ def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[
     without = [_ratio(np.delete(missing, i, 0), np.delete(whole, i, 0)) for i in range(len(whole))]
     variance = jackknife_variance(np.array(without))
     truncation = (np.square(part) @ left) / np.square(part).sum() / size
+    # An error of the whole changes the share more if the whole is small.
     return found, float(np.sqrt(variance + truncation * max(found, 1.0) ** 2))
 
 
@@ -277,9 +278,9 @@ def check_missing(
         lacking = [record for record in found if record.is_incomplete]
         why = "no significant part of the derivative is missing without them"
         if lacking:
-            worst = next((record for record in lacking if not record.is_unknown), lacking[0])
-            amount = "an unknown share" if worst.is_unknown else worst.percent()
-            why = f"without them, the derivative of {worst.parameter} lacks {amount}"
+            clear = next((record for record in lacking if not record.is_unknown), lacking[0])
+            amount = "an unknown share" if clear.is_unknown else clear.percent()
+            why = f"without them, the derivative of {clear.parameter} lacks {amount}"
         decision = Decision(setting="edges", value="on" if lacking else "off", why=why)
         tracer = as_decided(tracer, [decision])
         problem = replace(problem, decisions=[*problem.decisions, decision], integrator=tracer)
@@ -360,7 +361,8 @@ class _Short:
         return [embed(case, key, row) for row in rows]
 
     def measure(self) -> list[MissingRecord]:
-        """Measure all parameters in turn. Each one gets an equal part of the remaining samples.
+        """Measure all parameters with the shortest step, and those whose share stays open also with longer steps. Each
+        of these gets an equal part of the remaining samples.
 
         If the samples are too few, or if dL/dI is zero, all records have no share.
         """
@@ -369,21 +371,27 @@ class _Short:
         if too_few or not _weigh(self.problem, self._views, self._cases, image_spp):
             return [self._record(key, []) for key in self.keys]
         self._left -= image_spp
-        return [self._measure(key, self._left * (1 - 1 / (len(self.keys) - place)))
-                for place, key in enumerate(self.keys)]  # fmt: skip
+        short = {key: [self._difference(key, SHORTEST, seed) for seed in seeds(FEWEST)] for key in self.keys}
+        records = {key: self._record(key, samples) for key, samples in short.items()}
+        still_open = [key for key, record in records.items() if not record.is_decided]
+        for place, key in enumerate(still_open):
+            kept = self._left * (1 - 1 / (len(still_open) - place))
+            records[key] = self._look_longer(records[key], kept)
+        return list(records.values())
 
     def _spp_of_seed(self, *keys: str) -> int:
         """Return the maximum number of samples per pixel for one seed of these parameters."""
         return (1 + 2 * sum(len(self._rows[key]) for key in keys)) * self._spp
 
-    def _measure(self, key: str, kept: float) -> MissingRecord:
-        """Measure a parameter's share. `kept` samples per pixel remain for other parameters.
+    def _look_longer(self, found: MissingRecord, kept: float) -> MissingRecord:
+        """Measure a share with longer steps. `found` is the record of the shortest step. It is returned if the samples
+        are too few. `kept` samples per pixel remain for other parameters.
 
         A truncation error of the differences looks like a missing part. If a part seems to be missing, the step is
         therefore halved. The change of the differences is then their error.
         """
-        cost, step, before = self._spp_of_seed(key), LONGEST, np.zeros(len(self._rows[key]))
-        found = self._record(key, [])
+        key, step = found.parameter, LONGEST
+        cost, before = self._spp_of_seed(key), np.zeros(len(self._rows[key]))
         while step > SHORTEST and self._left - FEWEST * cost >= kept and not found.is_decided:
             samples = [self._difference(key, step, seed) for seed in seeds(FEWEST)]
             found = self._record(key, samples)
@@ -399,8 +407,8 @@ class _Short:
         return found
 
     def _record(self, key: str, samples: list[np.ndarray], left: np.ndarray | float = 0.0) -> MissingRecord:
-        """Return the parameter's record from samples (K,) of differences. `left` has squared errors of their mean.
-        Without samples, the record has no share.
+        """Return the parameter's record from samples (K,) of differences. `left` has the squared errors of their
+        mean that are equal for all seeds. Without samples, the record has no share.
         """
         share = None
         if samples:

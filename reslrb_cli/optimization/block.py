@@ -17,8 +17,8 @@ In the same units, a gradient is therefore at most as long as L, or as n^0.5 tim
 limit, squared, holds for an estimate of v. A fixed limit would leave a bias, because noise with rare bright samples is
 skewed.
 
-The image of a shape changes with its place in no linear way, and the first curvatures may be much too low, for example
-if few samples hit a small highlight. A long step would then move a shape to a place where the images hardly change. If
+An image does not depend linearly on the place of a shape. The first curvatures may also be much too low, for example if
+few samples hit a small highlight. A long step would then move a shape to a place where the images hardly change. If
 anything moves, the first step is therefore at most L / 4. In the same units, each step is at most twice as long as the
 last one.
 
