@@ -14,8 +14,7 @@ to the squares is subtracted. The reported standard error is the error of the me
 `gradcheck --missing` for an experiment. With the steps of `choose_step` and no extrapolation, the complete derivative
 of configs/lens_pose.yaml seems to lack 1.1 %.
 
-`check_missing` measures the missing share before a run's first iteration, and decides `edges: auto`. Each measurement
-is limited to a part of the run's samples.
+`check_missing` measures the missing share before a run's first iteration, and decides `edges: auto`.
 """
 
 from __future__ import annotations
@@ -371,12 +370,11 @@ class _Short:
         if too_few or not _weigh(self.problem, self._views, self._cases, image_spp):
             return [self._record(key, []) for key in self.keys]
         self._left -= image_spp
-        short = {key: [self._difference(key, SHORTEST, seed) for seed in seeds(FEWEST)] for key in self.keys}
-        records = {key: self._record(key, samples) for key, samples in short.items()}
+        records = {key: self._record(key, [self._difference(key, SHORTEST, seed) for seed in seeds(FEWEST)])
+                   for key in self.keys}  # fmt: skip
         still_open = [key for key, record in records.items() if not record.is_decided]
         for place, key in enumerate(still_open):
-            kept = self._left * (1 - 1 / (len(still_open) - place))
-            records[key] = self._look_longer(records[key], kept)
+            records[key] = self._look_longer(records[key], self._left * (1 - 1 / (len(still_open) - place)))
         return list(records.values())
 
     def _spp_of_seed(self, *keys: str) -> int:

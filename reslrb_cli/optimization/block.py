@@ -17,10 +17,9 @@ In the same units, a gradient is therefore at most as long as L, or as n^0.5 tim
 limit, squared, holds for an estimate of v. A fixed limit would leave a bias, because noise with rare bright samples is
 skewed.
 
-An image does not depend linearly on the place of a shape. The first curvatures may also be much too low, for example if
-few samples hit a small highlight. A long step would then move a shape to a place where the images hardly change. If
-anything moves, the first step is therefore at most L / 4. In the same units, each step is at most twice as long as the
-last one.
+The first curvatures may be much too low, for example if few samples hit a small highlight. A long step would move a
+shape to a place where the images hardly change. If anything moves, the first step is therefore at most L / 4. In the
+same units, each step is at most twice as long as the last one.
 
 n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.

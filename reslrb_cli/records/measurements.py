@@ -390,9 +390,7 @@ class MissingRecord(Line):
     @property
     def is_decided(self) -> bool:
         """True if more seeds would hardly change whether the derivative is incomplete."""
-        if self.share is None or self.standard_error is None:
-            return False
-        return self.standard_error < KNOWN or (self.is_incomplete and not self.is_unknown)
+        return not self.is_unknown and (self.is_incomplete or (self.standard_error or 0) < KNOWN)
 
     def percent(self) -> str:
         """Return the share in words."""
