@@ -17,10 +17,6 @@ In the same units, a gradient is therefore at most as long as L, or as n^0.5 tim
 limit, squared, holds for an estimate of v. A fixed limit would leave a bias, because noise with rare bright samples is
 skewed.
 
-The first curvatures may be much too low, for example if few samples hit a small highlight. A long step would move a
-shape to a place where the images hardly change. If anything moves, the first step is therefore at most L / 4. In the
-same units, each step is at most twice as long as the last one.
-
 n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.
 
@@ -43,8 +39,8 @@ import numpy as np
 from reslrb_cli.optimization.uncertainty.posterior import positive
 from reslrb_cli.statistics import Array
 
-#: s, decrease of n, the first step as a share of L, and the growth of steps.
-NOISE, SHRINK, FIRST, GROWTH = 0.3, 0.25, 0.25, 2.0
+#: s, and decrease of n.
+NOISE, SHRINK = 0.3, 0.25
 #: Standard errors from the estimate to a limit that holds with a probability of 85 %.
 SURE = 1.04
 #: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, and v.
@@ -56,7 +52,7 @@ class JointState:
     """Values, gradients, longest steps and bounds of all coordinates (M,).
 
     `known` marks coordinates with a gradient. `exposure` has the place of the exposure that a colour compensates for,
-    or -1. The value of an exposure is its logarithm. `moves` is true if any coordinate is one of a motion or heightmap.
+    or -1. The value of an exposure is its logarithm.
     """
 
     value: Array
@@ -66,7 +62,6 @@ class JointState:
     high: Array
     known: Array
     exposure: Array
-    moves: bool
 
 
 class Block:
@@ -138,11 +133,6 @@ class Block:
         step[free] = -(inverse @ A @ Y[free]) / root[free]
         error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
         distance = np.abs(step) + SURE * error
-        size, last_size = (float(np.linalg.norm(root * each)) for each in (step, last_step))
-        if now.moves and last == 0:
-            step = np.clip(step, -FIRST * now.longest, FIRST * now.longest)
-        elif now.moves and 0 < GROWTH * last_size < size:
-            step *= GROWTH * last_size / size
         # The first gradient has no predecessor, so it says nothing about the noise.
         fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0]
         rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)

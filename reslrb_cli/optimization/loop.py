@@ -10,7 +10,7 @@ to the optimum (`close_enough`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import NonFinite
-from reslrb_cli.integrators.step import Refused, gradient_step
+from reslrb_cli.integrators.step import Refused, gradient_step, render_image
 from reslrb_cli.optimization.losses import own_losses
 from reslrb_cli.optimization.nonfinite import (
     Findings,
@@ -184,6 +184,41 @@ def measure_block(problem: Problem, iteration: int) -> None:
     problem.apply()
 
 
+#: Most halvings of a step.
+HALVINGS = 3
+
+
+def update(problem: Problem, iteration: int, factor: float, held: Collection[str]) -> dict[str, int]:
+    """Update all parameters but `held`. Returns the number of non-finite entries of updates by key.
+
+    Where shapes, lamps or heightmaps move, the loss is far from quadratic, and a step of `auto` may be much too long.
+    The step of all small parameters is then halved until the loss does not rise (backtracking; Armijo 1966).
+    """
+    optimizer = problem.optimizer
+    searched = any(key in optimizer.extents for key in optimizer.block.at)
+    before = {key: dr.detach(optimizer[key]) for key in optimizer.block.at if searched}
+    loss = blurred_loss(problem, iteration) if searched else 0.0
+    updates = optimizer.step(factor, skip=held)
+    problem.apply()
+    for _ in range(HALVINGS if searched else 0):
+        if blurred_loss(problem, iteration) <= loss:
+            break
+        for key, value in before.items():
+            optimizer.set_value(key, 0.5 * (value + dr.detach(optimizer[key])))
+        problem.apply()
+    return updates
+
+
+def blurred_loss(problem: Problem, iteration: int) -> float:
+    """Return the loss at the current values, with the blur, the views, and a part of the samples of `iteration`."""
+    spp, unit, total = problem.config.run.spp, problem.samples_per_pass or 1, 0.0
+    for view, scale in problem.drawn(iteration):
+        at = seed(problem.config.run.seed, iteration, view.sensor, "step length")
+        image = render_image(problem.integrator, problem.scene, view.sensor, at, max(spp // PART // unit, 1) * unit)
+        total += scale * float(view.blurred_objective(image)[0])
+    return total
+
+
 #: The moments are set to zero each time a large loss has fallen to this fraction. A first loss is large if the loss of
 #: a black image is below this fraction of it.
 FALL = 0.1
@@ -258,8 +293,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
             optimizer.forget()
         for key in found.gradients if config.run.on_nonfinite == "zero" else ():
             zero_nonfinite(optimizer[key])
-        found.updates = optimizer.step(factor, skip=held)
-        problem.apply()
+        found.updates = update(problem, iteration, factor, held)
     standstill = state.standstill + 1 if held or found.updates else 0
     state = replace(
         state,

@@ -236,8 +236,7 @@ class Optimizer:
                 place = block.at[balanced]
                 own = np.arange(place.start, place.stop)
                 exposure[at] = own if len(own) in (1, at.stop - at.start) else -1
-        moves = any(key in self.extents for key in block.at)
-        change = block.steps(JointState(value, gradient, longest, low, high, known, exposure, moves))
+        change = block.steps(JointState(value, gradient, longest, low, high, known, exposure))
         return {key: change[at] for key, at in block.at.items() if key not in skip}
 
     def _move_variable(self, key: str, change: Array) -> None:

@@ -209,16 +209,21 @@ class View:
 
         With `blur`, the derivative is that of the loss of blurred images.
         """
+        loss = self._loss(image, 0.0)
+        if not self.blur or not dr.grad_enabled(image):
+            return loss
+        return dr.replace_grad(dr.detach(loss), self._loss(image, self.blur))
+
+    def _loss(self, image: mi.TensorXf, sigma: float) -> mi.Float:
         target = self.target
         if self.weights is not None:
             # Excluded pixels, even with non-finite values, have neither loss nor derivative.
             image = dr.select(self.weights > 0, image, target)
         given = () if self.weights is None else (self.weights,)
-        loss = self.loss(image, target, *given)
-        if not self.blur or not dr.grad_enabled(image):
-            return loss
-        finite = dr.select(dr.isfinite(image), image, target)  # a blur would spread a NaN to all pixels
-        return dr.replace_grad(dr.detach(loss), self.loss(blur(finite, self.blur), blur(target, self.blur), *given))
+        if sigma:
+            finite = dr.select(dr.isfinite(image), image, target)  # a blur would spread a NaN to all pixels
+            image, target = blur(finite, sigma), blur(target, sigma)
+        return self.loss(image, target, *given)
 
     def curvature(self, known: bool) -> Array:
         """Return the loss's curvature (H, W) in each pixel, scaled to a mean of 1. If it is not `known`, return that of
@@ -243,6 +248,11 @@ class View:
     def objective(self, image: mi.TensorXf) -> mi.Float:
         """Return the view's term in the loss of all views."""
         return self.compare(image) * self.share
+
+    def blurred_objective(self, image: mi.TensorXf) -> mi.Float:
+        """Return the view's term in the loss of all views, with the blur of this iteration."""
+        exposed = self.exposure.applied(first_channels(image, self.target.shape[2]))
+        return self._loss(exposed, self.blur) * self.share
 
 
 def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:
