@@ -89,6 +89,12 @@ class Block:
         rows[:, FIELDS:] = curvature
         self.rows = rows
 
+    def distrust(self) -> None:
+        """Halve n, because the loss rose along a step."""
+        rows = self.rows.copy()
+        rows[:, 6] = np.maximum(rows[:, 6] / 2, 1)
+        self.rows = rows
+
     def steepness(self, key: str) -> Array:
         """Return the gradient of each entry that moves it by 1, summed over the steps. It is infinite without a
         curvature.

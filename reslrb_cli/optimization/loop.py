@@ -184,8 +184,8 @@ def measure_block(problem: Problem, iteration: int) -> None:
     problem.apply()
 
 
-#: Most halvings of a step.
-HALVINGS = 3
+#: Most halvings of a step, and the largest ratio of the losses after and before a step that is not halved.
+HALVINGS, RISE = 3, 1.1
 
 
 def update(problem: Problem, iteration: int, factor: float, held: Collection[str]) -> dict[str, int]:
@@ -201,10 +201,13 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
     updates = optimizer.step(factor, skip=held)
     problem.apply()
     for _ in range(HALVINGS if searched else 0):
-        if blurred_loss(problem, iteration) <= loss:
+        now = blurred_loss(problem, iteration)
+        if now <= loss:
             break
         for key, value in before.items():
             optimizer.set_value(key, 0.5 * (value + dr.detach(optimizer[key])))
+        if now > RISE * loss:
+            optimizer.block.distrust()
         problem.apply()
     return updates
 
