@@ -18,7 +18,8 @@ limit, squared, holds for an estimate of v. A fixed limit would leave a bias, be
 skewed.
 
 n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
-gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many.
+gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many. If a step raises the
+loss by much (`loop.update`), n is halved.
 
 The images hardly change if an exposure E rises and all colours c fall. A step dE, dc is therefore taken in E and E c,
 
@@ -90,7 +91,7 @@ class Block:
         self.rows = rows
 
     def distrust(self) -> None:
-        """Halve n, because the loss rose along a step."""
+        """Halve n."""
         rows = self.rows.copy()
         rows[:, 6] = np.maximum(rows[:, 6] / 2, 1)
         self.rows = rows

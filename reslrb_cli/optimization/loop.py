@@ -184,7 +184,7 @@ def measure_block(problem: Problem, iteration: int) -> None:
     problem.apply()
 
 
-#: Most halvings of a step, and the largest ratio of the losses after and before a step that is not halved.
+#: Most halvings of a step, and the ratio of the losses after and before a step above which n is halved too.
 HALVINGS, RISE = 3, 1.1
 
 
@@ -192,7 +192,8 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
     """Update all parameters but `held`. Returns the number of non-finite entries of updates by key.
 
     Where shapes, lamps or heightmaps move, the loss is far from quadratic, and a step of `auto` may be much too long.
-    The step of all small parameters is then halved until the loss does not rise (backtracking; Armijo 1966).
+    The step of all small parameters is then halved until the loss does not rise (backtracking; Armijo 1966). After a
+    large rise, n is halved too, because the mean of n gradients misleads.
     """
     optimizer = problem.optimizer
     searched = any(key in optimizer.extents for key in optimizer.block.at)
