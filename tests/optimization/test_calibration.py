@@ -202,6 +202,7 @@ def judge_texture(
     half, row = len(values) // 2, own.value
     last = np.array([brightness(g, x, 1) for g, x in zip(gradients[half:], values[half:], strict=True)])
     object.__setattr__(own, "last", last)
+    object.__setattr__(own, "rows", np.stack([gradients, values], axis=1)[half:])
     found = weigh(
         {"t": own}, [ParameterDirection("t", row)], np.array([[row @ H @ row]]), np.zeros((1, 1)),
         {"t": EntryCurvature(np.mean([a * b for a, b in probes], axis=0), None, probes, (SIDE, SIDE, 1))},

@@ -45,6 +45,9 @@ STEP = 0.05
 #: Maximum number of the last iterations, at most half of all, whose gradients and values are used; maximum number of
 #: entries of a texture whose brightness is recorded.
 MOST_LAST, MOST_RECORDED = 200, 2**22
+#: Maximum number of entries of a texture whose gradients and values are recorded. In larger textures, the gradients at
+#: the final values determine the mean square of the offsets as well, because there are so many entries.
+MOST_ROWS = 2**10
 #: Curvature that takes longer than this share of the run's iterations, and than this many of them, is left out.
 SHARE, MOST_STEPS = 0.25, 50
 
@@ -76,7 +79,7 @@ class Certainty:
                 continue
             both = (state.gradients, before.values)
             gradient, value = (to_array(each[key]).astype(np.float64).ravel() for each in both)
-            if not is_small:
+            if not is_small and initial.size > MOST_ROWS:
                 gradient, value = brightness(gradient, value, shape[2])
             if np.isfinite(gradient).all():
                 earlier = self.last.get(key, np.zeros((0, 2, gradient.size)))
@@ -200,7 +203,11 @@ class Certainty:
     def _measured(self, gradients: Gradients, iterations: int) -> dict[str, Measured]:
         optimizer, found = self.problem.optimizer, {}
         for key, rows in gradients.items():
-            value, last = row_of(self.problem, key), self.last.get(key)
+            value, last, own = row_of(self.problem, key), self.last.get(key), None
+            last = None if last is None else last[-(iterations // 2) :]
+            if last is not None and not optimizer.is_small(key) and value.size <= MOST_ROWS:
+                channels = self.problem.selection.array(key).shape[2]
+                own, last = last, np.array([brightness(g, x, channels) for g, x in last])
             found[key] = Measured(
                 value=value,
                 bounds=self.problem.selection.specs[key].bounds or (-np.inf, np.inf),
@@ -209,7 +216,8 @@ class Certainty:
                 step=np.nan_to_num(optimizer.response(key) * optimizer.rate(key) * self.rates[-1]),
                 is_small=optimizer.is_small(key),
                 start=self._initial[key],
-                last=None if last is None else last[-(iterations // 2) :],
+                last=last,
+                rows=own,
                 seen=self._seen_entries(key, rows),
             )
         return found

@@ -61,6 +61,7 @@ class Measured:
     - `last` (n, 2, m) has the last n iterations, if known: the gradients, and the values at which they were computed.
         m is N for a small parameter. For a texture, they are the derivative by the logarithm of each channel's
         brightness, and that logarithm (`brightness`).
+    - `rows` (n, 2, N) has the gradients and the values of the last n iterations of a small texture, if known.
     - `seen` (N,) marks the entries of a texture that some view shows. `seen` is None for other parameters.
     """
 
@@ -73,6 +74,7 @@ class Measured:
     start: Array
     last: Array | None = None
     seen: Array | None = None
+    rows: Array | None = None
 
     @property
     def mean(self) -> Array:

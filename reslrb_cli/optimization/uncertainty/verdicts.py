@@ -43,6 +43,7 @@ import numpy as np
 
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.posterior import (
+    BLOCKS,
     CURVATURE_ERROR,
     SURE,
     TOLERANCE,
@@ -340,7 +341,8 @@ def _large(own: Measured, by_entry: EntryCurvature | None, at: Sequence[int], fo
 class Group:
     """Estimate for a group of `count` entries: the mean square of their offsets, its standard error, and the mean
     square of the part that comes from the target. `unknown` is the mean square of the part that images do not
-    determine. `is_pulled` is true if the entries are on their way.
+    determine. `is_pulled` is true if the entries are on their way. `noise` is the mean square of the error of the mean
+    offsets, if they were measured by gradients that have moved the values.
     """
 
     count: int
@@ -349,13 +351,14 @@ class Group:
     of_target: float
     unknown: float
     is_pulled: bool = False
+    noise: float = 0.0
 
     @property
     def known(self) -> float:
         """Root mean square of the offsets without the part that images do not determine. A standard error is added,
         because the estimate may be negative.
         """
-        return float(np.sqrt(max(self.square, 0.0) + self.error + self.of_target))
+        return float(np.sqrt(max(self.square, 0.0) + self.error + self.noise + self.of_target))
 
     @property
     def spread(self) -> float:
@@ -366,7 +369,7 @@ class Group:
     def limit(self) -> float:
         """Limit of the root mean square of the offsets, for a target without noise."""
         left = (1 + CURVATURE_ERROR) ** 2 * max(self.square, 0.0)
-        return float(np.sqrt(left + SURE * self.error + self.of_target + self.unknown))
+        return float(np.sqrt(left + SURE * (self.error + self.noise) + self.of_target + self.unknown))
 
     @property
     def limit_of_run(self) -> float:
@@ -379,10 +382,10 @@ class Group:
         if not groups:
             return None
         counts = np.array([each.count for each in groups])
-        rows = np.array([(each.square, each.of_target, each.unknown, each.error) for each in groups])
-        square, of_target, unknown, _ = counts @ rows / counts.sum()
-        error = float(np.linalg.norm(counts * rows[:, 3]) / counts.sum())
-        return Group(int(counts.sum()), float(square), error, float(of_target), float(unknown))
+        rows = np.array([(each.square, each.of_target, each.unknown, each.noise, each.error) for each in groups])
+        square, of_target, unknown, noise, _ = counts @ rows / counts.sum()
+        error = float(np.linalg.norm(counts * rows[:, -1]) / counts.sum())
+        return Group(int(counts.sum()), float(square), error, float(of_target), float(unknown), noise=float(noise))
 
 
 def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) -> list[Group]:
@@ -390,7 +393,13 @@ def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) ->
     curvature.
     """
     inside = np.isin(np.arange(own.value.size), np.concatenate(groups)) if groups else np.zeros(0, dtype=bool)
-    offsets, h, unknown = by_entry.solve(np.where(inside, own.gradients, 0.0), groups)
+    gradients, left = own.gradients, 0.0
+    if own.rows is not None:  # as in `joint`
+        rows = np.concatenate([own.rows, [[g, own.value] for g in own.gradients]])
+        gradients, values = np.array([part.mean(axis=0) for part in np.array_split(rows, BLOCKS)]).swapaxes(0, 1)
+        left = values - own.value
+    offsets, h, unknown = by_entry.solve(np.where(inside, gradients, 0.0), groups)
+    offsets = offsets - left
     found = []
     for group in groups:
         if h[group[0]] <= 0:
@@ -400,8 +409,9 @@ def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) ->
         way, left = (own.value - own.start)[group], offsets[:, group].mean(axis=0)
         cosine = -way @ left / max(float(np.linalg.norm(way) * np.linalg.norm(left)), 1e-300)
         of_target = by_entry.mean_of_target(group) / h[group[0]] ** 2
+        noise = 0.0 if own.rows is None else float(offsets[:, group].var(axis=0, ddof=1).mean() / len(offsets))
         is_pulled = bool(square > SURE * error and cosine > ON_THE_WAY)
-        found.append(Group(len(group), square, error, of_target, unknown * own.prior**2, is_pulled))
+        found.append(Group(len(group), square, error, of_target, unknown * own.prior**2, is_pulled, noise))
     return found
 
 
