@@ -409,7 +409,9 @@ def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) ->
         way, left = (own.value - own.start)[group], offsets[:, group].mean(axis=0)
         cosine = -way @ left / max(float(np.linalg.norm(way) * np.linalg.norm(left)), 1e-300)
         of_target = by_entry.mean_of_target(group) / h[group[0]] ** 2
-        noise = 0.0 if own.rows is None else float(offsets[:, group].var(axis=0, ddof=1).mean() / len(offsets))
+        # Both halves of the mean have twice its variance, and a drift counts as a whole.
+        halves = [half.mean(axis=0) for half in np.array_split(offsets[:, group], 2)]
+        noise = 0.0 if own.rows is None else float(np.mean((halves[0] - halves[1]) ** 2)) / 4
         is_pulled = bool(square > SURE * error and cosine > ON_THE_WAY)
         found.append(Group(len(group), square, error, of_target, unknown * own.prior**2, is_pulled, noise))
     return found
