@@ -59,8 +59,6 @@ MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metal
 #: Maximum distance of two texels that are coupled, along each axis, and the smallest eigenvalue of their coupling that
 #: counts as not 0.
 NEIGHBOURS, LEAST_EIGENVALUE = 2, 0.05
-#: Root mean square of the couplings, in standard errors, below which all of them count as noise.
-NOTABLE = 2.0
 #: Standard errors that are subtracted from curvature and added to the noise of the target.
 MARGIN = 1.0
 #: Maximum number of image values in H along directions; of more, a random subset, the same for all. Also the number of
@@ -230,14 +228,9 @@ class EntryCurvature:
         """Return the eigenvalues (height, width) of the coupling K between texels of unit curvature."""
         known = _correlation((root > 0).reshape(self.shape), (root > 0).reshape(self.shape))
         pairs = (((a * root).reshape(self.shape), (b * root).reshape(self.shape)) for a, b in self.probes)
-        each = np.sum([(_correlation(a, b), _correlation(a**2, b**2)) for a, b in pairs], axis=0)
-        each = 0.25 * (each + each[:, ::-1] + each[:, :, ::-1] + each[:, ::-1, ::-1])
-        kernel, squares = each / np.maximum(known, 0.5)
-        apart = np.ones(kernel.shape, dtype=bool)
-        apart[NEIGHBOURS, NEIGHBOURS] = False
-        errors = np.sqrt(np.maximum(squares / np.maximum(known, 0.5), 1e-300))
-        if rms((kernel / errors)[apart]) < NOTABLE:
-            kernel = np.where(apart, 0.0, kernel)
+        sums = np.sum([(_correlation(a, b), _correlation(a**2, b**2)) for a, b in pairs], axis=0)
+        kernel, squares = 0.25 * (sums + sums[:, ::-1] + sums[:, :, ::-1] + sums[:, ::-1, ::-1])
+        kernel *= np.maximum(1 - squares / np.maximum(kernel**2, 1e-300), 0.0) / np.maximum(known, 0.5)
         lags = np.arange(-NEIGHBOURS, NEIGHBOURS + 1)
         waves = [np.cos(np.outer(np.pi * np.arange(size) / size, lags)) for size in self.shape[:2]]
         middle = max(float(kernel[NEIGHBOURS, NEIGHBOURS]), 1e-300)
