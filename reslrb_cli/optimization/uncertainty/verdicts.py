@@ -393,13 +393,13 @@ def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) ->
     curvature.
     """
     inside = np.isin(np.arange(own.value.size), np.concatenate(groups)) if groups else np.zeros(0, dtype=bool)
-    gradients, left = own.gradients, 0.0
+    gradients, moved = own.gradients, 0.0
     if own.rows is not None:  # as in `joint`
         rows = np.concatenate([own.rows, [[g, own.value] for g in own.gradients]])
         gradients, values = np.array([part.mean(axis=0) for part in np.array_split(rows, BLOCKS)]).swapaxes(0, 1)
-        left = values - own.value
+        moved = values - own.value
     offsets, h, unknown = by_entry.solve(np.where(inside, gradients, 0.0), groups)
-    offsets = offsets - left
+    offsets = offsets - moved
     found = []
     for group in groups:
         if h[group[0]] <= 0:
