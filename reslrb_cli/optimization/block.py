@@ -86,12 +86,10 @@ class Block:
 
     def bend(self, curvature: Array) -> None:
         """Take a measurement of H (M, M)."""
-        rows = self.rows.copy()
-        rows[:, FIELDS:] = curvature
-        self.rows = rows
+        self.rows = np.concatenate([self.rows[:, :FIELDS], curvature], axis=1, dtype=np.float32)
 
     def distrust(self) -> None:
-        """Halve n."""
+        """Halve the number n of gradients in the mean, which is at least 1."""
         rows = self.rows.copy()
         rows[:, 6] = np.maximum(rows[:, 6] / 2, 1)
         self.rows = rows

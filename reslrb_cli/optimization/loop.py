@@ -165,13 +165,12 @@ def is_due(iteration: int, cost: float = 0.0) -> bool:
 
 def measure_block(problem: Problem, iteration: int) -> None:
     """Measure the joint curvature of all small parameters for `auto` by differences of images, if its samples fit."""
-    optimizer, block, unit = problem.optimizer, problem.optimizer.block, problem.samples_per_pass or 1
+    optimizer, block = problem.optimizer, problem.optimizer.block
     scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
               else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
-    changes, spp = plan_changes(problem, scales, DISPLACEMENT), problem.config.run.spp
-    part = max(spp // PART // unit, 1) * unit
+    changes, part = plan_changes(problem, scales, DISPLACEMENT), part_of_samples(problem)
     views = len(problem.trained) / len(problem.drawn(iteration))
-    if not is_due(iteration, views * 2 * (len(changes) + 1) * part / spp):
+    if not is_due(iteration, views * 2 * (len(changes) + 1) * part / problem.config.run.spp):
         return
     curvature = LossCurvature(problem, part, of_target=False)
     directions, *_ = curvature.along(changes, lambda: True)
@@ -182,6 +181,12 @@ def measure_block(problem: Problem, iteration: int) -> None:
     whole[np.ix_(at, at)] = curvature.for_steps(directions) * np.outer(slopes[at], slopes[at])
     block.bend(np.nan_to_num(whole))
     problem.apply()
+
+
+def part_of_samples(problem: Problem) -> int:
+    """Return the samples per pixel of an image that `auto` measures: 1 / `PART` of those of a step, in whole passes."""
+    unit = problem.samples_per_pass or 1
+    return max(problem.config.run.spp // PART // unit, 1) * unit
 
 
 #: Most halvings of a step, and the ratio of the losses after and before a step above which n is halved too.
@@ -215,10 +220,10 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
 
 def blurred_loss(problem: Problem, iteration: int) -> float:
     """Return the loss at the current values, with the blur, the views, and a part of the samples of `iteration`."""
-    spp, unit, total = problem.config.run.spp, problem.samples_per_pass or 1, 0.0
+    total = 0.0
     for view, scale in problem.drawn(iteration):
         at = seed(problem.config.run.seed, iteration, view.sensor, "step length")
-        image = render_image(problem.integrator, problem.scene, view.sensor, at, max(spp // PART // unit, 1) * unit)
+        image = render_image(problem.integrator, problem.scene, view.sensor, at, part_of_samples(problem))
         total += scale * float(view.blurred_objective(image)[0])
     return total
 

@@ -39,7 +39,6 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.optimization.problem import Problem
@@ -174,8 +173,7 @@ def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose
     for view in problem.trained:
         at = seed(run.seed, round, view.sensor, purpose)
         image = render_image(problem.integrator, problem.scene, view.sensor, at, spp or run.spp)
-        exposed = view.exposure.applied(first_channels(image, view.target.shape[2]))
-        images.append(view.kept(np.array(exposed, dtype=np.float64)))
+        images.append(view.kept(np.array(view.exposed(image), dtype=np.float64)))
     return images
 
 

@@ -198,11 +198,13 @@ class View:
         if weights.any():  # glass before the whole film would leave no pixels, so the mask stays
             self.weigh(weights)
 
+    def exposed(self, image: mi.TensorXf) -> mi.TensorXf:
+        """Return an image (H, W, C) without alpha, with the view's exposure."""
+        return self.exposure.applied(first_channels(image, self.target.shape[2]))
+
     def compare(self, image: mi.TensorXf) -> mi.Float:
-        """Return the attached loss of an image (H, W, C), with width 1. Alpha is dropped, and the view's exposure is
-        applied.
-        """
-        return self.judge(self.exposure.applied(first_channels(image, self.target.shape[2])))
+        """Return the attached loss of an image (H, W, C), with width 1. The view's exposure is applied."""
+        return self.judge(self.exposed(image))
 
     def judge(self, image: mi.TensorXf) -> mi.Float:
         """Return the loss of an image. The exposure is already applied, and the image has the target's channels.
@@ -251,8 +253,7 @@ class View:
 
     def blurred_objective(self, image: mi.TensorXf) -> mi.Float:
         """Return the view's term in the loss of all views, with the blur of this iteration."""
-        exposed = self.exposure.applied(first_channels(image, self.target.shape[2]))
-        return self._loss(exposed, self.blur) * self.share
+        return self._loss(self.exposed(image), self.blur) * self.share
 
 
 def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:

@@ -230,6 +230,7 @@ class EntryCurvature:
         pairs = (((a * root).reshape(self.shape), (b * root).reshape(self.shape)) for a, b in self.probes)
         sums = np.sum([(_correlation(a, b), _correlation(a**2, b**2)) for a, b in pairs], axis=0)
         kernel, squares = 0.25 * (sums + sums[:, ::-1] + sums[:, :, ::-1] + sums[:, ::-1, ::-1])
+        # A few probes of a small texture show mostly noise.
         kernel *= np.maximum(1 - squares / np.maximum(kernel**2, 1e-300), 0.0) / np.maximum(known, 0.5)
         lags = np.arange(-NEIGHBOURS, NEIGHBOURS + 1)
         waves = [np.cos(np.outer(np.pi * np.arange(size) / size, lags)) for size in self.shape[:2]]
