@@ -18,8 +18,8 @@ limit, squared, holds for an estimate of v. A fixed limit would leave a bias, be
 skewed.
 
 n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls by a quarter otherwise. While the
-gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many. If a step raises the
-loss by much (`loop.update`), n is halved.
+gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many. If the loss
+rises by more than 10 % along a step, n is halved (`loop.update`).
 
 The images hardly change if an exposure E rises and all colours c fall. A step dE, dc is therefore taken in E and E c,
 
