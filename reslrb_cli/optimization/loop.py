@@ -29,6 +29,7 @@ from reslrb_cli.optimization.nonfinite import (
     why_end,
     zero_nonfinite,
 )
+from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
 from reslrb_cli.optimization.shards import add_gradient, scaled
@@ -189,8 +190,9 @@ def part_of_samples(problem: Problem) -> int:
     return max(problem.config.run.spp // PART // unit, 1) * unit
 
 
-#: Most halvings of a step, and the ratio of the losses after and before a step above which n is halved too.
-HALVINGS, RISE = 3, 1.1
+#: Most halvings of a step, the ratio of the losses after and before a step above which n is halved too, and the longest
+#: step that is not checked, as a share of the extent.
+HALVINGS, RISE, SHORT = 3, 1.1, 0.002
 
 
 def update(problem: Problem, iteration: int, factor: float, held: Collection[str]) -> dict[str, int]:
@@ -198,15 +200,15 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
 
     Where shapes, lamps or heightmaps move, the loss is far from quadratic, and a step of `auto` may be much too long.
     The step of all small parameters is then halved until the loss does not rise (backtracking; Armijo 1966). After a
-    large rise, n is halved too, because the mean of n gradients misleads.
+    large rise, n is halved too, because the mean of n gradients misleads. Short steps are not checked.
     """
     optimizer = problem.optimizer
-    searched = any(key in optimizer.extents for key in optimizer.block.at)
-    before = {key: dr.detach(optimizer[key]) for key in optimizer.block.at if searched}
-    loss = blurred_loss(problem, iteration) if searched else 0.0
+    before = {key: dr.detach(optimizer[key]) for key in optimizer.block.at}
     updates = optimizer.step(factor, skip=held)
+    moved = [key for key in before if key in optimizer.extents and _moved(optimizer, key, before[key]) > SHORT]
+    loss = blurred_loss(problem, iteration) if moved else 0.0  # the scene still has the values before the step
     problem.apply()
-    for _ in range(HALVINGS if searched else 0):
+    for _ in range(HALVINGS if moved else 0):
         now = blurred_loss(problem, iteration)
         if now <= loss:
             break
@@ -216,6 +218,11 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
             optimizer.block.distrust()
         problem.apply()
     return updates
+
+
+def _moved(optimizer: Optimizer, key: str, before: Any) -> float:
+    """Return the largest change of an entry since `before`, as a share of the extent."""
+    return float(np.abs(np.array(dr.detach(optimizer[key]) - before)).max() / optimizer.extent(key))
 
 
 def blurred_loss(problem: Problem, iteration: int) -> float:

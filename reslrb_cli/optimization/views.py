@@ -165,6 +165,7 @@ class View:
     codes: list[OwnLoss] = field(default_factory=list)
     blur: float = 0.0
     fixed: Array | None = None
+    _kept: tuple[float, int, Any] = (0.0, 0, None)
 
     @property
     def target(self) -> mi.TensorXf:
@@ -224,8 +225,14 @@ class View:
         given = () if self.weights is None else (self.weights,)
         if sigma:
             finite = dr.select(dr.isfinite(image), image, target)  # a blur would spread a NaN to all pixels
-            image, target = blur(finite, sigma), blur(target, sigma)
+            image, target = blur(finite, sigma), self._blurred_target(sigma)
         return self.loss(image, target, *given)
+
+    def _blurred_target(self, sigma: float) -> mi.TensorXf:
+        """Return the target blurred by `sigma` pixels. An iteration needs it several times, so it is kept."""
+        if self._kept[:2] != (sigma, id(self.made)):
+            self._kept = sigma, id(self.made), blur(self.target, sigma)
+        return self._kept[2]
 
     def curvature(self, known: bool) -> Array:
         """Return the loss's curvature (H, W) in each pixel, scaled to a mean of 1. If it is not `known`, return that of
