@@ -138,15 +138,11 @@ class OptimizerSettings(Choice):
     type: str
     learning_rate: Positive = 0.02
     """Step size at the first iteration, in the units of the parameter, or of its transformed variable if it has a
-    `transform`. With `scale: auto`, a fraction of the measured length."""
-    scale: Literal["none", "auto", "curvature"] = "none"
-    """Units in which the optimizer moves each parameter. `none`: its own. `auto`: units that a run measures before its
-    first iteration, so that one learning rate suits parameters that differ by orders of magnitude, and `epsilon` does
-    not matter. The run measures the size of the gradient, and a length: the change of the parameter that would make up
-    the image in the pixels that it affects. Learning rates are fractions of this length: 0.02 is 2 % per step.
-    `curvature`, only for `sgd`: divide the gradient of each parameter by the largest curvature of the loss, which a run
-    measures. A learning rate of 1 is then the step that reaches the minimum along the steepest direction; the default
-    is 0.5."""
+    `transform`."""
+    scale: Literal["none", "curvature"] = "none"
+    """Units in which `sgd` moves each parameter. `none`: its own. `curvature`: the gradient of each parameter is
+    divided by the largest curvature of the loss, which a run measures before its first iteration. A learning rate of 1
+    is then the step that reaches the minimum along the steepest direction; the default is 0.5."""
     schedule: Literal["constant", "cosine", "exponential"] = "constant"
     """How the learning rate changes from its first to its last value."""
     final_fraction: float = Field(default=0.01, gt=0, le=1)

@@ -31,7 +31,7 @@ from reslrb_cli.optimization.nonfinite import (
 )
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import measure_curvatures, rescale
+from reslrb_cli.optimization.sensitivity import measure_curvatures
 from reslrb_cli.optimization.shards import add_gradient, scaled
 from reslrb_cli.optimization.state import State, put, standing
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
@@ -262,9 +262,10 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     state.
 
     Non-finite values never reach a parameter. The module `nonfinite` describes how the run reacts to non-finite values,
-    and when a run ends (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged.
-    `optimizer.scale: auto` measures before the first iteration. `elapsed_s` includes the measurement time. The schedule
-    follows either the iteration count or the elapsed time (`run.max_seconds`), whichever has progressed further.
+    and when a run ends (`State.end`). `on_nonfinite` is called before the update, while the scene is unchanged. With
+    `optimizer.scale: curvature`, the first step measures before its iteration, and `elapsed_s` includes the time of the
+    measurement. The schedule follows either the iteration count or the elapsed time (`run.max_seconds`), whichever has
+    progressed further.
 
     A first loss is large if it exceeds ten times the loss of a black image. After a large first loss, the step sets the
     optimiser's moments to zero each time the loss has fallen by another factor of ten. Otherwise, the large first
@@ -277,7 +278,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     scaling = state.scaling
     if config.optimizer.scale != "none" and scaling is None:
         with clock.counted():
-            scaling = rescale(problem) if config.optimizer.scale == "auto" else measure_curvatures(problem)
+            scaling = measure_curvatures(problem)
     errors = problem.meter.errors(problem.selection.array)
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
     elapsed = time_share(problem.limit_s, state)

@@ -391,9 +391,9 @@ class Optimizer:
             return self._rates[key]
         return self._variables[key].reach(dr.detach(self._own[key][key]), self._rates[key])
 
-    def units(self) -> dict[str, tuple[float, float]]:
-        """Return length and gain of each parameter that moves through a `Variable`."""
-        return {key: (variable.length, variable.gain) for key, variable in self._variables.items()}
+    def gains(self) -> dict[str, float]:
+        """Return the gain of each parameter that moves through a `Variable`."""
+        return {key: variable.gain for key, variable in self._variables.items()}
 
     def moments(self) -> dict[str, dict[str, Any]]:
         """Return the optimiser's data for each parameter, without the parameter's value.
@@ -409,15 +409,12 @@ class Optimizer:
             found[key] = moved | kept | joint
         return found
 
-    def restore(
-        self, values: Mapping[str, Any], units: Mapping[str, tuple[float, float]], moments: Mapping[str, Any]
-    ) -> None:
-        """Continue from stored values of the scene, and from earlier results of `units` and `moments`."""
+    def restore(self, values: Mapping[str, Any], gains: Mapping[str, float], moments: Mapping[str, Any]) -> None:
+        """Continue from stored values of the scene, and from earlier results of `gains` and `moments`."""
         for key, own in self._own.items():
             kept = moments[key]
-            if key in units:
-                before = self.variable(key)
-                self._variables[key] = replace(before, length=units[key][0], gain=units[key][1])
+            if key in gains:
+                self._variables[key] = replace(self.variable(key), gain=gains[key])
                 self._scene[key] = _leaf(values[key])
             elif key in self._variables:
                 del self._variables[key], self._scene[key]

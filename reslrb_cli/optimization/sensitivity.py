@@ -1,26 +1,10 @@
-"""Sensitivity of image and loss to each parameter, from samples, and the resulting units (`scale: auto`).
+"""Sampled gradients and images at the current values, and units for gradient descent (`scale: curvature`).
 
 Gradient samples are steps that leave the parameters unchanged (`sample_gradient`).
 
-Sensitivities (`measure_sensitivities`): g is the mean of some gradient samples. z = -sign(g) is the direction of Adam's
-first step, for all entries of one parameter x. I(x) is the image at common random numbers, and T the target.
-
-    D = I(x + h z) - I(x)
-    change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
-
-`change` is the relative change of the image per unit of the parameter. `length` is the change of the parameter that
-would explain the image or the target. A least-squares fit over the pixels that the parameter affects gives the change.
-For a scene's only light, `length` is the light's intensity. For a wall, `length` is the albedo, regardless of the
-wall's share of the picture. h is chosen so that the image changes by about 3 %. With an image change of about 3 %,
-neither rounding nor curvature dominates the differences.
-
-`rescale` measures units so that all parameters can use one learning rate. Step lengths from `Sensitivity.length` make
-all parameters move equally fast. Gradients are divided by the root mean square of a gradient sample, so Adam's absolute
-epsilon has no effect.
-
-Units for gradient descent (`measure_curvatures`, `scale: curvature`): lambda is the largest curvature of the loss in
-the optimiser's variable v. Power iteration computes lambda from differences of gradients at common random numbers. h
-changes the image by about 3 %.
+Units for gradient descent (`measure_curvatures`): lambda is the largest curvature of the loss in the optimiser's
+variable v. Power iteration computes lambda from differences of gradients at common random numbers. h is chosen so that
+the image changes by about 3 %. Then neither rounding nor curvature dominates the differences.
 
     H d = (g(v + h d) - g(v - h d)) / (2 h),   d <- H d / |H d|,   lambda = |H d|
 
@@ -42,8 +26,7 @@ import numpy as np
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.variables import Bounds, Transform
-from reslrb_cli.records.decisions import Scaled, Sensitivity
+from reslrb_cli.records.decisions import Scaled
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms
 
@@ -94,74 +77,6 @@ _PURPOSE = "conditioning"
 AIM, LEAST, MOST = 0.03, 0.003, 0.3
 #: Maximum number of renderings for each parameter while h is searched.
 TRIALS = 8
-#: Gradient samples of a run.
-SAMPLES = 4
-
-
-def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
-    """Measure every parameter of `problem` at its current value. The measurement uses `samples` (at least two)
-    gradients and a few images.
-
-    Each gradient and image has the run's samples per pixel.
-    """
-    problem.apply()
-    rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
-    total: dict[str, Any] = {}
-    for round in range(samples):
-        taken = sample_gradient(problem, problem.integrator, round, _PURPOSE, problem.config.run.spp)
-        for key, gradient in taken.items():
-            known = dr.select(dr.isfinite(gradient), gradient, 0)
-            total[key] = known if round == 0 else total[key] + known
-        for key, gradient in take_gradient(problem).items():
-            rows[key].append(gradient.astype(np.float64))
-    base = see_images(problem)
-    targets = [view.kept(np.array(view.target, dtype=np.float64)) for view in problem.trained]
-    reference = [np.maximum(np.abs(a), np.abs(b)) for a, b in zip(base, targets, strict=True)]
-    found = []
-    for key, gradients in rows.items():
-        value = problem.selection.array(key)
-        noise = rms(np.std(gradients, axis=0, ddof=1))
-        square = rms(np.mean(gradients, axis=0)) ** 2 - noise**2 / samples  # minus the contribution of noise
-        row = Sensitivity(key, value.size, rms(value), math.sqrt(max(square, 0.0)), noise)
-        downhill = dr.select(total[key] == 0, 0, -dr.sign(total[key]))
-        found.append(_probe(problem, row, downhill, base, reference))
-    problem.apply()
-    return found
-
-
-def _probe(
-    problem: Problem, row: Sensitivity, direction: Any, base: Sequence[Array], reference: Sequence[Array]
-) -> Sensitivity:
-    """Return `row` with the image's sensitivity along `direction`. If the image does not change, return `row`
-    unchanged.
-    """
-    key, value = row.key, dr.detach(problem.optimizer[row.key])
-    low, high = problem.selection.specs[key].bounds or (-math.inf, math.inf)
-    # 1 % of the parameter, in any unit; of its range if it is 0; a guess if it has none.
-    step = 0.01 * (rms(np.array(value)) or (high - low if math.isfinite(high - low) else 1.0))
-    norm = math.sqrt(sum(float(np.square(r).sum()) for r in reference))
-    for _ in range(TRIALS):
-        step = min(step, 0.5 * (high - low))
-        moved = value + direction * step
-        moved = dr.select((moved < low) | (moved > high), value - direction * step, moved)
-        dr.make_opaque(moved)
-        problem.apply({key: moved})
-        difference = [a - b for a, b in zip(see_images(problem), base, strict=True)]
-        squares = sum(float(np.square(d).sum()) for d in difference)
-        shared = sum(float((np.abs(d) * r).sum()) for d, r in zip(difference, reference, strict=True))
-        if not (0 < squares < math.inf and 0 < shared < math.inf):
-            step *= 1e3 if squares == 0 else 1e-3
-            continue
-        share = squares / shared
-        row = replace(
-            row,
-            change=math.sqrt(squares) / (step * norm),
-            length=min(step / share, high - low),
-        )
-        if LEAST <= share <= MOST or (share < LEAST and step == 0.5 * (high - low)):
-            break
-        step *= AIM / share
-    return row
 
 
 def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose: str = _PURPOSE) -> list[Array]:
@@ -175,30 +90,6 @@ def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose
         image = render_image(problem.integrator, problem.scene, view.sensor, at, spp or run.spp)
         images.append(view.kept(np.array(view.exposed(image), dtype=np.float64)))
     return images
-
-
-def rescale(problem: Problem) -> list[Scaled]:
-    """Measure all parameters and return the result. The optimiser then moves each parameter in units of the measured
-    length.
-
-    A parameter without an effect on the image keeps its units.
-    """
-    optimizer = problem.optimizer
-    measured = [Scaled(**row.to_json()) for row in measure_sensitivities(problem, SAMPLES)]
-    for place, row in enumerate(measured):
-        size = math.hypot(row.gradient, row.noise)  # of the gradients of one step
-        if row.length is None or size == 0:
-            continue
-        variable, value = optimizer.variable(row.key), dr.detach(optimizer[row.key])
-        length = own_length(variable.transform, variable.bounds, value, row.length)
-        unit = replace(variable, length=length, gain=1.0)
-        slope = np.array(unit.chain(unit.from_scene(value), type(value)(size)), dtype=np.float64)
-        unit.gain = 1 / rms(slope)
-        optimizer.set_variable(row.key, unit)
-        first_step = unit.reach(unit.from_scene(value), optimizer.rate(row.key))
-        measured[place] = replace(row, own_length=length, first_step=first_step)
-    problem.apply()
-    return measured
 
 
 #: Differences of gradients for the largest curvature.
@@ -219,7 +110,7 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
         variable = optimizer.variable(key)
         v = variable.from_scene(start)
         gradient = _gradient_at(problem, key, v)
-        row = Scaled(key, gradient.size, rms(np.array(start)), rms(gradient), 0.0)
+        row = Scaled(key, gradient.size, rms(np.array(start)), rms(gradient))
         found = _steepest(problem, key, v, gradient, base)
         optimizer.set_value(key, start)
         if found > 0:
@@ -227,7 +118,7 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
             optimizer.set_variable(key, unit)
             step = _like(v, gradient * (unit.gain * optimizer.rate(key)))
             first = rms(np.array(unit.to_scene(v - step)) - np.array(start))
-            row = replace(row, curvature=found, own_length=1.0, first_step=first)
+            row = replace(row, curvature=found, first_step=first)
         measured.append(row)
     problem.apply()
     return measured
@@ -286,25 +177,8 @@ def _like(value: Any, row: Array) -> Any:
     return type(value)(row.reshape(np.array(value).shape).astype(np.float32))
 
 
-def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:
-    """Convert `length` from the unit of the scene's `value` to the unit of the optimiser's variable. The result is a
-    mean over the entries.
-    """
-    if transform is None:
-        return length
-    low, high = bounds or (-math.inf, math.inf)
-    if math.isfinite(low) and math.isfinite(high):  # at most half way to the farther bound
-        room = dr.select(value < 0.5 * (low + high), high - value, low - value)
-        moved = value + dr.clip(room, -2 * length, 2 * length) / 2
-    else:
-        moved = value + length
-    distance = np.array(dr.abs(transform.inverse(moved) - transform.inverse(value)), dtype=np.float64)
-    return float(distance.mean())
-
-
 def scale_line(row: Scaled) -> str:
     """Return a line for the user about the scale of one parameter."""
-    if row.own_length is None:
-        lacks = "no effect on the image" if row.length is None else "no gradient"
-        return f"{row.key} has {lacks} at its start; it is not scaled"
+    if row.curvature is None:
+        return f"{row.key} has no effect on the image at its start; it is not scaled"
     return f"{row.key} moves by about {row.first_step or 0.0:.3g} at first"

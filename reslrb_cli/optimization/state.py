@@ -34,8 +34,8 @@ class State:
 
     - `iteration` is the number of finished iterations. `standstill` counts the latest consecutive iterations in which
         some update was skipped.
-    - `peak_mib` is the allocator's peak memory. `scaling` is the result of `scale: auto`.
-    - `units` has the length and the gain of each parameter's variable (`Variable`). `moments` are the optimiser's
+    - `peak_mib` is the allocator's peak memory. `scaling` is the result of `scale: curvature`.
+    - `gains` has the gain of each parameter's variable (`Variable`). `moments` are the optimiser's
         moments.
     - `guiding` has the gradient count of guided emission for each sensor. `learned` has the arrays of guided emission,
         named `<sensor>/<what>`.
@@ -52,7 +52,7 @@ class State:
     elapsed_s: float
     peak_mib: float
     standstill: int
-    units: dict[str, tuple[float, float]]
+    gains: dict[str, float]
     scaling: list[Scaled] | None = None
     guiding: dict[str, int] | None = None
     stopped: str = ""
@@ -82,7 +82,7 @@ def standing(problem: Problem, state: State | None = None) -> State:
     calls, learned = (None, {}) if guiding is None else guiding.state()
     values = {key: dr.detach(optimizer[key]) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
     moments = optimizer.moments()
-    found = replace(state, values=values, units=optimizer.units(), moments=moments, guiding=calls, learned=learned)
+    found = replace(state, values=values, gains=optimizer.gains(), moments=moments, guiding=calls, learned=learned)
     optimizer.stands_at = found
     return found
 
@@ -91,7 +91,7 @@ def put(problem: Problem, state: State) -> str | None:
     """Set optimiser, guided emission and scene to `state`. Returns the name of a table that does not fit
     (`restore_tables`).
     """
-    problem.optimizer.restore(state.values, state.units, state.moments)
+    problem.optimizer.restore(state.values, state.gains, state.moments)
     wrong = restore_tables(problem, state.guiding or {}, state.learned)
     problem.apply()
     problem.optimizer.stands_at = state
@@ -103,8 +103,8 @@ def load(problem: Problem, stored: Stored) -> State:
     experiment.
     """
     told, optimizer = stored.read(State), problem.optimizer
-    for key, (length, _) in told.units.items():
-        optimizer.set_variable(key, replace(optimizer.variable(key), length=length))
+    for key, gain in told.gains.items():
+        optimizer.set_variable(key, replace(optimizer.variable(key), gain=gain))
     learned = dict.fromkeys(f"{number}/{name}" for number in told.guiding or () for name in KNOWN)
     values = _stored_values(problem, stored, "parameter")
     asked = replace(told, moments=optimizer.moments(), learned=learned)

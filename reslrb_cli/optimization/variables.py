@@ -107,16 +107,14 @@ class Smoother:
 
 @dataclass
 class Variable:
-    """Variable v of the optimiser for a parameter x: x = T(length * S v), with x within its bounds.
+    """Variable v of the optimiser for a parameter x: x = T(S v), with x within its bounds.
 
-    S is 1 or a `Smoother`. The optimiser receives the gradient `gain` times dL/dv. `length` and `gain` are 1 until they
-    are measured (`sensitivity.py`). `length` and `gain` reach kernels as data, so new values do not require new
-    kernels.
+    S is 1 or a `Smoother`. The optimiser receives the gradient `gain` times dL/dv. `gain` is 1 until it is measured
+    (`sensitivity.py`). It reaches kernels as data, so a new value does not require new kernels.
     """
 
     transform: Transform | None
     bounds: Bounds
-    length: float = 1.0
     gain: float = 1.0
     smoother: Smoother | None = None
 
@@ -136,7 +134,7 @@ class Variable:
         u = x if self.transform is None else self.transform.inverse(x)
         if self.smoother is not None:
             u = self.smoother.roughen(u)
-        return self.clamp(u * _opaque(x, 1 / self.length))
+        return self.clamp(u)
 
     def clamp(self, v: Any) -> Any:
         """Return v if its x is within the bounds, otherwise the nearest allowed value."""
@@ -144,15 +142,15 @@ class Variable:
         if ends is None:
             return v
         if self.smoother is None:
-            return dr.clip(v, *(_opaque(v, end / self.length) for end in ends))
+            return dr.clip(v, *(_opaque(v, end) for end in ends))
         u = self._u(v)
         if not dr.any(flat((u < ends[0]) | (u > ends[1])))[0]:
             return v  # unchanged: transforming back and forth would round it again in each step
-        return self.smoother.roughen(dr.clip(u, *ends)) * _opaque(v, 1 / self.length)
+        return self.smoother.roughen(dr.clip(u, *ends))
 
     def chain(self, v: Any, gradient: Any) -> Any:
         """Return `gain` times dL/dv, given dL/dx."""
-        result = gradient * _opaque(v, self.length) * _opaque(v, self.gain)
+        result = gradient * _opaque(v, self.gain)
         if self.transform is not None:
             result = result * self.transform.derivative(self._u(v))
         return result if self.smoother is None else self.smoother.smooth(result)
@@ -166,8 +164,7 @@ class Variable:
         return rms(np.array(dr.maximum(up, down)))
 
     def _u(self, v: Any) -> Any:
-        u = v * _opaque(v, self.length)
-        return u if self.smoother is None else self.smoother.smooth(u)
+        return v if self.smoother is None else self.smoother.smooth(v)
 
 
 def _opaque(like: Any, number: float) -> Any:

@@ -2,7 +2,7 @@
 
 Decision                setting that was `auto`: its value, and why
 DecisionCache           decisions of earlier runs, for the next run of the same scene and parameters
-Sensitivity, Scaled     measured sensitivity of a parameter
+Scaled                  measured scale of a parameter
 """
 
 from __future__ import annotations
@@ -125,36 +125,21 @@ class DecisionCache:
         return content if isinstance(content, dict) else {}
 
 
-# --- sensitivities ----------------------------------------------------------------------------------------------------
+# --- scales -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Sensitivity(Jsonable):
-    """Measured sensitivity of a parameter with `entries` numbers, in the scene's units.
+class Scaled(Jsonable):
+    """Measured scale of a parameter with `entries` numbers, for `scale: curvature`.
 
-    `value`, `gradient` and `noise` are root mean squares over the entries. `gradient` is 0 if it cannot be
-    distinguished from noise, and `noise` is the standard deviation of one step's gradient. `change` is relative, per
-    unit. `change` and `length` are None if the image did not change.
+    `value` and `gradient` are root mean squares over the entries. `curvature` is the largest curvature of the loss in
+    the optimiser's variable. `first_step` is how far one learning rate initially moves the value, in the scene's units.
+    Both are None if the parameter was not scaled.
     """
 
     key: str
     entries: int
     value: float
     gradient: float
-    noise: float
-    change: float | None = None
-    length: float | None = None
-
-
-@dataclass(frozen=True)
-class Scaled(Sensitivity):
-    """Sensitivity of a parameter, and the resulting scale.
-
-    `own_length` is `length` in the optimiser's variable. `first_step` is how far one learning rate initially moves the
-    value, in the scene's units. `own_length` and `first_step` are None if the parameter was not scaled. `curvature` is
-    that of the loss in the optimiser's variable, for `scale: curvature`.
-    """
-
-    own_length: float | None = None
-    first_step: float | None = None
     curvature: float | None = None
+    first_step: float | None = None

@@ -78,7 +78,7 @@ class Manifest:
     - `plan`: the parts of a step.
     - `decisions`: settings of the integrator that were `auto` (`Decision`).
     - `incomplete`: the missing share of the derivative, for each parameter that moves light (`MissingRecord`).
-    - `scaling`: the measurements of each parameter for `scale: auto`.
+    - `scaling`: the measurements of each parameter for `scale: curvature`.
     - `views`: for each view, the share of the loss, the excluded pixels of each kind, and the factor for viewing
         (`shown`). With a white balance, the illuminant of the scene (`white`). For a film with its own responses, the
         names of its `channels`.

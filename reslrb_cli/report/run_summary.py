@@ -40,15 +40,11 @@ LOWER, MORE_SAMPLES = 3, 16
 ORDER = (
     "a limit",
     "a lower rate",
-    "scale: auto",
     "a higher rate",
     "a new run from here",
     "more iterations",
     "more samples for it",
 )
-
-#: Quantities of emitters, which can have any magnitude.
-EMITTED = ("radiance", "irradiance", "intensity")
 
 #: Maximum number of parameters named for one verdict.
 MOST_NAMED = 3
@@ -130,9 +126,6 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
     way = moved + max((abs(value) for value in about.get("to_go") or () if value is not None), default=0.0)
     reach = about.get("reach")
     if reach and rate and way > REACHED * reach:
-        emits = (results.get("parameters") or {}).get(key, {}).get("quantity")
-        if emits in EMITTED and measured.get("scale") == "none":
-            return Remedy("scale: auto", "--set optimizer.scale=auto")
         return Remedy("a higher rate", _rate_setting(measured, rate, max(2 * way / reach, 2.0)))
     # More of the same steps would not help, or the run would end again at once.
     if (results.get("loss_trend") or {}).get("late") == "flat" or (rate is None and results.get("stopped")):

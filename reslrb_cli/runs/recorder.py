@@ -200,7 +200,7 @@ class Recording:
         """Record the measurements for `scale` in the manifest, and log the resulting steps."""
         self.manifest.scaling = [row.to_json() for row in measured]
         for row in measured:
-            level = logging.WARNING if row.own_length is None else logging.INFO
+            level = logging.WARNING if row.curvature is None else logging.INFO
             logger.log(level, f"scale {self.problem.config.optimizer.scale}: {scale_line(row)}")
 
     def _on_nonfinite(self, found: Findings) -> None:

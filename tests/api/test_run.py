@@ -68,7 +68,9 @@ def status_of(folder: Path) -> str:
     return str(json.loads((folder / "manifest.json").read_text())["status"])
 
 
-@pytest.mark.parametrize("settings", [pytest.param({}, marks=pytest.mark.long), {"optimizer.scale": "auto"}])
+@pytest.mark.parametrize(
+    "settings", [pytest.param({}, marks=pytest.mark.long), {"optimizer": {"type": "sgd", "scale": "curvature"}}]
+)
 def test_a_loop_gives_the_results_of_the_command(experiment: Path, settings: dict[str, Any]) -> None:
     """All results match bit by bit. The loop is tested with and without a folder."""
     sets = [word for key, value in (SET | settings).items() for word in ("--set", f"{key}={json.dumps(value)}")]

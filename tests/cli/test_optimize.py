@@ -98,11 +98,11 @@ def test_a_texture_is_recovered(experiment):
 
 @pytest.mark.long  # test_going_on.py has runs with scale and transform
 def test_a_texture_is_recovered_with_a_transform(experiment):
-    sets = ["run.iterations=40", "run.adjoint=independent", "optimizer={scale: auto, learning_rate: 0.1}"]
+    sets = ["run.iterations=40", "run.adjoint=independent", "optimizer={type: sgd, scale: curvature}"]
     sets += ["parameters[0].transform=sigmoid", "integrator={type: reslrb, max_depth: 3, estimator: stack}"]
     code, _, err = outcome("optimize", "box.yaml", *(word for each in sets for word in ("--set", each)))
     assert code == 0, err
-    assert f"scale auto: {KEY} moves by about" in err
+    assert f"scale curvature: {KEY} moves by about" in err
     manifest, records = manifest_of("runs/box"), read_metrics("runs/box")
     errors = manifest["results"]["parameter_rmse"][KEY]
     assert errors["initial"] == pytest.approx(np.sqrt(np.mean((experiment - 0.5) ** 2)), rel=1e-5)

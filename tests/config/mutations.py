@@ -28,7 +28,7 @@ parameters:
   - {key: floor.data, initial: {file: floor.png, color_space: srgb}}
 integrator: {type: reslrb, max_depth: -1, rr_depth: 3, hide_emitters: true, estimator: event, capacity: 2}
 loss: {type: relative_l2, epsilon: 1e-3}
-optimizer: {type: adam, learning_rate: 1e-1, schedule: cosine, final_fraction: 1e-2, beta_1: 0, scale: auto}
+optimizer: {type: adam, learning_rate: 1e-1, schedule: cosine, final_fraction: 1e-2, beta_1: 0, scale: none}
 run: {name: "Fläche: rot/blau", output: out, iterations: 3, spp: 16, adjoint: batched, batches: 4}
 """
 RENDERED = """\

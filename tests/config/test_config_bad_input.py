@@ -54,7 +54,7 @@ ADDED: dict[str, str | tuple[str, ...]] = {
     "run: {spp: 0, seed: -1, iterations: x}": ("run.", "(and 2 more)"),
     "run: fast": ("run: must be a mapping", "'fast'"),
     "loss: [l1]": "loss[0]: must be a mapping such as {type: NAME}",
-    "optimizer: {scale: 1e6}": ("optimizer.scale: must be", "auto"),
+    "optimizer: {scale: 1e6}": ("optimizer.scale: must be", "curvature"),
     "views: [{sensor: -1}]": "views[0].sensor: must be at least 0",
     "integrator: {type: reslbr}": "integrator.type: must be one of reslrb, ptracer, prb, prb_projective, walk_ad,",
     "integrator: {type: prb, estimator: reservoir}": "integrator.estimator: not an option of prb but of reslrb",

@@ -58,8 +58,6 @@ WORK = [
     Toy("relative loss", {LEFT: FAST}, {LEFT: SETTLED}, ("run.spp=128", "loss={type: relative_l2}")),
     Toy("colour and roughness", {WALL: COLOR, ALPHA: METAL}, {WALL: SETTLED, ALPHA: SETTLED},
         ("run.spp=256", "optimizer.schedule=cosine")),
-    Toy("scaled", {LEFT: "initial: 1.0, bounds: [0, 1000]", WALL: COLOR}, {LEFT: SETTLED, WALL: SETTLED},
-        ("run.spp=256", "run.iterations=200", "optimizer={scale: auto, schedule: cosine}")),
 ]  # fmt: skip
 FAIL = [
     Toy("a lamp, too slow", {LEFT: SLOW}, {LEFT: MOVING}, ("run.iterations=40", "run.spp=64")),

@@ -87,8 +87,9 @@ def write_convergence(path, parameter="all"):
 # A run folder as `reslrb optimize` leaves it, made without rendering.
 
 FLOOR, LAMP = "floor.reflectance.data", "lamp.intensity.value"
-SCALING = [{"key": LAMP, "entries": 3, "value": 3e6, "gradient": 7e-9, "noise": 2e-10, "change": 1e-7,
-            "curvature": 4e-15, "length": 7.76e6, "own_length": 7.76e6, "first_step": 7.76e5}]  # fmt: skip
+SCALING = [
+    {"key": LAMP, "entries": 3, "value": 3e6, "gradient": 7e-9, "curvature": 4e-15, "first_step": 7.76e5},
+]
 
 
 def texture(height, width, seed=0):

@@ -136,17 +136,16 @@ def judged(about, **measured):
     """Return results of a lamp with the verdict of `MOVING | about`."""
     lamp = {"quantity": "radiance", "shape": [3], "initial": {"value": [5.0]}, "final": {"value": [7.9]}, "true": None}
     common = {"measure_s": 1.0, "share": 0.1, "iterations": 200,
-              "scale": "none", "learning_rate": 0.03, "target_noise": "measured", "target_spp": 64}  # fmt: skip
+              "learning_rate": 0.03, "target_noise": "measured", "target_spp": 64}  # fmt: skip
     certainty = common | {"parameters": {"lamp.radiance.value": MOVING | about}} | measured
     trend = measured.pop("trend", None)
     return results(parameters={"lamp.radiance.value": lamp}, certainty=certainty, loss_trend=trend)
 
 
 @pytest.mark.parametrize(("found", "words", "setting"), [
-    # The steps moved the lamp in one direction all the time, but not far enough. The unit of a lamp has to be measured.
-    (judged({}), "scale: auto", "--set optimizer.scale=auto"),
-    (judged({}, scale="auto"), "a higher rate", "--set optimizer.learning_rate=0.2"),
-    (judged({"rate": 0.5}, scale="auto"), "a higher rate", "its own learning_rate: 3"),
+    # The steps moved the lamp in one direction all the time, but not far enough.
+    (judged({}), "a higher rate", "--set optimizer.learning_rate=0.2"),
+    (judged({"rate": 0.5}), "a higher rate", "its own learning_rate: 3"),
     # The steps were long enough in total, but the lamp did not arrive. It oscillates, or moves along a valley.
     (judged({"reach": 60.0}), "more iterations", "--set run.iterations=680"),
     (judged({"reach": 60.0, "moved": 0.0}), "more iterations", "--set run.iterations=1000"),
@@ -157,7 +156,8 @@ def judged(about, **measured):
      "a new run from here", "initial: {run: RUN} for each parameter"),
     (judged({"reach": 60.0}, trend=trend("fell", 26.0, 0.3) | {"late": "fell"}),
      "more iterations", "--set run.iterations=680"),
-    (judged({}, trend=trend("fell", 26.0, 0.3) | {"late": "flat"}), "scale: auto", "--set optimizer.scale=auto"),
+    (judged({}, trend=trend("fell", 26.0, 0.3) | {"late": "flat"}),
+     "a higher rate", "--set optimizer.learning_rate=0.2"),
 ])  # fmt: skip
 def test_a_moving_value_gets_a_remedy(found, words, setting):
     assert parameter_lines(found, 120)[1].endswith(f"still moving: {words}")

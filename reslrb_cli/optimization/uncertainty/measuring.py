@@ -141,7 +141,6 @@ class Certainty:
                 measure_s=measure_s,
                 share=measure_s / max(elapsed_s, 1e-9),
                 iterations=iterations,
-                scale=config.optimizer.scale,
                 learning_rate=config.optimizer.learning_rate,
                 target_noise=self._target_noise(),
                 target_spp=None if render is None else render.spp,

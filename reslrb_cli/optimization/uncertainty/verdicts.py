@@ -165,7 +165,7 @@ class CertaintyRecord(Jsonable):
     """Certainty of all parameters, by key, and the time of the estimate.
 
     `measure_s` is the measuring time in seconds without compilation. `share` is `measure_s` divided by the time of the
-    run's iterations. `iterations`, `scale`, `learning_rate` and `target_spp` repeat the run's settings.
+    run's iterations. `iterations`, `learning_rate` and `target_spp` repeat the run's settings.
     `learning_rate` is that of `optimizer`. `target_noise` is `measured` if all targets were rendered, `in part` if some
     were, otherwise `left out`. The spreads include only the noise of rendered targets.
     """
@@ -174,7 +174,6 @@ class CertaintyRecord(Jsonable):
     measure_s: float
     share: float
     iterations: int
-    scale: str
     learning_rate: float
     target_noise: str
     target_spp: int | None = None
