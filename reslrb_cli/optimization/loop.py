@@ -29,7 +29,6 @@ from reslrb_cli.optimization.nonfinite import (
     why_end,
     zero_nonfinite,
 )
-from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures
 from reslrb_cli.optimization.shards import add_gradient, scaled
@@ -191,8 +190,8 @@ def part_of_samples(problem: Problem) -> int:
 
 
 #: Most halvings of a step, the ratio of the losses after and before a step above which n is halved too, and the longest
-#: step that is not checked, as a share of the extent.
-HALVINGS, RISE, SHORT = 3, 1.1, 0.002
+#: step that is not checked, in standard errors.
+HALVINGS, RISE, NOISE = 3, 1.1, 0.5
 
 
 def update(problem: Problem, iteration: int, factor: float, held: Collection[str]) -> dict[str, int]:
@@ -200,12 +199,12 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
 
     Where shapes, lamps or heightmaps move, the loss is far from quadratic, and a step of `auto` may be much too long.
     The step of all small parameters is then halved until the loss does not rise (backtracking; Armijo 1966). After a
-    large rise, n is halved too, because the mean of n gradients misleads. Short steps are not checked.
+    large rise, n is halved too, because the mean of n gradients misleads. Steps that are mostly noise are not checked.
     """
     optimizer = problem.optimizer
     before = {key: dr.detach(optimizer[key]) for key in optimizer.block.at}
     updates = optimizer.step(factor, skip=held)
-    moved = [key for key in before if key in optimizer.extents and _moved(optimizer, key, before[key]) > SHORT]
+    moved = [key for key in before if key in optimizer.extents and optimizer.block.significance(key) > NOISE]
     loss = blurred_loss(problem, iteration) if moved else 0.0  # the scene still has the values before the step
     problem.apply()
     for _ in range(HALVINGS if moved else 0):
@@ -218,11 +217,6 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
             optimizer.block.distrust()
         problem.apply()
     return updates
-
-
-def _moved(optimizer: Optimizer, key: str, before: Any) -> float:
-    """Return the largest change of an entry since `before`, as a share of the extent."""
-    return float(np.abs(np.array(dr.detach(optimizer[key]) - before)).max() / optimizer.extent(key))
 
 
 def blurred_loss(problem: Problem, iteration: int) -> float:
