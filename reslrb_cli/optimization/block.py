@@ -105,11 +105,6 @@ class Block:
         """Return a limit of the root mean square distance to the optimum. It is infinite if it is not known."""
         return float(np.sqrt(np.mean(np.square(self.rows[self.at[key], 5], dtype=np.float64))))
 
-    def significance(self, key: str) -> float:
-        """Return the largest ratio of the last step of an entry to the standard error of the optimum."""
-        step, distance = np.abs(self.rows[self.at[key], 4]), self.rows[self.at[key], 5]
-        return float(np.max(SURE * step / np.maximum(distance - step, 1e-30)))
-
     @property
     def averaged(self) -> float:
         """Number n of gradients in the mean."""

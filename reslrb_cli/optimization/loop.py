@@ -189,9 +189,8 @@ def part_of_samples(problem: Problem) -> int:
     return max(problem.config.run.spp // PART // unit, 1) * unit
 
 
-#: Most halvings of a step, the ratio of the losses after and before a step above which n is halved too, and the longest
-#: step that is not checked, in standard errors.
-HALVINGS, RISE, NOISE = 3, 1.1, 0.5
+#: Most halvings of a step, and the ratio of the losses after and before a step above which n is halved too.
+HALVINGS, RISE = 3, 1.1
 
 
 def update(problem: Problem, iteration: int, factor: float, held: Collection[str]) -> dict[str, int]:
@@ -199,15 +198,15 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
 
     Where shapes, lamps or heightmaps move, the loss is far from quadratic, and a step of `auto` may be much too long.
     The step of all small parameters is then halved until the loss does not rise (backtracking; Armijo 1966). After a
-    large rise, n is halved too, because the mean of n gradients misleads. Steps that are mostly noise are not checked.
+    large rise, n is halved too, because the mean of n gradients misleads.
     """
     optimizer = problem.optimizer
-    before = {key: dr.detach(optimizer[key]) for key in optimizer.block.at}
+    searched = any(key in optimizer.extents for key in optimizer.block.at)
+    before = {key: dr.detach(optimizer[key]) for key in optimizer.block.at if searched}
+    loss = blurred_loss(problem, iteration) if searched else 0.0
     updates = optimizer.step(factor, skip=held)
-    moved = [key for key in before if key in optimizer.extents and optimizer.block.significance(key) > NOISE]
-    loss = blurred_loss(problem, iteration) if moved else 0.0  # the scene still has the values before the step
     problem.apply()
-    for _ in range(HALVINGS if moved else 0):
+    for _ in range(HALVINGS if searched else 0):
         now = blurred_loss(problem, iteration)
         if now <= loss:
             break
