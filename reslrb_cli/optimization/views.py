@@ -165,7 +165,7 @@ class View:
     codes: list[OwnLoss] = field(default_factory=list)
     blur: float = 0.0
     fixed: Array | None = None
-    _kept: tuple[float, int, Any] = (0.0, 0, None)
+    _kept: tuple[float, Any, Any] = (0.0, None, None)
 
     @property
     def target(self) -> mi.TensorXf:
@@ -230,8 +230,8 @@ class View:
 
     def _blurred_target(self, sigma: float) -> mi.TensorXf:
         """Return the target blurred by `sigma` pixels. An iteration needs it several times, so it is kept."""
-        if self._kept[:2] != (sigma, id(self.made)):
-            self._kept = sigma, id(self.made), blur(self.target, sigma)
+        if self._kept[0] != sigma or self._kept[1] is not self.made:
+            self._kept = sigma, self.made, blur(self.target, sigma)
         return self._kept[2]
 
     def curvature(self, known: bool) -> Array:

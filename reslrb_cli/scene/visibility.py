@@ -49,10 +49,10 @@ def spread(pixels: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
     """Return `pixels` together with all pixels whose reconstruction filter reaches some of `pixels`. Masks are boolean
     (H, W).
     """
-    return _widened(pixels, _margin(sensor))
+    return widened(pixels, _margin(sensor))
 
 
-def _widened(pixels: np.ndarray, margin: int) -> np.ndarray:
+def widened(pixels: np.ndarray, margin: int) -> np.ndarray:
     """Return the pixels, boolean (H, W), with a true pixel at most `margin` rows and columns away. SciPy's filter would
     take 0.1 s to import.
     """
@@ -102,7 +102,7 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
         cells |= np.array(what_is_seen(scene, sensor, point)[2]).reshape(LOOK, LOOK)
     if not cells.any():
         return np.zeros((height, width), dtype=bool)
-    cells = _widened(cells, 1)  # an edge may be anywhere between the centres of two cells
+    cells = widened(cells, 1)  # an edge may be anywhere between the centres of two cells
     for axis, size in enumerate((height, width)):
         first = np.arange(size) * LOOK // size
         cells = np.maximum.reduceat(cells, first, axis=axis) if size < LOOK else np.take(cells, first, axis=axis)

@@ -112,8 +112,10 @@ def test_a_blur_is_a_reflected_gaussian(sigma):
 
 
 def blurred_view(image, target, weights=None):
-    """Return the loss of an image that a blurred view sees, and its derivative."""
+    """Return the loss of an image that a blurred view sees, and its derivative. The view has seen another target."""
     view = View(0, make_loss("l2"), blur=3.0)
+    view.see(0.5 * target)
+    view.blurred_objective(mi.TensorXf(image.astype(np.float32)))
     view.see(target, weights)
     attached = mi.TensorXf(image.astype(np.float32))
     dr.enable_grad(attached)

@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import summarise
@@ -27,6 +28,7 @@ from reslrb_cli.scene.visibility import (
     sees_lamps,
     sees_specular,
     visible_texels,
+    widened,
 )
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -493,3 +495,9 @@ def test_pixels_that_see_lamps(size: int, sensor: dict) -> None:
     far = ((y < 3 / 8 - 2 * near) | (y > 5 / 8 + 2 * near))[:, None] | ((x < 1 / 2 - near) | (x > 3 / 4 + near))
     assert not found[far].any()
     assert found.sum() > (1.5 if sensor else 0.9) * inside.sum()
+
+
+@pytest.mark.parametrize("margin", [0, 1, 3, 20])
+def test_pixels_are_widened_as_by_a_maximum_filter(margin: int) -> None:
+    pixels = np.random.default_rng(0).random((7, 13)) < 0.05
+    np.testing.assert_array_equal(widened(pixels, margin), maximum_filter(pixels, 2 * margin + 1))
