@@ -148,7 +148,7 @@ class CameraTangents(CameraHooks):
             f_s = tracked_factor(plan, si, bsdf, scattering, scattering.active)
             Le_h = zero if met is None else met.radiance()
             f_c = zero if event is None else evaluate(plan, si, bsdf, event.wo, event.active)
-            Le_n = zero if event is None else event.radiance(si)
+            Le_n = zero if event is None else event.radiance(si, s)
             df_s, dLe_h, df_c, dLe_n = forward_derivatives(f_s, Le_h, f_c, Le_n)
         if met is not None:
             dL = dL + dr.select(met.active, (dP * met.Le + P * dLe_h) * met.weight, 0)

@@ -118,8 +118,13 @@ class NextEvent(Connection):
     ds: mi.DirectionSample3f
     through: mi.Spectrum
 
-    def radiance(self, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
-        """Return the arriving radiance, with its derivative if it has one."""
+    def radiance(self, si: mi.SurfaceInteraction3f, samples: Samples | None = None) -> mi.Spectrum:
+        """Return the arriving radiance, with its derivative if it has one.
+
+        Forward mode and naive AD need Mitsuba's own call. Pass `samples` for them.
+        """
+        if samples is not None and not _unseen(samples):
+            return samples.scene.eval_emitter_direction(si, self.ds, self.active)
         # Mitsuba's own call fails beside a `directionalarea` in any scene, because Dr.Jit records all emitters.
 
         def radiance(
@@ -276,7 +281,7 @@ def camera_walk(
             weight = event.rest
             if hooks.tracked:
                 event.f = evaluate(plan, si, bsdf, event.wo, event.active)
-                weight = event.radiance(si) * event.scale
+                weight = event.radiance(si, samples) * event.scale
             else:
                 event.f = dr.select(event.active, event.f, 0)
             event.c = dr.select(event.active, event.f * event.through * weight, 0)

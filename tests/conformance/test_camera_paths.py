@@ -331,7 +331,7 @@ def test_gradients_equal_naive_ad(case: GradientCase, paths: str, steps: tuple[s
         assert error < scene.rounding(), f"{name}: {error:.1e}"
 
 
-@pytest.mark.parametrize("name", a_few([case.name for case in BOTH], ["texture"]))
+@pytest.mark.parametrize("name", a_few([case.name for case in BOTH], ["texture", "area"]))
 @pytest.mark.parametrize("paths", a_few(["camera", "both"], ["camera"]))  # the next test has both
 def test_forward_mode_equals_naive_ad(name: str, paths: str):
     case = next(case for case in CASES if case.name == name)
