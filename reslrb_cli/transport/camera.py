@@ -119,17 +119,12 @@ class NextEvent(Connection):
     through: mi.Spectrum
 
     def radiance(self, si: mi.SurfaceInteraction3f, samples: Samples | None = None) -> mi.Spectrum:
-        """Return the arriving radiance, with its derivative if it has one.
-
-        Forward mode and naive AD need Mitsuba's own call. Pass `samples` for them.
-        """
-        if samples is not None and not _unseen(samples):
+        """Return the arriving radiance, with its derivative if it has one. Forward mode and naive AD give `samples`."""
+        if samples is not None and not _unseen(samples):  # they need Mitsuba's own call
             return samples.scene.eval_emitter_direction(si, self.ds, self.active)
-        # Mitsuba's own call fails beside a `directionalarea` in any scene, because Dr.Jit records all emitters.
 
-        def radiance(
-            emitter: mi.Emitter, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool
-        ) -> mi.Spectrum:
+        # Mitsuba's own call fails beside a `directionalarea` in any scene, because Dr.Jit records all emitters.
+        def radiance(emitter: mi.Emitter, si: Any, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Spectrum:
             parallel = emitter.class_name() == "DirectionalArea"
             return mi.Spectrum(0) if parallel else emitter.eval_direction(si, ds, active)
 
