@@ -119,7 +119,7 @@ class NextEvent(Connection):
     through: mi.Spectrum
 
     def radiance(self, si: mi.SurfaceInteraction3f, samples: Samples | None = None) -> mi.Spectrum:
-        """Return the arriving radiance, with its derivative if it has one. Forward mode and naive AD give `samples`."""
+        """Return the arriving radiance, with its derivative if it has one. Forward mode and naive AD pass `samples`."""
         if samples is not None and not _unseen(samples):  # they need Mitsuba's own call
             return samples.scene.eval_emitter_direction(si, self.ds, self.active)
 

@@ -92,6 +92,7 @@ def failing_last(monkeypatch, name, failure=full, calls=1):
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = "poster.reflectance.data"
+DESCENT = "optimizer={type: sgd, scale: curvature}"
 #: Three positions of the camera.
 EYES = ("0, 0, 4", "1, 0.5, 4", "-1, 1, 3")
 

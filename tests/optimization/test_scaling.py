@@ -1,4 +1,4 @@
-"""Units of curvature for gradient descent, and smoothing of parameters that cannot be smoothed."""
+"""Units of curvature for gradient descent, and the refusal of `precondition` for a colour."""
 
 from __future__ import annotations
 

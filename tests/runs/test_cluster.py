@@ -36,15 +36,9 @@ calls = pytest.importorskip("reslrb_cli.cluster.calls", reason="pip install resl
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
 SETS = ["run.iterations=3", "run.spp=8", "run.measuring=0", "run.certainty=false"]
-DESCENT = "optimizer={type: sgd, scale: curvature}"
 #: Experiments by name: two rounds and one round, guided emission, views, exposures, motion, and passes.
 CASES = {
-    "guided, scaled": [
-        "run.shards=4",
-        "integrator.guiding=on",
-        DESCENT,
-        "run.views_per_iteration=2",
-    ],
+    "guided, scaled": ["run.shards=4", "integrator.guiding=on", tiny.DESCENT, "run.views_per_iteration=2"],
     "views": ["run.shards=3", "run.adjoint=batched", "integrator.guiding=on"],
     "exposure": ["run.shards=6", f"parameters=[{{key: {tiny.KEY}, initial: 0.5}}]", "views.1.exposure=auto"],
     "motion": ["run.shards=6", f"parameters[2]={MOTION}"],

@@ -55,8 +55,6 @@ SIMPLE = ["--set", f"parameters=[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]
 VIEWS = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
 FALLING = ["--set", f"parameters=[{{key: {tiny.KEY}, initial: 0.05, bounds: [0, 1]}}]"]
 
-DESCENT = "optimizer={type: sgd, scale: curvature}"
-
 #: Settings by name: every optimiser, schedule and transform, measurements before the first iteration, and views.
 CASES: dict[str, list[str]] = {
     "adam": [],
@@ -68,17 +66,14 @@ CASES: dict[str, list[str]] = {
     "momentum": ["optimizer={type: sgd, momentum: 0.8, learning_rate: 0.1}"],
     "sigmoid, momentum": ["parameters[0].transform=sigmoid", "optimizer={type: sgd, momentum: 0.8}"],
     "log": ["parameters[1].transform=log", "parameters[1].bounds=[0.1, 20]"],
-    "curvature, sigmoid": [
-        DESCENT,
-        "parameters[0].transform=sigmoid",
-    ],
+    "curvature, sigmoid": [tiny.DESCENT, "optimizer.schedule=cosine", "parameters[0].transform=sigmoid"],
     "views": [VIEWS, "run.views_per_iteration=1"],
-    "held out": [VIEWS, "run.views_per_iteration=1", "run.held_out=[2]", DESCENT],
+    "held out": [VIEWS, "run.views_per_iteration=1", "run.held_out=[2]", tiny.DESCENT],
     "exposure": [
         "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0.3, 0.7]}]",
         "views=[{sensor: 0}, {sensor: 1, exposure: auto}]",
     ],
-    "motion, curvature": [f"parameters[2]={MOTION}", DESCENT, VIEWS],
+    "motion, curvature": [f"parameters[2]={MOTION}", tiny.DESCENT, VIEWS],
     "certainty": ["run.certainty=true", "run.iterations=24", "run.checkpoint_every={iterations: 5}"],
     "independent, l1": ["run.adjoint=independent", "loss.type=l1"],
     "reservoir": [*BATCHED, "integrator.estimator=reservoir"],
@@ -86,7 +81,7 @@ CASES: dict[str, list[str]] = {
     "gather": [*BATCHED, "integrator.estimator=gather"],
     "guided": [*BATCHED, "integrator.guiding=on", "integrator.estimator=stack"],
     "pixels": [*BATCHED, "run.spp=16", "integrator={estimator: stack, paths: both, pixels: measured}"],
-    "shards": ["run.spp=8", "run.shards=4", "integrator.guiding=on", DESCENT],
+    "shards": ["run.spp=8", "run.shards=4", "integrator.guiding=on", tiny.DESCENT],
     "shards of views": [*BATCHED, VIEWS, "run.shards=2"],
     "passes": [*BATCHED, "integrator.samples_per_pass=1"],
     "a list of losses": ["loss=[{type: l1}, {type: l2, weight: 0.5}]"],
