@@ -48,8 +48,9 @@ moved since the last measurement of H is therefore another limit.
 
 from __future__ import annotations
 
+import itertools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import drjit.opt as dropt
@@ -60,13 +61,16 @@ from reslrb_cli.optimization.block import Block
 
 #: Step as a share of Newton's, decay of the momentum, decay of the means s and v, and decay of the mean r.
 #: docs/optimizers.md has measurements.
-GAIN, MOMENTUM, MEMORY, FORGETTING = 0.3, 0.5, 0.99, 0.9
+GAIN, MOMENTUM, MEMORY, FORGETTING = 0.5, 0.5, 0.99, 0.9
 #: Classes of gradients by size, classes for a factor of two, and the smallest share of the entries that c uses.
 CLASSES, OCTAVE, SHARE = 128, 4, 0.02
 #: Displacement d of a measurement as a share of the extent, and the weight of the newest measurement.
 DISPLACEMENT, NEWEST = 0.05, 0.75
 #: L and P as shares of the extent, and q.
-LONGEST, NEAR, SHORTER = 0.13, 0.07, 0.4
+LONGEST, NEAR, SHORTER = 0.13, 0.07, 1.2
+#: P of fine steps, the share of the curvature h below which the images hardly show the fine part, and the number of
+#: steps before the first measurement of fine steps.
+NEAR_FINE, UNSEEN, EARLY = 0.0175, 0.2, 3
 #: The limit of the distance uses this many iterations, and exceeds the largest of them by this factor.
 RECENT, SURE = 4, 1.5
 #: A mean square distance that is not known. A state on file has only finite numbers.
@@ -139,40 +143,50 @@ class Joint(Rule, dropt.SGD):
         return self._block.steepness(key)
 
 
+class Moments(NamedTuple):
+    """m, s, n, H, and the roots of v and r, flat."""
+
+    velocity: Any
+    size: Any
+    turns: Any
+    bent: Any
+    spread: Any
+    noise: Any
+
+
 class Newton(Rule, dropt.Optimizer[Any]):
     """The update of `optimizer: auto` for one large parameter. The learning rate is the longest step L.
 
-    Data: m, s, n, H, the variable at the last measurement of H, the roots of v and r, g', x', and arrays of width
-    1: the sum of the weights in s and v, P, and the mean square distances of the last iterations, newest first.
+    Data: the moments of the entries, the moments of the fine steps of a texture, g', x', the variable at the last
+    measurement of H, and arrays of width 1. These are the sum of the weights in s and v, P, and the mean square
+    distances of the last iterations, newest first.
     """
 
     longest = LONGEST
 
     def _step(self, cache: Any, value: Any, grad: Any, lr: Any, extra: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
-        velocity, size, turns, bent, earlier, spread, noise, last, before, weights, _, *squares = extra
-        size, spread = dr.lerp(dr.abs(grad), size, MEMORY), _root_mean(grad, spread, MEMORY)
-        steepness = _steepness(size, bent)
-        surprise = math.sqrt(0.5) * (grad - last - steepness * (value - before))
-        mean = dr.select(weights > 1.5 * (1 - MEMORY), _root_mean(surprise, noise, FORGETTING), dr.abs(surprise))
-        noise = dr.select(weights > 0, mean, 0)  # the first gradient has no predecessor
-        weights = dr.lerp(1, weights, MEMORY)
+        (entries, *fine), (last, before, earlier, weights, _, *squares) = _parts(extra)
+        most = dr.opaque(dr.leaf_t(grad), lr)
+        near, rows = NEAR / LONGEST * most, (grad, grad - last, value - before)
+        entries, steepness = _observe(entries, rows, weights)
         known = steepness > 0
         weight = total(dr.select(known, steepness, 0))
-        offsets = dr.select(known, grad * ((1 - MOMENTUM) * velocity / steepness), 0)
+        offsets = dr.select(known, grad * ((1 - MOMENTUM) * entries.velocity / steepness), 0)
         square = dr.select(weight > 0, total(offsets) / weight, UNKNOWN)
-        turns = turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
-        most = dr.opaque(dr.leaf_t(grad), lr)
-        near, longest = NEAR / LONGEST * most, most * dr.select(known, dr.square(size / spread) / weights, 1)
-        divisor = _divisor(steepness, turns, noise, near)
-        reach = (1 - MOMENTUM) * longest * divisor
-        velocity = MOMENTUM * velocity + dr.clip(grad, -reach, reach)
-        step = dr.select(known, dr.clip(velocity / divisor, -longest, longest), 0)
-        kept = velocity, size, turns, bent, earlier, spread, noise, grad, value, weights, near, square, *squares[:-1]
-        return value - step, kept
+        step, entries = _move(entries, steepness, grad, weights, most, near)
+        if fine:
+            rows = tuple(fine_part(row, self._shape) for row in rows)
+            moments, bent = _observe(fine[0], rows, weights)
+            bent = dr.select(bent > 0, bent + dr.square(UNSEEN * steepness) / bent, 0)
+            detail, moments = _move(moments, bent, rows[0], weights, most, NEAR_FINE / NEAR * near)
+            step, fine = step + fine_part(detail - 0.5 * step, self._shape), [moments]
+        moved = grad, value, earlier, dr.lerp(1, weights, MEMORY), near, square, *squares[:-1]
+        return value - step, (*entries, *itertools.chain(*fine), *moved)
 
     def _reset(self, key: str, value: Any, promoted: bool) -> None:
-        array = value.array
-        zeros = [dr.opaque(type(array), 0, array.shape) for _ in range(9)]
+        array, self._shape = value.array, dr.shape(value)
+        levels = 2 if len(self._shape) == 3 else 1
+        zeros = [dr.opaque(type(array), 0, array.shape) for _ in range(levels * len(Moments._fields) + 3)]
         single = [dr.opaque(dr.leaf_t(array), each) for each in (0, 1, *RECENT * [UNKNOWN])]
         self.state[key] = value, promoted, None, (*zeros, *single)
 
@@ -184,37 +198,104 @@ class Newton(Rule, dropt.Optimizer[Any]):
         newest = np.array(gradient, dtype=np.float64)
         return -newest - MOMENTUM * np.array(self.state[key][3][0], dtype=np.float64).reshape(newest.shape)
 
-    def bend(self, key: str, curvature: Any) -> None:
-        """Take a measurement of H, in the shape of the parameter. Entries that are not finite keep their curvature."""
-        value, promoted, lr, (velocity, size, turns, bent, _, *others) = self.state[key]
-        curvature = dr.select(dr.isfinite(curvature), curvature, bent)
-        newest = dr.lerp(bent, curvature, NEWEST)
-        bent = dr.select(dr.all(flat(bent) == 0), curvature, newest)
-        dr.make_opaque(bent)
-        self.state[key] = value, promoted, lr, (velocity, size, turns, bent, dr.detach(value).array, *others)
+    def has_fine(self, key: str) -> bool:
+        """Return True if a measurement now includes fine steps: those of a texture, after its first `EARLY` steps."""
+        levels, (_, _, _, weights, *_) = _parts(self.state[key][3])
+        return len(levels) == 2 and float(np.array(weights).ravel()[0]) > 1 - MEMORY ** (EARLY + 0.5)
+
+    def bend(self, key: str, change: Any, step: Any, fine_step: Any) -> None:
+        """Take a measurement of H. `change` is the change of the gradient by a displacement of `step` and the fine part
+        of `fine_step`, which is None without fine steps. All are flat. Entries that are not finite keep their
+        curvature.
+        """
+        value, promoted, lr, extra = self.state[key]
+        levels, (last, before, _, *others) = _parts(extra)
+        found = [change / step] if fine_step is None else [change / step, fine_part(change, self._shape) / fine_step]
+        for at, curvature in enumerate(found):
+            bent = levels[at].bent
+            curvature = dr.select(dr.isfinite(curvature), curvature, bent)
+            bent = dr.select(dr.all(flat(bent) == 0), curvature, dr.lerp(bent, curvature, NEWEST))
+            dr.make_opaque(bent)
+            levels[at] = levels[at]._replace(bent=bent)
+        self.state[key] = (
+            value,
+            promoted,
+            lr,
+            (*itertools.chain(*levels), last, before, dr.detach(value).array, *others),
+        )
 
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
-        _, size, turns, bent, _, _, noise, _, _, _, near, *_ = self.state[key][3]
-        steepness = _steepness(size, bent)
-        summed = (1 - MOMENTUM) * _divisor(steepness, turns, noise, near)
+        (entries, *_), (_, _, _, _, near, *_) = _parts(self.state[key][3])
+        steepness = _steepness(entries.size, entries.bent)
+        summed = (1 - MOMENTUM) * _divisor(steepness, entries.turns, entries.noise, near)
         return np.array(dr.select(steepness > 0, summed, math.inf), dtype=np.float64).ravel()
 
     def averaged(self, key: str) -> float:
-        _, size, turns, bent, *_ = self.state[key][3]
-        steepness, turned = (np.array(each, dtype=np.float64).ravel() for each in (_steepness(size, bent), turns))
-        mean = np.sum(steepness * turned) / max(np.sum(steepness), 1e-300)
-        return float((1 + SHORTER * mean) * (1 - MOMENTUM) / GAIN)
+        (entries, *_), _ = _parts(self.state[key][3])
+        steepness = np.array(_steepness(entries.size, entries.bent), dtype=np.float64).ravel()
+        turns = np.array(entries.turns, dtype=np.float64).ravel()
+        return float(1 + np.sum(steepness * turns) / max(np.sum(steepness), 1e-300))
 
     def to_go(self, key: str) -> float:
-        value, _, _, (_, size, _, bent, earlier, *others) = self.state[key]
-        squares = others[-RECENT:]
+        value, _, _, extra = self.state[key]
+        (entries, *_), (_, _, earlier, _, _, *squares) = _parts(extra)
         left = np.abs([float(np.array(each).ravel()[0]) for each in squares])
-        steepness = np.array(_steepness(size, bent), dtype=np.float64).ravel()
+        steepness = np.array(_steepness(entries.size, entries.bent), dtype=np.float64).ravel()
         moved = np.array(dr.detach(value).array - earlier, dtype=np.float64).ravel()
         if left.max() >= np.float32(UNKNOWN) or not steepness.any():
             return float("inf")
         far = np.sum(steepness * np.square(moved)) / np.sum(steepness)
         return float(np.sqrt(max(SURE**2 * left.max(), far)))
+
+
+def _parts(extra: tuple[Any, ...]) -> tuple[list[Moments], tuple[Any, ...]]:
+    """Return the moments of the entries, those of the fine steps, if any, and the other data of `Newton`."""
+    width, others = len(Moments._fields), len(extra) - 5 - RECENT
+    return [Moments(*extra[at : at + width]) for at in range(0, others, width)], extra[others:]
+
+
+def _observe(moments: Moments, rows: tuple[Any, ...], weights: Any) -> tuple[Moments, Any]:
+    """Return the moments with one more gradient, and the curvature h.
+
+    `rows` are the gradient, its change and the change of the value since the last step. `weights` is the sum of the
+    weights in s and v before the step.
+    """
+    grad, turned, moved = rows
+    size, spread = dr.lerp(dr.abs(grad), moments.size, MEMORY), _root_mean(grad, moments.spread, MEMORY)
+    steepness = _steepness(size, moments.bent)
+    surprise = math.sqrt(0.5) * (turned - steepness * moved)
+    mean = dr.select(weights > 1.5 * (1 - MEMORY), _root_mean(surprise, moments.noise, FORGETTING), dr.abs(surprise))
+    noise = dr.select(weights > 0, mean, 0)  # the first gradient has no predecessor
+    return moments._replace(size=size, spread=spread, noise=noise), steepness
+
+
+def _move(moments: Moments, steepness: Any, grad: Any, weights: Any, most: Any, near: Any) -> tuple[Any, Moments]:
+    """Return the step, and the moments with its m and n. `most` is L, and `near` is P."""
+    velocity, known = moments.velocity, steepness > 0
+    turns = moments.turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
+    weights = dr.lerp(1, weights, MEMORY)
+    longest = most * dr.select(known, dr.square(moments.size / moments.spread) / weights, 1)
+    divisor = _divisor(steepness, turns, moments.noise, near)
+    reach = (1 - MOMENTUM) * longest * divisor
+    velocity = MOMENTUM * velocity + dr.clip(grad, -reach, reach)
+    step = dr.select(known, dr.clip(velocity / divisor, -longest, longest), 0)
+    return step, moments._replace(velocity=velocity, turns=turns)
+
+
+def fine_part(texels: Any, shape: tuple[int, ...]) -> Any:
+    """Return flat texels minus their means over 3 x 3 texels with binomial weights. `shape` is (H, W, channels).
+
+    The matrix of this linear map is symmetric.
+    """
+    H, W, channels = shape
+    index = dr.int32_array_t(texels)(dr.arange(dr.uint32_array_t(texels), H * W * channels))
+    channel, column, row = index % channels, index // channels % W, index // (channels * W)
+    mean = dr.zeros(type(texels), H * W * channels)
+    for down, right in itertools.product((-1, 0, 1), repeat=2):
+        at = dr.clip(row + down, 0, H - 1) * W + dr.clip(column + right, 0, W - 1)
+        neighbour = dr.gather(type(texels), texels, dr.uint32_array_t(texels)(at * channels + channel))
+        mean += (2 - abs(down)) * (2 - abs(right)) / 16 * neighbour
+    return texels - mean
 
 
 def _steepness(size: Any, bent: Any) -> Any:

@@ -29,7 +29,7 @@ import numpy as np
 
 from reslrb_cli.backend.memory import flat
 from reslrb_cli.optimization.block import Block, JointState
-from reslrb_cli.optimization.newton import DISPLACEMENT, AdamRule, Descent, Joint, Newton
+from reslrb_cli.optimization.newton import DISPLACEMENT, AdamRule, Descent, Joint, Newton, fine_part
 from reslrb_cli.optimization.nonfinite import count_nonfinite
 from reslrb_cli.optimization.variables import Smoother, Transform, Variable
 from reslrb_cli.statistics import Array, rms
@@ -289,7 +289,8 @@ class Optimizer:
     @contextmanager
     def displaced(self, random: np.random.Generator) -> Iterator[None]:
         """Displace all entries of large parameters in the directions of their next steps, by equal amounts, and measure
-        the curvature for `auto`. Entries that do not move have random directions.
+        the curvature for `auto`. Entries that do not move have random directions. The fine part of random directions
+        is added where fine steps are measured (`newton.py`).
 
         Accumulate the gradient before, and within the block the gradient at the displaced values, with the same
         samples. Afterwards, values and gradients are as before.
@@ -303,10 +304,14 @@ class Optimizer:
             v, variable = dr.detach(own[key]), self.variable(key)
             toward = own.toward(key, before[key])
             signs = random.choice([-1.0, 1.0], size=toward.shape)
-            signs = np.where(toward != 0, np.sign(toward), signs) * DISPLACEMENT * self.extent(key)
-            ahead = v + type(v)(signs.astype(np.float32))
+            signs, far = np.where(toward != 0, np.sign(toward), signs), DISPLACEMENT * self.extent(key)
+            ahead = v + type(v)((signs * far).astype(np.float32))
             ahead = variable.clamp(dr.select(variable.clamp(ahead) == ahead, ahead, 2 * v - ahead))
-            steps[key] = ahead - v
+            steps[key] = (ahead - v).array, None
+            if own.has_fine(key):
+                fine = type(flat(v))((far * random.choice([-1.0, 1.0], size=signs.size)).astype(np.float32))
+                steps[key] = steps[key][0], fine
+                ahead = variable.clamp(ahead + type(v)(fine_part(fine, dr.shape(v)), dr.shape(v)))
             dr.eval(ahead, steps[key])
             self.set_value(key, variable.to_scene(ahead))
         yield
@@ -317,7 +322,7 @@ class Optimizer:
             if value is not None:
                 self._scene[key] = value
         for key, own in large.items():
-            own.bend(key, ((after[key] - before[key]) / steps[key]).array)
+            own.bend(key, (after[key] - before[key]).array, *steps[key])
 
     def _descents(self) -> dict[str, Any]:
         """Return the accumulated gradients by the optimiser's variables, evaluated."""

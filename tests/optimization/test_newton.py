@@ -20,7 +20,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.block import Block
-from reslrb_cli.optimization.newton import LONGEST, NEAR, SHORTER, _steepness
+from reslrb_cli.optimization.newton import GAIN, LONGEST, NEAR, SHORTER, _steepness, fine_part
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.uncertainty.curvature import raise_eigenvalues
@@ -83,7 +83,7 @@ def test_updates_follow_the_formula():
         h = curvature_by_size(s, curvature)
         n = n + (g * m < 0)
         longest = LONGEST * s**2 / v / (1 - 0.99 ** (iteration + 1))
-        divisor = h * (1 + SHORTER * n) / 0.3
+        divisor = h * (1 + SHORTER * n) / GAIN
         if iteration > 0:
             newest = (g - last - h * (x - before)) ** 2 / 2
             r = newest if iteration == 1 else 0.9 * r + 0.1 * newest
@@ -311,7 +311,7 @@ def test_noise_shortens_the_steps_and_a_steady_pull_does_not():
         lengths.append(np.abs(np.array(optimizer["p"]) - before))
     turns = np.array(optimizer.moments()["p"]["2"], dtype=np.float64).ravel()
     assert 20 < turns[:3].min() <= turns[:3].max() < 40
-    assert optimizer.averaged("p") == pytest.approx((1 + SHORTER * turns.mean()) * 0.5 / 0.3)
+    assert optimizer.averaged("p") == pytest.approx(1 + turns.mean())
     first, last = (np.mean(part, axis=0) for part in (lengths[:10], lengths[-10:]))
     assert last[:3].max() < 0.25 * first[:3].min()
     assert last[3:].min() > 0.9 * first[3:].max()
@@ -344,6 +344,95 @@ def test_skewed_noise_leaves_no_bias():
         dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(noise), axis=None))
         optimizer.step(1.0)
     assert np.array(optimizer["p"]).mean() == pytest.approx(0.5, abs=0.005)
+
+
+def fine_matrix(H, W):
+    """Return the matrix (H W, H W) of `fine_part` for a single channel."""
+
+    def blur(n):
+        once = 0.5 * np.eye(n) + 0.25 * (np.eye(n, k=1) + np.eye(n, k=-1))
+        once[0, 0] += 0.25
+        once[-1, -1] += 0.25
+        return once
+
+    return np.eye(H * W) - np.kron(blur(H), blur(W))
+
+
+def test_the_fine_part_of_texels():
+    H, W, channels = 5, 4, 3
+    texels = np.random.default_rng(0).normal(size=(H, W, channels)).astype(np.float32)
+    found = np.array(fine_part(mi.Float(texels.ravel()), (H, W, channels))).reshape(H * W, channels)
+    np.testing.assert_allclose(found, fine_matrix(H, W) @ texels.reshape(H * W, channels), atol=1e-6)
+    flat = np.array(fine_part(mi.Float(np.full(20, 0.7)), (5, 4, 1)))
+    np.testing.assert_allclose(flat, 0, atol=1e-6)
+
+
+def pull_images(optimizer, seen, best, error=0.0):
+    """Accumulate the gradient of the loss |seen (x - best) + error|^2 / 2."""
+    x = np.array(optimizer["p"], dtype=np.float64)
+    gradient = seen.T @ (seen @ (x.ravel() - best) + error)
+    optimizer.clear_gradient("p")
+    given = mi.TensorXf(gradient.astype(np.float32).reshape(x.shape))
+    dr.backward(dr.sum(optimizer["p"] * given, axis=None))
+
+
+def descend(seen, best, noise, shape, iterations=40):
+    """Return the texels after each step. The images have `noise`."""
+    random, optimizer, values = np.random.default_rng(5), make({"p": np.full(shape, 0.5)}), []
+    for iteration in range(iterations):
+        error = noise * random.normal(size=best.size)
+        pull_images(optimizer, seen, best, error)
+        if iteration in (0, 2, 6, 14, 30):
+            with optimizer.displaced(np.random.default_rng(iteration)):
+                pull_images(optimizer, seen, best, error)
+        optimizer.step(1.0)
+        values.append(np.array(optimizer["p"], dtype=np.float64).ravel())
+    return np.array(values)
+
+
+def test_a_measurement_shows_the_curvature_of_the_fine_part():
+    """The mean over the texels is the mean of the diagonal of F S'S F. F is the fine part, and S shows the images."""
+    F = fine_matrix(12, 12)
+    seen, best, found = np.eye(144) - 0.7 * F, np.full(144, 0.45), []
+    optimizer = make({"p": np.full((12, 12, 1), 0.5)})
+    for _ in range(4):
+        pull_images(optimizer, seen, best)
+        optimizer.step(1.0)
+    for seed in range(40):
+        with optimizer.displaced(np.random.default_rng(seed)):
+            pull_images(optimizer, seen, best)
+        found.append(np.array(optimizer.moments()["p"]["9"]).mean())
+    assert np.mean(found) == pytest.approx(np.trace(F @ seen.T @ seen @ F) / 144, rel=0.05)
+
+
+def fine_errors(values, best):
+    return np.sqrt(np.mean(np.square((values - best) @ fine_matrix(12, 12)), axis=1))
+
+
+def test_fine_steps_reach_details_that_blurred_images_show_weakly():
+    """The pixels are means of 3 x 3 texels. Without fine steps, the same texels have one dimension."""
+    best = np.random.default_rng(1).choice([0.3, 0.7], size=144)
+    seen = np.eye(144) - 0.7 * fine_matrix(12, 12)
+    errors = [fine_errors(descend(seen, best, 0.02, shape), best) for shape in ((12, 12, 1), (144,))]
+    assert errors[0][-1] < 0.6 * errors[1][-1]
+
+
+def test_fine_steps_leave_details_alone_that_no_image_shows():
+    best = np.random.default_rng(1).choice([0.3, 0.7], size=144)
+    seen = np.eye(144) - fine_matrix(12, 12)
+    for _ in range(3):
+        seen = seen @ seen  # a wide blur
+    with_fine, without = (descend(seen, best, 0.02, shape)[-1] for shape in ((12, 12, 1), (144,)))
+    moved = [np.std(fine_matrix(12, 12) @ (values - 0.5)) for values in (with_fine, without)]
+    assert moved[0] < 1.1 * moved[1]
+
+
+def test_noise_shortens_fine_steps():
+    """The noise of an image would move details by several times their size."""
+    best = np.full(144, 0.5)
+    seen = np.eye(144) - 0.7 * fine_matrix(12, 12)
+    with_fine, without = (fine_errors(descend(seen, best, 0.3, shape), best)[-1] for shape in ((12, 12, 1), (144,)))
+    assert with_fine < without
 
 
 def test_one_noisy_measurement_does_not_set_the_curvature_of_a_dim_texel():
@@ -383,11 +472,11 @@ def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):
 
 
 def test_a_run_goes_on_until_its_steps_are_means_of_many_gradients(tmp_path, steps, monkeypatch):
-    """Gradients have a random factor between 0.9 and 1.1. The value is close to the optimum early."""
+    """Gradients have a random factor between 0.5 and 1.5. The value is close to the optimum early."""
     random = np.random.default_rng(1)
-    steps.spoil = lambda call, key: float(random.uniform(0.9, 1.1))
+    steps.spoil = lambda call, key: float(random.uniform(0.5, 1.5))
     ends = []
-    for least in (1, 12):
+    for least in (1, 20):
         monkeypatch.setattr(loop, "AVERAGED", least)
         problem = steps.problem = make_problem(tmp_path, sets=[AUTO, "run.iterations=500"])
         *_, (state, _) = loop.iterate(problem, standing(problem))
