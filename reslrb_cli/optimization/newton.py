@@ -8,7 +8,7 @@ iteration, the entries i move as follows.
     h_i   =  c_i s_i,   c_i = sum_j H_j s_j / sum_j s_j²      curvature; the sums are over all j with s_j <= s_i
     r_i                                                       mean of (g_i - g_i' - h_i (x_i - x_i'))² / 2
     L_i   =  L s_i² / v_i                                     longest step
-    d_i   =  h_i (1 + q n_i) / 0.3 + 0.5 r_i / (h_i P²)       divisor of a step
+    d_i   =  h_i (1 + q n_i) / 0.5 + 0.5 r_i / (h_i P²)       divisor of a step
     m_i  <-  0.5 m_i + clip(g_i, ±0.5 L_i d_i)                momentum
     x_i  <-  x_i - clip(m_i / d_i, ±L_i)                      step
 
@@ -31,10 +31,21 @@ r_i is the variance of the noise of a gradient. It comes from the last gradient 
 noise would move an entry by much more than P, steps are shorter from the start. Otherwise, the first steps would move
 dim entries far from the optimum, and later steps would be too short to correct them.
 
-Steps of 0.3 are a compromise. Larger steps keep more noise of the first, large gradients in directions that the images
-do not determine, such as differences of texels in one pixel. n_i counts the iterations in which g_i and m_i have
-opposite signs (Kesten 1958). As long as an entry moves in one direction, its steps keep their length. When it
-oscillates, or when noise dominates, its steps become shorter, as 1/n.
+n_i counts the iterations in which g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one
+direction, its steps keep their length. When it oscillates, or when noise dominates, its steps become shorter, as 1/n.
+
+A pixel shows several texels, so the details of a texture bend the loss less than its coarse parts. Steps that suit the
+coarse parts are too short for details. In every iteration, a texture therefore moves by a sum of two steps. The fine
+part F x of a texture is x minus its mean over 3 x 3 texels.
+
+    x  <-  x - a + F a / 2 - F b
+
+a is the step above. b is the same step for the gradient F g, with moments, curvature, noise and a limit P of its own. A
+measurement of H displaces x by d z + F d w, with random signs w. Then H for a is as above, because the mean of F d w
+does not change it, and H for b is w_i F (g(x + d z + F d w) - g(x))_i / d. With the curvature h of a and the measured
+curvature k of b, a step of b divides by k + (0.2 h)² / k. Details that the images hardly show therefore stay. The factor
+1/2 leaves details to b, whose noise is limited. Fine steps start with the measurement in iteration 6. Before, the first
+large gradients would move details.
 
 `to_go` is a limit of the distance to the optimum. m_i contains only earlier samples, so the product g_i m_i has no bias
 from noise, and
@@ -69,8 +80,8 @@ DISPLACEMENT, NEWEST = 0.05, 0.75
 #: L and P as shares of the extent, and q.
 LONGEST, NEAR, SHORTER = 0.13, 0.07, 1.2
 #: P of fine steps, the share of the curvature h below which the images hardly show the fine part, and the number of
-#: steps before the first measurement of fine steps.
-NEAR_FINE, UNSEEN, EARLY = 0.0175, 0.2, 3
+#: iterations without fine steps.
+NEAR_FINE, UNSEEN, EARLY = 0.0175, 0.2, 4
 #: The limit of the distance uses this many iterations, and exceeds the largest of them by this factor.
 RECENT, SURE = 4, 1.5
 #: A mean square distance that is not known. A state on file has only finite numbers.
@@ -178,6 +189,7 @@ class Newton(Rule, dropt.Optimizer[Any]):
             rows = tuple(fine_part(row, self._shape) for row in rows)
             moments, bent = _observe(fine[0], rows, weights)
             bent = dr.select(bent > 0, bent + dr.square(UNSEEN * steepness) / bent, 0)
+            bent = dr.select(weights > 1 - MEMORY ** (EARLY - 0.5), bent, 0)
             detail, moments = _move(moments, bent, rows[0], weights, most, NEAR_FINE / NEAR * near)
             step, fine = step + fine_part(detail - 0.5 * step, self._shape), [moments]
         moved = grad, value, earlier, dr.lerp(1, weights, MEMORY), near, square, *squares[:-1]
@@ -199,9 +211,8 @@ class Newton(Rule, dropt.Optimizer[Any]):
         return -newest - MOMENTUM * np.array(self.state[key][3][0], dtype=np.float64).reshape(newest.shape)
 
     def has_fine(self, key: str) -> bool:
-        """Return True if a measurement now includes fine steps: those of a texture, after its first `EARLY` steps."""
-        levels, (_, _, _, weights, *_) = _parts(self.state[key][3])
-        return len(levels) == 2 and float(np.array(weights).ravel()[0]) > 1 - MEMORY ** (EARLY + 0.5)
+        """Return True for textures."""
+        return len(_parts(self.state[key][3])[0]) == 2
 
     def bend(self, key: str, change: Any, step: Any, fine_step: Any) -> None:
         """Take a measurement of H. `change` is the change of the gradient by a displacement of `step` and the fine part
