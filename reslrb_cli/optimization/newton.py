@@ -34,18 +34,16 @@ dim entries far from the optimum, and later steps would be too short to correct 
 n_i counts the iterations in which g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one
 direction, its steps keep their length. When it oscillates, or when noise dominates, its steps become shorter, as 1/n.
 
-A pixel shows several texels, so the details of a texture bend the loss less than its coarse parts. Steps that suit the
-coarse parts are too short for details. In every iteration, a texture therefore moves by a sum of two steps. The fine
-part F x of a texture is x minus its mean over 3 x 3 texels.
+A pixel shows several texels, so the details of a texture bend the loss less than its coarse parts. The steps above are
+too short for details. A texture therefore has fine steps too. Its fine part F x is x minus the mean over 3 x 3 texels.
 
     x  <-  x - a + F a / 2 - F b
 
-a is the step above. b is the same step for the gradient F g, with moments, curvature, noise and a limit P of its own. A
-measurement of H displaces x by d z + F d w, with random signs w. Then H for a is as above, because the mean of F d w
-does not change it, and H for b is w_i F (g(x + d z + F d w) - g(x))_i / d. With the curvature h of a and the measured
-curvature k of b, a step of b divides by k + (0.2 h)² / k. Details that the images hardly show therefore stay. The factor
-1/2 leaves details to b, whose noise is limited. Fine steps start with the measurement in iteration 6. Before, the first
-large gradients would move details.
+a is the step above. b is the same step for the gradient F g, with its own moments, curvature, noise and P. A
+measurement of H displaces x by d z + F d w, with random signs w. The mean of F d w is 0, so H for a stays as above. H
+for b is w_i F (g(x + d z + F d w) - g(x))_i / d. Let h be the curvature for a, and k for b. A step of b divides by
+k + (0.2 h)² / k in place of k, so details that the images hardly show stay. The factor 1/2 leaves details to b, where
+noise shortens steps more. Fine steps start after four iterations. The first large gradients would move details.
 
 `to_go` is a limit of the distance to the optimum. m_i contains only earlier samples, so the product g_i m_i has no bias
 from noise, and
@@ -177,20 +175,15 @@ class Newton(Rule, dropt.Optimizer[Any]):
 
     def _step(self, cache: Any, value: Any, grad: Any, lr: Any, extra: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
         (entries, *fine), (last, before, earlier, weights, _, *squares) = _parts(extra)
-        most = dr.opaque(dr.leaf_t(grad), lr)
-        near, rows = NEAR / LONGEST * most, (grad, grad - last, value - before)
-        entries, steepness = _observe(entries, rows, weights)
+        most, rows = dr.opaque(dr.leaf_t(grad), lr), (grad, grad - last, value - before)
+        near, ahead = NEAR / LONGEST * most, (1 - MOMENTUM) * entries.velocity
+        step, steepness, entries = _advance(entries, rows, weights, most, near)
         known = steepness > 0
         weight = total(dr.select(known, steepness, 0))
-        offsets = dr.select(known, grad * ((1 - MOMENTUM) * entries.velocity / steepness), 0)
-        square = dr.select(weight > 0, total(offsets) / weight, UNKNOWN)
-        step, entries = _move(entries, steepness, grad, weights, most, near)
+        square = dr.select(weight > 0, total(dr.select(known, grad * (ahead / steepness), 0)) / weight, UNKNOWN)
         if fine:
             rows = tuple(fine_part(row, self._shape) for row in rows)
-            moments, bent = _observe(fine[0], rows, weights)
-            bent = dr.select(bent > 0, bent + dr.square(UNSEEN * steepness) / bent, 0)
-            bent = dr.select(weights > 1 - MEMORY ** (EARLY - 0.5), bent, 0)
-            detail, moments = _move(moments, bent, rows[0], weights, most, NEAR_FINE / NEAR * near)
+            detail, _, moments = _advance(fine[0], rows, weights, most, NEAR_FINE / NEAR * near, steepness)
             step, fine = step + fine_part(detail - 0.5 * step, self._shape), [moments]
         moved = grad, value, earlier, dr.lerp(1, weights, MEMORY), near, square, *squares[:-1]
         return value - step, (*entries, *itertools.chain(*fine), *moved)
@@ -210,14 +203,11 @@ class Newton(Rule, dropt.Optimizer[Any]):
         newest = np.array(gradient, dtype=np.float64)
         return -newest - MOMENTUM * np.array(self.state[key][3][0], dtype=np.float64).reshape(newest.shape)
 
-    def has_fine(self, key: str) -> bool:
-        """Return True for textures."""
-        return len(_parts(self.state[key][3])[0]) == 2
-
     def bend(self, key: str, change: Any, step: Any, fine_step: Any) -> None:
-        """Take a measurement of H. `change` is the change of the gradient by a displacement of `step` and the fine part
-        of `fine_step`, which is None without fine steps. All are flat. Entries that are not finite keep their
-        curvature.
+        """Take a measurement of H. All arguments are flat.
+
+        `change` is the change of the gradient by a displacement of `step` plus the fine part of `fine_step`. Without
+        fine steps, `fine_step` is None. Entries that are not finite keep their curvature.
         """
         value, promoted, lr, extra = self.state[key]
         levels, (last, before, _, *others) = _parts(extra)
@@ -265,38 +255,38 @@ def _parts(extra: tuple[Any, ...]) -> tuple[list[Moments], tuple[Any, ...]]:
     return [Moments(*extra[at : at + width]) for at in range(0, others, width)], extra[others:]
 
 
-def _observe(moments: Moments, rows: tuple[Any, ...], weights: Any) -> tuple[Moments, Any]:
-    """Return the moments with one more gradient, and the curvature h.
+def _advance(
+    moments: Moments, rows: tuple[Any, ...], weights: Any, most: Any, near: Any, coarse: Any = None
+) -> tuple[Any, Any, Moments]:
+    """Return the step, the curvature, and the moments after one more gradient.
 
     `rows` are the gradient, its change and the change of the value since the last step. `weights` is the sum of the
-    weights in s and v before the step.
+    weights in s and v before the step, `most` is L, and `near` is P. Fine steps need the curvature h of the entries,
+    `coarse`.
     """
     grad, turned, moved = rows
-    size, spread = dr.lerp(dr.abs(grad), moments.size, MEMORY), _root_mean(grad, moments.spread, MEMORY)
-    steepness = _steepness(size, moments.bent)
+    velocity, size = moments.velocity, dr.lerp(dr.abs(grad), moments.size, MEMORY)
+    spread, steepness = _root_mean(grad, moments.spread, MEMORY), _steepness(size, moments.bent)
     surprise = math.sqrt(0.5) * (turned - steepness * moved)
     mean = dr.select(weights > 1.5 * (1 - MEMORY), _root_mean(surprise, moments.noise, FORGETTING), dr.abs(surprise))
     noise = dr.select(weights > 0, mean, 0)  # the first gradient has no predecessor
-    return moments._replace(size=size, spread=spread, noise=noise), steepness
-
-
-def _move(moments: Moments, steepness: Any, grad: Any, weights: Any, most: Any, near: Any) -> tuple[Any, Moments]:
-    """Return the step, and the moments with its m and n. `most` is L, and `near` is P."""
-    velocity, known = moments.velocity, steepness > 0
+    if coarse is not None:
+        started = (steepness > 0) & (weights > 1 - MEMORY ** (EARLY - 0.5))
+        steepness = dr.select(started, steepness + dr.square(UNSEEN * coarse) / steepness, 0)
+    known = steepness > 0
     turns = moments.turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
-    weights = dr.lerp(1, weights, MEMORY)
-    longest = most * dr.select(known, dr.square(moments.size / moments.spread) / weights, 1)
-    divisor = _divisor(steepness, turns, moments.noise, near)
+    longest = most * dr.select(known, dr.square(size / spread) / dr.lerp(1, weights, MEMORY), 1)
+    divisor = _divisor(steepness, turns, noise, near)
     reach = (1 - MOMENTUM) * longest * divisor
     velocity = MOMENTUM * velocity + dr.clip(grad, -reach, reach)
     step = dr.select(known, dr.clip(velocity / divisor, -longest, longest), 0)
-    return step, moments._replace(velocity=velocity, turns=turns)
+    return step, steepness, Moments(velocity, size, turns, moments.bent, spread, noise)
 
 
 def fine_part(texels: Any, shape: tuple[int, ...]) -> Any:
     """Return flat texels minus their means over 3 x 3 texels with binomial weights. `shape` is (H, W, channels).
 
-    The matrix of this linear map is symmetric.
+    The map is linear, and its matrix is symmetric.
     """
     H, W, channels = shape
     index = dr.int32_array_t(texels)(dr.arange(dr.uint32_array_t(texels), H * W * channels))

@@ -289,8 +289,8 @@ class Optimizer:
     @contextmanager
     def displaced(self, random: np.random.Generator) -> Iterator[None]:
         """Displace all entries of large parameters in the directions of their next steps, by equal amounts, and measure
-        the curvature for `auto`. Entries that do not move have random directions. The fine part of random directions
-        is added where fine steps are measured (`newton.py`).
+        the curvature for `auto`. Entries that do not move have random directions. A texture is also displaced by the
+        fine part of random directions (`newton.py`).
 
         Accumulate the gradient before, and within the block the gradient at the displaced values, with the same
         samples. Afterwards, values and gradients are as before.
@@ -308,7 +308,7 @@ class Optimizer:
             ahead = v + type(v)((signs * far).astype(np.float32))
             ahead = variable.clamp(dr.select(variable.clamp(ahead) == ahead, ahead, 2 * v - ahead))
             steps[key] = (ahead - v).array, None
-            if own.has_fine(key):
+            if len(dr.shape(v)) == 3:
                 fine = type(flat(v))((far * random.choice([-1.0, 1.0], size=signs.size)).astype(np.float32))
                 steps[key] = steps[key][0], fine
                 ahead = variable.clamp(ahead + type(v)(fine_part(fine, dr.shape(v)), dr.shape(v)))
