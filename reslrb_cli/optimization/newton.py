@@ -272,7 +272,8 @@ def _advance(
     noise = dr.select(weights > 0, mean, 0)  # the first gradient has no predecessor
     if coarse is not None:
         started = (steepness > 0) & (weights > 1 - MEMORY ** (EARLY - 0.5))
-        steepness = dr.select(started, steepness + dr.square(UNSEEN * coarse) / steepness, 0)
+        unseen = UNSEEN**2 * coarse * (coarse / steepness)  # squares of curvatures would underflow
+        steepness = dr.select(started, steepness + unseen, 0)
     known = steepness > 0
     turns = moments.turns + dr.select((grad < 0) & (velocity > 0) | (grad > 0) & (velocity < 0), 1, 0)
     longest = most * dr.select(known, dr.square(size / spread) / dr.lerp(1, weights, MEMORY), 1)

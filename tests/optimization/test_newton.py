@@ -414,6 +414,8 @@ def test_fine_steps_reach_details_that_blurred_images_show_weakly():
     best = np.random.default_rng(1).choice([0.3, 0.7], size=144)
     seen = np.eye(144) - 0.7 * fine_matrix(12, 12)
     errors = [fine_errors(descend(seen, best, 0.02, shape), best) for shape in ((12, 12, 1), (144,))]
+    tiny = fine_errors(descend(1e-13 * seen, best, 0.02e-13, (12, 12, 1)), best)
+    np.testing.assert_allclose(tiny, errors[0], rtol=1e-3)  # squares of these curvatures would underflow
     assert errors[0][-1] < 0.6 * errors[1][-1]
 
 
