@@ -184,7 +184,8 @@ class Newton(Rule, dropt.Optimizer[Any]):
         if fine:
             rows = tuple(fine_part(row, self._shape) for row in rows)
             detail, _, moments = _advance(fine[0], rows, weights, most, NEAR_FINE / NEAR * near, steepness)
-            step, fine = step + fine_part(detail - 0.5 * step, self._shape), [moments]
+            step = dr.select(known, step + fine_part(detail - 0.5 * step, self._shape), 0)
+            fine = [moments]
         moved = grad, value, earlier, dr.lerp(1, weights, MEMORY), near, square, *squares[:-1]
         return value - step, (*entries, *itertools.chain(*fine), *moved)
 
@@ -218,12 +219,8 @@ class Newton(Rule, dropt.Optimizer[Any]):
             bent = dr.select(dr.all(flat(bent) == 0), curvature, dr.lerp(bent, curvature, NEWEST))
             dr.make_opaque(bent)
             levels[at] = levels[at]._replace(bent=bent)
-        self.state[key] = (
-            value,
-            promoted,
-            lr,
-            (*itertools.chain(*levels), last, before, dr.detach(value).array, *others),
-        )
+        kept = *itertools.chain(*levels), last, before, dr.detach(value).array, *others
+        self.state[key] = value, promoted, lr, kept
 
     def steepness(self, key: str) -> np.ndarray[Any, Any]:
         (entries, *_), (_, _, _, _, near, *_) = _parts(self.state[key][3])

@@ -429,6 +429,15 @@ def test_fine_steps_leave_details_alone_that_no_image_shows():
     assert moved[0] < 1.1 * moved[1]
 
 
+def test_texels_that_no_image_shows_stay_beside_those_that_move():
+    best = np.random.default_rng(1).choice([0.3, 0.7], size=144)
+    seen = np.eye(144) - 0.7 * fine_matrix(12, 12)
+    seen[:, :24] = 0
+    last = descend(seen, best, 0.02, (12, 12, 1))[-1]
+    assert (last[:24] == 0.5).all()
+    assert (last[24:] != 0.5).all()
+
+
 def test_noise_shortens_fine_steps():
     """The noise of an image would move details by several times their size."""
     best = np.full(144, 0.5)
