@@ -34,8 +34,9 @@ dim entries far from the optimum, and later steps would be too short to correct 
 n_i counts the iterations in which g_i and m_i have opposite signs (Kesten 1958). As long as an entry moves in one
 direction, its steps keep their length. When it oscillates, or when noise dominates, its steps become shorter, as 1/n.
 
-A pixel shows several texels, so the details of a texture bend the loss less than its coarse parts. The steps above are
-too short for details. A texture therefore has fine steps too. Its fine part F x is x minus the mean over 3 x 3 texels.
+A pixel shows several texels, so the curvature of the loss is smaller for the details of a texture than for its coarse
+parts. The steps above are too short for details. A texture therefore has fine steps too. Its fine part F x is x minus
+the mean over 3 x 3 texels.
 
     x  <-  x - a + F a / 2 - F b
 
@@ -43,7 +44,8 @@ a is the step above. b is the same step for the gradient F g, with its own momen
 measurement of H displaces x by d z + F d w, with random signs w. The mean of F d w is 0, so H for a stays as above. H
 for b is w_i F (g(x + d z + F d w) - g(x))_i / d. Let h be the curvature for a, and k for b. A step of b divides by
 k + (0.2 h)² / k in place of k, so details that the images hardly show stay. The factor 1/2 leaves details to b, where
-noise shortens steps more. Fine steps start after four iterations. The first large gradients would move details.
+noise shortens steps more. Fine steps start after four iterations, because the first large gradients would move details
+by too much.
 
 `to_go` is a limit of the distance to the optimum. m_i contains only earlier samples, so the product g_i m_i has no bias
 from noise, and
