@@ -44,8 +44,11 @@ from reslrb_cli.statistics import Array
 NOISE, SHRINK = 0.3, 0.25
 #: Standard errors from the estimate to a limit that holds with a probability of 85 %.
 SURE = 1.04
-#: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, and v.
-FIELDS = 8
+#: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, v, and the
+#: standard error of the smallest eigenvalue of H.
+FIELDS = 9
+#: Largest ratio of the errors of a measurement of H and of the last one.
+WORSE = 4.0
 
 
 @dataclass(frozen=True)
@@ -84,9 +87,22 @@ class Block:
         self.rows: Array = np.zeros((M, FIELDS + M), np.float32)
         self.rows[:, 5] = np.inf
 
-    def bend(self, curvature: Array) -> None:
-        """Take a measurement of H (M, M)."""
-        self.rows = np.concatenate([self.rows[:, :FIELDS], curvature], axis=1, dtype=np.float32)
+    def bend(self, curvature: Array, error: float = 0.0) -> None:
+        """Take a measurement of H (M, M). `error` is the standard error of its smallest eigenvalue, in units in which
+        the diagonal of H is 1.
+
+        A few bright samples can make this error a hundred times as large as usual. The smallest eigenvalue, which is
+        raised to its error, would then be much too large, and the run would end far from the optimum. The measurement
+        is therefore left out if its error is more than `WORSE` times that of the last measurement. Each measurement
+        that is left out doubles the limit for the next one.
+        """
+        rows = self.rows.copy()
+        if error > WORSE * rows[0, 8] > 0:
+            rows[:, 8] *= 2
+        else:
+            rows[:, 8] = error
+            rows[:, FIELDS:] = curvature
+        self.rows = rows
 
     def distrust(self) -> None:
         """Halve the number n of gradients in the mean, which is at least 1."""
@@ -120,7 +136,7 @@ class Block:
         K = positive(np.where(np.outer(use, use), H / np.outer(root, root), 0.0))
         mean_g, mean_x, last_g, last_x, last_step = rows[:, :5].T
         y, x = np.where(use, now.gradient / root, 0.0), now.value * root
-        last, variance = rows[0, 6:FIELDS]
+        last, variance = rows[0, 6:8]
         n = last + 1 if now.gradient @ last_step > 0 else max(1.0, last - SHRINK)
         reach = float(np.mean(np.square(root * now.longest)[use]))
         most = max(reach, n * variance)
@@ -140,7 +156,7 @@ class Block:
         distance = np.abs(step) + SURE * error
         # The first gradient has no predecessor, so it says nothing about the noise.
         fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0]
-        rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
+        rows[:, : FIELDS - 1] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
         change = np.clip(step, -now.longest, now.longest)
         if (tied := now.exposure >= 0).any():
             du = change[now.exposure[tied]]

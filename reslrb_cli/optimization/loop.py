@@ -177,9 +177,9 @@ def measure_block(problem: Problem, iteration: int) -> None:
     # A texture has no entries, but channels.
     at = np.array([block.at[each.key].start + (each.entry or each.channel or 0) for each in directions])
     slopes = np.concatenate([optimizer.slopes(key) for key in block.at])
-    whole = np.zeros((len(slopes), len(slopes)))
-    whole[np.ix_(at, at)] = curvature.for_steps(directions) * np.outer(slopes[at], slopes[at])
-    block.bend(np.nan_to_num(whole))
+    whole, (found, error) = np.zeros((len(slopes), len(slopes))), curvature.for_steps(directions)
+    whole[np.ix_(at, at)] = found * np.outer(slopes[at], slopes[at])
+    block.bend(np.nan_to_num(whole), error)
     problem.apply()
 
 

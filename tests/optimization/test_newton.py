@@ -456,6 +456,15 @@ def test_one_noisy_measurement_does_not_set_the_curvature_of_a_dim_texel():
     np.testing.assert_allclose(found, 2 * size, rtol=0.05)
 
 
+def test_measurements_that_are_much_noisier_than_the_last_are_left_out():
+    """The limit is four times the last error, and doubles with each measurement that is left out."""
+    block, taken = Block({"p": 2}), []
+    for number, error in enumerate((0.01, 0.9, 0.02, 0.1, 0.1, 0.001), start=1):
+        block.bend(number * np.eye(2), error)
+        taken.append(int(block.steepness("p")[0]))
+    assert taken == [1, 1, 3, 3, 5, 6]
+
+
 def test_a_noisy_curvature_does_not_lead_to_long_steps():
     """Three directions change 2,000 pixels almost alike, so two eigenvalues are smaller than their noise."""
     random, common = np.random.default_rng(3), np.random.default_rng(2).normal(size=2000)
@@ -464,13 +473,13 @@ def test_a_noisy_curvature_does_not_lead_to_long_steps():
     least = []
     for _ in range(50):
         a, b = (slopes + 0.3 * random.normal(size=slopes.shape) for _ in range(2))
-        found = raise_eigenvalues(a, b, np.zeros((3, 3)))
+        found, _ = raise_eigenvalues(a, b, np.zeros((3, 3)))
         least.append(np.linalg.eigvalsh(found)[0])
         np.testing.assert_allclose(found, true, rtol=0.15)
     assert min(least) > 3  # about the noise, 0.09 sqrt(2000)
     assert max(least) < 50
     certain = np.diag([0.0, 0.0, 1e5])
-    np.testing.assert_allclose(raise_eigenvalues(slopes, slopes, certain), true + certain, rtol=0.02)
+    np.testing.assert_allclose(raise_eigenvalues(slopes, slopes, certain)[0], true + certain, rtol=0.02)
 
 
 def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):

@@ -310,8 +310,10 @@ class LossCurvature:
         a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
         return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
 
-    def for_steps(self, directions: Sequence[ParameterDirection]) -> Array:
-        """Return H (M, M) along the directions of `along`, with eigenvalues of at least their standard errors."""
+    def for_steps(self, directions: Sequence[ParameterDirection]) -> tuple[Array, float]:
+        """Return H (M, M) along the directions of `along`, with eigenvalues of at least their standard errors, and the
+        standard error of the smallest eigenvalue (`raise_eigenvalues`).
+        """
         return raise_eigenvalues(*self.slopes, self._of_regularizers(directions))
 
     def _of_regularizers(self, directions: Sequence[ParameterDirection]) -> Array:
@@ -477,9 +479,10 @@ def _of_channel(image: Array, channel: int | None) -> Array:
     return np.asarray(np.where(np.arange(image.shape[2]) == channel, image, 0.0))
 
 
-def raise_eigenvalues(a: Array, b: Array, certain: Array) -> Array:
-    """Return the sum of a bᵀ and `certain` (M, M), with eigenvalues of at least their standard errors. The eigenvalues
-    are those in units in which the diagonal is 1. The columns of a and b (M, N) are independent samples.
+def raise_eigenvalues(a: Array, b: Array, certain: Array) -> tuple[Array, float]:
+    """Return the sum of a bᵀ and `certain` (M, M), with eigenvalues of at least their standard errors, and the
+    standard error of the smallest eigenvalue. The eigenvalues are those in units in which the diagonal is 1. The
+    columns of a and b (M, N) are independent samples.
 
     Noise may exceed a small eigenvalue. Steps in its direction would be too long if the result is small, and would stop
     if it is negative.
@@ -489,7 +492,7 @@ def raise_eigenvalues(a: Array, b: Array, certain: Array) -> Array:
     root = np.sqrt(np.where(size > 0, size, 1.0))[:, None]
     values, vectors = np.linalg.eigh(H / (root @ root.T))
     errors = np.sqrt(np.square((vectors.T @ (a / root)) * (vectors.T @ (b / root))).sum(axis=1))
-    return np.asarray((vectors * np.maximum(values, errors)) @ vectors.T * (root @ root.T))
+    return np.asarray((vectors * np.maximum(values, errors)) @ vectors.T * (root @ root.T)), float(errors[0])
 
 
 def _sure_share(terms: Array) -> Array:
