@@ -181,8 +181,8 @@ class Newton(Rule, dropt.Optimizer[Any]):
         near, ahead = NEAR / LONGEST * most, (1 - MOMENTUM) * entries.velocity
         step, steepness, entries = _advance(entries, rows, weights, most, near)
         known = steepness > 0
-        weight = total(dr.select(known, steepness, 0))
-        square = dr.select(weight > 0, total(dr.select(known, grad * (ahead / steepness), 0)) / weight, UNKNOWN)
+        weight = dr.sum(dr.select(known, steepness, 0))
+        square = dr.select(weight > 0, dr.sum(dr.select(known, grad * (ahead / steepness), 0)) / weight, UNKNOWN)
         if fine:
             rows = tuple(fine_part(row, self._shape) for row in rows)
             detail, _, moments = _advance(fine[0], rows, weights, most, NEAR_FINE / NEAR * near, steepness)
@@ -327,8 +327,3 @@ def _root_mean(grad: Any, spread: Any, memory: float) -> Any:
     largest = dr.maximum(dr.abs(grad), spread)
     root = largest * dr.sqrt(dr.lerp(dr.square(grad / largest), dr.square(spread / largest), memory))
     return dr.select(largest > 0, root, 0)
-
-
-def total(value: Any) -> Any:
-    """Return the sum of all entries, of width 1."""
-    return dr.sum(flat(value))
