@@ -94,7 +94,7 @@ class Block:
         A few bright samples can make this error a hundred times as large as usual. The smallest eigenvalue, which is
         raised to its error, would then be much too large, and the run would end far from the optimum. The measurement
         is therefore left out if its error is more than `WORSE` times that of the last measurement. Each measurement
-        that is left out doubles the limit for the next one.
+        that is left out doubles the limit for the next one. A measurement without an `error` is always taken.
         """
         rows = self.rows.copy()
         if error > WORSE * rows[0, 8] > 0:
