@@ -47,7 +47,7 @@ SURE = 1.04
 #: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, v, and the
 #: standard error of the smallest eigenvalue of H.
 FIELDS = 9
-#: Largest ratio of the errors of a measurement of H and of the last one.
+#: Largest ratio of the error of a measurement of H to the error of the last one.
 WORSE = 4.0
 
 
@@ -155,8 +155,8 @@ class Block:
         error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
         distance = np.abs(step) + SURE * error
         # The first gradient has no predecessor, so it says nothing about the noise.
-        fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0]
-        rows[:, : FIELDS - 1] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
+        fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0, rows[0, 8]]
+        rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
         change = np.clip(step, -now.longest, now.longest)
         if (tied := now.exposure >= 0).any():
             du = change[now.exposure[tied]]

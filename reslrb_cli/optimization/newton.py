@@ -43,9 +43,9 @@ the mean over 3 x 3 texels.
 a is the step above. b is the same step for the gradient F g, with its own moments, curvature, noise and P. A
 measurement of H displaces x by d z + F d w, with random signs w. The mean of F d w is 0, so H for a stays as above. H
 for b is w_i F (g(x + d z + F d w) - g(x))_i / d. Let h be the curvature for a, and k for b. A step of b divides by
-k + (0.2 h)² / k in place of k, so details that the images hardly show stay. The factor 1/2 leaves details to b, where
-noise shortens steps more. Fine steps start after four iterations, because the first large gradients would move details
-by too much.
+k + (0.2 h)² / k in place of k. Details therefore hardly move if the images hardly show them. a moves details by half,
+because noise shortens the steps b more. Fine steps start after four iterations. Before, large gradients would move
+details by too much.
 
 `to_go` is a limit of the distance to the optimum. m_i contains only earlier samples, so the product g_i m_i has no bias
 from noise, and
@@ -79,7 +79,7 @@ CLASSES, OCTAVE, SHARE = 128, 4, 0.02
 DISPLACEMENT, NEWEST = 0.05, 0.75
 #: L and P as shares of the extent, and q.
 LONGEST, NEAR, SHORTER = 0.13, 0.07, 1.2
-#: P of fine steps, the share of the curvature h below which the images hardly show the fine part, and the number of
+#: P of fine steps, the ratio k / h of curvatures below which the images hardly show details, and the number of
 #: iterations without fine steps.
 NEAR_FINE, UNSEEN, EARLY = 0.0175, 0.2, 4
 #: The limit of the distance uses this many iterations, and exceeds the largest of them by this factor.
@@ -185,7 +185,7 @@ class Newton(Rule, dropt.Optimizer[Any]):
         square = dr.select(weight > 0, dr.sum(dr.select(known, grad * (ahead / steepness), 0)) / weight, UNKNOWN)
         if fine:
             rows = tuple(fine_part(row, self._shape) for row in rows)
-            detail, _, moments = _advance(fine[0], rows, weights, most, NEAR_FINE / NEAR * near, steepness)
+            detail, _, moments = _advance(fine[0], rows, weights, most, NEAR_FINE / LONGEST * most, steepness)
             step = dr.select(known, step + fine_part(detail - 0.5 * step, self._shape), 0)
             fine = [moments]
         moved = grad, value, earlier, dr.lerp(1, weights, MEMORY), near, square, *squares[:-1]

@@ -307,11 +307,11 @@ class Optimizer:
             signs, far = np.where(toward != 0, np.sign(toward), signs), DISPLACEMENT * self.extent(key)
             ahead = v + type(v)((signs * far).astype(np.float32))
             ahead = variable.clamp(dr.select(variable.clamp(ahead) == ahead, ahead, 2 * v - ahead))
-            steps[key] = (ahead - v).array, None
+            step, fine = (ahead - v).array, None
             if len(dr.shape(v)) == 3:
-                fine = type(flat(v))((far * random.choice([-1.0, 1.0], size=signs.size)).astype(np.float32))
-                steps[key] = steps[key][0], fine
+                fine = type(step)((far * random.choice([-1.0, 1.0], size=signs.size)).astype(np.float32))
                 ahead = variable.clamp(ahead + type(v)(fine_part(fine, dr.shape(v)), dr.shape(v)))
+            steps[key] = step, fine
             dr.eval(ahead, steps[key])
             self.set_value(key, variable.to_scene(ahead))
         yield

@@ -43,13 +43,19 @@ def make(values, bounds=(0.0, 1.0), transforms=None) -> Optimizer:
     return Optimizer("auto", 1.0, {}, tensors, same, dict.fromkeys(tensors, bounds), transforms)
 
 
+def accumulate(optimizer, key, gradient):
+    """Add a gradient, with the number of entries of the parameter, to the accumulated gradient."""
+    given = mi.TensorXf(np.reshape(gradient, dr.shape(optimizer[key])).astype(np.float32))
+    dr.backward(dr.sum(flat(optimizer[key]) * given.array))
+
+
 def pull(optimizer, losses):
     """Accumulate the gradients of `losses` at the current values, and return them."""
     found = {}
     for key, (curvature, best) in losses.items():
         optimizer.clear_gradient(key)
         gradient = curvature * (np.array(optimizer[key], dtype=np.float64) - best)
-        dr.backward(dr.sum(optimizer[key] * mi.TensorXf(gradient.astype(np.float32)), axis=None))
+        accumulate(optimizer, key, gradient)
         found[key] = gradient
     return found
 
@@ -76,7 +82,7 @@ def test_updates_follow_the_formula():
         if iteration == 0:
             measure(optimizer, {"p": loss})
         noise = random.normal(size=best.shape) * [0.3, 0.0, 0.1, 1.0, 0.0, 0.5]
-        dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(noise.astype(np.float32)), axis=None))
+        accumulate(optimizer, "p", noise)
         g = np.array(optimizer.gradient("p"), dtype=np.float64)
         optimizer.step(1.0)
         s, v = 0.99 * s + 0.01 * np.abs(g), 0.99 * v + 0.01 * g**2
@@ -147,7 +153,7 @@ def test_the_curvature_of_texels_that_share_a_pixel_is_that_of_moving_together()
     def pull_all():
         optimizer.clear_gradient("p")
         gradient = shared @ (np.array(optimizer["p"], dtype=np.float64) - 0.6)
-        dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(gradient.astype(np.float32)), axis=None))
+        accumulate(optimizer, "p", gradient)
 
     pull_all()
     with optimizer.displaced(np.random.default_rng(0)):
@@ -256,8 +262,7 @@ def pull_exposed(optimizer: Optimizer) -> np.ndarray:
     by_exposure = off[0] @ once / E + off[1] @ twice / E
     for key, gradient in (("exposure", by_exposure), ("floor", by_texel)):
         optimizer.clear_gradient(key)
-        weight = mi.TensorXf(np.reshape(gradient, dr.shape(optimizer[key])).astype(np.float32))
-        dr.backward(dr.sum(flat(optimizer[key]) * weight.array))
+        accumulate(optimizer, key, gradient)
     return np.stack([np.concatenate([once, twice]), np.concatenate([once, 2 * twice])], axis=1)
 
 
@@ -306,7 +311,7 @@ def test_noise_shortens_the_steps_and_a_steady_pull_does_not():
         before = np.array(optimizer["p"], dtype=np.float64)
         gradient = np.where(np.arange(6) < 3, random.choice([-1.0, 1.0], size=6), 1.0)
         optimizer.clear_gradient("p")
-        dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(gradient.astype(np.float32)), axis=None))
+        accumulate(optimizer, "p", gradient)
         optimizer.step(1.0)
         lengths.append(np.abs(np.array(optimizer["p"]) - before))
     turns = np.array(optimizer.moments()["p"]["2"], dtype=np.float64).ravel()
@@ -340,8 +345,7 @@ def test_skewed_noise_leaves_no_bias():
         pull(optimizer, {"p": loss})
         if iteration == 0:
             measure(optimizer, {"p": loss})
-        noise = np.where(random.random(60) < 0.1, -0.9, 0.1).astype(np.float32)
-        dr.backward(dr.sum(optimizer["p"] * mi.TensorXf(noise), axis=None))
+        accumulate(optimizer, "p", np.where(random.random(60) < 0.1, -0.9, 0.1))
         optimizer.step(1.0)
     assert np.array(optimizer["p"]).mean() == pytest.approx(0.5, abs=0.005)
 
@@ -358,22 +362,26 @@ def fine_matrix(H, W):
     return np.eye(H * W) - np.kron(blur(H), blur(W))
 
 
+#: Texels with details, the matrix of their fine part, and that of images whose pixels blur them.
+DETAILS, FINE = np.random.default_rng(1).choice([0.3, 0.7], size=144), fine_matrix(12, 12)
+BLURRED = np.eye(144) - 0.7 * FINE
+#: Shapes of the parameter with and without fine steps.
+SHAPES = (12, 12, 1), (144,)
+
+
 def test_the_fine_part_of_texels():
     H, W, channels = 5, 4, 3
     texels = np.random.default_rng(0).normal(size=(H, W, channels)).astype(np.float32)
     found = np.array(fine_part(mi.Float(texels.ravel()), (H, W, channels))).reshape(H * W, channels)
     np.testing.assert_allclose(found, fine_matrix(H, W) @ texels.reshape(H * W, channels), atol=1e-6)
-    flat = np.array(fine_part(mi.Float(np.full(20, 0.7)), (5, 4, 1)))
-    np.testing.assert_allclose(flat, 0, atol=1e-6)
+    np.testing.assert_allclose(np.array(fine_part(mi.Float(np.full(20, 0.7)), (5, 4, 1))), 0, atol=1e-6)
 
 
 def pull_images(optimizer, seen, best, error=0.0):
     """Accumulate the gradient of the loss |seen (x - best) + error|^2 / 2."""
-    x = np.array(optimizer["p"], dtype=np.float64)
-    gradient = seen.T @ (seen @ (x.ravel() - best) + error)
+    x = np.array(optimizer["p"], dtype=np.float64).ravel()
     optimizer.clear_gradient("p")
-    given = mi.TensorXf(gradient.astype(np.float32).reshape(x.shape))
-    dr.backward(dr.sum(optimizer["p"] * given, axis=None))
+    accumulate(optimizer, "p", seen.T @ (seen @ (x - best) + error))
 
 
 def descend(seen, best, noise, shape, iterations=40):
@@ -392,48 +400,41 @@ def descend(seen, best, noise, shape, iterations=40):
 
 def test_a_measurement_shows_the_curvature_of_the_fine_part():
     """The mean over the texels is the mean of the diagonal of F S'S F. F is the fine part, and S shows the images."""
-    F = fine_matrix(12, 12)
-    seen, best, found = np.eye(144) - 0.7 * F, np.full(144, 0.45), []
-    optimizer = make({"p": np.full((12, 12, 1), 0.5)})
+    best, found, optimizer = np.full(144, 0.45), [], make({"p": np.full((12, 12, 1), 0.5)})
     for _ in range(4):
-        pull_images(optimizer, seen, best)
+        pull_images(optimizer, BLURRED, best)
         optimizer.step(1.0)
     for seed in range(40):
         with optimizer.displaced(np.random.default_rng(seed)):
-            pull_images(optimizer, seen, best)
+            pull_images(optimizer, BLURRED, best)
         found.append(np.array(optimizer.moments()["p"]["9"]).mean())
-    assert np.mean(found) == pytest.approx(np.trace(F @ seen.T @ seen @ F) / 144, rel=0.05)
+    assert np.mean(found) == pytest.approx(np.trace(FINE @ BLURRED.T @ BLURRED @ FINE) / 144, rel=0.05)
 
 
 def fine_errors(values, best):
-    return np.sqrt(np.mean(np.square((values - best) @ fine_matrix(12, 12)), axis=1))
+    return np.sqrt(np.mean(np.square((values - best) @ FINE), axis=1))
 
 
 def test_fine_steps_reach_details_that_blurred_images_show_weakly():
     """The pixels are means of 3 x 3 texels. Without fine steps, the same texels have one dimension."""
-    best = np.random.default_rng(1).choice([0.3, 0.7], size=144)
-    seen = np.eye(144) - 0.7 * fine_matrix(12, 12)
-    errors = [fine_errors(descend(seen, best, 0.02, shape), best) for shape in ((12, 12, 1), (144,))]
-    tiny = fine_errors(descend(1e-13 * seen, best, 0.02e-13, (12, 12, 1)), best)
+    errors = [fine_errors(descend(BLURRED, DETAILS, 0.02, shape), DETAILS) for shape in SHAPES]
+    tiny = fine_errors(descend(1e-13 * BLURRED, DETAILS, 0.02e-13, SHAPES[0]), DETAILS)
     np.testing.assert_allclose(tiny, errors[0], rtol=1e-3)  # squares of these curvatures would underflow
     assert errors[0][-1] < 0.6 * errors[1][-1]
 
 
 def test_fine_steps_leave_details_alone_that_no_image_shows():
-    best = np.random.default_rng(1).choice([0.3, 0.7], size=144)
-    seen = np.eye(144) - fine_matrix(12, 12)
+    seen = np.eye(144) - FINE
     for _ in range(3):
         seen = seen @ seen  # a wide blur
-    with_fine, without = (descend(seen, best, 0.02, shape)[-1] for shape in ((12, 12, 1), (144,)))
-    moved = [np.std(fine_matrix(12, 12) @ (values - 0.5)) for values in (with_fine, without)]
+    with_fine, without = (descend(seen, DETAILS, 0.02, shape)[-1] for shape in SHAPES)
+    moved = [np.std(FINE @ (values - 0.5)) for values in (with_fine, without)]
     assert moved[0] < 1.1 * moved[1]
 
 
 def test_texels_that_no_image_shows_stay_beside_those_that_move():
-    best = np.random.default_rng(1).choice([0.3, 0.7], size=144)
-    seen = np.eye(144) - 0.7 * fine_matrix(12, 12)
-    seen[:, :24] = 0
-    last = descend(seen, best, 0.02, (12, 12, 1))[-1]
+    seen = BLURRED * (np.arange(144) >= 24)
+    last = descend(seen, DETAILS, 0.02, SHAPES[0])[-1]
     assert (last[:24] == 0.5).all()
     assert (last[24:] != 0.5).all()
 
@@ -441,8 +442,7 @@ def test_texels_that_no_image_shows_stay_beside_those_that_move():
 def test_noise_shortens_fine_steps():
     """The noise of an image would move details by several times their size."""
     best = np.full(144, 0.5)
-    seen = np.eye(144) - 0.7 * fine_matrix(12, 12)
-    with_fine, without = (fine_errors(descend(seen, best, 0.3, shape), best)[-1] for shape in ((12, 12, 1), (144,)))
+    with_fine, without = (fine_errors(descend(BLURRED, best, 0.3, shape), best)[-1] for shape in SHAPES)
     assert with_fine < without
 
 
