@@ -91,7 +91,7 @@ class Block:
         """Take a measurement of H (M, M). `error` is the standard error of its smallest eigenvalue, in units in which
         the diagonal of H is 1.
 
-        A few bright samples can make this error a hundred times as large as usual. The smallest eigenvalue, which is
+        A few bright samples can make this error much larger than usual. The smallest eigenvalue, which is
         raised to its error, would then be much too large, and the run would end far from the optimum. The measurement
         is therefore left out if its error is more than `WORSE` times that of the last measurement. Each measurement
         that is left out doubles the limit for the next one. A measurement without an `error` is always taken.
