@@ -69,7 +69,7 @@ def test_the_loss_reveals_correlated_samples(folder: Path) -> None:
 
 
 def test_a_too_small_budget_is_reported(folder: Path) -> None:
-    code, out, err = outcome("convergence", "tiny.yaml", "--budget", "1", "--integrators", "reslrb:stack")
+    code, out, err = outcome("convergence", "tiny.yaml", "--budget", "0.001", "--integrators", "reslrb:stack")
     assert (code, "Traceback" in err) == (1, False)
     assert "dL/dI was not computed: the budget was spent; allow more with --budget" in out
 
