@@ -64,7 +64,7 @@ class OpenedRun:
 
     @property
     def has_stopped(self) -> bool:
-        """True if `run.max_seconds` ended the run, and is unchanged."""
+        """True if the run ended before its last iteration, and `run.max_seconds` is unchanged."""
         return bool(self.stored.read(State).stopped) and "run.max_seconds" not in self.changed
 
     def done_line(self, option: str, equals: str) -> str:
