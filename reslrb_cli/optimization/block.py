@@ -1,8 +1,8 @@
 """Joint steps of the entries of all small parameters (`optimizer: auto`).
 
 Colours that light each other, a lamp and the surfaces that it lights, and an exposure compensate for each other. Their
-curvature H is therefore measured as a whole, by differences of images (`loop.measure_block`). Motions take part,
-because differences of images contain silhouettes and shadows. Near the optimum x*, a gradient is
+curvature H is therefore measured as a whole, by differences of images (`loop.measure_block`), until its error is small.
+Motions take part, because differences of images contain silhouettes and shadows. Near the optimum x*, a gradient is
 g = H (x - x*) + noise. With the means of the last n gradients and of their values, a step is
 
     y = mean g - H (mean x - x),   x <- x - (n H² + s v C^-1)^-1 n H y
@@ -44,11 +44,12 @@ from reslrb_cli.statistics import Array
 NOISE, SHRINK = 0.3, 0.25
 #: Standard errors from the estimate to a limit that holds with a probability of 85 %.
 SURE = 1.04
-#: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, v, and the
-#: standard error of the smallest eigenvalue of H.
-FIELDS = 9
-#: Largest ratio of the error of a measurement of H to the error of the last one.
-WORSE = 4.0
+#: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, v, the
+#: standard error of the smallest eigenvalue of H, and the change since the last measurement of H in longest steps.
+FIELDS = 10
+#: Error of H that one longest step adds, and largest error of an H that needs no further measurement, as a share of its
+#: smallest eigenvalue.
+SHIFT, KNOWN = 0.25, 0.25
 
 
 @dataclass(frozen=True)
@@ -91,18 +92,35 @@ class Block:
         """Take a measurement of H (M, M). `error` is the standard error of its smallest eigenvalue, in units in which
         the diagonal of H is 1.
 
-        A few bright samples can make this error much larger than usual. The smallest eigenvalue, which is
-        raised to its error, would then be much too large, and the run would end far from the optimum. The measurement
-        is therefore left out if its error is more than `WORSE` times that of the last measurement. Each measurement
-        that is left out doubles the limit for the next one. A measurement without an `error` is always taken.
+        H is the mean of all measurements, weighted by their errors. The error of the earlier ones rises as the values
+        change. A measurement with a few bright samples has a large error, so it hardly counts. A measurement without
+        an `error` replaces all earlier ones.
         """
         rows = self.rows.copy()
-        if error > WORSE * rows[0, 8] > 0:
-            rows[:, 8] *= 2
-        else:
-            rows[:, 8] = error
-            rows[:, FIELDS:] = curvature
+        before = self.doubt
+        share = before**2 / (before**2 + error**2) if error > 0 and before < np.inf else 1.0
+        rows[:, FIELDS:] += share * (curvature - rows[:, FIELDS:])
+        rows[:, 8], rows[:, 9] = np.sqrt(share) * error, 0.0
         self.rows = rows
+
+    @property
+    def doubt(self) -> float:
+        """Standard error of the smallest eigenvalue of H at the current values, in units in which the diagonal of H is
+        1. It is infinite without a measurement.
+        """
+        if not self.rows[:, FIELDS:].any():
+            return np.inf
+        return float(np.hypot(self.rows[0, 8], SHIFT * np.abs(self.rows[:, 9]).max()))
+
+    @property
+    def is_known(self) -> bool:
+        """True if a further measurement of H would hardly change the steps."""
+        H = self.rows[:, FIELDS:].astype(np.float64)
+        use = np.diag(H) > 0
+        if not use.any() or not self.rows[0, 8] > 0:
+            return False
+        root = np.sqrt(np.diag(H)[use])
+        return bool(self.doubt <= KNOWN * np.linalg.eigvalsh(H[np.ix_(use, use)] / np.outer(root, root))[0])
 
     def distrust(self) -> None:
         """Halve the number n of gradients in the mean, which is at least 1."""
@@ -155,9 +173,10 @@ class Block:
         error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
         distance = np.abs(step) + SURE * error
         # The first gradient has no predecessor, so it says nothing about the noise.
-        fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0, rows[0, 8]]
-        rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in fields], axis=1)
         change = np.clip(step, -now.longest, now.longest)
+        shifted = rows[:, 9] + change / np.where(now.longest > 0, now.longest, 1.0)
+        fields = [mean_g, mean_x, now.gradient, now.value, step, distance, n, variance if last > 0 else 0.0, rows[0, 8]]
+        rows[:, :FIELDS] = np.stack([np.broadcast_to(field, x.shape) for field in (*fields, shifted)], axis=1)
         if (tied := now.exposure >= 0).any():
             du = change[now.exposure[tied]]
             colour = now.value[tied]

@@ -166,6 +166,8 @@ def is_due(iteration: int, cost: float = 0.0) -> bool:
 def measure_block(problem: Problem, iteration: int) -> None:
     """Measure the joint curvature of all small parameters for `auto` by differences of images, if its samples fit."""
     optimizer, block = problem.optimizer, problem.optimizer.block
+    if block.is_known:
+        return
     scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
               else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
     changes, part = plan_changes(problem, scales, DISPLACEMENT), part_of_samples(problem)

@@ -236,10 +236,10 @@ def key_of(part: str, values: Mapping[str, np.ndarray]) -> str:
 
 def test_errors_of_a_box_are_as_large_as_their_spreads(tmp_path: Path) -> None:
     """If 1 % of the light was missing, because paths were too short, all colours would be too bright by more than their
-    spread.
+    spread. The errors of one box are alike: with 8 boxes, the result is between 0.74 and 0.93 by chance.
     """
     ratios = []
-    for seed in range(8):
+    for seed in range(24):
         folder = tmp_path / str(seed)
         folder.mkdir()
         colours = write_box(folder, seed)

@@ -19,7 +19,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.block import Block
+from reslrb_cli.optimization.block import SHIFT, Block, JointState
 from reslrb_cli.optimization.newton import GAIN, LONGEST, NEAR, SHORTER, _steepness, fine_part
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import standing
@@ -456,13 +456,48 @@ def test_one_noisy_measurement_does_not_set_the_curvature_of_a_dim_texel():
     np.testing.assert_allclose(found, 2 * size, rtol=0.05)
 
 
-def test_measurements_that_are_much_noisier_than_the_last_are_left_out():
-    """The limit is four times the last error, and doubles with each measurement that is left out."""
-    block, taken = Block({"p": 2}), []
-    for number, error in enumerate((0.01, 0.9, 0.02, 0.1, 0.1, 0.001), start=1):
-        block.bend(number * np.eye(2), error)
-        taken.append(int(block.steepness("p")[0]))
-    assert taken == [1, 1, 3, 3, 5, 6]
+def test_curvature_is_the_mean_of_measurements_weighted_by_their_errors():
+    """Changes of the values make earlier measurements less certain. Measurements without an error replace them."""
+    block = Block({"p": 2})
+    assert block.doubt == np.inf
+    block.bend(np.eye(2), 0.03)
+    assert block.doubt == pytest.approx(0.03)
+    block.bend(3 * np.eye(2), 0.03)
+    np.testing.assert_allclose(block.steepness("p"), 2, rtol=1e-6)
+    assert block.doubt == pytest.approx(0.03 / np.sqrt(2))
+    block.bend(100 * np.eye(2), 1.0)  # with a few bright samples
+    np.testing.assert_allclose(block.steepness("p"), 2, atol=0.05)
+    block.rows[0, 9] = -1  # one longest step
+    assert block.doubt == pytest.approx(SHIFT, rel=0.01)
+    block.bend(5 * np.eye(2), 0.03)
+    np.testing.assert_allclose(block.steepness("p"), 5, atol=0.05)
+    block.bend(7 * np.eye(2))
+    np.testing.assert_allclose(block.steepness("p"), 7, rtol=1e-6)
+
+
+def test_curvature_is_measured_until_it_is_known():
+    """The error must be at most a quarter of the smallest eigenvalue, which is 0.1 in units of the diagonal."""
+    block = Block({"p": 2})
+    assert not block.is_known
+    for number in range(1, 5):
+        block.bend(np.array([[4.0, 1.8], [1.8, 1.0]]), 0.04)
+        assert block.is_known is (number >= 3)
+    block.rows[1, 9] = 0.1
+    assert not block.is_known
+
+
+def test_steps_since_a_measurement_count():
+    """Two steps of half the longest one in opposite directions cancel each other."""
+    block = Block({"p": 1})
+    block.bend(np.eye(1), 0.01)
+    value, shifts = np.array([0.5]), []
+    for gradient in (0.05, -0.05):
+        now = JointState(value, np.array([gradient]), np.array([0.1]), *np.array([[0.0], [1.0]]), np.ones(1, bool),
+                         np.array([-1]))  # fmt: skip
+        value = value + block.steps(now)
+        shifts.append((value[0] - 0.5) / 0.1)
+        assert block.rows[0, 9] == pytest.approx(shifts[-1], abs=1e-5)
+    assert shifts[0] < -0.3
 
 
 def test_a_noisy_curvature_does_not_lead_to_long_steps():
