@@ -487,7 +487,7 @@ def test_curvature_is_measured_until_it_is_known():
 
 
 def test_steps_since_a_measurement_count():
-    """Two steps of half the longest one in opposite directions cancel each other."""
+    """Steps in opposite directions cancel each other. The unit is the longest step."""
     block = Block({"p": 1})
     block.bend(np.eye(1), 0.01)
     value, shifts = np.array([0.5]), []
