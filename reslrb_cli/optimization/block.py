@@ -47,8 +47,8 @@ SURE = 1.04
 #: Columns of `rows` before H: mean gradient, mean value, last gradient, last value, last step, distance, n, v, the
 #: standard error of the smallest eigenvalue of H, and the change since the last measurement of H in longest steps.
 FIELDS = 10
-#: Error of H that one longest step adds, and largest error of an H that needs no further measurement, as a share of its
-#: smallest eigenvalue.
+#: Standard error of the smallest eigenvalue after a movement by one longest step, and the largest standard error, as a
+#: share of the smallest eigenvalue, at which measurements end.
 SHIFT, KNOWN = 0.25, 0.25
 
 
@@ -92,9 +92,9 @@ class Block:
         """Take a measurement of H (M, M). `error` is the standard error of its smallest eigenvalue, in units in which
         the diagonal of H is 1.
 
-        H is the mean of all measurements, weighted by their errors. The error of the earlier ones rises as the values
-        change. A measurement with a few bright samples has a large error, so it hardly counts. A measurement without
-        an `error` replaces all earlier ones.
+        H becomes the mean of all measurements, weighted by the inverse squares of their errors. The error of the
+        earlier ones rises as the values change (`doubt`). A measurement with a few bright samples has a large error, so
+        it hardly counts. A measurement without an `error` replaces all earlier ones.
         """
         rows = self.rows.copy()
         before = self.doubt
@@ -114,7 +114,7 @@ class Block:
 
     @property
     def is_known(self) -> bool:
-        """True if a further measurement of H would hardly change the steps."""
+        """True if the standard error of the smallest eigenvalue of H is small, so no further measurement is needed."""
         H = self.rows[:, FIELDS:].astype(np.float64)
         use = np.diag(H) > 0
         if not use.any() or not self.rows[0, 8] > 0:

@@ -181,9 +181,8 @@ def measure_block(problem: Problem, iteration: int) -> None:
     slopes = np.concatenate([optimizer.slopes(key) for key in block.at])
     whole, (found, error) = np.zeros((len(slopes), len(slopes))), curvature.for_steps(directions)
     whole[np.ix_(at, at)] = found * np.outer(slopes[at], slopes[at])
-    # The noise of a moving shape rises as its blur falls, and its curvature changes.
-    moves = any(key in optimizer.extents for key in block.at)
-    block.bend(np.nan_to_num(whole), 0.0 if moves else error)
+    # If shapes move, noise and curvature change as the blur falls.
+    block.bend(np.nan_to_num(whole), 0.0 if optimizer.extents else error)
     problem.apply()
 
 
@@ -205,7 +204,7 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
     large rise, n is halved too, because the mean of n gradients misleads.
     """
     optimizer = problem.optimizer
-    searched = any(key in optimizer.extents for key in optimizer.block.at)
+    searched = optimizer.measures_curvature and bool(optimizer.extents)
     before = {key: dr.detach(optimizer[key]) for key in optimizer.block.at if searched}
     loss = blurred_loss(problem, iteration) if searched else 0.0
     updates = optimizer.step(factor, skip=held)

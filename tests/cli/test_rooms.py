@@ -236,7 +236,7 @@ def key_of(part: str, values: Mapping[str, np.ndarray]) -> str:
 
 def test_errors_of_a_box_are_as_large_as_their_spreads(tmp_path: Path) -> None:
     """If 1 % of the light was missing, because paths were too short, all colours would be too bright by more than their
-    spread. The errors of one box are alike: with 8 boxes, the result is between 0.74 and 0.93 by chance.
+    spread. The errors of one box are correlated, so 8 boxes would be too few: five runs printed 0.74 to 0.93.
     """
     ratios = []
     for seed in range(24):
