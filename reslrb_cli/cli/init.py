@@ -228,7 +228,7 @@ def command(
         path, options, description.variables, sensors, index, proposals, find_movable_in_view(scene, index),
         scene=scene_file, target=image,
         variant=given.variant, is_raw=is_raw, is_integer=is_integer, size=size, film=own, reason=reason,
-        hides_emitters=hides, depth=depth, missing=missing,
+        hides_emitters=description.hides_emitters, depth=depth, missing=missing,
     )  # fmt: skip
     specs = loads(text, path).parameters
     scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])
@@ -242,6 +242,8 @@ def command(
     echo(f"{path}{made}: {count} of {len(proposals)} parameters, at {size[0]}x{size[1]} pixels")
     if reason is not None:
         echo(f"integrator.paths: camera, since light paths cannot render this: {reason}")
+    if description.hides_emitters and target is not None:
+        echo(f"integrator.hide_emitters: the scene hides lamps and background; set it if {target} does not show them")
     echo(f"next: check it, then run `reslrb optimize {path}`" + ("" if target is not None else " with a target"))
 
 

@@ -375,7 +375,9 @@ def test_a_scene_that_hides_its_lights_keeps_hiding_them(choices: Path) -> None:
         assert load(choices / "hall.yaml").integrator.hide_emitters == (value == "true")
     scene.write_text(scene.read_text().replace('"false"', '"true"'))
     write_noise(choices / "photo.png", 16, 16)
-    tiny.done("init", "hall.xml", "-o", "photo.yaml", "--target", "photo.png")
+    made = tiny.done("init", "hall.xml", "-o", "photo.yaml", "--target", "photo.png")
+    assert "set it if photo.png does not show them" in made.output
+    assert "  # hide_emitters: true" in (choices / "photo.yaml").read_text()
     assert not load(choices / "photo.yaml").integrator.hide_emitters  # the photograph shows what is behind the scene
 
 
