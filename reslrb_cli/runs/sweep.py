@@ -207,8 +207,11 @@ def with_chosen(
 
     If the value of `integrator` is a string, the string names a method, as in `convergence --integrators`. The named
     method keeps the depth and the shared options of the experiment's own integrator.
+
+    All runs of a sweep have the same rendered target: settings of the integrator that vary do not apply to it.
     """
-    methods = [each for each in chosen if each.location == ("integrator",) and isinstance(each.value, str)]
+    own = [each for each in chosen if each.location[0] == "integrator"]
+    methods = [each for each in own if each.location == ("integrator",) and isinstance(each.value, str)]
     others = [each for each in chosen if each not in methods]
     config = loads(text, path, [*overrides, *others]).with_code(allow_code)
     for each in methods:
@@ -216,6 +219,11 @@ def with_chosen(
         if len(cases) > 1:
             raise ConfigError(each.label, "", "names several integrators in one value; write [prb, reslrb:stack]")
         config = cases[0].at(config, config.integrator.max_depth, known=False, auto=True)
+    render = config.target.render
+    if own and render is not None and render.integrator is None:
+        base = loads(text, path, [*overrides, *(each for each in chosen if each not in own)])
+        render = render.model_copy(update={"integrator": base.integrator})
+        config = config.model_copy(update={"target": config.target.model_copy(update={"render": render})})
     return config
 
 

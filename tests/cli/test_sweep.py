@@ -21,7 +21,9 @@ from kit import count_iterations, wait_for
 from reslrb_cli.cli import jobs, main, sweep
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.cli.terminal import Interrupts
+from reslrb_cli.config.loader import dump, load
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.images import load_image
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.records.sweeps import (
     Combination,
@@ -103,6 +105,19 @@ def test_integrators_are_varied_as_methods_with_the_depth_of_the_experiment(fold
     assert list(plan.configs) == names
     depths = make_plan(Path("tiny.yaml"), ["integrator=[prb]", "integrator.max_depth=[2, 3]"], 1, [])
     assert [config.integrator.max_depth for config in depths.configs.values()] == [2, 3]
+
+
+@pytest.mark.parametrize("varied", ["integrator=[prb, 'reslrb:stack(paths=camera)', {type: ptracer}]",
+                                    "integrator.max_depth=[2, 5]", "integrator.paths=[light, both]"])  # fmt: skip
+def test_one_target_for_all_integrators(folder, varied):
+    """The integrator without `--vary` renders the target, unless the target names one."""
+    base, own = load("tiny.yaml", ["integrator.max_depth=4"]), "target.render.integrator={type: prb, max_depth: 7}"
+    other = [varied, "run.spp=[4, 8]"]
+    for sets, expected in (([], base.integrator), ([own], load("tiny.yaml", [own]).target.render.integrator)):
+        plan = make_plan(Path("tiny.yaml"), other, 1, ["integrator.max_depth=4", *sets])
+        assert len({dump(each) for each in plan.configs.values()}) == len(plan.configs)
+        assert [each.target.render.integrator for each in plan.configs.values()] == [expected] * len(plan.configs)
+    assert make_plan(Path("tiny.yaml"), other[1:], 1, []).configs["spp=4"].target.render.integrator is None
 
 
 def test_names_are_short_safe_and_different(folder):
@@ -360,7 +375,11 @@ def test_only_runs_of_equal_time_are_fresh(folder, monkeypatch):
     runs, _ = table("s")
     assert [run["iterations"] for run in runs if run["settings"]["run.max_seconds"]] == [1] * 2
     assert "iterations" in result.output
-    assert "the loss of each integrator has its own noise, and what its paths lack" in result.output
+    assert "the loss of each integrator has its own noise, and what its paths lack: compare the errors" in result.output
+    targets = [load_image(run / "images/target.exr") for run in sorted(Path("s").glob("*-seed=0"))]
+    assert len(targets) == 4
+    for target in targets:
+        np.testing.assert_allclose(target, targets[0], rtol=1e-4)
 
 
 def test_a_run_in_use_is_waited_for(folder, monkeypatch):
@@ -457,8 +476,9 @@ def test_the_best_is_judged_by_seeds_that_all_share():
     for key, compared in (("loss", ["error"]), ("loss.type", ["error"]), ("scene.size", []), ("target", ["error"]),
                           ("parameters[0].bounds", []), ("lossy", ["loss", "error"]),
                           ("parameters[0].learning_rate", ["loss", "error"]),
-                          ("integrator.guiding", ["loss", "error"])):  # fmt: skip
+                          ("integrator.guiding", ["error"]), ("integrator", ["error"])):  # fmt: skip
         assert [each.of for each in best_records(*pretended([noise, noise], key))] == compared, key
+    assert [each.of for each in best_records(*pretended([noise, noise], "integrator", error=None))] == ["loss"]
     noted = "the loss of each integrator has its own noise"
     assert [any(noted in line for line in notes(*pretended([noise, noise], key)))
             for key in ("integrator.guiding", "run.spp")] == [True, False]  # fmt: skip

@@ -114,10 +114,12 @@ def best_records(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[Sweep
     empty for a single combination.
 
     Only seeds that all combinations have are compared. Combinations with a run that failed or lacks the value are left
-    out, because their other runs are a biased sample.
+    out, because their other runs are a biased sample. Losses of several integrators are left out if errors are known.
     """
     found = []
     for of in OTHERS:
+        if of == "loss" and varies_integrator(sweep) and any(run.error is not None for run in runs):
+            continue
         values = {} if incomparable(sweep, of) else _paired(sweep, runs, of)
         if len(values) > 1:
             best, second = sorted(values, key=lambda name: float(np.median(values[name])))[:2]
@@ -172,6 +174,13 @@ def incomparable(sweep: SweepPlan, of: str) -> str:
     return next((key for key in keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in OTHERS[of])), "")
 
 
+def varies_integrator(sweep: SweepPlan) -> bool:
+    """Whether a setting of the integrator varies. The final images of the runs then differ in noise, and perhaps in the
+    light that they contain.
+    """
+    return any(key.partition(".")[0] == "integrator" for key in sweep.keys)
+
+
 def _paired(sweep: SweepPlan, runs: Sequence[SweepRunRecord], of: str) -> dict[str, list[float]]:
     """Return the values of each combination by its name, one for each seed that all combinations have."""
     found: dict[str, dict[int, float]] = {}
@@ -194,11 +203,10 @@ def notes(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[str]:
     ]
     if key := incomparable(sweep, "loss"):
         lines.append(f"losses of different `{key}` are not of the same, and not compared")
-    elif any(key.partition(".")[0] == "integrator" for key in sweep.keys):
-        lines.append(
-            "the loss of each integrator has its own noise, and what its paths lack: raise run.final_spp until that "
-            "makes no difference"
-        )
+    elif varies_integrator(sweep):
+        known = any(run.error is not None for run in runs)
+        remedy = "compare the errors" if known else "raise run.final_spp until that makes no difference"
+        lines.append(f"the loss of each integrator has its own noise, and what its paths lack: {remedy}")
     failed = [run for run in runs if run.status == "failed"]
     lines += [f"{run.name} failed: {run.message}" for run in failed[:MOST_NAMED]]
     if len(failed) > MOST_NAMED:
