@@ -251,7 +251,9 @@ def worst(results: Mapping[str, Any]) -> str | None:
 
 
 def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
-    """Return warnings about a run that did not fail: a loss that did not fall, errors that rose, unreliable values."""
+    """Return warnings about a run that did not fail: a loss that did not fall, errors that rose, unreliable values,
+    failed measurements.
+    """
     lines = []
     trend, ratio = results.get("loss_trend") or {}, image_ratio(results)
     if trend.get("change") in ("rose", "flat") and not (ratio is not None and ratio < IMPROVED):
@@ -272,7 +274,7 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
         lines.append(f"and so did {count(len(worse) - MOST_NAMED, 'more parameter')}")
     if lines:
         lines += _reasons(results)
-    return [*lines, *certainty_lines(results)]
+    return [*lines, *certainty_lines(results), *(results.get("unmeasured") or ())]
 
 
 def _reasons(results: Mapping[str, Any]) -> list[str]:

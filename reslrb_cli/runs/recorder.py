@@ -57,6 +57,8 @@ class Recording:
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
     certainty: CertaintyRecord | None = None
+    #: One line about each measurement after the run that was not possible.
+    unmeasured: list[str] = field(default_factory=list)
     #: How the run ended, or RUNNING.
     status: Status = Status.RUNNING
     _told_nonfinite: bool = False
@@ -229,10 +231,10 @@ class Recording:
         if failure is not None:
             status = Status.FAILED
         elif status is Status.FINISHED:  # an interrupt must not wait
-            self._add("the certainty of the values was", self._measure_certainty)
-            self._add("perceptual errors were", self._measure_seen_errors)
+            self._add("the certainty of the values was not measured", self._measure_certainty)
+            self._add("perceptual errors were not measured", self._measure_seen_errors)
             if self.problem.config.fabrication is not None:
-                self._add("the fabrication data of the solid were", self._measure_solid)
+                self._add("the fabrication data of the solid were not measured", self._measure_solid)
         # Only files of the run folder are written here, and the folder was writable when the run started.
         if isinstance(failure, OSError) or (failure is not None and is_machine_fault(failure)):
             failure = MachineError(f"{describe(failure)}; {self._kept()}")
@@ -263,13 +265,15 @@ class Recording:
             write_report(self.folder.path, content, self.problem.values())
 
     def _add(self, failed: str, measure: Callable[[], None]) -> None:
-        """Add the results of `measure`. An error does not fail the run. It is logged after the text `failed`."""
+        """Add the results of `measure`. An error does not fail the run. The last line reports it after the text
+        `failed`.
+        """
         try:
             measure()
         except Exception as error:
-            logger.warning("%s not measured: %s", failed, describe(error))
-        else:
-            self._note_results()
+            self.unmeasured.append(f"{failed}: {describe(error)}")
+            logger.warning(self.unmeasured[-1])
+        self._note_results()
 
     def _measure_certainty(self) -> None:
         last = self.course.last
@@ -277,7 +281,7 @@ class Recording:
         if last is None or self.done < LEAST_ITERATIONS or not config.run.certainty:
             return
         if not config.by_pixel:
-            logger.info("the certainty of the values is not measured: it needs a loss of separate pixels")
+            self.unmeasured.append("the certainty of the values was not measured: it needs a loss of separate pixels")
             return
         logger.info("measuring the certainty of the values")
         measured = self.course.certainty.measure(self.done, last.elapsed_s, self._stop)
@@ -319,6 +323,8 @@ class Recording:
             found["incomplete"] = self.manifest.incomplete
         if self.certainty is not None:
             found["certainty"] = finite(self.certainty.to_json())
+        if self.unmeasured:
+            found["unmeasured"] = self.unmeasured
         found["warnings"] = warnings({"iterations": self.done, **found})
         return {
             "iterations": self.done,

@@ -12,6 +12,7 @@ import pytest
 from cli.tiny import KEY, done, outcome, read_metrics, write_experiment
 from report.measured import make_run, write_bench, write_convergence, write_gradcheck
 
+from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.records import measurement_files
 from reslrb_cli.records.manifest import read_content
 from reslrb_cli.records.measurement_files import LivePage
@@ -224,10 +225,28 @@ def test_the_manifest_has_the_plan_and_perceptual_errors(optimize):
 
 
 def test_unmeasurable_errors_do_not_end_a_run(optimize, monkeypatch):
-    def fail(folder, results):
+    def fail(*given):
         raise ImportError("no colours here")
 
     monkeypatch.setattr(recording, "seen_errors", fail)
-    err = optimize("--set", "run.iterations=1")
-    assert "perceptual errors were not measured: " in err
-    assert "seen" not in read_content(RUN)["results"]
+    monkeypatch.setattr(Certainty, "measure", fail)
+    monkeypatch.setattr(recording, "LEAST_ITERATIONS", 1)
+    result = done("optimize", "tiny.yaml", "--set", "run.iterations=1")
+    lines = [f"{what} not measured: ImportError: no colours here"
+             for what in ("the certainty of the values was", "perceptual errors were")]  # fmt: skip
+    results, last = read_content(RUN)["results"], result.stdout.splitlines()[-1]
+    assert f"; {lines[0]}; {lines[1]}; look at" in last
+    assert results["unmeasured"] == lines
+    assert results["warnings"][-2:] == lines
+    assert all(line in result.stderr and line in PAGE.read_text() for line in lines)
+    assert "seen" not in results
+
+
+def test_a_loss_without_a_certainty_is_named_in_the_last_line(optimize, monkeypatch):
+    monkeypatch.setattr(recording, "LEAST_ITERATIONS", 1)
+    code = "import drjit as dr\ndef loss(a, b):\n    return dr.mean((a - b)**2, axis=None)\n"
+    Path("own.py").write_text(code)
+    own = "loss={type: custom, file: 'own.py:loss'}"
+    result = done("optimize", "tiny.yaml", "--allow-code", "--set", own, "--set", "run.iterations=1")
+    line = "the certainty of the values was not measured: it needs a loss of separate pixels"
+    assert f"; {line}; look at" in result.stdout.splitlines()[-1]

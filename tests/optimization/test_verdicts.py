@@ -214,6 +214,49 @@ def test_a_texture_without_a_measured_curvature_is_below_the_noise():
     assert (found.verdict, found.spread, found.to_go) == ("below the noise", None, None)
 
 
+NOT_SEEN, AT_BOUND = ParameterVerdict.NOT_SEEN.value, ParameterVerdict.AT_BOUND.value
+
+
+@pytest.mark.parametrize("curvature", ["none", "unknown", "known"])
+@pytest.mark.parametrize("recorded", [False, True])
+@pytest.mark.parametrize("seen", ["none", "one", "all"])
+@pytest.mark.parametrize("touched", ["none", "one", "all"])
+@pytest.mark.parametrize("held", ["none", "one", "all"])
+def test_every_state_of_a_texture_has_a_verdict(seen, touched, held, recorded, curvature):
+    """A mirror may show texels that no view shows directly, and all texels may be at a bound. A lamp is judged beside
+    the texture in each state.
+    """
+    random, size = np.random.default_rng(3), 12
+    count = {"none": 0, "one": 1, "all": size}
+    which = {name: np.arange(size) < count[state] for name, state in (("t", touched), ("s", seen), ("h", held))}
+    value = np.where(which["h"], 0.0, 0.5)
+
+    def gradients(number):
+        pulled = np.where(which["h"], 5.0, random.normal(size=(number, size)))
+        return np.where(which["t"], pulled, 0.0)
+
+    rows = np.stack([gradients(30), np.tile(value, (30, 1))], axis=1)
+    texture = Measured(
+        value, (0.0, 1.0), 0.5, gradients(4), np.full(size, 1e-3), False, np.full(size, 0.8),
+        seen=which["s"], rows=rows if recorded else None,
+    )  # fmt: skip
+    lamp = Measured(np.ones(1), (0, np.inf), 1.0, random.normal(size=(4, 1)), np.full(1, 1e-3), True, np.full(1, 2.0))
+    places = [ParameterDirection("lamp", np.ones(1), None, 0), ParameterDirection("texture", value, 0)]
+    places = places if value.any() else places[:1]
+    diagonal = np.full(size, 50.0 if curvature == "known" else -1.0)
+    by_entry = {} if curvature == "none" else {"texture": EntryCurvature(diagonal, diagonal)}
+    many = len(places)
+    found = weigh({"lamp": lamp, "texture": texture}, places, 100 * np.eye(many), np.zeros((many, many)), by_entry)
+    shares = found["texture"].shares
+    assert sum(shares.values()) == pytest.approx(1)
+    assert shares.get(NOT_SEEN, 0.0) == pytest.approx(np.mean(~which["s"]))
+    assert shares.get(AT_BOUND, 0.0) == pytest.approx(np.mean(which["s"] & which["h"]))  # their way ended at the bound
+    if not any(which["s"] & which["t"] & ~which["h"]):
+        assert found["texture"].spread is None
+    assert found["lamp"].verdict == "settled"
+    assert np.isfinite(found["lamp"].spread).all()
+
+
 def blurred(width, side=24):
     """Return an image of a texture under a Gaussian filter of `width` texels, and probes of the curvature."""
     random, at = np.random.default_rng(9), np.arange(side)

@@ -391,7 +391,9 @@ def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) ->
     """Estimate the offsets of the entries of each group. They are as large as at the start if noise hides the
     curvature.
     """
-    inside = np.isin(np.arange(own.value.size), np.concatenate(groups)) if groups else np.zeros(0, dtype=bool)
+    if not groups:
+        return []
+    inside = np.isin(np.arange(own.value.size), np.concatenate(groups))
     gradients, moved = own.gradients, 0.0
     if own.rows is not None:  # as in `joint`
         rows = np.concatenate([own.rows, [[g, own.value] for g in own.gradients]])
