@@ -278,20 +278,23 @@ class Preparation:
     def emitters(self, plan: Plan, scene: mi.Scene) -> EmitterDensities:
         """Return the current densities of the scene's emitters, for a plan of the scene."""
         made, weights = self._found.emitters, tuple(float(emitter.sampling_weight()) for emitter in scene.emitters())
-        if (weights, plan.horizon) not in made:
-            made.clear()
-            made[weights, plan.horizon] = EmitterDensities.of(plan, scene)
-        return made[weights, plan.horizon]
+        key = weights, plan.horizon, plan.lit
+        for old in [old for old in made if old[:2] != key[:2]]:
+            del made[old]
+        if key not in made:
+            made[key] = EmitterDensities.of(plan, scene)
+        return made[key]
 
     def _first_plan(self, sensor: mi.Sensor, paths: str, moves: bool, scene: mi.Scene, whole: bool) -> Plan:
         """Return the first image plan for a sensor and a kind of paths. `moves` is true if something moves."""
         check_paths(scene, sensor, paths, self._hide_emitters)
-        needs = scene_needs(scene, sensor)
+        lit = self.sampling.lit.get(sensor_number(scene, sensor))
+        needs = scene_needs(scene, sensor, lit)
         renewal = self._found.renewal = self._found.renewal or Renewal(scene)
         set_up(scene)
         plan = make_plan(needs, *self._depths, self._hide_emitters)
         on = self.sampling.on - {"pixels"} if moves or paths == "light" else self.sampling.on
-        plan = replace(plan, paths=paths, whole=whole, by_class=moves and paths == "both", on=on)
+        plan = replace(plan, paths=paths, whole=whole, by_class=moves and paths == "both", on=on, lit=lit)
         if plan.weighs:
             plan = renewal.renew(plan, scene)  # the horizon
         if plan.paths == "camera" or (self.guiding is None and "sequence" not in on):

@@ -207,7 +207,7 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             [dE] = forward_derivatives(E)
         if plan.visible_emission and plan.paths == "light" and (plan.differentiate_emission or plan.differentiate_null):
             ray, u, weight, colours = primary_ray(samples)
-            tangent = visible_tangent(plan, samples.scene, ray)
+            tangent = visible_tangent(samples, ray)
             samples.film.put(block, u, tangent * weight * samples.fraction, mi.Bool(True), colours)
         if plan.small_lamps and plan.differentiate_emission:
             u, C, active, colours = small_splat(samples)

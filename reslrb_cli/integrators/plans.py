@@ -154,6 +154,7 @@ class SamplingOptions:
     - If `whole` is true, images of light paths alone have the same film border as images with camera paths.
     - `given` are distributions (H, W) of camera paths over the pixels by sensor, for all scenes with the same sensors.
         Other distributions are stored for each scene and its parameters.
+    - `lit` has the indices of the lit emitters by sensor, for sensors with unlit emitters.
     - `expected` is the sample count of the passes that tables learn from. If it is None, each pass uses its own count.
     """
 
@@ -162,6 +163,7 @@ class SamplingOptions:
     chosen: Mapping[str, str] = field(default_factory=dict)
     whole: bool = False
     given: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+    lit: Mapping[int, tuple[int, ...]] = field(default_factory=dict)
     expected: int | None = None
 
     def __post_init__(self) -> None:
@@ -169,7 +171,8 @@ class SamplingOptions:
         if not 0 <= self.light_share <= 1:
             raise ValueError(f'"light_share" must lie in [0, 1], not {self.light_share}')
         paths = traced_paths(self.paths, self.light_share)
-        chosen = {**self.chosen, "guiding": "off"} if paths == "camera" else self.chosen  # no table has its starts
+        # No table has the starts of camera paths, and tables have one emission for all sensors.
+        chosen = {**self.chosen, "guiding": "off"} if paths == "camera" or self.lit else self.chosen
         for name, value in {"paths": paths, "whole": self.whole or paths != "light", "chosen": chosen}.items():
             object.__setattr__(self, name, value)
 

@@ -175,9 +175,10 @@ class LightTracer(StepIntegrator):
 
     def _sides(self, plan: Plan, scene: mi.Scene) -> tuple[float, EmitterDensities | None]:
         """Return the share of light paths. Also return the emitters' densities if paths from both sides are
-        weighted.
+        weighted, or not all emitters are lit.
         """
-        return self.light_share, self.preparation.emitters(plan, scene) if plan.weighs else None
+        needed = plan.weighs or plan.lit is not None
+        return self.light_share, self.preparation.emitters(plan, scene) if needed else None
 
     def _shares(self, job: Job, plan: Plan) -> Callable[[int], PixelShares | None] | None:
         """Return the distribution of the job's camera paths, or None for a uniform distribution.

@@ -64,14 +64,14 @@ LOOK = 128
 class SceneNeeds:
     """Static facts of a scene for one sensor. Features that are false or absent need not be compiled.
 
-    `emitters` holds class names in the order of `scene.emitters()`. `environment` is the index of the surrounding
-    emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
+    `emitters` holds the class names of the lit emitters, in the order of `scene.emitters()`. `environment` is the class
+    name of the surrounding emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
     tells whether a thin lens may see objects outside of its clip planes, or nothing because of its focus. `disperses`
     tells whether a smooth boundary refracts each wavelength into another direction.
     """
 
     emitters: tuple[str, ...]
-    environment: int | None
+    environment: str | None
     has_visible_emitters: bool
     has_glossy: bool
     has_delta_lobes: bool
@@ -107,15 +107,18 @@ class PrimaryHits:
     emission: float
 
 
-def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
-    """Return the features that light tracing of `scene` for `sensor` needs."""
+def scene_needs(scene: Any, sensor: Any, lit: Sequence[int] | None = None) -> SceneNeeds:
+    """Return the features that light tracing of `scene` for `sensor` needs. `lit` has the indices of the emitters that
+    emit; None: all.
+    """
     graph = SceneGraph.of(scene)
     flags = 0
     for bsdf in graph.surface_bsdfs():
         flags |= int(bsdf.flags())
     emitters, environment = list(scene.emitters()), scene.environment()
+    emitters = emitters if lit is None else [emitters[index] for index in lit]
     delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` includes it
-    lamps = graph.find_lamps(scene)
+    lamps = tuple(lamp for lamp in graph.find_lamps(scene) if lamp.emitter in emitters)
     is_projective = sensor.class_name() in SENSORS
     near_clip, lens_clip = _clip_planes(scene, sensor) if is_projective else (False, False)
     params = mi.traverse(sensor)
@@ -123,7 +126,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     unfollowed = {owner for bsdf in others for owner in graph.owning_bsdfs(bsdf)}
     return SceneNeeds(
         emitters=tuple(emitter.class_name() for emitter in emitters),
-        environment=None if environment is None else emitters.index(environment),
+        environment=environment.class_name() if environment in emitters else None,
         has_visible_emitters=any(not int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in emitters),
         has_glossy=flags & int(mi.BSDFFlags.Glossy) != 0,
         has_delta_lobes=flags & delta != 0,

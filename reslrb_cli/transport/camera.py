@@ -329,7 +329,7 @@ def _behind_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
 def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> MetLight:
     """Return the light at `si`, or from the environment if the ray has left the scene."""
     plan, scene = samples.plan, samples.scene
-    emitter = si.emitter(scene, path.active)
+    emitter = samples.emitter_of(si, path.active)
     active = path.active & (emitter != dr.zeros(mi.EmitterPtr))
     direct = path.events == 0
     if plan.hide_emitters:
@@ -347,7 +347,13 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
         reference.p, reference.time, reference.wavelengths = path.before, path.ray.time, path.ray.wavelengths
         ds = mi.DirectionSample3f(scene, si, reference)
         indirect = active & ~direct
-        p_D = scene.pdf_emitter_direction(reference, ds, indirect)
+        number = dr.reinterpret_array(mi.UInt32, emitter)
+        if plan.lit is None:
+            p_D = scene.pdf_emitter_direction(reference, ds, indirect)
+        else:
+            assert samples.emitters is not None
+            p_D = emitter.pdf_direction(reference, ds, indirect)
+            p_D *= dr.gather(mi.Float, samples.emitters.choice, number, indirect)
         spheres = _spheres(samples)
         for lamp in plan.needs.lamps:
             if lamp.surrounds or lamp in spheres:
@@ -356,7 +362,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
                     area = 0.5 * area * (1 - _sphere_seen_from(mi.traverse(lamp.shape)["to_world"], path.before)[3])
                 even = dr.square(ds.dist) / (dr.abs(dr.dot(ds.n, ds.d)) * area)
                 here = indirect & (emitter == mi.EmitterPtr(lamp.emitter))
-                p_D = dr.select(here, scene.pdf_emitter(mi.UInt32(lamp.index)) * even, p_D)
+                p_D = dr.select(here, samples.chance_of(lamp) * even, p_D)
         # Points of a lamp with a black texture have no density: paths only hit them.
         sampled = dr.select(dr.isfinite(p_D), p_D, 0)
         if not path.rivals:
@@ -365,8 +371,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
             [own] = path.rivals
             table = samples.emitters
             assert table is not None
-            choice = dr.gather(mi.Float, table.choice, dr.reinterpret_array(mi.UInt32, emitter), indirect)
-            place = p_D / choice
+            place = p_D / dr.gather(mi.Float, table.choice, number, indirect)
             if plan.needs.lamps:
                 cos = dr.abs(dr.dot(ds.n, ds.d))
                 place = dr.select(emitter.is_environment(), place, place * cos / dr.square(ds.dist))
@@ -431,9 +436,9 @@ def sample_lamp(
     scene, unseen = samples.scene, _unseen(samples)
     spheres = {lamp.emitter: lamp.shape for lamp in _spheres(samples)}
     with dr.suspend_grad():
-        if not (unseen or spheres):
+        if not (unseen or spheres or samples.plan.lit):
             return scene.sample_emitter_direction(si, numbers, False, active)
-        index, weight, reused = scene.sample_emitter(numbers.x, active)
+        index, weight, reused = samples.choose_emitter(numbers.x, active)
         emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
 
         def sample(

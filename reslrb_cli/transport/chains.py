@@ -225,7 +225,7 @@ class LampChains(Chains):
         samples, zero = self.samples, mi.UInt32(0)
         there, other = u / LAMP_CELLS, self.random(zero, PLACE)
         choice, time = self.random(zero, APERTURE).x, samples.time(lambda: mi.Float(0.5))
-        index, _, _ = samples.scene.sample_emitter(choice, True)
+        index, _, _ = samples.choose_emitter(choice, mi.Bool(True))
         emitter = dr.gather(mi.EmitterPtr, samples.scene.emitters_dr(), index)
         # Point lamps and directional lamps use only one of the numbers.
         place = dr.select(mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta), there, other)

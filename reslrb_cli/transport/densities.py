@@ -1,5 +1,5 @@
-"""Densities of the rays that a scene's emitters send out. The densities are defined for any ray, not only for sampled
-rays.
+"""Probabilities of a scene's emitters, and densities of the rays that emitters send out. The densities are defined for
+any ray, not only for sampled rays.
 
 Mitsuba does not provide these densities. The densities describe the rays of Mitsuba's `sample_ray`, and the rays that
 `emission.py` and `lamps.py` sample.
@@ -32,29 +32,53 @@ class EmitterDensities:
     which emitter pointers also contain.
 
     `choice` is the probability of selecting an emitter. `emitted` is e without the factor that varies between rays, for
-    example a texture's density. `kind` tells which factor this is.
+    example a texture's density. `kind` tells which factor this is. If not all emitters are lit, `lit` (L,) has the
+    indices of the lit ones in `scene.emitters()`, and `ends` (L,) has the cumulative sums of their probabilities.
     """
 
     choice: mi.Float
     emitted: mi.Float
     kind: mi.UInt32
+    lit: mi.UInt32 | None = None
+    ends: mi.Float | None = None
 
     @staticmethod
     def of(plan: Plan, scene: mi.Scene) -> EmitterDensities:
         """Return the densities of all emitters of a scene."""
         emitters = scene.emitters()
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
-        sampled = np.array([float(np.ravel(emitter.sampling_weight())[0]) for emitter in emitters])
+        lit = range(len(emitters)) if plan.lit is None else plan.lit
+        sampled = np.zeros(len(emitters))
+        sampled[[*lit]] = [float(np.ravel(emitters[index].sampling_weight())[0]) for index in lit]
         choice, emitted, kind = (np.zeros(max(numbers) + 1) for _ in range(3))
         lamps = {lamp.index: lamp for lamp in plan.needs.lamps}
         for index, (emitter, number) in enumerate(zip(emitters, numbers, strict=True)):
             choice[number] = sampled[index] / sampled.sum()
-            own, kind[number] = _ray_density(plan, emitter, lamps.get(index), index == plan.needs.environment)
+            own, kind[number] = _ray_density(plan, emitter, lamps.get(index), emitter == scene.environment())
             emitted[number] = choice[number] * own
         made = [kind_of(array.astype(dtype)) for kind_of, array, dtype in (
             (mi.Float, choice, np.float32), (mi.Float, emitted, np.float32), (mi.UInt32, kind, np.uint32))]  # fmt: skip
+        if plan.lit is not None:
+            # Opaque, so that views with other lamps have the same kernels.
+            ends = np.cumsum(sampled[[*lit]]) / sampled.sum()
+            made += [mi.UInt32(np.array(lit, np.uint32)), mi.Float(ends.astype(np.float32))]
         dr.make_opaque(made)
         return EmitterDensities(*made)
+
+    def select(self, number: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        """Select one of the lit emitters, as `mi.Scene.sample_emitter` selects one of all emitters.
+
+        Returns the index in `scene.emitters()`, 1 / probability, and a new uniform number.
+        """
+        lit, ends = self.lit, self.ends
+        assert lit is not None
+        assert ends is not None
+        last = dr.width(lit) - 1
+        place = dr.binary_search(0, last, lambda index: dr.gather(mi.Float, ends, index, active) <= number)
+        begin = dr.select(place > 0, dr.gather(mi.Float, ends, place - 1, active & (place > 0)), 0)
+        chance = dr.gather(mi.Float, ends, place, active) - begin
+        reused = dr.clip((number - begin) / chance, 0, dr.one_minus_epsilon(mi.Float))
+        return dr.gather(mi.UInt32, lit, place, active), dr.rcp(chance), reused
 
 
 def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: bool) -> tuple[float, int]:
@@ -112,8 +136,7 @@ def density_of_rays(
     number = dr.reinterpret_array(mi.UInt32, emitter)
     e = dr.gather(mi.Float, table.emitted, number, active)
     textured = any(lamp.texture is not None for lamp in plan.needs.lamps)
-    surrounds = None if plan.needs.environment is None else plan.needs.emitters[plan.needs.environment]
-    mapped = surrounds not in (None, "ConstantBackgroundEmitter")
+    mapped = plan.needs.environment not in (None, "ConstantBackgroundEmitter")
     if not (textured or mapped or "Projector" in plan.needs.emitters):
         return e
     kind = dr.gather(mi.UInt32, table.kind, number, active)

@@ -377,7 +377,7 @@ def _past_balls(samples: Samples, table: EdgeTable, row: mi.UInt32, other: Viewe
 
     def view(p: mi.Point3f, active: mi.Bool) -> EdgeView:
         first, scene = other(p, active), samples.scene
-        _, chosen, number = scene.sample_emitter(chances.viewpoint.x, active)
+        _, chosen, number = samples.choose_emitter(chances.viewpoint.x, active)
         number = number * len(table.balls)
         place = mi.Point2f(number - dr.floor(number), chances.viewpoint.y)
         away, density = mi.Vector3f(0), mi.Float(0)

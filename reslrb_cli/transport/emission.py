@@ -83,15 +83,15 @@ def emission_of(
 ) -> Emission:
     """Return the ray of these random numbers."""
     plan, scene = samples.plan, samples.scene
-    if not (plan.environment_map or plan.placed_lamps):
+    if not (plan.environment_map or plan.placed_lamps or plan.lit):
         ray, weight, emitter = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
         weight = _at_fixed_wavelengths(plan, ray, emitter, weight)
         return Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter, position=sample_2)
 
-    index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
+    index, index_weight, reused = samples.choose_emitter(wavelength_sample, mi.Bool(True))
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
     if plan.environment_map:
-        is_environment = index == plan.needs.environment
+        is_environment = emitter == mi.EmitterPtr(scene.environment())
         ray, weight = environment_ray(plan, scene.environment(), time, reused, sample_2, sample_3)
         if len(plan.needs.emitters) > 1:
             other = _emitter_ray(samples, emitter, time, reused, sample_2, sample_3, ~is_environment)
@@ -189,29 +189,29 @@ class _Look:
     tangents: list[mi.Spectrum] = field(default_factory=list)
 
 
-def visible_radiance(plan: Plan, scene: mi.Scene, ray: mi.Ray3f, loop_mode: str = "symbolic") -> mi.Spectrum:
+def visible_radiance(samples: Samples, ray: mi.Ray3f, loop_mode: str = "symbolic") -> mi.Spectrum:
     """Return the radiance (C,) that arrives along a primary ray, through null surfaces if the scene has any.
 
     If `loop_mode` is evaluated and derivatives are enabled, the radiance has derivatives for naive AD.
     """
-    return _look(plan, scene, ray, None, loop_mode).radiance
+    return _look(samples, ray, None, loop_mode).radiance
 
 
-def visible_tangent(plan: Plan, scene: mi.Scene, ray: mi.Ray3f) -> mi.Spectrum:
+def visible_tangent(samples: Samples, ray: mi.Ray3f) -> mi.Spectrum:
     """Return the derivative (C,) of `visible_radiance` along the parameters' tangents (forward mode)."""
     with dr.suspend_grad():  # the loop itself tracks nothing
-        return _look(plan, scene, ray, None, "symbolic", tangents=True).tangents[1]
+        return _look(samples, ray, None, "symbolic", tangents=True).tangents[1]
 
 
-def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, ray: mi.Ray3f, adjoint: mi.Spectrum) -> None:
+def differentiate_visible_radiance(samples: Samples, ray: mi.Ray3f, adjoint: mi.Spectrum) -> None:
     """Differentiate the radiance along the primary rays, times `adjoint` (C,). Add the derivatives to the parameters'
     gradients.
 
     The derivative with respect to a transmission needs the radiance behind the surface. A first pass measures the total
     radiance at the sensor. The total minus the radiance up to the surface is then divided by the transmission.
     """
-    masks = plan.differentiate_null
-    total = visible_radiance(plan, scene, ray) if masks else mi.Spectrum(0)
+    plan, masks = samples.plan, samples.plan.differentiate_null
+    total = visible_radiance(samples, ray) if masks else mi.Spectrum(0)
 
     def differentiate(state: _Look, Le: mi.Spectrum, radiance: mi.Spectrum, transmission: mi.Spectrum) -> None:
         weight = dr.select(state.active, adjoint * state.transmittance, 0)
@@ -223,30 +223,32 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, ray: mi.Ray3f, a
         dr.backward_from(objective, flags=MAY_LACK)
 
     with dr.resume_grad():
-        _look(plan, scene, ray, differentiate, "symbolic")
+        _look(samples, ray, differentiate, "symbolic")
 
 
-def _radiance(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+def _radiance(samples: Samples, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
     """Return the radiance (C,) that leaves `si`. Lamps smaller than a pixel are left out, because they have their own
     samples.
     """
-    emitter = si.emitter(scene)
-    for lamp in plan.small_lamps:
+    emitter = samples.emitter_of(si, active)
+    for lamp in samples.plan.small_lamps:
         active = active & (emitter != mi.EmitterPtr(lamp.emitter))
     return emitter.eval(si, active)
 
 
 def _look(
-    plan: Plan, scene: mi.Scene, ray: mi.Ray3f,
+    samples: Samples, ray: mi.Ray3f,
     on_surface: Callable[[_Look, mi.Spectrum, mi.Spectrum, mi.Spectrum], None] | None, mode: str,
     tangents: bool = False,
 ) -> _Look:  # fmt: skip
+    plan, scene = samples.plan, samples.scene
+
     def look(state: _Look) -> tuple[_Look]:
         with dr.suspend_grad():  # if lamps move, `moving_splats` has the derivative
             si = scene.ray_intersect(state.ray, state.active)
         hit = state.active & si.is_valid()
         with dr.resume_grad(when=tangents):
-            Le = _radiance(plan, scene, si, state.active)
+            Le = _radiance(samples, si, state.active)
             transmission = si.bsdf().eval_null_transmission(si, hit) if plan.needs.has_null else mi.Spectrum(0)
             if tangents:
                 d_Le, d_transmission = forward_derivatives(Le, transmission)
@@ -273,7 +275,7 @@ def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: st
     """Add C_0 to the block."""
     if samples.plan.visible_emission and samples.plan.paths == "light":
         ray, u, weight, colours = primary_ray(samples)
-        radiance = visible_radiance(samples.plan, samples.scene, ray, loop_mode)
+        radiance = visible_radiance(samples, ray, loop_mode)
         samples.film.put(block, u, radiance * weight * samples.fraction, mi.Bool(True), colours)
     if samples.plan.small_lamps:
         samples.film.put(block, *small_splat(samples))
@@ -285,7 +287,7 @@ def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> N
     if plan.visible_emission and plan.paths == "light" and (plan.differentiate_emission or plan.differentiate_null):
         ray, u, weight, colours = primary_ray(samples)
         delta = adjoint.lookup(u, mi.Bool(True), colours) * weight * samples.fraction
-        differentiate_visible_radiance(plan, samples.scene, ray, delta)
+        differentiate_visible_radiance(samples, ray, delta)
     if plan.small_lamps and plan.differentiate_emission:
         with dr.resume_grad():
             u, C, active, colours = small_splat(samples)

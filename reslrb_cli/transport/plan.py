@@ -112,6 +112,8 @@ class Plan:
     max_depth: int
     rr_depth: int
     hide_emitters: bool = False
+    # Indices of the emitters that are lit for this sensor, if not all are.
+    lit: tuple[int, ...] | None = None
     track_zeros: bool = False
     differentiate_bsdfs: bool = False
     differentiate_emission: bool = False
@@ -224,10 +226,7 @@ class Plan:
     @property
     def environment_map(self) -> bool:
         """Whether an environment map emits. `lamps.py` samples its rays."""
-        return (
-            self.needs.environment is not None
-            and self.needs.emitters[self.needs.environment] == "EnvironmentMapEmitter"
-        )
+        return self.needs.environment == "EnvironmentMapEmitter"
 
     @property
     def placed_lamps(self) -> tuple[Lamp, ...]:

@@ -242,9 +242,9 @@ class Samples:
     fraction: mi.Float
     guide: Guide | None = None
     net: Net | None = None
-    #: If paths from both sides are weighted: all light paths divided by the camera paths of a pixel (width 1), and the
-    #: emitters' densities.
+    #: If paths from both sides are weighted: all light paths divided by the camera paths of a pixel (width 1).
     ratio: mi.Float | None = None
+    #: The emitters' densities, if paths from both sides are weighted or not all emitters are lit.
     emitters: EmitterDensities | None = None
     #: Distribution of the camera paths over the pixels; None: uniform.
     shares: PixelShares | None = None
@@ -274,6 +274,31 @@ class Samples:
         pixel = mi.UInt32(mi.Int32(u.y) * width + mi.Int32(u.x))
         mean = self.shares.mean()
         return self.ratio * dr.select(inside, mean / self.shares.count(pixel, inside), 1)
+
+    def choose_emitter(self, number: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        """Select a lit emitter. Returns its index in `scene.emitters()`, 1 / probability, and a new uniform number."""
+        if self.plan.lit is None:
+            index, weight, reused = self.scene.sample_emitter(number, active)
+            return index, weight, reused
+        assert self.emitters is not None
+        return self.emitters.select(number, active)
+
+    def emitter_of(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.EmitterPtr:
+        """Return the lit emitter at `si`, or null."""
+        emitter = si.emitter(self.scene, active)
+        if self.plan.lit is None:
+            return emitter
+        assert self.emitters is not None
+        chance = dr.gather(mi.Float, self.emitters.choice, dr.reinterpret_array(mi.UInt32, emitter), active)
+        return dr.select(chance > 0, emitter, dr.zeros(mi.EmitterPtr))
+
+    def chance_of(self, lamp: Lamp) -> mi.Float:
+        """Return the probability that `choose_emitter` selects a lamp."""
+        if self.plan.lit is None:
+            return self.scene.pdf_emitter(mi.UInt32(lamp.index))
+        assert self.emitters is not None
+        number = dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(lamp.emitter))
+        return dr.gather(mi.Float, self.emitters.choice, number)
 
     def sampler(self) -> mi.Sampler:
         """Return a sampler at the beginning of these samples' random number stream."""
@@ -374,7 +399,7 @@ def passes(
 
     The first pass uses `seed` itself, so that it traces the same paths as `ptracer`. With a `table` for the plan's
     grid, emission is sampled from the table. If the plan has both kinds of paths, `light_share` is the share of light
-    paths in each pass. `emitters` then contains the emitters' densities. Raises ValueError for too many passes, or too
+    paths in each pass. If both kinds are weighted, `emitters` has the emitters' densities. Raises ValueError for too many passes, or too
     many paths in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
@@ -389,6 +414,8 @@ def passes(
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
+    if plan.lit is not None and emitters is None:
+        emitters = EmitterDensities.of(plan, scene)
     if table is None:  # a plan has a grid only if paths are guided
         plan = replace(plan, grid=None, aims=False)
     film, pixels = Film(sensor, plan.whole), int(dr.prod(sensor.film().size()))  # as in `ptracer`
