@@ -312,7 +312,7 @@ def make_plan(subject: Subject, scene: Any, selection: Selection | str) -> list[
     try:
         [sensor, *_] = sensors = choose_sensors(config, scene)
         paths = paths_of(config.integrator, scene, sensors, what_moves(config, selection))
-        integrator = as_decided(make_configured(config, config.integrator, paths), decisions)
+        integrator = as_decided(make_configured(config, config.integrator, paths, scene), decisions)
         assert isinstance(integrator, Reslrb)
         integrator.expect(pass_spp(config))
         params = selection.params

@@ -120,7 +120,7 @@ def command(
     samples = config.run.spp
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
     own = {} if run is None or is_given("exposure") else exposures(run)
-    applied = own.get(sensors[0], np.float32(1))
+    applied = own.get(sensors[0] if sensor is None else sensor, np.float32(1))
     image[:, :, : 1 if image.shape[2] <= 2 else 3] *= applied
     suits = 1.0 if linear else _suiting(image, scene, scene.sensors()[sensors[0]])
     factor = suits if exposure is None else exposure
@@ -145,10 +145,16 @@ def _suiting(image: Any, scene: Any, sensor: Any) -> float:
 
 
 def _of_sensor(config: Config, sensor: int) -> Config:
-    """Return the experiment with only the sensor `sensor`, even if the sensor's view is held out."""
+    """Return the experiment with only the sensor `sensor`, even if the sensor's view is held out. The lamps of its view
+    stay on.
+    """
+    known = dict(zip(config.view_sensors, config.views or (), strict=True))
+    if config.shares_sensors and sensor not in known:
+        raise ConfigError("--sensor", "", f"is {sensor}, but the experiment has {len(known)} views")
+    view = known.get(sensor, ViewSpec(sensor=sensor))
     return config.model_copy(
         update={
-            "views": [ViewSpec(sensor=sensor)],
+            "views": [ViewSpec(sensor=view.sensor, lamps=view.lamps)],
             # One image does not need the settings of several views.
             "target": config.target.model_copy(update={"exposure": 1.0}),
             "run": config.run.model_copy(update={"held_out": [], "views_per_iteration": None}),

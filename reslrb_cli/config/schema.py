@@ -162,6 +162,16 @@ class Config(Section):
         return spp % sets == 0 and _passes_divide(self.integrator, spp // sets)
 
     @property
+    def shares_sensors(self) -> bool:
+        """True if several views have one sensor. The loaded scene then has one sensor for each view."""
+        return self.views is not None and len({view.sensor for view in self.views}) < len(self.views)
+
+    @property
+    def view_sensors(self) -> list[int]:
+        """Index of each view's sensor in the loaded scene. The list is empty without `views`."""
+        return [number if self.shares_sensors else view.sensor for number, view in enumerate(self.views or ())]
+
+    @property
     def drawn_views(self) -> int | None:
         """Number of views in an iteration, or None if only the scene determines it."""
         if self.views is None and self.scene.cameras is not None:

@@ -200,9 +200,13 @@ class TargetConfig(Section):
 
 
 class ViewSpec(Section):
-    """A view: a sensor of the scene, and its target."""
+    """A view: a sensor of the scene, the lamps that are on, and the target."""
 
-    sensor: Annotated[int, Field(ge=0)] = Field(description="Index of the sensor in the scene.")
+    sensor: Annotated[int, Field(ge=0)] = Field(default=0, description="Index of the sensor in the scene.")
+    lamps: Annotated[list[str], must(bool, lambda _: "must name a lamp")] | None = None
+    """Lamps that are on in this view, by id; globs are allowed. The id of an area light is the id of its shape. null:
+    all lamps are on. Views with other lamps may share a sensor. Then the scene gets a copy of the sensor for each view,
+    and the index of a view's sensor is the view's number. Needs integrator.type: reslrb."""
     target: ConfigPath | None = None
     """Target image, relative to the config file. null: rendered, as `target.render` describes."""
     mask: ViewMask | None = None
@@ -215,10 +219,12 @@ class ViewSpec(Section):
 
 def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:
     """Raise an error that names the key if views contradict each other or `target`."""
-    places: dict[int, int] = {}
+    places: dict[tuple[int, frozenset[str] | None], int] = {}
     for number, view in enumerate(views):
-        if places.setdefault(view.sensor, number) < number:
-            raise located(f"views[{number}].sensor", f"{view.sensor} is already in views[{places[view.sensor]}]")
+        key = view.sensor, None if view.lamps is None else frozenset(view.lamps)
+        if places.setdefault(key, number) < number:
+            reason = f"{view.sensor} is already in views[{places[key]}]; views of one sensor need different `lamps`"
+            raise located(f"views[{number}].sensor", reason)
         if view.target is None and target.render is None and scene.cameras is None:
             raise located(f"views[{number}].target", "missing; give an image, or render all targets with target.render")
     if target.file is not None:

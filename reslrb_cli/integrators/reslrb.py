@@ -119,6 +119,14 @@ class LightTracer(StepIntegrator):
         other.preparation = other.preparation.afresh(given={int(number): density for number, density in noted.items()})
         return other
 
+    def lit_by(self, lit: Mapping[int, tuple[int, ...]]) -> Self:
+        """Return a copy of the tracer with no facts about any scene. `lit` has the indices of the emitters that are on,
+        by sensor number. For other sensors, all are on.
+        """
+        other = copy.copy(self)
+        other.preparation = self.preparation.afresh(lit=lit)
+        return other
+
     def to_measure(self) -> Self:
         """Return this tracer. If the tracer is guided, return a copy with separate tables instead.
 

@@ -128,7 +128,7 @@ def load_for_rendering(
     scene = load_configured(config, selects=False)
     sensors = choose_sensors(config, scene)
     check_integrator(config, config.integrator, scene, sensors)
-    integrator = make_configured(config, config.integrator, paths_of(config.integrator, scene, sensors))
+    integrator = make_configured(config, config.integrator, paths_of(config.integrator, scene, sensors), scene)
     return scene, sensors, integrator, samples_per_pass(config)
 
 
@@ -185,7 +185,7 @@ def assemble_scene(config: Config, scene: Any = None) -> Problem:
         scene=scene,
         views=views,
         selection=selection,
-        integrator=make_configured(config, config.integrator, paths),
+        integrator=make_configured(config, config.integrator, paths, scene),
         paths=paths,
         moves=moves,
         optimizer=make_optimizer(config, selection),

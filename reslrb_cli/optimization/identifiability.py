@@ -129,8 +129,9 @@ def check_exposures(problem: Problem) -> None:
         "number, such as "
     )
     place = "target.exposure"
-    for number, spec in enumerate(problem.config.views or ()):
-        if spec.exposure is not None and exposure == f"{SHARED}.{spec.sensor}":
+    config = problem.config
+    for number, (spec, sensor) in enumerate(zip(config.views or (), config.view_sensors, strict=True)):
+        if spec.exposure is not None and exposure == f"{SHARED}.{sensor}":
             place = f"views[{number}].exposure"
     raise ConfigError(problem.config.source, place, f"{reason}exposure: 1, or remove a parameter with a known value")
 

@@ -5,7 +5,9 @@ A pass is small enough to fit into memory.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Iterator, Sequence
+from fnmatch import fnmatchcase
 from typing import Any
 
 import drjit as dr
@@ -22,8 +24,9 @@ from reslrb_cli.integrators.freezing import MOST_PATHS_APART
 from reslrb_cli.integrators.own import load_estimator
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
-from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.integrators.step import render_image
+from reslrb_cli.scene.cameras import repeat_sensors
 from reslrb_cli.scene.deformation import Moves, where_moved
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.load import INSTEAD, load_scene, warn_once
@@ -108,7 +111,17 @@ def load_configured(
     keys = selected_keys(config) if selects else []
     if scene.file.name == IN_MEMORY:
         return _lent_scene(config, keys, config.parameters if selects else [])
-    return load_scene(scene.file, scene.options, scene.size, scene.cameras, look, keys)
+
+    def prepare(description: Description) -> None:
+        if config.shares_sensors:
+            order = [view.sensor for view in config.views or ()]
+            count = sum(child.tag == "sensor" for child in description.root.children)
+            _check_sensors(config, order, count)
+            repeat_sensors(description, order)
+        if look is not None:
+            look(description)
+
+    return load_scene(scene.file, scene.options, scene.size, scene.cameras, prepare, keys)
 
 
 def _lent_scene(config: Config, keys: list[str], specs: Sequence[ParameterSpec]) -> mi.Scene:
@@ -117,6 +130,9 @@ def _lent_scene(config: Config, keys: list[str], specs: Sequence[ParameterSpec])
     if own is None:
         reason = f"was an mi.Scene in the memory of another process; {INSTEAD}"
         raise ConfigError(config.source, "scene.file", reason)
+    if config.shares_sensors:
+        reason = "views share a sensor, of which an mi.Scene cannot get copies; give the scene one sensor for each view"
+        raise ConfigError(config.source, "views", reason)
     changed = next((name for name in ("options", "size", "cameras") if getattr(scene, name)), None)
     if changed is not None:
         raise ConfigError(config.source, f"scene.{changed}", f"cannot change an mi.Scene; {INSTEAD}")
@@ -134,14 +150,39 @@ def selected_keys(config: Config) -> list[str]:
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
     """Return the index of each view's sensor. Raises ConfigError for an index that does not exist."""
     count = len(scene.sensors())
-    if config.views is not None:
-        named = {f"views[{place}].sensor": view.sensor for place, view in enumerate(config.views)}
-    else:
+    if config.views is None:
         return [0] if config.scene.cameras is None else list(range(count))
-    for key, sensor in named.items():
+    _check_sensors(config, config.view_sensors, count)
+    return config.view_sensors
+
+
+def _check_sensors(config: Config, sensors: Sequence[int], count: int) -> None:
+    """Raise ConfigError for a view with a sensor that does not exist."""
+    for place, sensor in enumerate(sensors):
         if sensor >= count:
+            key = f"views[{place}].sensor"
             raise ConfigError(config.source, key, f"is {sensor}, but the scene has {sensors_in_words(count)}")
-    return list(named.values())
+
+
+def lit_emitters(config: Config, scene: mi.Scene) -> dict[int, tuple[int, ...]]:
+    """Return the indices of the emitters that are on, by sensor, for views in which others are off. Raises ConfigError
+    for a lamp that does not exist.
+    """
+    emitters, found = scene.emitters(), {}
+    names = [{item.id() for item in (emitter, emitter.get_shape()) if item is not None} for emitter in emitters]
+    for place, (view, sensor) in enumerate(zip(config.views or (), config.view_sensors, strict=True)):
+        lit: set[int] = set()
+        for number, lamp in enumerate(view.lamps or ()):
+            own = {index for index, known in enumerate(names) if any(fnmatchcase(name, lamp) for name in known)}
+            if not own:
+                shown = [emitter.id() if (shape := emitter.get_shape()) is None else shape.id() for emitter in emitters]
+                near = difflib.get_close_matches(lamp, shown, n=3, cutoff=0.5) or shown[:3]
+                reason = f"is `{lamp}`, which is no lamp of the scene; did you mean {', '.join(near)}?"
+                raise ConfigError(config.source, f"views[{place}].lamps[{number}]", reason)
+            lit |= own
+        if lit and len(lit) < len(emitters):
+            found[sensor] = tuple(sorted(lit))
+    return found
 
 
 def are_upright(config: Config) -> bool:
@@ -219,10 +260,11 @@ def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> Non
         warn_once(f"{config.scene.file}: sensor {sensor.id()}: ptracer {wrong}; reslrb is correct there")
 
 
-def make_configured(config: Config, integrator: Integrator, paths: str) -> StepIntegrator:
-    """Make `integrator`, which `config` gives for the run or for the target. `paths` is the result of `paths_of`.
+def make_configured(config: Config, integrator: Integrator, paths: str, scene: mi.Scene) -> StepIntegrator:
+    """Make `integrator`, which `config` gives for the run or for the target, for a scene of `config`. `paths` is the
+    result of `paths_of`.
 
-    Settings that are `auto` have their plain values.
+    Settings that are `auto` have their plain values. Raises ConfigError.
     """
     if isinstance(integrator, ReslrbConfig):
         integrator = integrator.plain().model_copy(update={"paths": paths})
@@ -236,7 +278,17 @@ def make_configured(config: Config, integrator: Integrator, paths: str) -> StepI
             load_estimator(integrator.file, config.source, "integrator.estimator")
     if isinstance(integrator, Own):
         options["allowed"] = config.allows_code
-    return make_integrator(integrator.type, **options)
+    made, lit = make_integrator(integrator.type, **options), lit_emitters(config, scene)
+    if not lit:
+        return made
+    if not isinstance(made, LightTracer):
+        place = next(number for number, view in enumerate(config.views or ()) if view.lamps is not None)
+        reason = f"lights only some lamps, which {integrator.type} cannot do; use integrator.type: reslrb"
+        raise ConfigError(config.source, f"views[{place}].lamps", reason)
+    if made.preparation.guiding is not None:
+        reason = "is on, but views with different `lamps` cannot share its tables; use off"
+        raise ConfigError(config.source, "integrator.guiding", reason)
+    return made.lit_by(lit)
 
 
 def pass_spp(config: Config) -> int:

@@ -236,7 +236,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
     chosen = render.integrator or config.integrator
     check_integrator(config, chosen, true_scene, problem.sensors, problem.moves)
     paths = paths_of(chosen, true_scene, problem.sensors, problem.moves)
-    integrator = make_configured(config, chosen, paths)
+    integrator = make_configured(config, chosen, paths, true_scene)
     multiple = chosen.options().get("samples_per_pass")
     rendered = [view for view in problem.views if view.file is None]
     if rendered:

@@ -101,7 +101,7 @@ def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
     for the scene's sensor or cameras.
     """
     if config.views is not None:
-        return config.views
+        return [spec.model_copy(update={"sensor": sensor}) for spec, sensor in zip(config.views, sensors, strict=True)]
     return [ViewSpec.model_construct(sensor=sensor, target=config.target.file) for sensor in sensors]
 
 
@@ -310,7 +310,8 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
         key = f"{SHARED}.{spec.sensor}" if own else SHARED
         file, file_key = spec.target, "target.file" if config.views is None else f"{place}.target"
         if spec.target is None:
-            file, file_key = images.get(spec.sensor), "scene.cameras"
+            named = spec.sensor if config.views is None else config.views[number].sensor
+            file, file_key = images.get(named), "scene.cameras"
         loss, codes = _make_losses(config, scene.sensors()[spec.sensor].film())
         views.append(
             View(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,23 @@ def replace_sensors(description: Description, cameras: list[Camera]) -> None:
             name += "_"
         taken.add(name)
         root.children.append(_sensor(own[0] if own else root.new("sensor"), camera, name))
+
+
+def repeat_sensors(description: Description, order: Sequence[int]) -> None:
+    """Replace the sensors of a scene by one sensor for each entry of `order`, which has indices of the sensors. Further
+    copies of a sensor get ids of their own, such as `camera_view2`. Raises IndexError for an index without a sensor.
+    """
+    root = description.root
+    own = [child for child in root.children if child.tag == "sensor"]
+    made: list[Element] = []
+    for place, index in enumerate(order):
+        if not any(own[index] is each for each in made):
+            made.append(own[index])
+            continue
+        copied = _copy(own[index])
+        copied.attributes["id"] = f"{own[index].id or 'sensor'}_view{place}"
+        made.append(copied)
+    root.children = [*(child for child in root.children if child.tag != "sensor"), *made]
 
 
 def _sensor(like: Element, camera: Camera, name: str) -> Element:

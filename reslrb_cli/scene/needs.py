@@ -65,9 +65,11 @@ class SceneNeeds:
     """Static facts of a scene for one sensor. Features that are false or absent need not be compiled.
 
     `emitters` holds the class names of the lit emitters, in the order of `scene.emitters()`. `environment` is the class
-    name of the surrounding emitter, or None. `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip`
-    tells whether a thin lens may see objects outside of its clip planes, or nothing because of its focus. `disperses`
-    tells whether a smooth boundary refracts each wavelength into another direction.
+    name of the surrounding emitter, or None.
+
+    `near_clip` tells whether an object may be between the sensor and its near clip plane. `lens_clip` tells whether a
+    thin lens may see objects outside of its clip planes, or nothing because of its focus. `disperses` tells whether a
+    smooth boundary refracts each wavelength into another direction.
     """
 
     emitters: tuple[str, ...]

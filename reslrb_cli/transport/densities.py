@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.scene.graph import Lamp, SceneGraph
 from reslrb_cli.transport.lamps import DEFENSIVE
 from reslrb_cli.transport.plan import Plan
@@ -56,14 +57,10 @@ class EmitterDensities:
             choice[number] = sampled[index] / sampled.sum()
             own, kind[number] = _ray_density(plan, emitter, lamps.get(index), emitter == scene.environment())
             emitted[number] = choice[number] * own
-        made = [kind_of(array.astype(dtype)) for kind_of, array, dtype in (
-            (mi.Float, choice, np.float32), (mi.Float, emitted, np.float32), (mi.UInt32, kind, np.uint32))]  # fmt: skip
-        if plan.lit is not None:
-            # Opaque, so that views with other lamps have the same kernels.
-            ends = np.cumsum(sampled[[*lit]]) / sampled.sum()
-            made += [mi.UInt32(np.array(lit, np.uint32)), mi.Float(ends.astype(np.float32))]
-        dr.make_opaque(made)
-        return EmitterDensities(*made)
+        made = [(mi.Float, choice), (mi.Float, emitted), (mi.UInt32, kind)]
+        if plan.lit is not None:  # opaque as well, so that views with other lamps have the same kernels
+            made += [(mi.UInt32, np.array(lit)), (mi.Float, np.cumsum(sampled[[*lit]]) / sampled.sum())]
+        return EmitterDensities(*(own_memory(kind, array) for kind, array in made))
 
     def select(self, number: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Select one of the lit emitters, as `mi.Scene.sample_emitter` selects one of all emitters.
@@ -74,6 +71,8 @@ class EmitterDensities:
         assert lit is not None
         assert ends is not None
         last = dr.width(lit) - 1
+        if last == 0:
+            return lit, mi.Float(1), number
         place = dr.binary_search(0, last, lambda index: dr.gather(mi.Float, ends, index, active) <= number)
         begin = dr.select(place > 0, dr.gather(mi.Float, ends, place - 1, active & (place > 0)), 0)
         chance = dr.gather(mi.Float, ends, place, active) - begin

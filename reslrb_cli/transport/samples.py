@@ -399,8 +399,8 @@ def passes(
 
     The first pass uses `seed` itself, so that it traces the same paths as `ptracer`. With a `table` for the plan's
     grid, emission is sampled from the table. If the plan has both kinds of paths, `light_share` is the share of light
-    paths in each pass. If both kinds are weighted, `emitters` has the emitters' densities. Raises ValueError for too many passes, or too
-    many paths in one pass.
+    paths in each pass. If both kinds are weighted, `emitters` has the emitters' densities. Raises ValueError for
+    too many passes, or too many paths in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from cli.tiny import EYES, KEY, scene_seen, write_experiment
+from cli.tiny import EYES, KEY, done, outcome, scene_seen, settings, write_experiment
 from optimization.toy import make_problem
 
 from reslrb_cli.config.loader import dump, load, loads
@@ -82,6 +82,10 @@ def test_colours_move_only_with_an_exposure_that_all_views_share(folder, sets, i
 
 BAD = [
     ("views=[{sensor: 0}, {sensor: 0}]", "views[1].sensor", "is already in views[0]"),
+    ("views=[{lamps: [lamp]}, {lamps: [lamp]}]", "views[1].sensor", "views of one sensor need different `lamps`"),
+    ("views=[{lamps: [lmp]}]", "views[0].lamps[0]", "no lamp of the scene; did you mean lamp?"),
+    ("views=[{lamps: []}]", "views[0].lamps", "must name a lamp"),
+    ("views=[{sensor: 4}, {sensor: 4, lamps: [lamp]}]", "views[0].sensor", "is 4, but the scene has 3 sensors"),
     ("views=[{sensor: 7}]", "views[0].sensor", "3 sensors"),
     ("views=[{sensor: 0, target: missing.exr}, {sensor: 1}]", "views[0].target", "no such file"),
     ("views=[{sensor: 0, target: a.exr}]", "target.render", "every view has its own target"),
@@ -96,6 +100,54 @@ BAD = [
     ("target.white_balance={scene: D64}", "target.white_balance.scene", "did you mean D65 or"),
     ("target.white_balance={photograph: A}", "target.white_balance", "has no effect on a rendered target"),
 ]
+
+
+LED = """<emitter type="point" id="led{0}"><point name="position" x="{0}" y="1" z="2"/></emitter>"""
+ONE_BY_ONE = "views=[{lamps: [led0]}, {lamps: ['l*d1']}, {sensor: 0}]"
+
+
+@pytest.fixture
+def lamps(folder):
+    """Folder with an experiment in which two point lamps light the scene beside the area lamp."""
+    text = scene_seen(EYES[0]).replace("</scene>", LED.format(0) + LED.format(1) + "</scene>")
+    (folder / "scene.xml").write_text(text)
+    return folder
+
+
+def test_views_of_one_sensor_have_their_own_lamps(lamps):
+    precise = "target.render.spp=4096"
+    problem = make(lamps, ONE_BY_ONE, precise)
+    assert [view.sensor for view in problem.views] == problem.sensors == [0, 1, 2]
+    assert [sensor.id() for sensor in problem.scene.sensors()][1:] == ["Perspective_1_view1", "Perspective_1_view2"]
+    first, second, whole = (np.array(view.target) for view in problem.views)
+    lamp = np.array(make(lamps, "views=[{lamps: [lamp]}]", precise).views[0].target)
+    assert np.abs(first - second).max() > 0.1 * first.mean()
+    np.testing.assert_allclose((first + second + lamp).mean(), whole.mean(), rtol=0.02)
+    alone = [gradient(make(lamps, f"views=[{{lamps: [led{number}]}}]", "run.shards=1")) for number in (0, 1)]
+    assert all(np.isfinite(each).all() and each.any() for each in alone)
+
+
+@pytest.mark.parametrize(("setting", "place", "words"), [
+    ("integrator.type=prb", "views[0].lamps", "prb cannot do; use integrator.type: reslrb"),
+    ("integrator.guiding=on", "integrator.guiding", "cannot share its tables"),
+])  # fmt: skip
+def test_settings_without_lamps_of_a_view(lamps, setting, place, words):
+    more = ["integrator={type: prb, max_depth: 3}"] if "prb" in setting else [setting]
+    with pytest.raises(ConfigError) as error:
+        make(lamps, ONE_BY_ONE, *more)
+    assert place in str(error.value)
+    assert words in str(error.value)
+
+
+def test_render_shows_a_view_with_its_lamps(lamps, monkeypatch):
+    monkeypatch.chdir(lamps)
+    images = []
+    for number in range(2):
+        done("render", "tiny.yaml", *settings(ONE_BY_ONE), "--sensor", number, "-o", f"{number}.exr")
+        images.append(np.array(mi.Bitmap(f"{number}.exr")))
+    assert np.abs(images[0] - images[1]).max() > 0.1 * images[0].mean()
+    code, _, shown = outcome("render", "tiny.yaml", *settings(ONE_BY_ONE), "--sensor", 3, "-o", "3.exr")
+    assert (code, "--sensor: is 3, but the experiment has 3 views" in shown) == (2, True)
 
 
 @pytest.mark.parametrize(("setting", "key", "words"), BAD)

@@ -64,7 +64,7 @@ def test_everything(make_scene):
         veil={"type": "sphere", "bsdf": {"type": "mask", "bsdf": GLASS, "opacity": 0.5}},
     )
     needs = scene_needs(scene, scene.sensors()[0])
-    assert needs.emitters[needs.environment] == "ConstantBackgroundEmitter"
+    assert needs.environment == "ConstantBackgroundEmitter"
     assert needs.has_delta_lobes
     assert needs.has_null
     assert needs.has_visible_emitters

@@ -278,6 +278,9 @@ def _guiding(tuner: Tuner) -> None:
     if problem.integrator.paths == "camera" and not alone:
         return  # no path starts at an emitter
     off = Decision(setting="guiding", value="off", why="it pays in long runs")
+    if problem.integrator.preparation.sampling.lit:
+        tuner.take(replace(off, why="views with different lamps cannot share its tables"))
+        return
     independent = {"sequence": "independent"} if is_auto(config, "sequence") else {}
     if independent and problem.moves:
         if problem.integrator.paths == "light":

@@ -384,7 +384,7 @@ class LossCurvature:
             return []
         chosen = render.integrator or config.integrator
         paths = paths_of(chosen, self.problem.scene, self.problem.sensors, self.problem.moves)
-        integrator = make_configured(config, chosen, paths)
+        integrator = make_configured(config, chosen, paths, self.problem.scene)
         multiple = chosen.options().get("samples_per_pass")
         by_view = [self._noises(view, integrator, render.spp, multiple) for view in trained]
         return [list(sample) for sample in zip(*by_view, strict=True)]
