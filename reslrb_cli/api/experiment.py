@@ -51,34 +51,53 @@ ARGUMENTS = {
     "--allow-code permits it": "allow_code=True permits it, or the experiment `load(...).with_code()`",
 }
 
+#: Signals of batch systems and of a terminal that closes.
+KILLING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
 logger = logging.getLogger(__name__)
+
+
+#: Dr.Jit records and launches kernels on variables that all threads share. Two threads that work at the same time
+#: disturb each other's recordings, or wait for each other forever.
+_turn = threading.RLock()
+
+
+def end_by(number: int, frame: FrameType | None) -> None:
+    """Handle a signal that would kill the script: end the script as `sys.exit` does, so that loops complete their run
+    folders.
+    """
+    raise SystemExit(128 + number)
 
 
 @contextlib.contextmanager
 def held() -> Iterator[Callable[[], bool]]:
-    """Delay Ctrl-C and a notebook's interrupt until the end of the block, then raise KeyboardInterrupt.
+    """Delay Ctrl-C and a notebook's interrupt until the end of the block, then raise KeyboardInterrupt. The blocks of
+    different threads take turns.
 
     An interrupt inside Mitsuba or Dr.Jit would cause a crash or an unrelated error. Yields a function that returns True
-    if an interrupt is waiting. Long blocks can call the function to stop early. The context manager does nothing
-    outside of the main thread. A nested `held` block also does nothing.
+    if an interrupt is waiting. Long blocks can call the function to stop early. Signals that `end_by` handles are also
+    delayed. Signals are not delayed outside of the main thread, and not again in a nested `held` block.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
-        yield lambda: False
-        return
-    came = False
+    with _turn:
+        if threading.current_thread() is not threading.main_thread():
+            yield lambda: False
+            return
+        before = {number: handler for number in (signal.SIGINT, *KILLING)
+                  if (handler := signal.getsignal(number)) in (signal.default_int_handler, end_by)}  # fmt: skip
+        came: list[int] = []
 
-    def mark(number: int, frame: FrameType | None) -> None:
-        nonlocal came
-        came = True
+        def mark(number: int, frame: FrameType | None) -> None:
+            came.append(number)
 
-    signal.signal(signal.SIGINT, mark)
-    try:
-        yield lambda: came
-    finally:
-        signal.signal(signal.SIGINT, before)
+        for number in before:
+            signal.signal(number, mark)
+        try:
+            yield lambda: bool(came)
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
     if came:
-        raise KeyboardInterrupt
+        before[came[0]](came[0], None)  # raises
 
 
 @contextlib.contextmanager

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import logging
 import os
+import signal
+import threading
 import weakref
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from inspect import GEN_CLOSED, getgeneratorstate
@@ -16,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 import numpy as np
 
-from reslrb_cli.api.experiment import Experiment, Scene, called, held, load_with
+from reslrb_cli.api.experiment import KILLING, Experiment, Scene, called, end_by, held, load_with
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config.files import as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override, overrides_of
@@ -47,6 +50,37 @@ Loss: TypeAlias = (
 
 logger = logging.getLogger(__name__)
 
+#: Runs in a loop, and resumed runs before their loop. Both hold the locks of their folders.
+_looping: weakref.WeakSet[Run] = weakref.WeakSet()
+_waiting: weakref.WeakSet[Run] = weakref.WeakSet()
+
+
+@contextlib.contextmanager
+def _completed_at_the_end(run: Run) -> Iterator[None]:
+    """While the block runs, let signals that would kill the script end it as `sys.exit` does. The end of the script
+    completes the run's folder.
+    """
+    is_main = threading.current_thread() is threading.main_thread()  # no other thread can set handlers
+    _looping.add(run)
+    for number in KILLING if is_main else ():
+        if signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, end_by)
+    try:
+        yield
+    finally:
+        _looping.discard(run)
+        for number in KILLING if is_main and not _looping else ():
+            if signal.getsignal(number) is end_by:
+                signal.signal(number, signal.SIG_DFL)
+
+
+@atexit.register
+def _leave_loops() -> None:
+    """Complete the folders of runs whose iterators are still open at the end of the script."""
+    for run in list(_looping):
+        with contextlib.suppress(Exception):  # it is logged, and the script has ended
+            run.close()
+
 
 class Run:
     """Optimisation that computes one iteration at a time. `optimize` returns a `Run`.
@@ -57,23 +91,28 @@ class Run:
     A run stops when you leave the loop (`break` or an error), at the end of a `with` block, and on `close`. The folder
     of a stopped run is complete, as after Ctrl-C on the command line. The folder holds manifest, checkpoint,
     parameters, final images and report, and its lock is released. A second loop continues where the first one stopped.
-    An interrupt (Ctrl-C, a notebook's stop button) ends the loop after the current iteration.
+    An interrupt (Ctrl-C, a notebook's stop button) ends the loop after the current iteration. SIGTERM and SIGHUP then
+    also end the script, with the exit code 143 or 129. The end of the script completes the folder of an open iterator.
 
-    Runs in one process share only the device. You can alternate between them: `zip(run_a, run_b)`.
+    Runs in one process share only the device. You can alternate between them: `zip(run_a, run_b)`. Runs in different
+    threads take turns, one iteration at a time.
     """
 
     def __init__(
-        self, stack: contextlib.ExitStack, begun: PreparedRun, writes: bool, callbacks: Sequence[Callback] = ()
-    ) -> None:
+        self, stack: contextlib.ExitStack, begun: PreparedRun, writes: bool, callbacks: Sequence[Callback] = (),
+        folder: Path | None = None,
+    ) -> None:  # fmt: skip
         self._begun, self._writes, self._stack, self._callbacks = begun, writes, stack, callbacks
         self._records: list[Record] = []
-        self._folder: Path | None = None
+        self._folder = folder
         done = begun.course.done >= self.config.run.iterations and not writes
         self._status = Status.FINISHED if done else Status.RUNNING
         self._stopped = False
         self._failure: BaseException | None = None
         self._loop: weakref.ref[Generator[Record, None, None]] | None = None
         self._uses = self._scene_uses()
+        if folder is not None and writes:
+            _waiting.add(self)
 
     # --- iterating ----------------------------------------------------------------------------------------------------
 
@@ -87,30 +126,32 @@ class Run:
 
     def _iterations(self) -> Generator[Record, None, None]:
         made = self._made()
-        try:
-            while True:
-                if self._scene_uses() != self._uses:
-                    reason = "has been used by another run or call since; load it once for each run"
-                    raise ConfigError("scene", "", reason)
-                with held():
-                    record = next(made, None)
-                if record is None:
-                    return
-                self._records.append(record)
-                yield record
-        except GeneratorExit:
-            # Python discards an exception raised while the loop is left, so `close` raises it.
+        _waiting.discard(self)
+        with _completed_at_the_end(self):
             try:
+                while True:
+                    if self._scene_uses() != self._uses:
+                        reason = "has been used by another run or call since; load it once for each run"
+                        raise ConfigError("scene", "", reason)
+                    with held():
+                        record = next(made, None)
+                    if record is None:
+                        return
+                    self._records.append(record)
+                    yield record
+            except GeneratorExit:
+                # Python discards an exception raised while the loop is left, so `close` raises it.
+                try:
+                    with held():
+                        made.close()
+                except Exception as error:
+                    self._failure = error
+                    logger.error("%s", describe(error))
+            finally:
                 with held():
                     made.close()
-            except Exception as error:
-                self._failure = error
-                logger.error("%s", describe(error))
-        finally:
-            with held():
-                made.close()
-                if self.config.own_scene is not None:
-                    self._leave_values()
+                    if self.config.own_scene is not None:
+                        self._leave_values()
 
     def _scene_uses(self) -> int:
         own = self.config.own_scene
@@ -149,7 +190,7 @@ class Run:
                     self._status = Status(self._begun.manifest.status)
 
     def _unwritten(self) -> Generator[Record, None, None]:
-        course, self._status = self._begun.course, Status.FAILED
+        course, status = self._begun.course, Status.FAILED
         calls = self._begun.calls(self._callbacks, None)
         try:
             calls.begin()
@@ -163,20 +204,16 @@ class Run:
                 yield record
             if calls:
                 calls.images("final", self.images)
-            self._status = Status.FINISHED
+            status = Status.FINISHED
         except (GeneratorExit, KeyboardInterrupt):
-            self._status = Status.INTERRUPTED
+            is_done = course.done >= self.config.run.iterations or bool(course.state.stopped)
+            status = Status.FINISHED if is_done else Status.INTERRUPTED
             raise
         finally:
             course.stand()
-            is_done = course.done >= self.config.run.iterations or bool(course.state.stopped)
-            if is_done and self._status is Status.INTERRUPTED:
-                self._status = Status.FINISHED
-            try:
-                calls.end(self._status.value)
-            except Exception:
-                self._status = Status.FAILED
-                raise
+            self._status = Status.FAILED
+            calls.end(status.value)
+            self._status = status
 
     def live(self) -> Iterator[Record]:
         """Iterate with a progress bar of `tqdm.auto`, which is a widget in a notebook with `reslrb[notebook]`."""
@@ -198,10 +235,17 @@ class Run:
         loop = None if self._loop is None else self._loop()
         if loop is not None:
             loop.close()
-        self._stack.close()
+        self._release()
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
+
+    def _release(self) -> None:
+        """Release the lock of a resumed run before its loop. The loop then opens the folder again."""
+        self._stack.close()
+        if self in _waiting:
+            _waiting.discard(self)
+            self._stopped = True
 
     def __enter__(self) -> Run:
         return self
@@ -251,7 +295,8 @@ class Run:
         Values are float32, in the units of the parameters. Shapes: texture (height, width, channels), colour
         (channels,), number (), vertices (count, 3).
         """
-        return self._begun.course.values()
+        with held():
+            return self._begun.course.values()
 
     @property
     def gradients(self) -> dict[str, Array]:
@@ -261,7 +306,8 @@ class Run:
         are not finite.
         """
         course = self._begun.course
-        return course.shown(course.state.gradients)
+        with held():
+            return course.shown(course.state.gradients)
 
     @property
     def images(self) -> dict[int, Array]:
@@ -283,7 +329,8 @@ class Run:
     @property
     def targets(self) -> dict[int, Array]:
         """The target of each view, by sensor index: float32 arrays (height, width, channels) without alpha."""
-        return {view.sensor: np.array(view.target) for view in self._begun.course.problem.views}
+        with held():
+            return {view.sensor: np.array(view.target) for view in self._begun.course.problem.views}
 
     @property
     def truth(self) -> dict[str, Array]:
@@ -361,9 +408,11 @@ def optimize(
                 raise ConfigError("scene", "", "cannot be given with resume, which uses that of the run")
             earlier = as_path(resume, "resume", "the folder of a run")
             listen = functools.partial(callbacks_of, more=callbacks, source="callbacks")
-            run = Run(*_reopened(earlier, put_in, loss, allow_code, listen))
-            run._folder = earlier
-            return run
+            folder = Path(os.path.abspath(earlier))
+            for run in list(_waiting):  # of a notebook's cell that was run before
+                if run.folder == folder:
+                    run._release()
+            return Run(*_reopened(earlier, put_in, loss, allow_code, listen), folder)
         if experiment is None:
             raise ConfigError("experiment", "", "is missing; give a configuration, or resume=RUN")
         config = _with_own(load_with(experiment, [*put_in, *named], scene=scene), loss, allow_code)
@@ -374,7 +423,7 @@ def optimize(
                 raise ConfigError("folder", "", error.message) from None
         variant = keep_variant(config.variant, config.source)
         listeners = callbacks_of(config, callbacks, "callbacks")
-        begun = begin(config, variant, logger.info, logger.warning)
+        begun = begin(config, variant, logger.info, logger.warning, "" if folder is None else path.name)
         return Run(contextlib.ExitStack(), begun, folder is not None, listeners)
 
 

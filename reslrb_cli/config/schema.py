@@ -7,7 +7,7 @@ the descriptions.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -279,6 +279,14 @@ class Config(Section):
         return own | {key: one for key, one in loss_keys("file", self.loss) if isinstance(one, Custom)}
 
     @property
+    def paths(self) -> dict[str, Path]:
+        """The file or folder in each setting that names one, as a mapping from the key. The section `run` is left out,
+        because it names only the place of the results.
+        """
+        found = dict(_paths(self.model_dump(exclude={"run"}), ""))
+        return found | {key: one.path for key, one in self.codes.items() if one.path is not None}
+
+    @property
     def by_pixel(self) -> bool:
         """Whether every loss is a sum of functions of single pixels."""
         return all(loss.type not in ("ssim", "custom") for loss in self.losses)
@@ -408,3 +416,15 @@ def _check_passes(integrator: Integrator, spp: int, key: str, spp_key: str) -> N
     if not _passes_divide(integrator, spp):
         per_pass = getattr(integrator, "samples_per_pass", None)
         raise located(f"{key}.samples_per_pass", f"{per_pass} does not divide {spp_key}, which is {spp}")
+
+
+def _paths(value: Any, key: str) -> Iterator[tuple[str, Path]]:
+    """Yield the paths in the settings, each with its key in the syntax of `--set`."""
+    if isinstance(value, Path):
+        yield key, value
+    elif isinstance(value, Mapping):
+        for name, each in value.items():
+            yield from _paths(each, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, (list, tuple)):
+        for place, each in enumerate(value):
+            yield from _paths(each, f"{key}[{place}]")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -41,6 +42,17 @@ MOST_RECORDINGS = 8
 #: Maximum number of recorded calls: a script that makes a new sensor for every image would record forever.
 MOST_CALLS = 256
 
+#: Thread whose calls are recorded. Recordings of two threads that alternate do not see the objects of their scenes.
+_recorder: threading.Thread | None = None
+
+
+def _may_record() -> bool:
+    """Return True if calls of this thread are recorded. Until the recording thread ends, no other thread may record."""
+    global _recorder
+    if _recorder is None or not _recorder.is_alive():
+        _recorder = threading.current_thread()
+    return _recorder is threading.current_thread()
+
 
 class Recordings:
     """Recordings of calls on the samples of one scene, by kind, plan and sensor."""
@@ -54,9 +66,9 @@ class Recordings:
 
         `function` must depend only on its inputs. `kind` must determine all values that are no Dr.Jit arrays. The
         derivatives that `function` adds to parameters must be proportional to the first of `inputs`. Calls that cannot
-        be recorded are made directly. For example, a call cannot be recorded while a second scene is alive. The second
-        scene takes part in indirect calls, but is not an input. Calls that were recorded too often are also made
-        directly. Raises UnsupportedScene if a recording no longer fits.
+        be recorded are made directly, and so are calls of a second thread. For example, a call cannot be recorded while
+        a second scene is alive. The second scene takes part in indirect calls, but is not an input. Calls that were
+        recorded too often are also made directly. Raises UnsupportedScene if a recording no longer fits.
         """
         s = samples
         # Sensors that share a recording would remake it at every change of sensor. The key holds the sensor, so no
@@ -70,6 +82,8 @@ class Recordings:
         common = (s.scene, s.sensor, *(_arrays(side) for side in s.sides()))
         if self._recordable is None:
             self._recordable = not has_software_textures(s.scene)
+        if not _may_record():
+            return plain(*common, *inputs)
         if self._recordable and key not in self._functions and len(self._functions) < MOST_CALLS:
             self._functions[key] = _record(kind, plain, common, inputs)
         recorded = self._functions.get(key)

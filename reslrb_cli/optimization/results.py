@@ -64,20 +64,18 @@ class Results:
         self._first = self.meter.errors(problem.selection.array)
         self._last: dict[str, float] = {}
         self._values: dict[str, dict[str, Any]] = {key: {} for key in problem.selection.keys}
-        self._losses: list[float] = []
-        self._iterations = 0
+        #: Losses (`loss`) and errors of parameters (`error/KEY`), with one number for each iteration.
+        self.history: dict[str, list[float]] = {"loss": []}
         self.images = {"initial": Images(), "final": Images()}
-        self._errors: dict[str, list[float]] = {}
         self._take("initial")
         for key, true in problem.truth.items():
             self._values[key]["true"] = summary(true, problem.masks.get(key))
 
     def add(self, record: Record) -> None:
         """Record one iteration."""
-        self._iterations += 1
-        self._losses.append(record.loss)
+        self.history["loss"].append(record.loss)
         for key, error in record.parameter_errors.items():
-            self._errors.setdefault(key, []).append(error)
+            self.history.setdefault(f"error/{key}", []).append(error)
 
     def end(self) -> None:
         """Record the current parameters as the final ones."""
@@ -110,12 +108,13 @@ class Results:
         - `samples` has the sample counts of a step and of a rendered target. Without a rendered target, the target's
             count is null.
         """
-        trend = find_trend(self._losses)
+        losses = self.history["loss"]
+        trend = find_trend(losses)
         run, render = self.problem.config.run, self.problem.config.target.render
         first, last = self._first, self._last
         relative = self.meter.relative(first), self.meter.relative(last)
-        worse = [key for key, error in last.items() if got_worse(self._errors.get(key, []), error)]
-        if self._iterations < min(run.iterations, LEAST_ITERATIONS):  # a run that continues has no result yet
+        worse = [key for key, error in last.items() if got_worse(self.history.get(f"error/{key}", []), error)]
+        if len(losses) < min(run.iterations, LEAST_ITERATIONS):  # a run that continues has no result yet
             worse = []
         found: dict[str, Any] = finite({
             "rmse": {"initial": self.meter.total(first), "final": self.meter.total(last)},

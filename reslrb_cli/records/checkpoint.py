@@ -54,8 +54,11 @@ def open_archive(path: Path) -> Iterator[Mapping[str, Array]]:
 
 STATE_FILE, PREVIOUS_FILE_NAME, _NEXT_FILE = "state.npz", "previous.npz", "next.npz"
 
+#: File with the values of all parameters, in the subfolder `parameters`.
+PARAMETERS_FILE = "parameters.npz"
+
 #: Format version in the JSON of a state. It changes when the meaning of an entry changes.
-FORMAT = 4
+FORMAT = 5
 
 
 def save_checkpoint(

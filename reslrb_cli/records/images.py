@@ -21,6 +21,7 @@ import numpy as np
 
 from reslrb_cli.config.parameters import HEIGHTMAP
 from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.records.checkpoint import PARAMETERS_FILE
 
 Array = np.ndarray[Any, Any]
 
@@ -180,10 +181,6 @@ def _place(letter: str) -> tuple[int, int, str]:
     if letter in tuple("RGBA"):
         return 0, "RGBA".index(letter), ""
     return 1, int(letter) if letter.isdecimal() else 0, letter
-
-
-#: File with the unchanged values of all parameters.
-PARAMETERS_FILE = "parameters.npz"
 
 
 def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:

@@ -1,7 +1,7 @@
 """The metrics of a run, `metrics.jsonl`: one JSON object per line, one line per iteration.
 
-A resumed run keeps the lines of the iterations that its checkpoint contains. All later lines are dropped. The tallies
-sum up non-finite values and regularizers over a whole run.
+The file is a log. A run resumes from its checkpoint alone, and keeps the lines of the iterations that the checkpoint
+contains. All later lines are dropped. The tallies sum up non-finite values and regularizers over a whole run.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import ConfigDict, ValidatorFunctionWrapHandler, WrapValidator
 
 from reslrb_cli.config.files import read_file
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import write_atomically
 
 METRICS_FILE = "metrics.jsonl"
@@ -140,7 +139,7 @@ class MetricsWriter:
             raise OSError(error.errno, error.strerror, str(self._path)) from error
 
     def sync(self) -> None:
-        """Flush the lines to the disk, so that a loss of power cannot remove lines that a checkpoint needs."""
+        """Flush the lines to the disk, so that after a loss of power the log is not behind the checkpoint."""
         if self._descriptor is not None:
             with contextlib.suppress(OSError):  # not all file systems support it; the lines are written anyway
                 os.fsync(self._descriptor)
@@ -165,45 +164,34 @@ def mend(folder: Path) -> None:
         pass
 
 
-def read_records(folder: Path, count: int) -> tuple[list[Record], int]:
-    """Return the first `count` records in `folder`, and their size in bytes. A checkpoint contains the iterations of
-    the returned records.
-
-    Raises a ConfigError that names the file if records are missing, or file and line if a complete line is damaged.
+def cut_back(folder: Path, count: int) -> int:
+    """Keep the lines of the first `count` iterations in the metrics file of `folder`, and drop all other lines. Returns
+    the number of missing lines. Raises OSError.
     """
-    path = folder / METRICS_FILE
-    content = read_file(path) if count and os.path.lexists(path) else b""
-    whole = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
-    records = [_record(line, number, path) for number, line in enumerate(whole)]
-    if len(records) < count:
-        held = f"holds {len(records)} of the {count} iterations of the checkpoint"
-        raise ConfigError(path, "", f"{held}; put it back, or begin anew from `initial: {{run: ...}}`")
-    return records, sum(map(len, whole))
-
-
-def cut_back(folder: Path, size: int) -> None:
-    """Cut the metrics file in `folder` back to its first `size` bytes."""
-    path = folder / METRICS_FILE
-    if size:
-        os.truncate(path, size)
-    else:
+    path, kept, following = folder / METRICS_FILE, list[bytes](), 0
+    content = read_file(path) if os.path.lexists(path) else b""
+    for line in content.splitlines(keepends=True):
+        number = _iteration_of(line)
+        if following <= number < count:
+            kept.append(line)
+            following = number + 1
+    text = b"".join(kept)
+    if not text:
         path.unlink(missing_ok=True)
+    elif content.startswith(text):
+        os.truncate(path, len(text))
+    else:
+        write_atomically(path, lambda file: file.write(text))
+    return count - len(kept)
 
 
-_RECORD: TypeAdapter[Record] = TypeAdapter(Record)
-
-
-def _record(line: bytes, number: int, path: Path) -> Record:
-    """Return the record of iteration `number` in `line`. Raises ConfigError."""
+def _iteration_of(line: bytes) -> int:
+    """Return the iteration of a complete line, or -1 if the line is damaged."""
     try:
-        record = _RECORD.validate_json(line)
-        if record.iteration == number:
-            return record
-        reason = "another iteration"
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        reason = ": ".join([*map(str, first["loc"]), first["msg"]])
-    raise ConfigError(path, f"line {number + 1}", f"is not what a run writes ({reason})")
+        number = json.loads(line)["iteration"] if line.endswith(b"\n") else None
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return -1
+    return number if isinstance(number, int) else -1
 
 
 class _Tally:
@@ -248,7 +236,7 @@ class RegularizedTally(_Tally):
     """
 
     iterations: int = 0
-    costs: dict[str, dict[str, float]] = field(default_factory=dict)
+    costs: dict[str, dict[str, Figure]] = field(default_factory=dict)
     held_iterations: int = 0
     held: dict[str, int] = field(default_factory=dict)
 

@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.config.loader import Override, load
+from reslrb_cli.config.loader import Override, changed, load, parse_override
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.records import metrics
 from reslrb_cli.records.atomic import remove_parts, unfinished_folder, write_atomically
-from reslrb_cli.records.checkpoint import STATE_FILE, newest_checkpoint, open_archive
+from reslrb_cli.records.checkpoint import PARAMETERS_FILE, STATE_FILE, newest_checkpoint, open_archive
 from reslrb_cli.records.lock import FolderLock, Holder, InUse
 from reslrb_cli.records.manifest import Manifest, Status, read_manifest
 
@@ -50,7 +50,7 @@ def workshop_file(name: str) -> str:
 
 
 def read_value(run: Path, key: str) -> Array:
-    """Return the value of `key` in the newest checkpoint of the run folder `run`.
+    """Return the newest value of `key` in the run folder `run`.
 
     Shapes are as in `parameters.npz`: texture (H, W, C), colour (C,), buffer (N,), number (). The caller must check for
     values that are not finite. Raises a ConfigError that names the folder or file if the folder is damaged or not a run
@@ -58,9 +58,10 @@ def read_value(run: Path, key: str) -> Array:
     """
     path = checkpoint_of(run)
     with open_archive(path) as archive:
-        known = [name.removeprefix("parameter/") for name in archive if name.startswith("parameter/")]
+        prefix = "" if path.name == PARAMETERS_FILE else "parameter/"
+        known = [name.removeprefix(prefix) for name in archive if name.startswith(prefix)]
         if key in known:
-            return archive[f"parameter/{key}"].astype(np.float32)
+            return archive[f"{prefix}{key}"].astype(np.float32)
     near = difflib.get_close_matches(key, known, n=_SHOWN, cutoff=0.5) or known[:_SHOWN]
     has = " and ".join(f"`{name}`" for name in near) or "nothing"
     more = f" and {len(known) - len(near)} more" if len(known) > len(near) else ""
@@ -73,10 +74,25 @@ def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
     Raises a ConfigError that names the folder if the folder is not a run folder or holds no values.
     """
     checkpoint_of(run)
-    config = load(run / "config.yaml", overrides)
+    config = read_config(run, overrides)
     start = RunValue(run=run.absolute())
     specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
     return config.model_copy(update={"parameters": specs})
+
+
+def read_config(run: Path, overrides: Sequence[str | Override] = ()) -> Config:
+    """Return the configuration of the run in the folder `run`, with `overrides`. Raises ConfigError.
+
+    If the run was moved together with the files of its experiment, the settings name the files' new places.
+    """
+    config = load(run / "config.yaml", overrides)
+    here, moved = Path(os.path.abspath(run)).parent, []
+    for key, path in config.paths.items():
+        place = Path(os.path.normpath(here / os.path.relpath(path, config.run.output)))
+        if not path.exists() and place.exists():
+            name = str(config.codes[key].file).rpartition(":")[2] if key in config.codes else ""
+            moved.append(replace(parse_override(f"{key}=null"), value=f"{place}:{name}" if name else str(place)))
+    return changed(config, moved)
 
 
 def exposures(run: Path) -> dict[int, Array]:
@@ -92,9 +108,13 @@ def exposures(run: Path) -> dict[int, Array]:
 
 
 def checkpoint_of(run: Path) -> Path:
-    """Return the file of the newest checkpoint of the run folder `run`. Raises ConfigError if there is none."""
+    """Return the file with the newest values in the run folder `run`: the newest checkpoint, or the parameters of a run
+    that has ended, if its checkpoints have been removed. Raises ConfigError if there is none.
+    """
     _manifest_of(run)
-    path = newest_checkpoint(run / "checkpoint")
+    path, final = newest_checkpoint(run / "checkpoint"), run / "parameters" / PARAMETERS_FILE
+    if path is None and final.exists():
+        return final
     if path is None:
         raise ConfigError(run, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
     return path
@@ -232,6 +252,8 @@ def link_latest(folder: Path) -> None:
 def _who_works(content: Mapping[str, Any]) -> str:
     """Return the process that uses a folder, from the content of its manifest."""
     holder = Holder.from_json(content.get("process"))
+    if holder is not None and replace(holder, locked=False) == Holder.here(locked=False):
+        return "a loop of this process; leave it, or call `close()` of its Run"
     return f"{holder}, since {content.get('started')}" if holder is not None else "another process"
 
 
@@ -258,7 +280,7 @@ def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
         raise in_use from None
     except OSError as error:
         raise ConfigError(path, "", f"cannot be opened: {error.strerror}") from None
-    with RunFolder(path, lock) as folder:
+    with RunFolder(Path(os.path.abspath(path)), lock) as folder:  # a script may change its working directory
         if not lock.real and content.get("status") == Status.RUNNING:
             raise in_use
         yield folder, read_manifest(path) or content

@@ -39,7 +39,7 @@ from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest, commit_of
 from reslrb_cli.records.metrics import NonFiniteTally, Record, RegularizedTally
 from reslrb_cli.records.run_folder import RunFolder
-from reslrb_cli.records.tree import Arrays, Stored, entries, entry
+from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
 from reslrb_cli.runs.callbacks import Callback, Calls, RunInfo
 from reslrb_cli.runs.log import collected
@@ -85,17 +85,29 @@ def changes(before: Config, now: Config) -> dict[str, Change]:
     }
 
 
-def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], run: Path) -> dict[str, Change]:
-    """Return the changed settings. Settings that only determine the run's place do not count as changes.
+def check_changes(
+    found: Mapping[str, Change], blame: Callable[[str], object], run: Path, now: Config
+) -> dict[str, Change]:
+    """Return the changed settings of the experiment `now`. Settings that only determine the run's place do not count as
+    changes. The place of a file may change, because `check_files` compares the contents.
 
     Raises ConfigError, located at the first setting that must not change. `blame` returns the source of this setting.
     """
-    wrong = next((key for key in found if not MAY_CHANGE.fullmatch(key)), None)
+    refused = (key for key, each in found.items() if not MAY_CHANGE.fullmatch(key) and not moves(key, each, now))
+    wrong = next(refused, None)
     if wrong is not None:
-        before, now = map(_shown, found[wrong])
-        reason = f"is {now}, {before} in the run; {run} may change only iterations and learning rates"
+        before, after = map(_shown, found[wrong])
+        reason = f"is {after}, {before} in the run; {run} may change only iterations, learning rates, and paths"
         raise ConfigError(blame(wrong), wrong, reason)
     return {key: change for key, change in found.items() if key not in PLACE}
+
+
+def moves(key: str, change: Change, config: Config) -> bool:
+    """Return True if the setting `key` of `config` names another place of a file, and for code the same class."""
+    before, now = change
+    if key not in config.paths or before is None or now is None:
+        return False
+    return key not in config.codes or before.rpartition(":")[2] == now.rpartition(":")[2]
 
 
 def flat(config: Config) -> dict[str, Any]:
@@ -170,12 +182,14 @@ def digests(config: Config) -> dict[str, str]:
 
 
 def check_files(before: Mapping[str, str], config: Config, run: str = "the run") -> None:
-    """Raise ConfigError if a file of the experiment is not the one with which the run began. `before` are digests."""
-    here = digests(config)
+    """Raise ConfigError if a file of the experiment has changed since the run began. `before` are digests."""
+    here, paths = digests(config), config.paths
     for key, digest in before.items():
         if here.get(key) != digest:
             what = "has changed" if key in here else "is missing"
-            raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or start a new run")
+            place = f"{paths[key]} " if key in paths else ""
+            reason = f"{place}{what} since {run} began; put it back, name its new place, or start a new run"
+            raise ConfigError(config.source, key, reason)
 
 
 Array = np.ndarray[Any, Any]
@@ -183,9 +197,15 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class SavedResults:
-    """Results in a checkpoint, in addition to the records of the iterations."""
+    """Results in a checkpoint. `last` is the record of the last iteration. `history` has an array with one number for
+    each iteration: `loss`, `rate` (the schedule's factor) and `error/KEY`.
+    """
 
     images: Images
+    last: Record | None
+    nonfinite: NonFiniteTally
+    regularized: RegularizedTally
+    history: Arrays = field(default_factory=dict, metadata=entry("history"))
     last_steps: Arrays = field(default_factory=dict, metadata=entry("last steps"))
 
 
@@ -218,7 +238,11 @@ class RunProgress:
 
     def add(self, state: State, record: Record) -> None:
         """Add one iteration, with the `state` after it."""
-        self._take(record)
+        self.last = record
+        self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
+        self.results.add(record)
+        self.nonfinite.add(record)
+        self.regularized.add(record)
         self.certainty.see(self.state, state)
         self.state = state
 
@@ -235,13 +259,6 @@ class RunProgress:
         """Reset the problem to `state` if an iteration was interrupted."""
         if self.problem.optimizer.stands_at is not self.state:
             put(self.problem, self.state)
-
-    def _take(self, record: Record) -> None:
-        self.last = record
-        self.certainty.rates.append(record.lr / self.problem.config.optimizer.learning_rate)
-        self.results.add(record)
-        self.nonfinite.add(record)
-        self.regularized.add(record)
 
     def shown(self, values: Mapping[str, Any]) -> dict[str, Array]:
         """Convert optimiser values or gradients, by key, to the form of `problem.values()`."""
@@ -260,24 +277,31 @@ class RunProgress:
         """Return the arrays and the other values that a checkpoint stores for `state`, in the form of
         `tree.entries`.
         """
+        history = {"rate": self.certainty.rates, **self.results.history}
         met = SavedResults(
-            self.results.images["initial"], self.certainty.last,
+            self.results.images["initial"], self.last, self.nonfinite, self.regularized,
+            {name: np.array(numbers, dtype=np.float64) for name, numbers in history.items()}, self.certainty.last,
         )  # fmt: skip
         return entries(self._settled, state.on_file(self.problem), met)
 
-    def restore(self, stored: Stored, records: Sequence[Record]) -> None:
-        """Restore the state from a checkpoint and the records of all iterations before it.
+    def restore(self, stored: Stored) -> None:
+        """Restore the state from a checkpoint.
 
         Raises a ConfigError that names the file if the content does not fit the run.
         """
         problem, met = self.problem, stored.read(SavedResults)
         self.state = load(problem, stored)
         last = dict.fromkeys(entries_below(stored.arrays, "last steps/"))
-        met = stored.fill(replace(met, last_steps=last))
-        for record in records:
-            self._take(record)
+        numbers = expected((self.done,))
+        history = dict.fromkeys(("loss", "rate", *entries_below(stored.arrays, "history/")), numbers)
+        met = stored.fill(replace(met, last_steps=last, history=history))
+        if (-1 if met.last is None else met.last.iteration) != self.done - 1:
+            raise stored.wrong("last", f"is not the record of iteration {self.done - 1}")
+        found = {name: array.tolist() for name, array in met.history.items()}
+        self.certainty.rates, self.results.history = found.pop("rate"), found
         self.results.images["initial"] = met.images
         self.certainty.last = dict(met.last_steps)
+        self.last, self.nonfinite, self.regularized = met.last, met.nonfinite, met.regularized
 
 
 @dataclass(frozen=True)
@@ -306,8 +330,8 @@ class PreparedRun:
         return Calls(callbacks, run, self.manifest)
 
 
-def begin(config: Config, variant: str, say: Say, warn: Say) -> PreparedRun:
-    """Prepare a new run in its own folder. A variant must be set.
+def begin(config: Config, variant: str, say: Say, warn: Say, folder: str = "") -> PreparedRun:
+    """Prepare a new run in its own folder, which `folder` names, or else `run.name`. A variant must be set.
 
     Call `check_output` first, to check that the folder can be made. Raises ConfigError and UnsupportedScene.
     """
@@ -317,6 +341,6 @@ def begin(config: Config, variant: str, say: Say, warn: Say) -> PreparedRun:
     return PreparedRun(
         course,
         manifest,
-        lambda: RunFolder.create(config.source, run.output, run.folder_name, dump(config), manifest),
+        lambda: RunFolder.create(config.source, run.output, folder or run.folder_name, dump(config), manifest),
         said,
     )

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from reslrb_cli.config.loader import OVERRIDDEN, Override, dump, load, loads
+from reslrb_cli.config.loader import OVERRIDDEN, Override, dump, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.state import Settled, State
 from reslrb_cli.records.checkpoint import PREVIOUS_FILE_NAME, STATE_FILE
 from reslrb_cli.records.manifest import Manifest, Status, now, versions
-from reslrb_cli.records.metrics import Record, cut_back, read_records
-from reslrb_cli.records.run_folder import RunFolder, check_writable, opened, write_beginning
+from reslrb_cli.records.metrics import METRICS_FILE, cut_back
+from reslrb_cli.records.run_folder import RunFolder, check_writable, opened, read_config, write_beginning
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.runs.log import collected
 from reslrb_cli.runs.prepare import (
@@ -32,13 +33,15 @@ from reslrb_cli.runs.prepare import (
 
 Say = Callable[[str], None]
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass
 class OpenedRun:
     """Run to be resumed: its locked folder, its manifest, its stored state and the new configuration.
 
-    `changed` holds the settings that differ from those at the start of the run. `records` are the records of the
-    iterations, which take `size` bytes. `said` collects warnings.
+    `changed` holds the settings that differ from those at the start of the run. `iteration` is the number of completed
+    iterations. `said` collects warnings.
     """
 
     folder: RunFolder
@@ -47,14 +50,8 @@ class OpenedRun:
     settled: Settled
     config: Config
     changed: dict[str, Change]
-    records: list[Record]
-    size: int
+    iteration: int
     said: list[str] = field(default_factory=list)
-
-    @property
-    def iteration(self) -> int:
-        """The number of completed iterations."""
-        return len(self.records)
 
     @property
     def is_done(self) -> bool:
@@ -77,8 +74,8 @@ class OpenedRun:
         more = f"run.{'max_seconds' if stopped else 'iterations'}{equals}NUMBER"
         done = f"{self.iteration} of {iterations} iterations"
         if stopped and self.config.run.max_seconds is None:
-            return f"{self.folder.path}: is finished, after {done}: {stopped}"
-        return f"{self.folder.path}: is finished, after {done}; {option} {more} continues it"
+            return f"{self.config.source.parent}: is finished, after {done}: {stopped}"
+        return f"{self.config.source.parent}: is finished, after {done}; {option} {more} continues it"
 
     def begin(self, variant: str, say: Say, warn: Say) -> PreparedRun:
         """Assemble the problem of the run and restore its state. A variant must be set.
@@ -89,7 +86,7 @@ class OpenedRun:
             problem = assemble(self.config, say, to_run=True, settled=self.stored)
         manifest = self._manifest(manifest_of(problem, variant, self.config.source))
         course = RunProgress(problem, variant)
-        course.restore(self.stored, self.records)
+        course.restore(self.stored)
         if not self.has_stopped:
             course.go_on()
         measured = course.state.scaling
@@ -131,7 +128,9 @@ class OpenedRun:
         folder = self.folder
         try:
             write_beginning(folder, dump(self.config), manifest)
-            cut_back(folder.path, self.size)
+            if missing := cut_back(folder.path, self.iteration):
+                lacks = f"lacks {missing} of the {self.iteration} iterations of the checkpoint, and so does the page"
+                logger.warning(f"{folder.path / METRICS_FILE}: {lacks}")
             if self.stored.path.name == PREVIOUS_FILE_NAME:  # the newest state is damaged
                 (folder.checkpoint / PREVIOUS_FILE_NAME).replace(folder.checkpoint / STATE_FILE)
         except OSError as error:
@@ -148,14 +147,14 @@ def open_earlier(run: Path, overrides: Sequence[str | Override]) -> Iterator[Ope
     The configuration is `config.yaml` in the run's folder, with `overrides`. Raises ConfigError if the folder holds no
     run, the run is in use, or the last two states are both damaged. Raises ConfigError also if a setting that must not
     change differs, or if `run.iterations` is below the number of finished iterations. Raises ConfigError also if an
-    input file has changed, if records are missing or damaged, or if the folder cannot be written to.
+    input file has changed, or if the folder cannot be written to.
     """
     with opened(run) as (folder, manifest):
         said: list[str] = []
         stored = _read_state(folder, said)
         settled, iteration = stored.read(Settled), stored.read(State).iteration
         began = loads(settled.config, stored.path)
-        config, source = load(run / "config.yaml", overrides), load(run / "config.yaml")
+        config, source = read_config(run, overrides), read_config(run)
         found = changes(began, config)
         asked = changes(source, config)
         blamed = "--set" if all(isinstance(each, str) for each in overrides) else OVERRIDDEN
@@ -163,13 +162,12 @@ def open_earlier(run: Path, overrides: Sequence[str | Override]) -> Iterator[Ope
             if key in asked:
                 reason = f"cannot change now; to leave {run} as it is, copy it and resume the copy"
                 raise ConfigError(blamed, key, reason)
-        differing = check_changes(found, lambda key: blamed if key in asked else config.source, run)
+        differing = check_changes(found, lambda key: blamed if key in asked else config.source, run, config)
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
             raise ConfigError(config.source, "run.iterations", reason)
         check_files(settled.files, config, str(run))
-        records, size = read_records(folder.path, iteration)
-        earlier = OpenedRun(folder, manifest, stored, settled, config, differing, records, size, said)
+        earlier = OpenedRun(folder, manifest, stored, settled, config, differing, iteration, said)
         if not earlier.is_done:
             check_writable(folder)
         yield earlier

@@ -7,9 +7,9 @@ reads its whole file, because times and sizes could hide a change.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from reslrb_cli.config.files import open_file
 from reslrb_cli.config.schema import Config
@@ -27,12 +27,10 @@ def files_of(config: Config) -> dict[str, Path]:
     A setting may lead to several files, with keys such as `scene.file (images/wood.png)`. Missing files are left out.
     Loading the experiment reports missing files. Raises ConfigError if a scene, cameras or a run cannot be read.
     """
-    settings = config.model_dump(exclude={"run"})
-    found = {key: path for key, path in _paths(settings, "") if path.exists()}
+    found = {key: path for key, path in config.paths.items() if path.exists()}
     for key, path in list(found.items()):
         if path.is_dir():  # of a run whose values are used
             found[key] = checkpoint_of(path)
-    found |= {key: one.path for key, one in config.codes.items() if one.path is not None}
     beside: list[tuple[str, Path]] = []
     if config.scene.file.is_file():
         description = read_description(config.scene.file, config.scene.options)
@@ -46,21 +44,8 @@ def files_of(config: Config) -> dict[str, Path]:
     for key, path in beside:
         if path not in (config.scene.file, cameras):
             folder = found[key].parent
-            name = path.relative_to(folder) if path.is_relative_to(folder) else path
-            found[f"{key} ({name})"] = path
+            found[f"{key} ({os.path.relpath(path, folder)})"] = path
     return {key: path for key, path in found.items() if path.is_file()}
-
-
-def _paths(value: Any, key: str) -> Iterator[tuple[str, Path]]:
-    """Yield the paths in the settings, each with its key in the syntax of `--set`."""
-    if isinstance(value, Path):
-        yield key, value
-    elif isinstance(value, Mapping):
-        for name, each in value.items():
-            yield from _paths(each, f"{key}.{name}" if key else str(name))
-    elif isinstance(value, (list, tuple)):
-        for place, each in enumerate(value):
-            yield from _paths(each, f"{key}[{place}]")
 
 
 def file_digests(files: Mapping[str, Path]) -> dict[str, str]:

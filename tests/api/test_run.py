@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from itertools import zip_longest
 from pathlib import Path
@@ -22,6 +23,7 @@ from compilation import search_path
 from runs.going_on import TIMES, begin_alone, differences, optimize, records_of
 
 import reslrb_cli as rl
+from reslrb_cli.api import experiment as experiment_module
 from reslrb_cli.errors import MachineError, NonFinite
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.runs import recorder as recording
@@ -128,6 +130,51 @@ def test_two_experiments_alternate(experiment: Path) -> None:
     assert [run.status for run in runs] == ["finished", "finished"]
 
 
+def test_runs_in_two_threads_take_turns(experiment: Path) -> None:
+    """Each run gives the same records as alone, bit by bit, and neither waits until the other has ended."""
+    cases = [SET | {"run.seed": seed} for seed in (0, 7)]
+    alone = [list(map(as_json, rl.optimize("tiny.yaml", overrides=each))) for each in cases]
+    found: list[list[dict[str, Any]]] = [[], []]
+    order, start = list[int](), threading.Barrier(2)
+
+    def work(place: int) -> None:
+        run = rl.optimize("tiny.yaml", overrides=cases[place])
+        start.wait(60)
+        for record in run:
+            assert run.status == "running"
+            found[place].append(as_json(record))
+            order.append(place)
+            assert set(run.parameters) == set(STAYS)
+
+    threads = [threading.Thread(target=work, args=(place,), daemon=True) for place in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(100)
+    assert found == alone
+    assert set(order[:4]) == {0, 1}
+
+
+def test_no_thread_waits_for_a_loop_to_end() -> None:
+    """A thread in a loop gives way to a thread that waits, and a thread does not wait for itself."""
+    done, waiting = [0, 0], threading.Event()
+
+    def work() -> None:
+        waiting.set()
+        with experiment_module.held(), experiment_module.held():
+            done[1] = done[0]
+
+    thread = threading.Thread(target=work)
+    for done[0] in range(300):
+        with experiment_module.held():
+            time.sleep(0.001)
+            if done[0] == 10:
+                thread.start()
+                waiting.wait(10)
+    thread.join(10)
+    assert 10 <= done[1] < 100
+
+
 def leave_by_break(run: rl.Run) -> None:
     for record in run:
         if record.iteration == 1:
@@ -219,19 +266,74 @@ def test_a_run_continues_from_its_folder(experiment: Path, caplog: pytest.LogCap
     assert again.iteration == 3
     assert values_equal(again.parameters, first.parameters)
     assert [record.iteration for record in again] == [3, 4, 5]
-    assert again.folder == Path("mine")
+    assert again.folder == experiment / "mine"
     assert differences(Path("whole"), Path("mine")) == []
 
     assert caplog.messages == []
     done = rl.optimize(resume="mine")
     left = "mine: is finished, after 6 of 6 iterations; the override run.iterations: NUMBER continues it"
     assert [record.message for record in caplog.records if record.levelname == "WARNING"] == [left]
-    assert (done.status, list(done), done.folder) == ("finished", [], Path("mine"))
+    assert (done.status, list(done), done.folder) == ("finished", [], experiment / "mine")
     assert values_equal(done.parameters, again.parameters)
     assert is_free(Path("mine"))
 
     longer = rl.optimize(resume="mine", overrides={"run.iterations": 7})
     assert [record.iteration for record in longer] == [6]
+
+
+def test_a_folder_keeps_its_name(experiment: Path) -> None:
+    run = rl.optimize("tiny.yaml", folder="mine/my run #1 (é)", overrides=SET | {"run.iterations": 1})
+    list(run)
+    assert run.folder == experiment / "mine/my run #1 (é)"
+    assert [path.name for path in (experiment / "mine").iterdir()] == ["my run #1 (é)"]
+    for name in ("~x", "###"):
+        with pytest.raises(rl.ConfigError, match=r"run\.name: must "):
+            rl.optimize("tiny.yaml", folder=f"mine/{name}", overrides=SET)
+
+
+def test_a_cell_that_resumes_can_be_run_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The earlier Run, which no loop has used, gives the folder back. It can still be used later."""
+    with rl.optimize("tiny.yaml", folder="mine", overrides=SET) as first:
+        next(iter(first))
+    earlier = rl.optimize(resume="mine")
+    again = rl.optimize(resume="../" + experiment.name + "/mine")
+    loop = iter(again)
+    assert next(loop).iteration == 1
+    (experiment / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")  # the script's own business
+    assert [record.iteration for record in loop] == [2, 3, 4, 5]
+    assert is_free(experiment / "mine")
+    monkeypatch.chdir(experiment)
+    assert list(earlier) == []
+    assert (earlier.status, earlier.iteration) == ("finished", 6)
+    assert list(rl.optimize(resume="mine", overrides={"run.iterations": 6})) == []
+
+
+ENDED = """
+import os, signal, sys
+import reslrb_cli as rl
+few = {"run.iterations": 1000, "run.certainty": False}
+runs = [rl.optimize("tiny.yaml", folder=name, overrides=few) for name in "ab"]
+left = iter(runs[0])
+next(left)
+for record in runs[1]:
+    if record.iteration == 2:
+        os.kill(os.getpid(), getattr(signal, sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.long)])
+def test_the_end_of_a_script_completes_its_folders(name: str, experiment: Path) -> None:
+    """A signal of a batch system ends the script, whose other iterator is still open."""
+    environment = {**os.environ, "PYTHONPATH": search_path(), "RESLRB_CACHE": str(experiment / "cache")}
+    done = subprocess.run([sys.executable, "-c", ENDED, name], capture_output=True, text=True, env=environment)
+    assert done.returncode == 128 + getattr(signal, name), done.stderr
+    assert "Traceback" not in done.stderr
+    for folder, count in (("a", 1), ("b", 3)):
+        manifest = json.loads((experiment / folder / "manifest.json").read_text())
+        assert (manifest["status"], manifest["error"]) == ("interrupted", None)
+        assert manifest["results"]["iterations"] == count
+        assert files(experiment / folder) >= tiny.COMPLETE
 
 
 def test_folder_replaces_the_output_of_the_experiment(experiment: Path) -> None:

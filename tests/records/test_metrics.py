@@ -16,7 +16,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Origin, read_lines
-from reslrb_cli.records.metrics import MetricsWriter, Record, Regularized, cut_back, finite, read_records
+from reslrb_cli.records.metrics import MetricsWriter, Record, Regularized, cut_back, finite
 
 # metrics.jsonl: its keys, values without a number, and lines that a crash cut short.
 
@@ -109,7 +109,7 @@ def test_non_finite_values_and_bad_lines_are_reported_on_reading(tmp_path):
     assert read_lines(file) == [{"a": None, "b": [None, None, {"c": None}], "d": 1.5, "e": 7}, {"a": 2}]
 
 
-# The part of `metrics.jsonl` from which a run resumes.
+# The log of a run, and its state after the run is resumed.
 
 RECORD = Record(
     iteration=0, loss=0.1 + 0.2, step_ms=1.5, codegen_ms=0.0, elapsed_s=1 / 3,
@@ -119,54 +119,36 @@ RECORD = Record(
 )  # fmt: skip
 
 
-def written(folder: Path, count: int) -> list[Record]:
+def written(folder: Path, count: int) -> list[str]:
     records = [replace(RECORD, iteration=number) for number in range(count)]
     with MetricsWriter(folder) as metrics:
         for record in records:
             metrics.write(record)
-    return records
+    return [json.dumps(finite(asdict(record))) for record in records]
 
 
-def text(record: Record) -> str:
-    return json.dumps(finite(asdict(record)))
-
-
-def test_records_survive_a_round_trip(tmp_path: Path) -> None:
-    records = written(tmp_path, 5)
-    found, size = read_records(tmp_path, 3)
-    assert list(map(text, found)) == list(map(text, records[:3]))
-    assert math.isnan(found[0].grad_norm)
-    assert isinstance(found[0].regularized, Regularized)
-    cut_back(tmp_path, size)
-    assert (tmp_path / "metrics.jsonl").read_text().splitlines() == list(map(text, records[:3]))
-
-
-def test_a_run_before_its_first_iteration_has_no_lines(tmp_path: Path) -> None:
-    written(tmp_path, 2)
-    cut_back(tmp_path, read_records(tmp_path, 0)[1])
-    assert list(tmp_path.iterdir()) == []
-
-
-BAD = {
-    "another iteration": '{"iteration": 5}',
-    "a nest": "[" * 100_000,
-    "text": text(RECORD).replace('"spp": 4', '"spp": "4"'),
-    "a list of errors": text(RECORD).replace('{"a": 0.1}', "[0.1]"),
-    "infinity": text(RECORD).replace("1.5", "1e999"),
+#: Places of the lines of five iterations in a damaged log, by the damage, and the iterations that remain of four.
+DAMAGES: dict[str, tuple[list[int | str], list[int]]] = {
+    "none": ([0, 1, 2, 3, 4], [0, 1, 2, 3]),
+    "short": ([0, 1], [0, 1]),
+    "empty": ([], []),
+    "a line is missing": ([0, 2, 3, 4], [0, 2, 3]),
+    "a line is twice": ([0, 1, 1, 2, 3], [0, 1, 2, 3]),
+    "other lines": ([0, "[1]", "[" * 100_000, "nothing", '{"iteration": "1"}', "\0" * 9, 3, 4], [0, 3]),
 }
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_foreign_files_are_located(tmp_path: Path, case: str) -> None:
-    (tmp_path / "metrics.jsonl").write_text(BAD[case] + "\n")
-    with pytest.raises(ConfigError, match=r"metrics\.jsonl: line 1: is not what a run writes"):
-        read_records(tmp_path, 1)
-
-
-def test_missing_lines_are_reported(tmp_path: Path) -> None:
-    written(tmp_path, 2)
-    with pytest.raises(ConfigError, match="holds 2 of the 4 iterations of the checkpoint"):
-        read_records(tmp_path, 4)
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_log_is_cut_back_to_the_iterations_of_a_state(tmp_path: Path, damage: str) -> None:
+    lines, (places, kept) = written(tmp_path, 5), DAMAGES[damage]
+    file = tmp_path / "metrics.jsonl"
+    file.write_text("".join(f"{lines[each] if isinstance(each, int) else each}\n" for each in places) + '{"iterat')
+    assert cut_back(tmp_path, 4) == 4 - len(kept)
+    assert file.exists() == bool(kept)
+    if kept:
+        assert file.read_text().splitlines() == [lines[each] for each in kept]
+    assert cut_back(tmp_path, 0) == 0
+    assert list(tmp_path.iterdir()) == []
 
 
 # The first line of a file of measurements.

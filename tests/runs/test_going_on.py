@@ -171,8 +171,8 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
 
     restore = prepare.RunProgress.restore
 
-    def without_steps(self, stored, records):
-        restore(self, stored, records)
+    def without_steps(self, stored):
+        restore(self, stored)
         self.certainty.last = {}
 
     # A state in the last fifth of the run has all parts.
@@ -183,7 +183,7 @@ def test_lost_state_is_detected(fault: str, experiment: Path, monkeypatch: pytes
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
         "another seed": (loop, "seed", _another_seed),
         "no last steps": (prepare.RunProgress, "restore", without_steps),
-        "metrics not cut back": (resume, "cut_back", lambda folder, size: None),
+        "metrics not cut back": (resume, "cut_back", lambda folder, count: 0),
     }
     monkeypatch.setattr(*places[fault])
     assert optimize("--resume", str(left), "--quiet") == 0

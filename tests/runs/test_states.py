@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,14 @@ import numpy as np
 import pytest
 from cli import tiny
 from cli.test_storms import mount
-from runs.going_on import optimize, records_of, state_of
+from runs.going_on import differences, one_thread, optimize, records_of, state_of
 
 from reslrb_cli.cli import main
+from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import save_checkpoint
-from reslrb_cli.records.lock import FolderLock
+from reslrb_cli.records.lock import FolderLock, Holder
+from reslrb_cli.records.run_folder import read_value
 
 STATE, PREVIOUS = "checkpoint/state.npz", "checkpoint/previous.npz"
 
@@ -63,7 +67,9 @@ WRONG: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "a shape": ({PARAMETER: np.ones((4, 5, 3), np.float32)}, {}, f"{PARAMETER}: has shape (4, 5, 3), not (4, 4, 3)"),
     "objects": ({"mask/x": np.array([{}], dtype=object)}, {}, "is damaged, cut off, or not written by reslrb ("),
     "no state": ({"state": None}, {}, ""),
-    "more iterations than lines": ({}, {"iteration": 6}, "metrics.jsonl: holds 4 of the 6 iterations"),
+    "more iterations than its history": ({}, {"iteration": 6}, "history/loss: has shape (4,), not (6,)"),
+    "another last record": ({}, {"last": None}, "last: is not the record of iteration 3"),
+    "no history": ({"history/rate": None}, {}, "history/rate: is missing"),
     "too many iterations": ({}, {"iteration": 7}, "run.iterations: is 6; the run has done 7 already"),
     "a time": ({}, {"elapsed_s": "long"}, "elapsed_s: Input should be a valid number"),
     "a decision": ({}, {"decisions": [{"setting": 3}]}, "decisions.0."),
@@ -128,7 +134,7 @@ def test_a_changed_scene_is_another_experiment(
     text = scene.read_text()
     scene.write_text(text.replace("8, 8, 8", "9, 9, 9"))
     try:
-        assert "scene.file: has changed since " in told(capsys, run)
+        assert f"scene.file: {scene} has changed since " in told(capsys, run)
     finally:
         scene.write_text(text)
 
@@ -173,15 +179,78 @@ def test_a_missing_run_is_reported(tmp_path: Path, run: Path, capsys: pytest.Cap
 @pytest.mark.skipif(os.name != "posix", reason="no locks")
 def test_a_running_run_is_left_alone(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FolderLock(run):
-        assert "is in use by a run (process" in told(capsys, run)
+        assert "is in use by a run (a loop of this process; leave it" in told(capsys, run)
+    process = subprocess.Popen(["sleep", "60"])
+    (run / "manifest.json").write_text(
+        json.dumps(
+            json.loads((run / "manifest.json").read_text())
+            | {"process": asdict(replace(Holder.here(True), pid=process.pid))}
+        )
+    )
+    process.kill()
+    process.wait()
+    with FolderLock(run):
+        assert f"is in use by a run (process {process.pid} on " in told(capsys, run)
 
 
-def test_lost_lines_are_reported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = (run / "metrics.jsonl").read_bytes().splitlines(keepends=True)
+def test_a_run_needs_no_log(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The log has a gap, or is missing. The results in the manifest do not depend on it."""
+    whole, lines = run.with_name("whole"), (run / "metrics.jsonl").read_bytes().splitlines(keepends=True)
+    shutil.copytree(run, whole)
     (run / "metrics.jsonl").write_bytes(b"".join(lines[:2]))
-    assert told(capsys, run).startswith("metrics.jsonl: holds 2 of the 4 iterations of the checkpoint; put it back")
-    (run / "metrics.jsonl").write_bytes(b"".join([lines[0], lines[2], *lines[2:]]))
-    assert told(capsys, run).startswith("metrics.jsonl: line 2: is not what a run writes")
+    with one_thread():
+        assert [optimize("--resume", str(each), "--quiet") for each in (whole, run)] == [0, 0]
+    assert "metrics.jsonl: lacks 2 of the 4 iterations of the checkpoint" in capsys.readouterr().err
+    assert [record["iteration"] for record in records_of(run)] == [0, 1, 4, 5]
+    assert differences(whole, run) == ["records_of"]
+    (run / "metrics.jsonl").unlink()
+    assert optimize("--resume", str(run)) == 0
+    assert "is finished, after 6 of 6 iterations" in capsys.readouterr().out
+
+
+def test_a_moved_run_continues(run: Path, interrupted: Path, tmp_path: Path) -> None:
+    """The files of the experiment were moved with the run. Their former places do not exist."""
+    place, away = tmp_path / "elsewhere", interrupted.parents[1] / "scene.old"
+    (place / "runs").mkdir(parents=True)
+    moved = run.rename(place / "runs/tiny")
+    scene = interrupted.parents[1] / "scene.xml"
+    for file in (scene, scene.with_name("poster.exr")):
+        shutil.copy(file, place)
+    scene.rename(away)
+    try:
+        assert optimize("--resume", str(moved), "--quiet") == 0
+        config = load(moved / "config.yaml")
+        assert config.scene.file == place / "scene.xml"
+        other = place / "other.xml"
+        (place / "scene.xml").rename(other)
+        again = ["--resume", str(moved), "--quiet", "--set", "run.iterations=7"]
+        assert optimize(*again, "--set", f"scene.file={other}") == 0
+        assert json.loads((moved / "manifest.json").read_text())["resumed"][1]["changed"]["scene.file"][1] == str(other)
+        assert int(state_of(moved)["iteration"]) == 7
+    finally:
+        away.rename(scene)
+
+
+def test_a_missing_file_is_named(run: Path, interrupted: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = interrupted.parents[1] / "scene.xml"
+    line = told(capsys, run, "--set", f"scene.file={run}/other.xml")
+    assert line.startswith("config.yaml: scene.file: other.xml is missing since "), line
+    (run / "other.xml").write_text(scene.read_text().replace("8, 8, 8", "9, 9, 9"))
+    assert "other.xml has changed since " in told(capsys, run, "--set", f"scene.file={run}/other.xml")
+
+
+def test_values_outlive_the_checkpoints(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    expected = read_value(run, tiny.KEY)
+    shutil.rmtree(run / "checkpoint")
+    assert (read_value(run, tiny.KEY) == expected).all()
+    with pytest.raises(SystemExit) as end:
+        main.main(["export", str(run), "-o", str(tmp_path / "out")])
+    assert not end.value.code, capsys.readouterr().err
+    with pytest.raises(ConfigError, match=f"did not recover `other`; it has `{tiny.KEY}`"):
+        read_value(run, "other")
+    (run / "parameters/parameters.npz").unlink()
+    with pytest.raises(ConfigError, match=r"has no checkpoint/state\.npz"):
+        read_value(run, tiny.KEY)
 
 
 def test_an_unwritable_folder_is_reported(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
