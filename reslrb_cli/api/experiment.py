@@ -31,7 +31,7 @@ from reslrb_cli.config.schema import IN_MEMORY, Config
 from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import GradcheckRecord
-from reslrb_cli.records.run_folder import recovered
+from reslrb_cli.records.run_folder import exposed, exposures, recovered
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -48,6 +48,7 @@ Scene: TypeAlias = "Mapping[str, Any] | mi.Scene"
 #: Advice in error messages on the command line, and its replacement in a script.
 ARGUMENTS = {
     "add --set run.output=FOLDER": "give folder=FOLDER",
+    "use `render --value KEY=VALUE`": "give `values` to `render`",
     "--allow-code permits it": "allow_code=True permits it, or the experiment `load(...).with_code()`",
 }
 
@@ -207,36 +208,49 @@ def render(
     spp: int | None = None,
     values: Mapping[str, Any] | None = None,
     initial: bool = True,
+    exposure: bool = False,
 ) -> dict[int, Array]:
     """Render every view of an experiment and return the images by sensor index.
 
     Images are (height, width, channels) float32, in linear radiance. The experiment's integrator renders the images
-    with `spp` samples per pixel (default: `run.spp`).
+    with `spp` samples per pixel (default: `run.spp`). With `exposure=True`, the images of a run folder are multiplied
+    by the exposures of the run.
 
-    The parameters have their initial values. For a run folder, the parameters have the recovered values. `values` maps
-    keys to replacement values for the parameters. Each value is an array of the parameter's shape, or a number or list
-    that NumPy converts to this shape. Parameters that `values` does not name are unchanged. With `initial=False` the
-    scene is rendered as it is in its file.
+    The parameters have their initial values. For a run folder, the parameters have the recovered values. With
+    `initial=False` the scene is as in its file. Then `values` are set. `values` maps keys to new values: any key that
+    `reslrb inspect` lists as recoverable, and the keys of motions and heightmaps of the experiment. A value is a
+    number, a list with one number for each channel, an array of the parameter's shape, or `{"file": IMAGE}`.
 
     Sets the experiment's Mitsuba variant if none is set. Raises ConfigError (also if another variant is set) and
     UnsupportedScene.
     """
     with called():
         config = load(experiment)
-        if values is not None and not initial:
-            raise ConfigError("values", "", "are those of parameters; leave out `initial=False`")
+        factors = _exposures(experiment) if exposure else {}
         keep_variant(config.variant, config.source)
         from reslrb_cli.optimization.assemble import check_passes, load_for_rendering
         from reslrb_cli.optimization.loading import render_in_passes
+        from reslrb_cli.optimization.views import color_channels
 
         with _scene_given_back(config):
             scene, sensors, integrator, multiple = load_for_rendering(config, initial, values)
             samples = config.run.spp if spp is None else spp
             check_passes("spp", samples, multiple)
-            return {
+            images = {
                 sensor: render_in_passes(integrator, scene, sensor, samples, config.run.seed, 0, "render", multiple)
                 for sensor in sensors
             }
+            for sensor in set(images) & set(factors):
+                colours = color_channels(scene.sensors()[sensor].film())
+                images[sensor] = exposed(images[sensor], factors[sensor], colours)
+            return images
+
+
+def _exposures(experiment: Experiment) -> dict[int, Array]:
+    """Return the exposure of each sensor of a run folder. Raises ConfigError if the experiment is no run folder."""
+    if isinstance(experiment, (str, os.PathLike)) and Path(experiment).is_dir():
+        return exposures(Path(experiment))
+    raise ConfigError("exposure", "", "is of a run folder; give the folder, or leave out `exposure=True`")
 
 
 def gradient(

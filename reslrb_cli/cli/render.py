@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import ViewSpec
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.config.yaml_text import parse
+from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.atomic import writing
 
 #: Formats with linear values; the other `FORMATS` are 8-bit sRGB.
@@ -53,6 +55,14 @@ class ExposureType(click.ParamType):
 @click.argument("path", metavar="CONFIG|RUN", type=click.Path(path_type=Path))
 @overrides_option
 @click.option(
+    "--value",
+    "values",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Value of a parameter of the scene, after all others: a number, a list such as [R, G, B], or {file: IMAGE}. "
+    "KEY is any key that `inspect` lists. Can be repeated.",
+)
+@click.option(
     "-o",
     "--output",
     required=True,
@@ -80,6 +90,7 @@ class ExposureType(click.ParamType):
 def command(
     path: Path,
     overrides: tuple[str, ...],
+    values: tuple[str, ...],
     output: Path,
     allow_code: bool,
     sensor: int | None,
@@ -88,8 +99,10 @@ def command(
 ) -> None:
     """Render the scene of CONFIG with its integrator, or that of the run in the folder RUN with its recovered values.
 
-    The image has run.spp samples per pixel; --set run.spp=N changes their number.
+    The image has run.spp samples per pixel; --set run.spp=N changes their number. To change the light or a material of
+    the recovered scene, use --value.
     """
+    given = parse_values(values)
     run = path if path.is_dir() else None
     if run is not None and is_given("initial"):
         raise click.UsageError("a run is rendered with its recovered values; remove --initial or --scene")
@@ -110,18 +123,19 @@ def command(
 
     from reslrb_cli.optimization.assemble import load_for_rendering
     from reslrb_cli.optimization.loading import render_in_passes
+    from reslrb_cli.optimization.views import color_channels
     from reslrb_cli.records.images import write_file
-    from reslrb_cli.records.run_folder import exposures
+    from reslrb_cli.records.run_folder import exposed, exposures
     from reslrb_cli.report.tonemap import exposure_words
 
     if sensor is not None:
         config = _of_sensor(config, sensor)
-    scene, sensors, integrator, multiple = load_for_rendering(config, initial)
+    scene, sensors, integrator, multiple = load_for_rendering(config, initial, given, "--value")
     samples = config.run.spp
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
     own = {} if run is None or is_given("exposure") else exposures(run)
     applied = own.get(sensors[0] if sensor is None else sensor, np.float32(1))
-    image[:, :, : 1 if image.shape[2] <= 2 else 3] *= applied
+    image = exposed(image, applied, color_channels(scene.sensors()[sensors[0]].film()))
     suits = 1.0 if linear else _suiting(image, scene, scene.sensors()[sensors[0]])
     factor = suits if exposure is None else exposure
     with writing("--output", output):
@@ -133,6 +147,19 @@ def command(
         words.append(f"times {shown}, the run's exposure (--exposure 1 ignores it)")
         hint = ""
     echo(f"{output}: {', '.join(words)}{hint}")
+
+
+def parse_values(texts: Sequence[str]) -> dict[str, Any]:
+    """Return the values of `--value` by key. Raises ConfigError."""
+    found: dict[str, Any] = {}
+    for text in texts:
+        label, (key, equals, value) = f"--value {one_line(text, 100)}", text.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(label, "", "must be KEY=VALUE, such as lamp.emitter.radiance.value=[8, 7, 5]")
+        if key.strip() in found:
+            raise ConfigError(label, "", "is given twice; give one value for each key")
+        found[key.strip()] = parse(value, label, str)
+    return found
 
 
 def _suiting(image: Any, scene: Any, sensor: Any) -> float:

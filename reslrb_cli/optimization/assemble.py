@@ -4,15 +4,16 @@ are decided.
 
 from __future__ import annotations
 
-import difflib
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.loader import check_code
+from reslrb_cli.config.parameters import ImageFile
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.baselines import Projective
@@ -40,7 +41,8 @@ from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.dispersion import bends_light
-from reslrb_cli.scene.parameters import select_parameters
+from reslrb_cli.scene.parameters import put_values, select_parameters, untied
+from reslrb_cli.scene.parameters import set_values as set_scene_values
 
 #: Parameters of emission; parameters of the same quantity have the same unit.
 _EMITTED = {
@@ -113,19 +115,25 @@ def assemble(
 
 
 def load_for_rendering(
-    config: Config, initial: bool, values: Mapping[str, Any] | None = None
+    config: Config, initial: bool, values: Mapping[str, Any] | None = None, source: str = "values"
 ) -> tuple[Any, list[int], Any, int | None]:
-    """Load the scene and make the integrator. With `initial`, the parameters get their initial values, and then the
-    given `values`. Without `initial`, the scene is as in its file, and `values` is ignored.
+    """Load the scene and make the integrator. With `initial`, the parameters get their initial values, otherwise the
+    scene is as in its file. Then the given `values` are set. `source` locates errors of these values.
 
     Returns the scene, the indices of the used sensors, the integrator, and its `samples_per_pass`.
     """
+    values = values or {}
     if initial:
-        problem = assemble_scene(config)
-        if values is not None:
-            problem = set_values(problem, values)
+        problem = assemble_scene(config, keys=values)
+        for key in values:
+            if key in problem.selection.factors:
+                raise ConfigError(source, key, "is the exposure; multiply the image by it instead")
+        if values:
+            problem = set_values(problem, values, source)
         return problem.scene, problem.sensors, problem.integrator, samples_per_pass(config)
-    scene = load_configured(config, selects=False)
+    scene = load_configured(config, selects=False, keys=values)
+    if values:
+        set_scene_values(scene, (), _arrays(values, source), source, "")
     sensors = choose_sensors(config, scene)
     check_integrator(config, config.integrator, scene, sensors)
     integrator = make_configured(config, config.integrator, paths_of(config.integrator, scene, sensors), scene)
@@ -140,37 +148,38 @@ def check_passes(source: str, spp: int, multiple: int | None) -> None:
         raise ConfigError(source, "", f"{spp} is not a multiple of integrator.samples_per_pass, {multiple}")
 
 
-def set_values(problem: Problem, values: Mapping[str, Any]) -> Problem:
-    """Return the problem before its first iteration. `values` has arrays for some of the problem's parameters. Each
-    array has the parameter's shape.
+def set_values(problem: Problem, values: Mapping[str, Any], source: str = "values") -> Problem:
+    """Return the problem before its first iteration, with the given values of parameters of the problem or of the
+    scene, by key or glob.
 
-    Raises ConfigError with `values` and the key as location.
+    A value is a number, a list with one number for each channel, an array of the parameter's shape, or `{"file":
+    IMAGE}`. Raises ConfigError with `source` and the key as location.
     """
-    found = {}
+    given = put_values(problem.selection, _arrays(values, source), source)
+    return replace(problem, selection=untied(problem.selection, given)).afresh(problem.values())
+
+
+def _arrays(values: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Return each value as an array, or as an image file. Raises ConfigError."""
+    found: dict[str, Any] = {}
     for key, value in values.items():
-        if key not in problem.selection.keys:
-            near = difflib.get_close_matches(key, problem.selection.keys, n=1, cutoff=0)
-            raise ConfigError("values", key, f"is not a parameter of this experiment; did you mean {near[0]}?")
-        shape = problem.selection.array(key).shape
         try:
-            array = np.broadcast_to(np.asarray(value, np.float32), shape).copy()
-        except (TypeError, ValueError):
-            has = f"of shape {np.shape(value)}" if isinstance(value, np.ndarray) else "no array"
-            raise ConfigError(
-                "values", key, f"is {has}; it must have the parameter's shape {shape} and contain numbers"
-            ) from None
-        if not np.isfinite(array).all():
-            raise ConfigError("values", key, "has a value that is not finite")
-        found[key] = array
-    return problem.afresh({**problem.values(), **found})
+            if isinstance(value, Mapping):
+                found[key] = ImageFile.model_validate(dict(value))
+            else:
+                found[key] = np.asarray(value, np.float32)
+        except (TypeError, ValueError):  # pydantic raises a ValueError
+            raise ConfigError(source, key, "must be a number, a list of numbers, or {file: IMAGE}") from None
+    return found
 
 
-def assemble_scene(config: Config, scene: Any = None) -> Problem:
+def assemble_scene(config: Config, scene: Any = None, keys: Iterable[str] = ()) -> Problem:
     """Load and check the experiment of `config` without its targets.
 
-    `scene` replaces `scene.file`.
+    `scene` replaces `scene.file`. `keys` are further parameters whose values will change.
     """
-    scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
+    if scene is None:
+        scene = load_configured(config, functools.partial(check_described, config), keys=keys)
     views = make_views(config, scene)
     check_films(config, scene, [view.sensor for view in views])
     sensors = [view.sensor for view in views]

@@ -6,7 +6,7 @@ A pass is small enough to fit into memory.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -101,14 +101,16 @@ def load_configured(
     config: Config,
     look: Callable[[Description], object] | None = None,
     selects: bool = True,
+    keys: Iterable[str] = (),
 ) -> mi.Scene:
     """Load the scene of `config`. `look` is called with the scene's description before the scene is built. Raises
     ConfigError.
 
-    With `selects`, the 8-bit and 16-bit textures that parameters select are read as floating point.
+    With `selects`, the 8-bit and 16-bit textures that parameters select are read as floating point. Those of `keys`,
+    which may be globs, always are.
     """
     scene = config.scene
-    keys = selected_keys(config) if selects else []
+    keys = [*(selected_keys(config) if selects else []), *keys]
     if scene.file.name == IN_MEMORY:
         return _lent_scene(config, keys, config.parameters if selects else [])
 

@@ -25,6 +25,7 @@ import numpy as np
 from reslrb_cli.config.loader import Override, changed, load, parse_override
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
+from reslrb_cli.config.yaml_text import format_location
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.records import metrics
 from reslrb_cli.records.atomic import remove_parts, unfinished_folder, write_atomically
@@ -71,10 +72,16 @@ def read_value(run: Path, key: str) -> Array:
 def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
     """Return the configuration of the run in the folder `run`, with its recovered values as initial values.
 
-    Raises a ConfigError that names the folder if the folder is not a run folder or holds no values.
+    Raises a ConfigError that names the folder if the folder is not a run folder or holds no values, or that names an
+    override of an initial value.
     """
     checkpoint_of(run)
-    config = read_config(run, overrides)
+    parsed = [each if isinstance(each, Override) else parse_override(each) for each in overrides]
+    for each in parsed:
+        if each.location[:1] == ("parameters",) and "initial" in each.location[2:3]:
+            reason = "has no effect, because the run's recovered value replaces it"
+            raise ConfigError(each.label, format_location(each.location), f"{reason}; use `render --value KEY=VALUE`")
+    config = read_config(run, parsed)
     start = RunValue(run=run.absolute())
     specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
     return config.model_copy(update={"parameters": specs})
@@ -105,6 +112,11 @@ def exposures(run: Path) -> dict[int, Array]:
         exposure = view.get("exposure", 1.0)
         found[view["sensor"]] = read_value(run, exposure) if isinstance(exposure, str) else np.float32(exposure)
     return found
+
+
+def exposed(image: Array, exposure: Array | float, colours: int) -> Array:
+    """Return an image (H, W, C) whose first `colours` channels are multiplied by an exposure. Alpha is unchanged."""
+    return np.concatenate([image[:, :, :colours] * np.float32(exposure), image[:, :, colours:]], axis=2)
 
 
 def checkpoint_of(run: Path) -> Path:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
@@ -196,22 +196,38 @@ def set_values(
     key. A heightmap may have the resolution of its image file.
     """
     selection, _ = _choose(mi.traverse(scene), specs, source)
-    names = selection.deformation.values
+    given = put_values(selection, values, source, option)
+    # Tied parameters get the value of the first one, unless they have their own.
+    tied = {key: others for key, others in selection.tied.items() if key in given}
+    return untied(replace(selection, tied=tied), given)
+
+
+def put_values(selection: Selection, values: Mapping[str, Any], source: object, option: str = "") -> set[str]:
+    """Set `values` of any parameters of a scene, by key or glob, and return their keys. Call `untied` afterwards.
+
+    Values are checked like initial values. Errors name `option` and the key. A heightmap may have the resolution of its
+    image file.
+    """
+    names = [*selection.deformation.values, *selection.factors]
     given: dict[str, str] = {}
     for pattern, value in values.items():
-        place = Place(source, f"{option}.{pattern}", lambda _: "")  # a number has no options
-        for key in [pattern] if pattern in names else matching_keys(selection.params, pattern, place, [*names]):
+        place = Place(source, f"{option}.{pattern}" if option else pattern, lambda _: "")  # a number has no options
+        for key in [pattern] if pattern in names else matching_keys(selection.params, pattern, place, names):
             if key in given:
                 raise place.fail("", f"`{key}` is already matched by `{given[key]}`")
             if key in selection.deformation.keys:
-                raise place.fail("", f"`{key}` depends on {' and '.join(f'`{name}`' for name in names)} here")
+                by = " and ".join(f"`{name}`" for name in selection.deformation.values)
+                raise place.fail("", f"`{key}` depends on {by} here")
             given[key] = pattern
             selection.colours.add(key)
             slot = selection.slot(key)
             slot.set(initial_array(slot, value, None, place, any_size=key in names))
-    # Tied parameters get the value of the first one, unless they have their own.
-    followed = ((key, others) for key, others in selection.tied.items() if key in given)
-    tied = {key: [other for other in others if other not in given] for key, others in followed}
+    return set(given)
+
+
+def untied(selection: Selection, given: Collection[str]) -> Selection:
+    """Return the selection in which the keys `given` follow no other key, and update the scene."""
+    tied = {key: [other for other in others if other not in given] for key, others in selection.tied.items()}
     selection = replace(selection, tied=tied)
     selection.update()
     return selection

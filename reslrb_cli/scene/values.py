@@ -82,7 +82,8 @@ class ParameterValue:
 def initial_array(
     slot: ParameterValue, initial: Any, resolution: tuple[int, int] | None, place: Place, any_size: bool = False
 ) -> Array:
-    """Return the initial value of the parameter in `slot` from "scene", a number, a list, an image file or a run.
+    """Return the initial value of the parameter in `slot` from "scene", a number, a list, an image file, a run, or an
+    array of the parameter's shape.
 
     `resolution` is the (width, height) to which a texture is resampled, or None. With `any_size`, the value keeps the
     resolution of the file. Raises ConfigError at `place`.
@@ -98,6 +99,8 @@ def initial_array(
         array = current
     elif isinstance(initial, (int, float)):
         array = np.full_like(current, initial)
+    elif isinstance(initial, np.ndarray):
+        array = _fitted(slot, current, initial, place)
     elif isinstance(initial, (list, tuple)):
         array = _fill(slot, current, list(initial), place)
     elif isinstance(initial, RunValue):
@@ -158,6 +161,17 @@ def _fill(slot: ParameterValue, current: Array, numbers: list[float], place: Pla
         has = "1 number" if slot.channels == 1 else f"{slot.channels} numbers"
         raise place.fail("initial", f"has {len(numbers)} numbers; `{slot.key}` takes {has}")
     return np.tile(np.array(numbers, dtype=np.float32), current.size // len(numbers)).reshape(current.shape)
+
+
+def _fitted(slot: ParameterValue, current: Array, array: Array, place: Place) -> Array:
+    """Return an array in the parameter's shape. One number, or one for each channel, fills the parameter."""
+    if array.shape == (slot.channels,):
+        return _fill(slot, current, array.tolist(), place)
+    try:
+        return np.broadcast_to(array, current.shape).copy()
+    except ValueError:
+        message = f"is of shape {array.shape}; it must have the parameter's shape {current.shape}"
+        raise place.fail("", message) from None
 
 
 def _from_file(slot: ParameterValue, current: Array, image_file: Any, any_size: bool, place: Place) -> Array:

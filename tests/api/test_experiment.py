@@ -108,13 +108,18 @@ def test_paths_of_a_mapping_are_relative_to_base(folder: Path, monkeypatch: pyte
         (lambda: rl.load("."), ".: is no run's folder"),
         (lambda: rl.render("tiny.yaml", spp=0), "spp: is 0; it must be at least 1"),
         (lambda: rl.render("tiny.yaml", values={"poster": 1}),
-         f"values: poster: is not a parameter of this experiment; did you mean {KEY}?"),
+         f"values: poster: `poster` matches no parameter of the scene; did you mean `{KEY}`"),
         (lambda: rl.render("tiny.yaml", values={KEY: np.zeros((3, 4, 3))}),
-         f"values: {KEY}: is of shape (3, 4, 3); it must have the parameter's shape (4, 4, 3) and contain numbers"),
+         f"values: {KEY}: is of shape (3, 4, 3); it must have the parameter's shape (4, 4, 3)"),
         (lambda: rl.render("tiny.yaml", values={KEY: "grey"}),
-         f"values: {KEY}: is no array; it must have the parameter's shape"),
-        (lambda: rl.gradient("tiny.yaml", values={KEY: np.nan}), f"values: {KEY}: has a value that is not finite"),
-        (lambda: rl.render("tiny.yaml", values={KEY: 1}, initial=False), "values: are those of parameters; leave out"),
+         f"values: {KEY}: must be a number, a list of numbers, or {{file: IMAGE}}"),
+        (lambda: rl.gradient("tiny.yaml", values={KEY: np.nan}),
+         f"values: {KEY}: `{KEY}` has nan at texel (0, 0), channel 0; all values must be finite"),
+        (lambda: rl.render("tiny.yaml", values={KEY: 1, "*": 1}), f"values: *: `{KEY}` is already matched by `{KEY}`"),
+        (lambda: rl.render("tiny.yaml", values={"wall.to_world": 1}), "values: wall.to_world: `wall.to_world` is re"),
+        (lambda: rl.render(rl.load("tiny.yaml", {"target.exposure": "auto"}), values={"exposure": 1}),
+         "values: exposure: is the exposure; multiply the image by it instead"),
+        (lambda: rl.render("tiny.yaml", exposure=True), "exposure: is of a run folder; give the folder, or leave out"),
         (lambda: rl.gradient("tiny.yaml", spp=0), "overrides: run.spp: must be at least 1"),
         (lambda: rl.gradcheck("tiny.yaml", "reslrb:stick"), "integrators reslrb:stick: integrator.estimator: must be"),
         (lambda: rl.convergence("tiny.yaml", "prb,nothing"), "integrators nothing: integrator.type: must be one of"),
@@ -201,6 +206,12 @@ def test_given_values_replace_initial_ones(folder: Path) -> None:
     as_initial = {"parameters[0].initial": 0.25, "parameters[1].initial": 6}
     expected = rl.render(rl.load("tiny.yaml", as_initial))
     assert np.array_equal(rl.render("tiny.yaml", values={KEY: 0.25, LAMP: 6})[0], expected[0])
+    # The lamp need not be a parameter
+    alone = {"parameters": [{"key": KEY, "initial": 0.25}]}
+    assert np.array_equal(rl.render(rl.load("tiny.yaml", alone), values={LAMP: [6, 6, 6]})[0], expected[0])
+    mi.Bitmap(np.full((4, 4, 3), 0.25, np.float32)).write("grey.exr")
+    from_file = rl.render("tiny.yaml", values={KEY: {"file": "grey.exr"}, LAMP: 6}, initial=False)
+    assert np.array_equal(from_file[0], expected[0])
 
 
 @pytest.mark.long

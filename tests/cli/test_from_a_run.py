@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import mitsuba as mi
@@ -12,7 +13,9 @@ from cli import tiny
 from cli.tiny import reslrb
 from turns import a_few
 
-from reslrb_cli.config.loader import load
+import reslrb_cli as rl
+from reslrb_cli.api.experiment import called
+from reslrb_cli.config.loader import Override, load
 from reslrb_cli.config.parameters import ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
@@ -103,6 +106,79 @@ def test_rendering_a_run_renders_its_recovered_values(folder: Path) -> None:
     assert not np.allclose(load_image(folder / "a.exr"), load_image(folder / "c.exr"), rtol=1e-2)
 
 
+def rendered(*words: object, image: str = "x.exr") -> np.ndarray:
+    """Render with these words of the command line, and return the image."""
+    tiny.done("render", *words, "-o", image)
+    return load_image(Path(image))
+
+
+#: A scene with a kind of parameter each: textures, colours, numbers, a mesh attribute and a mesh.
+RELIT = tiny.scene_seen("0, 0, 4").replace(
+    "</scene>",
+    """
+<emitter type="point" id="spark"><point name="position" x="0.4" y="0.2" z="1.5"/>
+  <rgb name="intensity" value="0.3, 0.2, 0.1"/></emitter>
+<texture type="bitmap" id="wood"><string name="filename" value="wood.png"/></texture>
+<bsdf type="roughconductor" id="metal"><float name="alpha" value="0.3"/>
+  <rgb name="eta" value="0.2, 0.9, 1.1"/><rgb name="k" value="3.9, 2.4, 2.1"/></bsdf>
+<shape type="rectangle" id="sheet"><transform name="to_world"><scale value="0.4"/><translate z="0.5"/></transform>
+  <bsdf type="diffuse"><ref name="reflectance" id="wood"/></bsdf></shape>
+<shape type="rectangle" id="mirror"><ref id="metal"/>
+  <transform name="to_world"><scale value="0.4"/><translate x="1" z="0.5"/></transform></shape></scene>""",
+)
+
+
+def test_any_key_that_inspect_lists_can_be_set(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`render --value` shows the same image as a scene in which Mitsuba has set the value."""
+    monkeypatch.chdir(tmp_path)
+    tiny.write_experiment(tmp_path, RELIT)
+    tiny.write_photo(tmp_path / "wood.png", np.full((4, 4, 3), 0.4, np.float32))
+    listed = json.loads(tiny.done("inspect", "scene.xml", "--json").stdout)["parameters"]
+    infos = [each for each in listed if each["obstacle"] is None and each["kind"] != "shape"]
+    keys = {each["key"]: each["shape"] for each in infos}
+    wood = "sheet.bsdf.reflectance.data"
+    assert {"spark.position", "spark.intensity.value", "metal.alpha.value", wood, tiny.KEY} <= set(keys)
+    common = ("tiny.yaml", "--set", "run.spp=4", "--set", "integrator.paths=camera", "--scene")
+    before = rendered(*common)
+    for key, shape in keys.items():
+        value = [0.2, 0.3, 0.6][: shape[-1]] if shape else 0.6
+        scene = load_scene("scene.xml", keys=[key])
+        params = mi.traverse(scene)
+        params[key] = type(params[key])(np.broadcast_to(np.float32(value), shape) if len(shape) == 3 else value)
+        params.update()
+        config = rl.load("tiny.yaml", {"integrator.paths": "camera"}, scene=scene)
+        now = rendered(*common, "--value", f"{key}={value}")
+        np.testing.assert_allclose(now, rl.render(config, initial=False)[0], rtol=1e-5, err_msg=key)
+        assert not np.array_equal(now, before), key
+
+
+def test_a_run_is_relit_with_its_recovered_values(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run, spp = folder / "runs/tiny", ("--set", "run.spp=16", "--set", "run.seed=3")
+    recovered_values = rendered(run, *spp)
+    lamp = read_value(run, LAMP)
+    brighter = rendered(run, *spp, "--value", f"{LAMP}={(2 * lamp).tolist()}")
+    np.testing.assert_allclose(brighter, 2 * recovered_values, rtol=1e-4)
+    white = rendered(run, *spp, "--value", "poster.reflectance.*=0.9", "--value", "wall.translation=[0, 0, 0]")
+    assert white.mean() > 1.1 * recovered_values.mean()
+    for words, line in (
+        (["--set", "parameters[1].initial=4"], "--set parameters[1].initial=4: parameters[1].initial: has no effect, "
+         "because the run's recovered value replaces it; use `render --value KEY=VALUE`"),
+        (["--value", "lamp=4"], f"--value: lamp: `lamp` matches no parameter of the scene; did you mean `{LAMP}`"),
+        (["--value", "4"], "--value 4: must be KEY=VALUE, such as"),
+        (["--value", f"{LAMP}=4", "--value", f"{LAMP}=5"], f"--value {LAMP}=5: is given twice"),
+        (["--value", f"{LAMP}=[1, 2]"], f"--value: {LAMP}: is of shape (2,); it must have the parameter's shape (3,)"),
+        (["--value", "wall.to_world=0"], "--value: wall.to_world: `wall.to_world` is recovered as a motion"),
+    ):  # fmt: skip
+        result = reslrb("render", run, *words, "-o", "x.exr")
+        said = [line for line in result.output.splitlines() if not line.startswith("variant ")]
+        assert (result.exit_code, len(said), said[0].startswith(line)) == (2, 1, True), said
+    with pytest.raises(ConfigError, match="give `values` to `render`"), called():
+        recovered(run, [Override("overrides", ("parameters", 1, "initial"), 4)])
+
+
 @pytest.mark.parametrize("exposure", a_few(["per_channel", "0.6"], ["per_channel"]))
 def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
     folder: Path, exposure: str, tmp_path: Path
@@ -122,6 +198,10 @@ def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
         assert "times" not in plain.output
     light, shown = (load_image(tmp_path / f"{name}.exr") for name in ("without", "with"))
     assert np.allclose(shown, light * factor, rtol=1e-5)
+    lit = rl.render(run, spp=4, values={LAMP: 9.0}, exposure=True)[0]
+    tiny.done("render", run, "--set", "run.spp=4", "--value", f"{LAMP}=9", "-o", tmp_path / "lit.exr")
+    assert np.allclose(load_image(tmp_path / "lit.exr"), lit, rtol=1e-5)
+    assert np.allclose(lit, 9 / 8 * shown, rtol=1e-4)  # the lamp has a radiance of 8
     assert load_image(tmp_path / "with.png").mean() != load_image(tmp_path / "without.png").mean()
     assert "--exposure is for PNG" in reslrb("render", run, "--exposure", 2, "-o", tmp_path / "a.exr").output
     result = reslrb("export", run, "-o", tmp_path / "exported")
