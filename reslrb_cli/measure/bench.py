@@ -85,6 +85,8 @@ def _result(run: BenchRun, value: int, baseline: BenchRun, size: Mapping[str, in
         spp=run.config.run.spp,
         status=BenchStatus.OK if run.end is None else run.end.status,
         **paths_in_records(run.config),
+        label=run.case.label,
+        options=run.case.options,
         **figures,
     )
     kernel, step = (_ratio(run, baseline, key) for key in ("kernel_ms", "step_ms"))

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 from typing_extensions import Self
 
 from reslrb_cli.records.atomic import write_atomically
@@ -23,8 +23,6 @@ from reslrb_cli.records.atomic import write_atomically
 
 class Jsonable:
     """Base class of dataclasses that are written as JSON and read back."""
-
-    __pydantic_config__ = ConfigDict(extra="forbid")
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as a mapping for JSON."""

@@ -27,11 +27,12 @@ from reslrb_cli.records.metrics import Line
 logger = logging.getLogger(__name__)
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
+def read_lines(path: Path, lost: list[int] | None = None) -> list[dict[str, Any]]:
     """Return the objects in a file of JSON lines, oldest first. Numbers that are not finite become None.
 
-    A last line without a line end is left out, because it is still being written or was interrupted. Raises a
-    ConfigError that names the file, and the line if it is damaged.
+    A last line without a line end is left out, because it is still being written or was interrupted. Damaged lines are
+    left out if the list `lost` is given, which receives their numbers. Otherwise raises a ConfigError that names the
+    file and the line.
     """
     # Numbers that are not finite are replaced during parsing, because a second pass takes twice as long.
     decoder, found = json.JSONDecoder(parse_float=_finite, parse_constant=lambda name: None), []
@@ -42,9 +43,12 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
             value = decoder.decode(line.decode())
         except (ValueError, RecursionError):
             value = None
-        if not isinstance(value, dict):
+        if isinstance(value, dict):
+            found.append(value)
+        elif lost is None:
             raise ConfigError(path, f"line {number}", "is damaged, or no line that reslrb wrote")
-        found.append(value)
+        else:
+            lost.append(number)
     return found
 
 

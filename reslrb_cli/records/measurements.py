@@ -1,11 +1,12 @@
 """Records that the measuring commands write with `--json`, one object per line.
 
-`record_of` turns a line of `gradcheck` back into a record.
+`record_of` turns a line back into a record.
 """
 
 from __future__ import annotations
 
 import enum
+import functools
 import json
 import statistics
 from collections.abc import Mapping, Sequence
@@ -54,6 +55,7 @@ class BenchRecord(Line):
     - `texels` is the texel count of all textures that are parameters.
     - `paths` are the paths of the integrator (`light`, `camera`, `both`). If `paths` is `both`, `light_share` is the
         share of light paths.
+    - `label` is the integrator as the user wrote it, and `options` are the options in it.
 
     Values that were not measured are None. If `status` is not `ok`, no value was measured, and all measured values are
     None.
@@ -79,6 +81,8 @@ class BenchRecord(Line):
     texels: int | None = None
     paths: str = "light"
     light_share: float | None = None
+    label: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 #: Relative errors for which the required time is reported.
@@ -425,19 +429,23 @@ def _percent(share: float) -> str:
     return f"{share:.1%}" if share < 0.0995 else f"{share:.0%}"
 
 
-_READERS: dict[type[Line], TypeAdapter[Any]] = {kind: TypeAdapter(kind) for kind in (GradcheckRecord, MissingRecord)}
 R = TypeVar("R", bound=Line)
 
 
 def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
     """Return the record of class `kind` in `entry`, which is a line read from a file. Return None if the line holds no
-    such record.
+    such record. Keys that the class does not have are left out, because a later version may have written them.
     """
     try:
-        found: R = _READERS[kind].validate_python(entry)
+        found: R = _reader(kind).validate_python(entry)
     except ValidationError:
         return None
     return found
+
+
+@functools.cache
+def _reader(kind: type[Line]) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
 
 
 def incomplete_records(entries: Sequence[Mapping[str, Any]]) -> list[MissingRecord]:

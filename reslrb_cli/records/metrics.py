@@ -93,7 +93,7 @@ class Record(Line):
         have no common unit, or if no true value is known.
     """
 
-    __pydantic_config__ = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    __pydantic_config__ = ConfigDict(strict=True, allow_inf_nan=False)
 
     iteration: int
     loss: Figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
@@ -13,17 +14,22 @@ import numpy as np
 from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.measurement_files import Origin, read_lines
+from reslrb_cli.records.measurements import record_of
 from reslrb_cli.records.metrics import METRICS_FILE, Record
 from reslrb_cli.records.sweeps import SweepPlan, is_sweep, read_sweep, run_name
+from reslrb_cli.report.format import count
 
 Array = np.ndarray[Any, Any]
 
-#: Values of a record's fields that a line may lack.
+logger = logging.getLogger(__name__)
+
+#: Values of a record's fields that a line may lack, and the other fields, which are numbers.
 _DEFAULTS = {
     each.name: each.default_factory() if each.default_factory is not MISSING else each.default
     for each in fields(Record)
     if each.default is not MISSING or each.default_factory is not MISSING
 }
+_FIGURES = [each.name for each in fields(Record) if each.name not in _DEFAULTS]
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,11 @@ class ShownRun:
     def results(self) -> Mapping[str, Any]:
         """The results so far."""
         return self.manifest.get("results") or {}
+
+    @property
+    def iterations(self) -> int:
+        """Number of iterations so far, including those whose lines are damaged."""
+        return int(self.records[-1]["iteration"] or 0) + 1 if self.records else 0
 
     def column(self, name: str) -> list[float | None]:
         """Return the metric `name` of every iteration."""
@@ -124,13 +135,20 @@ def read_sources(paths: Sequence[Path]) -> list[Source]:
 
 def read_run(folder: Path, name: str | None = None, mend: bool = True) -> ShownRun:
     """Read the run in `folder` as far as possible. For any other folder, return an empty run. `mend` is as in
-    `read_manifest`.
+    `read_manifest`. Damaged lines of the metrics are left out, with a warning.
 
-    Raises ConfigError, located in the metrics.
+    Raises ConfigError if the metrics cannot be read.
     """
-    metrics = folder / METRICS_FILE
-    records = [_DEFAULTS | entry for entry in read_lines(metrics)] if metrics.exists() else []
+    metrics, lost = folder / METRICS_FILE, list[int]()
+    entries = read_lines(metrics, lost) if metrics.exists() else []
+    records = [_DEFAULTS | entry for entry in entries if all(_is_figure(entry.get(name, "")) for name in _FIGURES)]
+    if left_out := len(lost) + len(entries) - len(records):
+        logger.warning("%s: %s left out, because they are damaged", metrics, count(left_out, "line"))
     return ShownRun(folder, name or folder.absolute().name, read_manifest(folder, mend) or {}, records)
+
+
+def _is_figure(value: object) -> bool:
+    return value is None or isinstance(value, int | float)
 
 
 def read_sweep_runs(folder: Path, name: str | None = None) -> SweepRuns:
@@ -150,7 +168,7 @@ def _read_file(path: Path, name: str) -> Measurements:
         )
         raise ConfigError(path, "", reason)
     heads, others = ([e for e in objects if (e.get("kind") == Origin.KIND) is own] for own in (True, False))
-    origins = [Origin(**{key: value for key, value in head.items() if key != "kind"}) for head in heads]
+    origins = [origin for head in heads if (origin := record_of(Origin, head)) is not None]
     return Measurements(path, name, kind, others, origins)
 
 

@@ -27,7 +27,7 @@ from reslrb_cli.records.measurements import BenchStatus
 
 KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "width", "height", "status", "step_ms",
         "kernel_ms", "codegen_ms", "tracing_ms", "cold_ms", "peak_mib", "scratch_bytes",
-        "repeats", "texels", "paths", "light_share"]  # fmt: skip
+        "repeats", "texels", "paths", "light_share", "label", "options"]  # fmt: skip
 SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--rounds", "3"]
 
 
@@ -42,6 +42,7 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [(row["integrator"], row["estimator"], row["capacity"], row["max_depth"]) for row in rows] == [
         ("reslrb", "stack", None, depth) for depth in (2, 4)
     ]
+    assert [(row["label"], row["options"]) for row in rows] == [("reslrb:stack", {"estimator": "stack"})] * 2
     for row in rows:
         assert (row["status"], row["spp"], row["width"], row["height"], row["repeats"]) == ("ok", 1, 16, 16, 3)
         for key in ("step_ms", "kernel_ms"):

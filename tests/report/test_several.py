@@ -22,7 +22,9 @@ from report.test_page import EVIL, Page
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.manifest import Status
+from reslrb_cli.records.sweeps import Combination, SweepPlan, run_name
 from reslrb_cli.report.page import render
+from reslrb_cli.report.page.measured import label
 from reslrb_cli.report.page.run import DAMAGED
 from reslrb_cli.report.plots import COLORS
 from reslrb_cli.report.sources import Measurements, ShownRun, read_sources
@@ -216,16 +218,81 @@ def test_a_damaged_manifest_leaves_the_rest(tmp_path, change):
     assert both.row("Run: good", "device")[1] == "a machine"
 
 
-def test_damaged_metrics_are_one_located_line(tmp_path):
+def test_damaged_lines_of_metrics_are_left_out(tmp_path, caplog):
     folder = make_run(tmp_path / "a")
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     lines[9] = re.sub(r'"loss": [^,]*', '"loss": NaN', lines[9])
     (folder / "metrics.jsonl").write_text("\n".join(lines) + '\n{"iteration": 30, "loss"')
     assert "30 iterations in" in page_of(folder).sections[""]
-    lines[3] = "{torn"
-    (folder / "metrics.jsonl").write_text("\n".join(lines))
-    with pytest.raises(ConfigError, match=r"metrics\.jsonl: line 4: is damaged"):
-        page_of(folder)
+    assert not caplog.records
+    for count, damaged in enumerate(("{torn", "[1]", "\0", '{"iteration": 3}', lines[3].replace("90.0", '"x"')), 1):
+        lines[count] = damaged
+        (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+        page = page_of(folder)
+        assert "30 iterations in" in page.sections[""]
+        assert "cannot be shown" not in page.sections["Convergence"]
+        said = f"{folder / 'metrics.jsonl'}: {count} line{'s' * (count > 1)} left out, because they are damaged"
+        assert caplog.messages[-1] == said
+
+
+def write_sweep(folder):
+    """Write a sweep of two combinations, with one finished run of each."""
+    plan = SweepPlan("a.yaml", [], [Combination(f"spp={spp}", {"run.spp": spp}) for spp in (4, 8)], [0])
+    for combination in plan.combinations:
+        make_run(folder / run_name(combination, 0), results={"image_loss": {"initial": 1.0, "final": 0.5}})
+    plan.write(folder)
+    return folder
+
+
+def test_one_damaged_run_leaves_the_page_of_a_sweep(tmp_path):
+    folder = write_sweep(tmp_path / "s")
+    before = page_of(folder)
+    path = folder / "spp=8-seed=0" / "metrics.jsonl"
+    path.write_text(path.read_text().replace('{"iteration": 5,', '{"iteration" 5,'))
+    after = page_of(folder)
+    assert "2 of 2 runs finished" in after.sections["Settings"] == before.sections["Settings"]
+    assert "cannot be shown" not in "".join(after.sections.values())
+
+
+def test_records_with_more_keys_are_shown_alike(tmp_path):
+    """A later version may add keys to any record."""
+    guiding = Decision(setting="guiding", value="off", why="not measured").to_json()
+    run = make_run(tmp_path / "a", iterations=30, decisions=[guiding], scaling=SCALING, plan=PLAN)
+    sweep = write_sweep(tmp_path / "s")
+    write_bench(tmp_path / "b")
+    write_gradcheck(tmp_path / "g")
+    write_convergence(tmp_path / "c")
+    for name in "bgc":
+        (tmp_path / name).write_text(f"{ORIGIN.to_json()}\n{(tmp_path / name).read_text()}")
+    sources = [run, sweep, *(tmp_path / name for name in "bgc")]
+    before = render(read_sources(sources))
+    assert DAMAGED not in before
+
+    def more(value):
+        """Return a value of JSON in which each record has one key more."""
+        if isinstance(value, list):
+            return [more(each) for each in value]
+        is_record = isinstance(value, dict) and {"kind", "integrator", "iteration", "setting", "program"} & set(value)
+        return value | {"later": {"x": 1}} if is_record else value
+
+    for path in [*tmp_path.rglob("*.jsonl"), *(tmp_path / name for name in "bgc")]:
+        lines = [json.dumps(more(json.loads(line))) for line in path.read_text().splitlines()]
+        path.write_text("\n".join(lines) + "\n")
+    for path in [*tmp_path.rglob("manifest.json"), sweep / "sweep.json"]:
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps(more({name: more(value) for name, value in content.items()}) | {"later": 3}))
+    assert render(read_sources(sources)) == before
+
+
+def test_cases_of_a_bench_have_the_names_that_the_user_wrote(tmp_path):
+    write_bench(tmp_path / "b")
+    lines = [json.loads(line) for line in (tmp_path / "b").read_text().splitlines()]
+    named = ["ptracer", "ptracer(rr_depth=1)", "own.py:A", "own.py:B"]
+    entries = [line | {"label": name, "integrator": "same"} for name in named for line in lines[::2]]
+    (tmp_path / "b").write_text("".join(json.dumps(each) + "\n" for each in entries))
+    assert set(map(label, entries)) == set(named)
+    page = page_of(tmp_path / "b")
+    assert all(name in page.sections["Cost of a step: b"] for name in named)
 
 
 def test_runs_that_have_just_started(tmp_path):

@@ -41,9 +41,11 @@ def bench(objects: Sequence[Entry]) -> Markup:
 
 
 def label(entry: Entry) -> str:
-    """Return an integrator's name with all options that differ from the defaults, for example `reslrb:reservoir,
-    capacity 4`.
+    """Return an integrator's name as the user wrote it. Records of older versions lack it: return the integrator, the
+    estimator, and the capacity if it differs from the default.
     """
+    if entry.get("label"):
+        return str(entry["label"])
     parts = ":".join(str(entry[name]) for name in ("integrator", "estimator") if entry.get(name))
     return parts + (f", capacity {entry['capacity']}" if entry.get("capacity") not in (None, 1) else "")
 
@@ -93,10 +95,8 @@ def quantity(entry: Entry) -> str:
 
 
 def method_label(entry: Entry, with_spp: bool = False) -> str:
-    """Return a method's name as the user wrote it. If the entry has no such name, return the integrator and the
-    estimator, and their sampling if known.
-    """
-    parts = [str(entry.get("label") or label(entry)), str(entry.get("adjoint") or "")]
+    """Return a method's name, and its sampling if known."""
+    parts = [label(entry), str(entry.get("adjoint") or "")]
     parts += [f"{entry['spp']} spp"] if with_spp and entry.get("spp") else []
     return ", ".join(part for part in parts if part)
 

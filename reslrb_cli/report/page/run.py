@@ -73,7 +73,7 @@ def outcome(run: ShownRun) -> Markup:
     """Return the results, the error and the warnings of a run."""
     seconds, loss = run.last("elapsed_s"), run.results.get("loss")
     parts = (
-        "" if seconds is None else f"{count(len(run.records), 'iteration')} in {duration(seconds)}",
+        "" if seconds is None else f"{count(run.iterations, 'iteration')} in {duration(seconds)}",
         "" if loss is None else f"loss {number(loss)}",
         error_line(run.results),
     )

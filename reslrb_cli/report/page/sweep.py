@@ -70,12 +70,12 @@ def run_record(source: SweepRuns, combination: Combination, seed: int) -> SweepR
     run, failure = source.runs.get(name), source.sweep.failures.get(name)
     if run is None or failure is not None:
         status, line = ("failed", failure.line) if failure is not None else ("waiting", "")
-        done = 0 if run is None else len(run.records)
+        done = 0 if run is None else run.iterations
         return SweepRunRecord(name, combination.settings, seed, status, done, message=line)
     results, relative = run.results, units_differ(run.results)
     status = str(run.manifest.get("status", ""))
     return SweepRunRecord(
-        name, combination.settings, seed, status, len(run.records),
+        name, combination.settings, seed, status, run.iterations,
         (results.get("image_loss") or {}).get("final"), _error(run, relative), relative, results.get("elapsed_s"),
         max((record["peak_mib"] for record in run.records), default=None),
         str(run.manifest.get("error") or ""),
