@@ -140,19 +140,20 @@ def find_ambiguous(problem: Problem) -> tuple[list[str], list[str]] | None:
     """Return the first combination of exposures and parameters that has no effect on the images, or None."""
     problem.apply()
     base = _row(problem)
-    factors, rows, keys = problem.selection.factors, [], []
+    factors, rows = problem.selection.factors, []
     for key in problem.selection.keys:
         value = dr.detach(problem.optimizer[key])
         moved = value * dr.opaque(dr.leaf_t(value), 1 + STEP)
         problem.apply({key: moved})
-        row = (_row(problem) - base) / STEP
-        if np.isfinite(row).all() and (norm := float(np.linalg.norm(row))) > 0:
-            rows.append(row / norm)
-            keys.append(key)
+        rows.append((_row(problem) - base) / STEP)
     problem.apply()
-    if not rows:
-        return None
     matrix = np.stack(rows)
+    matrix = matrix[:, np.isfinite(matrix).all(axis=0)]
+    norms = np.linalg.norm(matrix, axis=1)
+    keys = [key for key, norm in zip(problem.selection.keys, norms, strict=True) if norm > 0]
+    if not keys:
+        return None
+    matrix = matrix[norms > 0] / norms[norms > 0, None]
     values, vectors = np.linalg.eigh(matrix @ matrix.T)
     for value, vector in zip(values, vectors.T, strict=True):
         parts = [key for key, part in zip(keys, vector, strict=True) if abs(part) > PART]

@@ -9,8 +9,10 @@ to the optimum (`close_enough`).
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Collection, Iterator
+import operator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -145,8 +147,12 @@ def measure_curvature(problem: Problem, iteration: int) -> None:
         random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
         with optimizer.displaced(random):
             problem.apply()
-            gradient(problem, iteration)
+            _, _, counts, refused, _ = gradient(problem, iteration)
         problem.apply()
+        for key, count in counts.items():
+            problem.left_out[f"the measured gradient of {key}"] += int(count[0])
+        for sensor, each in refused:
+            problem.left_out[f"measured dL/dI of sensor {sensor}"] += int(each.count[0])
 
 
 def is_due(iteration: int, cost: float = 0.0) -> bool:
@@ -182,7 +188,7 @@ def measure_block(problem: Problem, iteration: int) -> None:
     whole, (found, error) = np.zeros((len(slopes), len(slopes))), curvature.for_steps(directions)
     whole[np.ix_(at, at)] = found * np.outer(slopes[at], slopes[at])
     # If shapes move, noise and curvature change as the blur falls.
-    block.bend(np.nan_to_num(whole), 0.0 if optimizer.extents else error)
+    block.bend(whole, 0.0 if optimizer.extents else error)
     problem.apply()
 
 
@@ -206,12 +212,12 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
     optimizer = problem.optimizer
     searched = optimizer.measures_curvature and bool(optimizer.extents)
     before = {key: dr.detach(optimizer[key]) for key in optimizer.block.at if searched}
-    loss = blurred_loss(problem, iteration) if searched else 0.0
+    first = exposed_images(problem, iteration) if searched else []
     updates = optimizer.step(factor, skip=held)
     problem.apply()
     for _ in range(HALVINGS if searched else 0):
-        now = blurred_loss(problem, iteration)
-        if now <= loss:
+        loss, now = blurred_losses(problem, iteration, first, exposed_images(problem, iteration))
+        if not now > loss:
             break
         for key, value in before.items():
             optimizer.set_value(key, 0.5 * (value + dr.detach(optimizer[key])))
@@ -221,14 +227,31 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
     return updates
 
 
-def blurred_loss(problem: Problem, iteration: int) -> float:
-    """Return the loss at the current values, with the blur, the views, and a part of the samples of `iteration`."""
-    total = 0.0
-    for view, scale in problem.drawn(iteration):
+def exposed_images(problem: Problem, iteration: int) -> list[mi.TensorXf]:
+    """Return the images of the views of `iteration` at the current values, exposed, with a part of its samples."""
+    images = []
+    for view, _ in problem.drawn(iteration):
         at = seed(problem.config.run.seed, iteration, view.sensor, "step length")
         image = render_image(problem.integrator, problem.scene, view.sensor, at, part_of_samples(problem))
-        total += scale * float(view.blurred_objective(image)[0])
-    return total
+        images.append(view.exposed(image))
+        count = count_nonfinite(images[-1])
+        dr.eval(images[-1], count)
+        problem.left_out[f"a measured image of sensor {view.sensor}"] += int(count[0])
+    return images
+
+
+def blurred_losses(problem: Problem, iteration: int, *images: Sequence[mi.TensorXf]) -> list[float]:
+    """Return the losses of several sets of exposed images, with the blur of `iteration`. Pixels that are not finite in
+    any of the sets are left out of all.
+    """
+    totals = [0.0] * len(images)
+    for place, (view, scale) in enumerate(problem.drawn(iteration)):
+        seen = [each[place] for each in images]
+        known = functools.reduce(operator.and_, (dr.isfinite(image.array) for image in seen))
+        for number, image in enumerate(seen):
+            kept = mi.TensorXf(dr.select(known, image.array, view.target.array), image.shape)
+            totals[number] += scale * float(view.blurred_objective(kept)[0])
+    return totals
 
 
 #: The moments are set to zero each time a large loss has fallen to this fraction. A first loss is large if the loss of
@@ -307,6 +330,9 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         for key in found.gradients if config.run.on_nonfinite == "zero" else ():
             zero_nonfinite(optimizer[key])
         found.updates = update(problem, iteration, factor, held)
+        told, found.measured = bool(found), problem.take_left_out()
+        if found and not told:
+            on_nonfinite(found)
     standstill = state.standstill + 1 if held or found.updates else 0
     state = replace(
         state,
@@ -368,6 +394,7 @@ def _findings(
 ) -> Findings:
     """Return the values of a step that were not finite. `refused` are the counts by sensor."""
     found = Findings(iteration, loss=not math.isfinite(loss), own=own_losses(problem.config))
+    found.measured = dict(+problem.left_out)
     found.gradients = {key: int(count[0]) for key, count in counts.items() if count[0]}
     found.lost = [key for key, bad in found.gradients.items() if bad == dr.prod(dr.shape(problem.optimizer[key]))]
     for sensor, view in refused:

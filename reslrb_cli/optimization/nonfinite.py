@@ -7,6 +7,9 @@
     without a finite gradient entry is not updated. If the loss is not finite, no parameter is updated.
 
 The run ends if updates are skipped in `PATIENCE` consecutive iterations.
+
+Images and gradients that only measure something, such as the curvature for `auto`, update no parameter. Their
+non-finite entries are left out of the measurement, and counted (`Problem.left_out`). With `stop`, they end the run.
 """
 
 from __future__ import annotations
@@ -15,8 +18,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import drjit as dr
+import numpy as np
 
 from reslrb_cli.backend.memory import flat
+from reslrb_cli.statistics import Array
 
 OnNonFinite = Literal["stop", "skip", "zero"]
 
@@ -30,7 +35,8 @@ class Findings:
 
     Non-finite values can be the iteration's loss, entries of dL/dI for each sensor, or entries of gradients and updates
     for each parameter. `refused` has the number of entries of dL/dI, and the first one as (x, y, channel). `lost` lists
-    the parameters whose gradient has no finite entry. `own` names the user's losses.
+    the parameters whose gradient has no finite entry. `own` names the user's losses. `measured` has the numbers of
+    entries that measurements left out, with the name of their image or gradient.
     """
 
     iteration: int
@@ -39,15 +45,17 @@ class Findings:
     gradients: dict[str, int] = field(default_factory=dict)
     lost: list[str] = field(default_factory=list)
     updates: dict[str, int] = field(default_factory=dict)
+    measured: dict[str, int] = field(default_factory=dict)
     own: str = ""
 
     def __bool__(self) -> bool:
-        return bool(self.loss or self.refused or self.gradients or self.updates)
+        return bool(self.loss or self.refused or self.gradients or self.updates or self.measured)
 
     @property
     def total(self) -> int:
         """Number of all non-finite values. A non-finite loss counts as one value."""
-        return int(self.loss) + sum(count for count, _ in self.refused.values()) + sum(self.by_parameter.values())
+        refused = sum(count for count, _ in self.refused.values())
+        return int(self.loss) + refused + sum(self.by_parameter.values()) + sum(self.measured.values())
 
     @property
     def by_parameter(self) -> dict[str, int]:
@@ -68,6 +76,7 @@ class Findings:
             parts.append(f"dL/dI in {_entries(count)}, {place}")
         parts += [f"the gradient of {key} in {_entries(count)}" for key, count in self.gradients.items()]
         parts += [f"the update of {key} in {_entries(count)}" for key, count in self.updates.items()]
+        parts += [f"{name} in {_entries(count)}" for name, count in self.measured.items()]
         return f"not finite in iteration {self.iteration}: {'; '.join(parts)}"
 
 
@@ -107,6 +116,20 @@ def zero_nonfinite(parameter: Any) -> None:
 def count_nonfinite(value: Any) -> Any:
     """Return the number of NaN and infinite entries of a tensor or a (nested) array, as an array of width 1."""
     return dr.count(~dr.isfinite(flat(value)))
+
+
+def finite(values: Array) -> Array:
+    """Return the values, with non-finite values replaced by 0."""
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def fill_gaps(rows: Array) -> Array:
+    """Return K samples (K, ...), with each non-finite value replaced by the mean of the finite values of its entry. The
+    mean of the samples is then the mean of the finite ones. It is 0 if there are none.
+    """
+    known = np.isfinite(rows)
+    means = np.where(known, rows, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(known, rows, means)
 
 
 def finite_square_norm(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -115,6 +116,21 @@ class Problem:
     regularizers: dict[str, dict[str, Cost]] = field(default_factory=dict)
     #: Computes the shards of a step (`shards.Engine`); None: this process, one by one.
     engine: Callable[..., Any] | None = None
+    #: Numbers of non-finite entries that measurements left out since the last iteration, by image or gradient.
+    left_out: Counter[str] = field(default_factory=Counter)
+
+    def leave_out(self, name: str, values: Array) -> Array:
+        """Return measured values with NaN for those that are not finite, and count these values."""
+        known = np.isfinite(values)
+        if count := int(np.count_nonzero(~known)):
+            self.left_out[name] += count
+        return np.where(known, values, np.nan)
+
+    def take_left_out(self) -> dict[str, int]:
+        """Return the numbers of values that measurements left out, and clear them."""
+        found = dict(+self.left_out)
+        self.left_out.clear()
+        return found
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
         """Write the optimiser's values to the scene, and update the masks of moving shapes. `others` limits the

@@ -25,6 +25,7 @@ import numpy as np
 
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import gradient_step, render_image
+from reslrb_cli.optimization.nonfinite import finite
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.decisions import Scaled
 from reslrb_cli.seeds import seed
@@ -36,7 +37,7 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
 
     The gradients are accumulated in `problem.optimizer`. Call `take_gradient` afterwards.
     """
-    run = problem.config.run
+    run, refused = problem.config.run, []
     for view in problem.trained:
         step = gradient_step(
             integrator, problem.scene, view.sensor, view.objective, seed=seed(run.seed, round, view.sensor, purpose),
@@ -45,6 +46,10 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
         )  # fmt: skip
         gradients = problem.gradients()
         dr.eval(step.loss, gradients)
+        refused.append((view.sensor, step.refused))
+    for sensor, each in refused:
+        if count := int(each.count[0]):
+            problem.left_out[f"measured dL/dI of sensor {sensor}"] += count
     return gradients
 
 
@@ -54,14 +59,10 @@ def take_gradient(problem: Problem) -> dict[str, Array]:
     """
     taken = {}
     for key, value in problem.gradients().items():
-        taken[key] = finite(np.array(value, dtype=np.float32)).ravel()
+        row = np.array(value, dtype=np.float32).ravel()
+        taken[key] = finite(problem.leave_out(f"the measured gradient of {key}", row))
         problem.optimizer.clear_gradient(key)
     return taken
-
-
-def finite(values: Array) -> Array:
-    """Return the values, with non-finite values replaced by 0."""
-    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def unrecorded(integrator: Any) -> Any:
@@ -80,7 +81,8 @@ TRIALS = 8
 
 
 def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose: str = _PURPOSE) -> list[Array]:
-    """Render every training view, exposed and without alpha, always from the same seeds. Masked pixels are 0.
+    """Render every training view, exposed and without alpha, always from the same seeds. Masked pixels are 0. Values
+    that are not finite are NaN.
 
     `spp` replaces the run's samples per pixel.
     """
@@ -88,7 +90,8 @@ def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose
     for view in problem.trained:
         at = seed(run.seed, round, view.sensor, purpose)
         image = render_image(problem.integrator, problem.scene, view.sensor, at, spp or run.spp)
-        images.append(view.kept(np.array(view.exposed(image), dtype=np.float64)))
+        exposed = view.kept(np.array(view.exposed(image), dtype=np.float64))
+        images.append(problem.leave_out(f"a measured image of sensor {view.sensor}", exposed))
     return images
 
 
@@ -109,7 +112,7 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
     for key, start in starts.items():
         variable = optimizer.variable(key)
         v = variable.from_scene(start)
-        gradient = _gradient_at(problem, key, v)
+        gradient = finite(_gradient_at(problem, key, v))
         row = Scaled(key, gradient.size, rms(np.array(start)), rms(gradient))
         found = _steepest(problem, key, v, gradient, base)
         optimizer.set_value(key, start)
@@ -128,14 +131,14 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
     """Return the loss's largest curvature in `v`, the optimiser's variable of `key`. Return 0 if `v` has no visible
     effect.
     """
-    size = math.sqrt(sum(float(np.square(image).sum()) for image in base))
+    size = math.sqrt(sum(float(np.square(finite(image)).sum()) for image in base))
     direction = gradient / (np.linalg.norm(gradient) or 1.0)
     step = 0.01 * (rms(np.array(v)) or 1.0) * math.sqrt(gradient.size)
     variable = problem.optimizer.variable(key)
     for _ in range(TRIALS):
         problem.apply({key: variable.to_scene(v + _like(v, step * direction))})
         images = zip(see_images(problem), base, strict=True)
-        change = math.sqrt(sum(float(np.square(a - b).sum()) for a, b in images)) / (size or 1.0)
+        change = math.sqrt(sum(float(np.square(finite(a - b)).sum()) for a, b in images)) / (size or 1.0)
         if not 0 < change < math.inf:
             step *= 1e3 if change == 0 else 1e-3
             continue
@@ -147,7 +150,9 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
     found = 0.0
     for _ in range(POWER_ITERATIONS):
         ends = [_gradient_at(problem, key, v + _like(v, side * step * direction)) for side in (1, -1)]
-        bent = (ends[0] - ends[1]) / (2 * step)
+        bent = finite(ends[0] - ends[1]) / (2 * step)
+        if not np.isfinite(ends).all(axis=0).any():  # this pair of gradients tells nothing
+            continue
         before, found = found, float(np.linalg.norm(bent))
         if not 0 < found < math.inf:
             return 0.0
@@ -159,7 +164,7 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
 
 def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
     """Return dL/dv as a flat array, at the value `v` of the optimiser's variable for `key`. Every call uses the same
-    samples.
+    samples. Values that are not finite are NaN.
     """
     optimizer = problem.optimizer
     variable = optimizer.variable(key)
@@ -169,7 +174,7 @@ def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
     problem.regularize()
     row = np.array(variable.chain(v, optimizer.gradient(key)), dtype=np.float64).ravel()
     take_gradient(problem)
-    return finite(row)
+    return np.where(np.isfinite(row), row, np.nan)
 
 
 def _like(value: Any, row: Array) -> Any:

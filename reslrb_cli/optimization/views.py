@@ -259,8 +259,8 @@ class View:
         return self.compare(image) * self.share
 
     def blurred_objective(self, image: mi.TensorXf) -> mi.Float:
-        """Return the view's term in the loss of all views, with the blur of this iteration."""
-        return self._loss(self.exposed(image), self.blur) * self.share
+        """Return the view's term in the loss of all views for an exposed image, with the blur of this iteration."""
+        return self._loss(image, self.blur) * self.share
 
 
 def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:

@@ -80,7 +80,8 @@ class Record(Line):
     - `elapsed_s` is the time in steps and updates since the start. Writing files and computing `parameter_errors` do
         not count.
     - `peak_mib` is the peak memory of the allocator since the start.
-    - `nonfinite` is the number of non-finite entries in the loss, in dL/dI, and in the gradients.
+    - `nonfinite` is the number of non-finite entries in the loss, in dL/dI, in the gradients, and in the images and
+        gradients that measure something.
     - `nonfinite_by_parameter` is the number of non-finite entries in gradients and updates, for each parameter with
         such entries.
     - `grad_norm` is the norm of the gradient without non-finite entries.

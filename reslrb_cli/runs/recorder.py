@@ -288,6 +288,8 @@ class Recording:
         self.certainty = measured and measured.without_derivatives(
             [record.parameter for record in incomplete_records(self.manifest.incomplete)]
         )
+        if left_out := sum(self.problem.take_left_out().values()):
+            logger.warning("the certainty of the values was measured without %d values that are not finite", left_out)
         for key, shown in self.course.certainty.shown.items():
             if key not in self.problem.masks:  # `_begin` has written the masks of the problem
                 write_mask(self.folder.parameters, key, shown)

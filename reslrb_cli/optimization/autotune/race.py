@@ -34,8 +34,9 @@ from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.optimization.loading import pass_spp
+from reslrb_cli.optimization.nonfinite import finite
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import finite, sample_gradient, take_gradient
+from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes
 from reslrb_cli.seeds import seed

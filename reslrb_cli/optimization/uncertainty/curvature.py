@@ -47,6 +47,7 @@ import numpy as np
 
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.optimization.loading import make_configured, paths_of, render_in_passes
+from reslrb_cli.optimization.nonfinite import fill_gaps, finite
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import see_images, take_gradient, unrecorded
 from reslrb_cli.optimization.views import View, slope, to_tensor
@@ -289,7 +290,7 @@ class LossCurvature:
                 even.append(0.0)
                 for half in (0, 1):
                     views = zip(self.problem.trained, images[half], self._base[half], strict=True)
-                    changed = [view.blurred(a - b) / change.amount for view, a, b in views]
+                    changed = [view.blurred(finite(a - b)) / change.amount for view, a, b in views]
                     slopes = [_of_channel(each, direction.channel) for each in changed]
                     columns[half].append(self._in_a_row(slopes))
                     pulls = [(n, each) for views in self.noises for n, each in zip(views, slopes, strict=True)]
@@ -299,7 +300,7 @@ class LossCurvature:
                         even[-1] += 0.5 * sums / len(self.noises)
         if not directions:
             return [], np.zeros((0, 0)), np.zeros((0, 0))
-        a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
+        a, b = (np.array(rows) for rows in columns)
         a = a * self._in_a_row(self._weights) * self._thinned
         self.slopes = a, b
         self.sure = _sure_share(a * b)
@@ -307,7 +308,7 @@ class LossCurvature:
         H = _symmetric(a @ b.T * sure) + self._of_regularizers(directions)
         if not self.noises:
             return directions, H, np.zeros_like(H)
-        a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
+        a, b = (np.array(rows) for rows in odd)
         return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
 
     def for_steps(self, directions: Sequence[ParameterDirection]) -> tuple[Array, float]:
@@ -409,7 +410,9 @@ class LossCurvature:
                 integrator, self.problem.scene, view.sensor, spp if again else few, run.seed, number,
                 f"{_PURPOSE}, target", multiple,
             )  # fmt: skip
-            images.append(view.kept(np.nan_to_num(image[:, :, : true.shape[2]].astype(np.float64))))
+            shown = view.kept(image[:, :, : true.shape[2]].astype(np.float64))
+            images.append(self.problem.leave_out(f"an image of the target of sensor {view.sensor}", shown))
+        images = list(fill_gaps(np.array(images)))
         # If noise has led the values astray, the images are not as bright as the target.
         bright = np.sum(view.kept(true)) * REPLICAS / max(float(np.sum(images)), 1e-300)
         images = [image * np.clip(bright, 1 / MOST_ASTRAY, MOST_ASTRAY) for image in images]
@@ -429,7 +432,7 @@ class LossCurvature:
 
     def _slope(self, view: View, target: Array, image: Array) -> Array:
         """Return dL/dI of an exposed `image` for another `target`, both (H, W, C)."""
-        return np.nan_to_num(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
+        return finite(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
 
     def _in_a_row(self, images: Sequence[Array]) -> Array:
         row = np.concatenate([image.ravel() for image in images])
@@ -461,9 +464,11 @@ class LossCurvature:
         """
         image = 0.5 * (self._base[0][place] + self._base[1][place])
         true = view.kept(np.array(view.target, dtype=np.float64))
+        known = np.isfinite(image)
+        image = np.where(known, image, true)
         step = max(rms(image - true), 1e-3 * rms(true), 1e-6)
         up, down = (slope(view.judge, image + side * step).astype(np.float64) for side in (1, -1))
-        return np.maximum(np.nan_to_num(up - down), 0.0) / (2 * step) * view.share
+        return np.where(known, np.maximum(finite(up - down), 0.0), 0.0) / (2 * step) * view.share
 
     def _seed(self, sensor: int, number: int) -> int:
         return seed(self.problem.config.run.seed, number, sensor, _PURPOSE)

@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from reslrb_cli.optimization.identifiability import shown_texels
+from reslrb_cli.optimization.nonfinite import fill_gaps
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
@@ -103,10 +104,11 @@ class Certainty:
                 with clock.step() as times:
                     sample_gradient(problem, problem.integrator, number, _PURPOSE, config.run.spp)
                     problem.regularize()
-                    for key, row in take_gradient(problem).items():
-                        rows[key].append(row.astype(np.float64))
+                    for key, row in problem.gradients().items():
+                        rows[key].append(np.array(row, dtype=np.float64).ravel())
+                    take_gradient(problem)
                 compiled_ms += times.codegen_ms
-            gradients = {key: np.array(samples) for key, samples in rows.items()}
+            gradients = {key: fill_gaps(np.array(samples)) for key, samples in rows.items()}
             go_on = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations), stop)
             with clock.step() as times:
                 unit = problem.samples_per_pass or 1
