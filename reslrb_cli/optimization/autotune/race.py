@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -222,12 +222,14 @@ Learn = Callable[[int, int], Step]
 class Finding:
     """Result of a race. `other` tells whether the other way is better.
 
-    `gain` is the gain of the other way. `note` gives a reason if the gain alone does not decide.
+    `gain` is the gain of the other way. `note` gives a reason if the gain alone does not decide. `is_open` is true if
+    the time was up before the race was decided. More time may lead to another result.
     """
 
     other: bool
     gain: Gain | None
     note: str
+    is_open: bool = False
 
     def why(self) -> str:
         """Return the gain in words, or the reason why there is none."""
@@ -264,13 +266,16 @@ class Turns:
         # Python's time is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            return Finding(False, None, f"measuring it would take more than {self._limit_ms / 1e3:.2g} s")
+            return Finding(False, None, f"measuring it would take more than {self._limit_ms / 1e3:.2g} s", True)
         self._spend(take(True, 0, spp))
         for round in range(1, 1 + LOOKS * self._sizes.rounds):
             for other in (False, True):
                 self._steps[other].append(self._spend(take(other, round, spp)))
             if not self._affords(sum(steps[-1].wall_ms for steps in self._steps)):
-                break
+                found = self._decided()
+                if found.gain is not None and found.gain[1] <= 1 <= found.gain[2]:
+                    return replace(found, note=f"not decided in {self._limit_ms / 1e3:.2g} s", is_open=True)
+                return found
             if round % self._sizes.rounds == 0 and self._is_clear():
                 break
         return self._decided()
@@ -325,7 +330,7 @@ class Turns:
 
     def _decided(self) -> Finding:
         if (count := len(self._steps[False])) < LEAST_ROUNDS:
-            return Finding(False, None, f"{count} steps of both are too few to decide")
+            return Finding(False, None, f"{count} steps of both are too few to decide", True)
         gain, image = self._gain(), self._image_gain()
         if gain is None:
             return Finding(False, None, "gradients have no noise")

@@ -101,8 +101,14 @@ class Tuner:
             how = "by measurement" if any(each.seconds for each in found) else "without measuring"
             self.say(f"chosen {how}: {chosen} (`reslrb --debug` gives the reasons)")
 
-    def race(self, otherwise: Decision, of: Any, kernels: float, measure: Callable[[float], Decision]) -> Decision:
-        """Return the decision of an earlier run, or the result of `measure`, which takes the time limit in seconds.
+    def race(
+        self, otherwise: Decision, other: str, of: Any, kernels: float, measure: Callable[[float], Finding],
+        whose: str = "",
+    ) -> Decision:  # fmt: skip
+        """Return the decision of an earlier run, or that of a race.
+
+        `measure` races the value `other`, and takes the time limit in seconds. A race that the limit ended undecided is
+        not kept for later runs. `whose` names the other way in the reason.
 
         The result is `otherwise` if the time does not suffice for LEAST_ITERATIONS and for the compilation of the
         kernels of `kernels` steps. `of` has the conditions of the decision that `situation` does not contain. All races
@@ -120,11 +126,15 @@ class Tuner:
         if not self._spent_s:
             self.say("measuring which sampling is most efficient")
         begin = time.perf_counter()
-        decision = measure(left_s)
+        found = measure(left_s)
         seconds = time.perf_counter() - begin
         self._spent_s += seconds
-        decision = replace(decision, seconds=seconds)
-        if self._cache is not None:
+        gain, low, high = found.gain or (None, None, None)
+        decision = replace(
+            otherwise, value=other if found.other else otherwise.value,
+            why=found.why() if gain is None else whose + found.why(), gain=gain, low=low, high=high, seconds=seconds,
+        )  # fmt: skip
+        if self._cache is not None and not found.is_open:
             self._cache.put(key, decision)
         return decision
 
@@ -208,20 +218,11 @@ def _paths(tuner: Tuner) -> None:
         tuner.take(replace(both, why="camera paths do not find all light here"))
         return
 
-    def measure(limit_s: float) -> Decision:
+    def measure(limit_s: float) -> Finding:
         trial = StepTrial(problem, "paths", problem.integrator.afresh(), problem.integrator.afresh(light_share=0.0))
-        found = trial.race(sizes(problem, PATHS_LONGER, PATHS_PLANNED), limit_s)
-        return _found(both, found, "camera" if found.other else "both", "camera paths have ")
+        return trial.race(sizes(problem, PATHS_LONGER, PATHS_PLANNED), limit_s)
 
-    tuner.take(tuner.race(both, None, PATHS_KERNELS, measure))
-
-
-def _found(otherwise: Decision, found: Finding, value: str, whose: str = "") -> Decision:
-    """Return the decision that follows from a race. `whose` names the other way, if there is a gain."""
-    if found.gain is None:
-        return replace(otherwise, value=value, why=found.why())
-    gain, low, high = found.gain
-    return replace(otherwise, value=value, why=whose + found.why(), gain=gain, low=low, high=high)
+    tuner.take(tuner.race(both, "camera", None, PATHS_KERNELS, measure, "camera paths have "))
 
 
 # --- pixels -----------------------------------------------------------------------------------------------------------
@@ -291,15 +292,14 @@ def _guiding(tuner: Tuner) -> None:
         return
     plan = sizes(problem, GUIDING_LONGER)
 
-    def measure(limit_s: float) -> Decision:
+    def measure(limit_s: float) -> Finding:
         plain, share = problem.integrator.afresh(), 1.0 if alone else None
         guided = problem.integrator.afresh(guiding="on", light_share=share, **independent)
-        found = StepTrial(problem, "guiding", plain, guided).race(plan, limit_s, guides=True)
-        return _found(off, found, "on" if found.other else "off")
+        return StepTrial(problem, "guiding", plain, guided).race(plan, limit_s, guides=True)
 
     # Learning is a larger part of a short run, because tables learn most often at the start.
     of = [plan.lessons, problem.integrator.paths, problem.integrator.light_share]
-    decision = tuner.race(off, of, GUIDING_KERNELS, measure)
+    decision = tuner.race(off, "on", of, GUIDING_KERNELS, measure)
     if decision.value == "off":
         tuner.take(decision)
         return
