@@ -36,15 +36,14 @@ LEAST_LONGER, MOST_LONGER = 2, 5
 #: Divisor of the learning rate if the loss rose, and factor for the samples of a noisy target.
 LOWER, MORE_SAMPLES = 3, 16
 
+#: The proposal for which a run continues; the others need a new run.
+LONGER = "more iterations"
+
+#: The proposal to render the target with more samples.
+CLEANER = "a cleaner target"
+
 #: Proposals in the order of priority: the first ones make the later ones useless.
-ORDER = (
-    "a limit",
-    "a lower rate",
-    "a higher rate",
-    "a new run from here",
-    "more iterations",
-    "more samples for it",
-)
+ORDER = ("a limit", "a lower rate", "a higher rate", "a new run from here", LONGER, CLEANER)
 
 #: Maximum number of parameters named for one verdict.
 MOST_NAMED = 3
@@ -79,14 +78,72 @@ def is_settled(results: Mapping[str, Any], key: str) -> bool:
 
 
 class Remedy(NamedTuple):
-    """Proposal in a few words, and the setting that implements the proposal."""
+    """Proposal in a few words, and the setting that implements the proposal. Of two equal proposals, the one with the
+    larger `size` serves both.
+    """
 
     words: str
     setting: str
+    size: float = 0.0
+
+    def command(self, manifest: Mapping[str, Any], folder: str) -> str:
+        """Return the command that continues or repeats the run in `folder` with this setting. Return the setting alone
+        if it belongs into the configuration file.
+        """
+        if not self.setting.startswith("--set "):
+            return self.setting
+        return f"{again(manifest, folder, resumes=self.words == LONGER)} {self.setting}"
+
+
+def again(manifest: Mapping[str, Any], folder: str, resumes: bool) -> str:
+    """Return the command that resumes the run in `folder`, or repeats it with its own configuration."""
+    words = ["--resume", folder] if resumes else [f"{folder}/config.yaml"]
+    allowed = ["--allow-code"] if "--allow-code" in (manifest.get("command_line") or ()) else []
+    return shlex.join(["reslrb", "optimize", *words, *allowed])
+
+
+def advice(results: Mapping[str, Any]) -> Remedy | None:
+    """Return the most important proposal for a run, or None. All texts about the run give this proposal only, because
+    two proposals may contradict each other.
+    """
+    found = [find_remedy(results, key) for key in verdicts_of(results)]
+    found += [_cleaner_target(results), _longer(results)]
+    remedies = [remedy for remedy in found if remedy is not None]
+    return min(remedies, key=lambda each: (ORDER.index(each.words), -each.size), default=None)
+
+
+def _cleaner_target(results: Mapping[str, Any]) -> Remedy | None:
+    """Return the proposal for a run that did not improve and has few samples in its target."""
+    samples = results.get("samples") or {}
+    step, target = samples.get("step"), samples.get("target")
+    if not (step and target and target < FEW_STEPS * step and _setbacks(results)):
+        return None
+    return _samples(max(FEW_STEPS * step, 4 * target))
+
+
+def _samples(spp: int) -> Remedy:
+    return Remedy(CLEANER, f"--set target.render.spp={spp}", spp)
+
+
+def _longer(results: Mapping[str, Any]) -> Remedy | None:
+    """Return the proposal for a run of few iterations that did not improve, although its target has enough samples, and
+    for a run without verdicts whose loss was still falling.
+    """
+    done, late = results.get("iterations") or LEAST_JUDGED, (results.get("loss_trend") or {}).get("late")
+    if done < LEAST_JUDGED and _setbacks(results) and _cleaner_target(results) is None:
+        return _iterations(200)
+    if late == "fell" and not verdicts_of(results) and _loss_fell(results):
+        return _iterations(2 * done)
+    return None
+
+
+def _iterations(count: int) -> Remedy:
+    return Remedy(LONGER, f"--set run.iterations={count}", count)
 
 
 def verdict_words(results: Mapping[str, Any], key: str) -> str:
-    """Return the verdict on the parameter `key`, with a proposal. The result is empty if nothing was measured.
+    """Return the verdict on the parameter `key`, with the proposal if it is the run's (`advice`). The result is empty
+    if nothing was measured.
 
     The result includes the share of entries with this verdict and the share of entries that no view shows.
     """
@@ -101,8 +158,10 @@ def verdict_words(results: Mapping[str, Any], key: str) -> str:
     words = words if share is None or share == 1 else f"{words} ({100 * share:.3g} %)"
     unseen = shares.get(UNSEEN) if verdict != UNSEEN else None
     words += f", {100 * unseen:.3g} % not seen" if unseen else ""
-    remedy = find_remedy(results, key)
-    return f"{words}: {remedy.words}" if remedy is not None else words
+    remedy, best = find_remedy(results, key), advice(results)
+    return (
+        f"{words}: {remedy.words}" if remedy is not None and best is not None and remedy.words == best.words else words
+    )
 
 
 def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
@@ -115,23 +174,23 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
     if about.get("verdict") == LOST:
         return Remedy("a limit", "its own bounds: [LOW, HIGH]")
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
-        return Remedy("more samples for it", f"--set target.render.spp={MORE_SAMPLES * measured['target_spp']}")
+        return _samples(MORE_SAMPLES * measured["target_spp"])
     moved, rate, iterations = about.get("moved"), about.get("rate"), measured.get("iterations")
     if about.get("verdict") != MOVING or moved is None or not iterations:
         return None
     if (results.get("loss_trend") or {}).get("change") == "rose":
         if rate is None or incomplete_records(results.get("incomplete") or ()):
             return None
-        return Remedy("a lower rate", _rate_setting(measured, rate, 1 / LOWER))
+        return Remedy("a lower rate", *_rate_setting(measured, rate, 1 / LOWER))
     way = moved + max((abs(value) for value in about.get("to_go") or () if value is not None), default=0.0)
     reach = about.get("reach")
     if reach and rate and way > REACHED * reach:
-        return Remedy("a higher rate", _rate_setting(measured, rate, max(2 * way / reach, 2.0)))
+        return Remedy("a higher rate", *_rate_setting(measured, rate, max(2 * way / reach, 2.0)))
     # More of the same steps would not help, or the run would end again at once.
     if (results.get("loss_trend") or {}).get("late") == "flat" or (rate is None and results.get("stopped")):
         return Remedy("a new run from here", "initial: {run: RUN} for each parameter")
     longer = min(max(way / moved if moved else MOST_LONGER, LEAST_LONGER), MOST_LONGER)
-    return Remedy("more iterations", f"--set run.iterations={int(float(f'{longer * iterations:.2g}'))}")
+    return _iterations(int(float(f"{longer * iterations:.2g}")))
 
 
 def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
@@ -147,22 +206,24 @@ def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
 
 
 def certainty_lines(results: Mapping[str, Any]) -> list[str]:
-    """Return one line for each verdict except `settled`, with the parameters that have this verdict."""
-    verdicts = verdicts_of(results)
+    """Return one line for each verdict except `settled`, with the parameters that have this verdict, and the run's
+    proposal (`advice`) if it is about them.
+    """
+    verdicts, best = verdicts_of(results), advice(results)
     lines = []
     for verdict in dict.fromkeys(verdict for verdict in verdicts.values() if verdict != SETTLED):
         keys = [key for key in verdicts if verdicts[key] == verdict]
         named = ", ".join(shorten(key, KEY_WIDTH) for key in keys[:MOST_NAMED])
         rest = f" and {count(len(keys) - MOST_NAMED, 'more parameter')}" if len(keys) > MOST_NAMED else ""
-        remedies = [remedy for key in keys if (remedy := find_remedy(results, key)) is not None]
-        of_target = " of the target" if verdict == NOISE and remedies else ""
+        of_target = (
+            " of the target" if any(verdict == NOISE and _is_of_target(_about(results, key)) for key in keys) else ""
+        )
         line = f"{'not converged, ' if verdict == MOVING else ''}{verdict}{of_target}: {named}{rest}"
         shares = [record.percent() for record in incomplete_records(results.get("incomplete") or ())
                   if record.parameter in keys and verdict == INCOMPLETE]  # fmt: skip
         line += f" ({', '.join(shares)} of it is missing)" if shares else ""
-        if remedies:  # proposals about steps come first, because more of the wrong steps do not help
-            remedy = min(remedies, key=lambda each: ORDER.index(each.words))
-            line += f" ({remedy.words}: {remedy.setting})"
+        own = {remedy.words for key in keys if (remedy := find_remedy(results, key)) is not None}
+        line += f" ({best.words}: {best.setting})" if best is not None and best.words in own else ""
         lines.append(line)
     return lines
 
@@ -182,13 +243,13 @@ def _is_of_target(about: Mapping[str, Any]) -> bool:
     return any(part is not None and whole and part > OF_TARGET * whole for part, whole in pairs)
 
 
-def _rate_setting(measured: Mapping[str, Any], rate: float, factor: float) -> str:
-    """Return the setting for another learning rate. The setting changes the rate of all parameters, or the rate of one
-    parameter that has its own.
+def _rate_setting(measured: Mapping[str, Any], rate: float, factor: float) -> tuple[str, float]:
+    """Return the setting for another learning rate, and the factor. The setting changes the rate of all parameters, or
+    the rate of one parameter that has its own.
     """
     value = f"{float(f'{factor * rate:.1g}'):g}"
     common = rate == measured.get("learning_rate")
-    return f"--set optimizer.learning_rate={value}" if common else f"its own learning_rate: {value}"
+    return f"--set optimizer.learning_rate={value}" if common else f"its own learning_rate: {value}", factor
 
 
 def _parameters(results: Mapping[str, Any]) -> dict[str, Any]:
@@ -243,6 +304,17 @@ def error_line(results: Mapping[str, Any]) -> str | None:
     return f"relative error {_from_to(results['relative_error'][key])} at worst ({shorten(key, KEY_WIDTH)})"
 
 
+def total_error(results: Mapping[str, Any], moment: str) -> float | None:
+    """Return the error of all parameters together at a `moment`, `initial` or `final`. If they have no common unit, it
+    is the root mean square of their relative errors. Return None if no true value is known.
+    """
+    if not units_differ(results):
+        return (results.get("rmse") or {}).get(moment)
+    errors = [pair.get(moment) for pair in (results.get("relative_error") or {}).values()]
+    known = [error for error in errors if error is not None]
+    return math.sqrt(sum(error**2 for error in known) / len(known)) if known else None
+
+
 def worst(results: Mapping[str, Any]) -> str | None:
     """Return the key with the largest relative error at the end, or None."""
     errors = {key: pair.get("final") for key, pair in (results.get("relative_error") or {}).items()}
@@ -251,9 +323,15 @@ def worst(results: Mapping[str, Any]) -> str | None:
 
 
 def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
-    """Return warnings about a run that did not fail: a loss that did not fall, errors that rose, unreliable values,
-    failed measurements.
-    """
+    """Return warnings about a run that did not fail: a loss that did not fall, errors that rose, unreliable values."""
+    lines = _setbacks(results, sign)
+    return [
+        *lines, *(_reasons(results) if lines else ()), *certainty_lines(results), *(results.get("unmeasured") or ())
+    ]  # fmt: skip
+
+
+def _setbacks(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
+    """Return lines about a loss that did not fall, images that became worse, and errors that rose."""
     lines = []
     trend, ratio = results.get("loss_trend") or {}, image_ratio(results)
     if trend.get("change") in ("rose", "flat") and not (ratio is not None and ratio < IMPROVED):
@@ -272,25 +350,21 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
     lines += [f"{shorten(key, KEY_WIDTH)} got worse (RMSE {_from_to(errors[key])})" for key in worse[:MOST_NAMED]]
     if len(worse) > MOST_NAMED:
         lines.append(f"and so did {count(len(worse) - MOST_NAMED, 'more parameter')}")
-    if lines:
-        lines += _reasons(results)
-    return [*lines, *certainty_lines(results), *(results.get("unmeasured") or ())]
+    return lines
 
 
 def _reasons(results: Mapping[str, Any]) -> list[str]:
     """Return possible reasons why a run did not improve, as far as its records show."""
-    samples = results.get("samples") or {}
     found = [f"the steps followed an incomplete derivative ({record.percent()} of the derivative of "
              f"{shorten(record.parameter, KEY_WIDTH)} is missing), and a lower rate does not help"
              for record in incomplete_records(results.get("incomplete") or ())]  # fmt: skip
-    step, target = samples.get("step"), samples.get("target")
-    if step and target and target < FEW_STEPS * step:
-        found.append(
-            f"the target itself has {count(target, 'sample')} per pixel only: --set target.render.spp="
-            f"{max(FEW_STEPS * step, 4 * target)} makes a cleaner one"
-        )
+    best = advice(results)
+    if _cleaner_target(results) is not None:
+        line = f"the target itself has {count(results['samples']['target'], 'sample')} per pixel only"
+        found.append(line + (f": {best.setting} makes a cleaner one" if best and best.words == CLEANER else ""))
     if (results.get("iterations") or LEAST_JUDGED) < LEAST_JUDGED:
-        found.append(f"{count(results.get('iterations') or 0, 'iteration')} are few: --set run.iterations=200")
+        line = f"{count(results.get('iterations') or 0, 'iteration')} are few"
+        found.append(line + (f": {best.setting}" if best and best.words == LONGER else ""))
     return found
 
 
@@ -410,9 +484,6 @@ def _blocks(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[
 
 # --- the outcome in one sentence, and what to do next -----------------------------------------------------------------
 
-#: A remedy for which a run continues; the others need a new run.
-LONGER = "more iterations"
-
 
 @dataclass(frozen=True)
 class Outcome:
@@ -432,7 +503,6 @@ class Outcome:
 
 def outcome_of(manifest: Mapping[str, Any], results: Mapping[str, Any], folder: str) -> Outcome:
     """Return the outcome of a run in `folder`, from its manifest and the results in it."""
-    resume = ["reslrb", "optimize", "--resume", folder]
     done, status = results.get("iterations") or 0, manifest.get("status")
     if status == Status.RUNNING:
         return Outcome("open", "The run is in progress.")
@@ -442,31 +512,68 @@ def outcome_of(manifest: Mapping[str, Any], results: Mapping[str, Any], folder: 
         if not done:
             return Outcome(grade, sentence)
         proposal = "Continue it" + (", after you have corrected the error:" if grade == "failed" else ":")
-        return Outcome(grade, sentence, proposal, shlex.join(resume))
-    fell = _loss_fell(results)
-    if fell is None:
+        return Outcome(grade, sentence, proposal, again(manifest, folder, resumes=True))
+    if _loss_fell(results) is None:
         few = ", too few to judge its result" if done < LEAST_JUDGED else ""
         return Outcome("open", f"The run finished after {count(done, 'iteration')}{few}.")
-    if not fell:
-        return _with_remedy(
-            "The loss did not fall, so the values are no better than at the start.", manifest, results, resume
-        )
+    better, course = _course(results)
     verdicts = verdicts_of(results)
-    if not verdicts:
-        return _without_verdicts(results, resume)
     open_keys = [key for key, verdict in verdicts.items() if verdict != SETTLED]
-    worse = bool(results.get("worse"))
-    if not open_keys and not worse:
+    if better and verdicts and not open_keys and not results.get("worse"):
         all_of = "its parameter is" if len(verdicts) == 1 else f"all {len(verdicts)} parameters are"
         export = shlex.join(["reslrb", "export", folder, "-o", "recovered"])
-        return Outcome("good", f"The loss fell, and {all_of} settled.", "Write the recovered scene:", export)
+        return Outcome("good", f"{course}, and {all_of} settled.", "Write the recovered scene:", export)
+    remedy = advice(results)
+    rest = (f"Try {remedy.words}:", remedy.command(manifest, folder)) if remedy is not None else ("", "")
+    if rest[1] and not rest[1].startswith("reslrb "):
+        rest = (f"{rest[0][:-1]}, with this in the configuration:", rest[1])
+    course += _settled(verdicts, open_keys, better)
+    if results.get("worse") and not open_keys:
+        course += f". {shorten(results['worse'][0], KEY_WIDTH)} is farther from its true value than at the start"
+    return Outcome("open", f"{course}.", *rest)
+
+
+def _settled(verdicts: Mapping[str, str], open_keys: Sequence[str], better: bool) -> str:
+    """Return the end of a sentence: how many parameters settled, and the first one that did not."""
     settled = len(verdicts) - len(open_keys)
-    sentence = f"The loss fell, and {settled} of {count(len(verdicts), 'parameter')} settled."
+    if not verdicts:
+        return ". The certainty of the values was not measured" if better else ""
+    if not better and not settled:
+        return ""
+    words = f", {'and' if better else 'though'} {settled} of {count(len(verdicts), 'parameter')} settled"
     if open_keys:
-        sentence += f" {shorten(open_keys[0], KEY_WIDTH)}: {verdicts[open_keys[0]]}."
+        words += f". {shorten(open_keys[0], KEY_WIDTH)}: {verdicts[open_keys[0]]}"
     if len(open_keys) > 1:
-        sentence += f" The table shows {count(len(open_keys) - 1, 'more parameter')} that did not settle."
-    return _with_remedy(sentence, manifest, results, resume)
+        words += f". The table shows {count(len(open_keys) - 1, 'more parameter')} that did not settle"
+    return words
+
+
+def _course(results: Mapping[str, Any]) -> tuple[bool, str]:
+    """Return whether the values are better than at the start, as far as loss and known errors show, and a sentence
+    about it without its full stop.
+    """
+    trend, fell = results.get("loss_trend") or {}, bool(_loss_fell(results))
+    start, end = (total_error(results, moment) for moment in ("initial", "final"))
+    loss = "The loss fell" if fell else "The loss rose" if trend.get("change") == "rose" else "The loss did not fall"
+    error = (
+        ""
+        if start is None or end is None
+        else "fell"
+        if end < IMPROVED * start
+        else "rose"
+        if end > start
+        else "hardly fell"
+    )
+    if fell and error in ("", "fell"):
+        losses = {} if verdicts_of(results) else results.get("image_loss") or {}
+        loss += f" from {number(losses['initial'], 3)} to {number(losses['final'], 3)}" if len(losses) == 2 else ""
+        late = not verdicts_of(results) and trend.get("late") == "fell"
+        return True, loss + ", and was still falling at the end" * late
+    if not error:
+        return False, f"{loss}, so nothing shows that the values are better than at the start"
+    joined = "and" if fell == (error == "fell") else "but"
+    words = f"{loss}, {joined} the error of the parameters {error} ({number(start, 3)} to {number(end, 3)})"
+    return error == "fell", words
 
 
 def _loss_fell(results: Mapping[str, Any]) -> bool | None:
@@ -475,29 +582,3 @@ def _loss_fell(results: Mapping[str, Any]) -> bool | None:
     if change is None and ratio is None:
         return None
     return change == "fell" or (ratio is not None and ratio < IMPROVED)
-
-
-def _without_verdicts(results: Mapping[str, Any], resume: list[str]) -> Outcome:
-    """Return the outcome of a run that did not measure how certain its values are."""
-    losses, late = results.get("image_loss") or {}, (results.get("loss_trend") or {}).get("late")
-    pair = f" from {number(losses['initial'], 3)} to {number(losses['final'], 3)}" if len(losses) == 2 else ""
-    if late == "fell":
-        longer = ["--set", f"run.iterations={2 * (results.get('iterations') or 0)}"]
-        return Outcome(
-            "open", f"The loss fell{pair}, and was still falling at the end.", "Continue the run:",
-            shlex.join([*resume, *longer]),
-        )  # fmt: skip
-    return Outcome("open", f"The loss fell{pair}. The certainty of the values was not measured.")
-
-
-def _with_remedy(sentence: str, manifest: Mapping[str, Any], results: Mapping[str, Any], resume: list[str]) -> Outcome:
-    """Return an open outcome with the most important proposal among all parameters."""
-    found = (find_remedy(results, key) for key in verdicts_of(results))
-    remedies: list[Remedy] = [remedy for remedy in found if remedy is not None]
-    if not remedies:
-        return Outcome("open", sentence)
-    remedy = min(remedies, key=lambda each: ORDER.index(each.words))
-    if not remedy.setting.startswith("--set "):
-        return Outcome("open", sentence, f"Try {remedy.words}, with this in the configuration:", remedy.setting)
-    command = resume if remedy.words == LONGER else ["reslrb", "optimize", str(manifest.get("config"))]
-    return Outcome("open", sentence, f"Try {remedy.words}:", f"{shlex.join(command)} {remedy.setting}")

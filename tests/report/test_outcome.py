@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
 
-from reslrb_cli.report.run_summary import Outcome, outcome_of
+from reslrb_cli.report.run_summary import ORDER, Outcome, advice, outcome_of, verdict_words, verdicts_of, warnings
 
 FELL = {"change": "fell", "late": "flat"}
 
@@ -32,12 +33,54 @@ def test_only_a_falling_loss_and_settled_parameters_are_good() -> None:
         assert found.sentence == f"The loss fell, and 1 of 2 parameters settled. p1: {verdict}."
 
 
-@pytest.mark.parametrize("change", ["rose", "flat"])
-def test_a_loss_that_did_not_fall_is_not_good(change: str) -> None:
+NOTHING = "so nothing shows that the values are better than at the start"
+
+
+@pytest.mark.parametrize(("change", "words"), [("rose", "rose"), ("flat", "did not fall")])
+def test_a_loss_that_did_not_fall_is_not_good(change: str, words: str) -> None:
     found = outcome(results("settled", trend={"change": change}))
-    assert found == Outcome("open", "The loss did not fall, so the values are no better than at the start.")
+    assert found == Outcome("open", f"The loss {words}, {NOTHING}, though 1 of 1 parameter settled.")
+    found = outcome(results("not seen", trend={"change": change}))
+    assert found == Outcome("open", f"The loss {words}, {NOTHING}.")
     better = {"image_loss": {"initial": 1.0, "final": 0.5}}  # saved images have less noise
     assert outcome(results("settled", trend={"change": change}, **better)).grade == "good"
+
+
+def errors(start: float, end: float, relative: bool) -> dict[str, Any]:
+    """Return results with errors of two parameters, whose units may differ."""
+    pairs = {key: {"initial": start, "final": end} for key in ("p0", "p1")}
+    total = {"initial": None, "final": None} if relative else {"initial": start, "final": end}
+    return {"rmse": total, "parameter_rmse": pairs, "relative_error": pairs}
+
+
+@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("verdict", ["settled", "below the noise"])
+@pytest.mark.parametrize(("start", "end", "change"), [(0.057, 0.0034, "fell"), (0.1, 0.3, "rose"),
+                                                      (0.1, 0.098, "hardly fell")])  # fmt: skip
+@pytest.mark.parametrize("loss", ["fell", "rose", "flat"])
+def test_known_errors_decide_and_the_sentence_agrees_with_the_table(
+    loss: str, start: float, end: float, change: str, verdict: str, relative: bool
+) -> None:
+    """Noise of the target can hide a fall of the loss, and a loss can fall though the values become worse."""
+    found = outcome(results(verdict, verdict, trend={"change": loss}, **errors(start, end, relative)))
+    assert (found.grade == "good") == (change == "fell" and verdict == "settled")
+    if (loss, change) == ("fell", "fell"):
+        assert "error" not in found.sentence
+    else:
+        said = {"fell": "The loss fell", "rose": "The loss rose", "flat": "The loss did not fall"}[loss]
+        joined = "and" if (loss == "fell") == (change == "fell") else "but"
+        words = f"{said}, {joined} the error of the parameters {change} ({start:g} to {end:g})"
+        assert found.sentence.startswith(words)
+    assert "no better" not in found.sentence
+    assert ("settled" in found.sentence) == (verdict == "settled" or change == "fell")
+
+
+def test_a_run_without_a_remedy_has_no_command() -> None:
+    found = outcome(results("settled", "settled", worse=["p0"], **errors(0.2, 0.1, False)))
+    assert found.sentence == (
+        "The loss fell, and 2 of 2 parameters settled. p0 is farther from its true value than at the start."
+    )
+    assert found.command == ""
 
 
 def test_the_remedy_is_a_command() -> None:
@@ -55,15 +98,53 @@ def test_a_remedy_that_needs_a_new_run_starts_from_the_configuration() -> None:
     found["certainty"]["parameters"]["p0"] |= {"moved": 1.0, "rate": 0.03}
     told = outcome(found)
     assert told.proposal == "Try a lower rate:"
-    assert told.command == "reslrb optimize 'a room.yaml' --set optimizer.learning_rate=0.01"
+    assert told.command == "reslrb optimize runs/room/config.yaml --set optimizer.learning_rate=0.01"
+    allowed = outcome(found, command_line=["reslrb", "optimize", "a room.yaml", "--allow-code", "--set", "run.spp=4"])
+    assert allowed.command == ("reslrb optimize runs/room/config.yaml --allow-code --set optimizer.learning_rate=0.01")
+
+
+def many_remedies() -> dict[str, Any]:
+    """Return results in which several parameters, the target and the length of the run have proposals."""
+    found = results(*["still moving"] * 3, "below the noise", "effect lost", trend=FLAT)
+    found |= {"iterations": 10, "samples": {"step": 16, "target": 32}}
+    found["certainty"] |= {"learning_rate": 0.03, "target_spp": 32, "iterations": 10}
+    moved = [{"moved": 1.0, "rate": 0.03, "reach": 100.0, "to_go": [2.0]}, {"moved": 1.0, "rate": 0.03, "reach": 100.0,
+             "to_go": [3.0]}, {"moved": 3.0, "rate": 0.03, "reach": 3.0, "to_go": [7.0]},
+             {"spread": [3.0], "of_target": [2.9]}, {}]  # fmt: skip
+    for about, more in zip(found["certainty"]["parameters"].values(), moved, strict=True):
+        about |= more
+    return found
+
+
+FLAT = {"change": "flat", "late": "unclear", "start": {"mean": 1.0, "error": 0.1}, "end": {"mean": 1.0, "error": 0.1}}
+
+
+@pytest.mark.parametrize("left_out", range(6))
+def test_a_page_has_one_proposal(left_out: int) -> None:
+    """All texts of a page give the same setting, the most important one. Without it, they give the next one."""
+    found = many_remedies()
+    for number in [4, 2, 1, 0, 3][:left_out]:
+        del found["certainty"]["parameters"][f"p{number}"]
+    best = advice(found)
+    expected = ["its own bounds", "learning_rate=0.2", "run.iterations=40", "run.iterations=30",
+                "target.render.spp=512", "target.render.spp=256"][left_out]  # fmt: skip
+    assert best is not None
+    assert expected in best.setting
+    texts = [outcome(found).command, *warnings(found)]
+    settings = {
+        word for text in texts for word in re.findall(r"[\w.]+=[\w.]+", text) if not text.startswith("the loss")
+    }
+    assert settings == ({best.setting.removeprefix("--set ")} if "=" in best.setting else set())
+    table = " ".join(verdict_words(found, key) for key in verdicts_of(found))
+    assert [words for words in ORDER if f": {words}" in table] in ([best.words], [])
 
 
 def test_a_run_that_did_not_measure_certainty() -> None:
     found = {"iterations": 50, "loss_trend": {"change": "fell", "late": "fell"},
              "image_loss": {"initial": 2.0, "final": 0.5}}  # fmt: skip
     assert outcome(found) == Outcome(
-        "open", "The loss fell from 2 to 0.5, and was still falling at the end.", "Continue the run:",
-        "reslrb optimize --resume runs/room --set run.iterations=100",
+        "open", "The loss fell from 2 to 0.5, and was still falling at the end. The certainty of the values was not "
+        "measured.", "Try more iterations:", "reslrb optimize --resume runs/room --set run.iterations=100",
     )  # fmt: skip
     assert outcome(found | {"loss_trend": FELL}).grade == "open"
     assert outcome({"iterations": 3}).sentence == "The run finished after 3 iterations, too few to judge its result."

@@ -167,9 +167,9 @@ def test_a_moving_value_gets_a_remedy(found, words, setting):
 def test_noise_of_the_target_is_told_from_noise_of_the_run():
     noisy = {"verdict": "below the noise", "shares": {"below the noise": 1.0}, "spread": [3.0], "of_target": [2.9]}
     found = judged(noisy)
-    assert parameter_lines(found, 120)[1].endswith("below the noise of the target: more samples for it")
+    assert parameter_lines(found, 120)[1].endswith("below the noise of the target: a cleaner target")
     assert warnings(found) == [
-        "below the noise of the target: lamp.radiance.value (more samples for it: --set target.render.spp=1024)"
+        "below the noise of the target: lamp.radiance.value (a cleaner target: --set target.render.spp=1024)"
     ]
     found = judged(noisy | {"of_target": [1.0]})
     assert parameter_lines(found, 120)[1].endswith("below the noise")

@@ -34,7 +34,7 @@ from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, lay_out, soft
 from reslrb_cli.report.page.run import guarded
 from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve
-from reslrb_cli.report.run_summary import units_differ
+from reslrb_cli.report.run_summary import total_error, units_differ
 from reslrb_cli.report.sources import ShownRun, SweepRuns
 from reslrb_cli.report.tonemap import exposure_words, shown_exposures
 
@@ -76,19 +76,11 @@ def run_record(source: SweepRuns, combination: Combination, seed: int) -> SweepR
     status = str(run.manifest.get("status", ""))
     return SweepRunRecord(
         name, combination.settings, seed, status, run.iterations,
-        (results.get("image_loss") or {}).get("final"), _error(run, relative), relative, results.get("elapsed_s"),
+        (results.get("image_loss") or {}).get("final"), total_error(results, "final"), relative,
+        results.get("elapsed_s"),
         max((record["peak_mib"] for record in run.records), default=None),
         str(run.manifest.get("error") or ""),
     )  # fmt: skip
-
-
-def _error(run: ShownRun, relative: bool) -> float | None:
-    """Return the final error of all parameters. If `relative`, return the root mean square of their relative errors."""
-    if not relative:
-        return (run.results.get("rmse") or {}).get("final")
-    pairs = (run.results.get("relative_error") or {}).values()
-    known = [pair["final"] for pair in pairs if pair.get("final") is not None]
-    return math.sqrt(sum(error**2 for error in known) / len(known)) if known else None
 
 
 def row_records(sweep: SweepPlan, runs: Sequence[SweepRunRecord]) -> list[SweepRowRecord]:
