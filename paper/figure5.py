@@ -23,7 +23,7 @@ from make_figures import encode
 from paper.gradients import OWN, Kind, colored, compare, compared, own_label, sample, take_pictures
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
-from reslrb_cli.measure.comparison import compare_equal_seeds, parts, z_scores
+from reslrb_cli.measure.comparison import Deviation, compare_equal_seeds, parts
 from reslrb_cli.records.measurements import Verdict
 from reslrb_cli.report.tonemap import signed_end
 
@@ -106,7 +106,7 @@ def z_map(naive: Kind, ours: Kind) -> np.ndarray:
     down, across = min(TILES, height), min(TILES, width)
     sums = [parts(kind.rows, shape, TILES).reshape(-1, down, across, channels).sum(-1) for kind in (ours, naive)]
     rows, columns = np.arange(height) * down // height, np.arange(width) * across // width
-    return np.asarray(z_scores(*sums)[np.ix_(rows, columns)])
+    return np.asarray(Deviation.of(*sums, 1e-5).z()[np.ix_(rows, columns)])
 
 
 def panels(image: np.ndarray, kinds: list[Kind]) -> list[list[tuple[str, np.ndarray]]]:

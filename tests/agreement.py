@@ -19,7 +19,10 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from reslrb_cli.measure.comparison import ALPHA, combined_z_rms, effective_entries, sidak, z_rms_limit, z_scores
+from reslrb_cli.measure.comparison import ALPHA, Deviation, combined_z_rms, effective_entries, sidak, z_rms_limit
+
+#: Relative rounding error of means.
+ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -89,20 +92,22 @@ def compare(a: np.ndarray, b: np.ndarray, block: int | None = 8, alpha: float = 
     else:
         parts_a, parts_b = blocks(a, block), blocks(b, block)
     all_a, all_b = (np.concatenate([x, x.mean(1, keepdims=True)], 1) for x in (parts_a, parts_b))
-    z = z_scores(all_a, all_b)
+    deviation = Deviation.of(all_a, all_b, ROUNDING)
+    z = deviation.z()
 
     index, channel = np.unravel_index(np.argmax(np.where(np.isfinite(z), np.abs(z), np.inf)), z.shape)
     in_a, in_b = all_a[:, index, channel].mean(), all_b[:, index, channel].mean()
     where = "whole" if index == len(z) - 1 else f"block {index}"
     total_a, total_b = parts_a.mean((1, 2)), parts_b.mean((1, 2))
     scale = abs(total_b.mean()) or 1.0
-    count: float = len(z) - 1
-    if block is None:
-        count = min(effective_entries(x.reshape(len(x), -1)) for x in (a, b))
+    noisy = deviation.noisy[:-1]
+    count: float = max(int(noisy.any(1).sum()), 1)
+    if block is None and noisy.any():
+        count = min(effective_entries(x.reshape(len(x), -1)[:, noisy[:, 0]]) for x in (a, b))
     return Agreement(
         z=z,
         threshold=sidak(z.size, alpha),
-        z_rms=combined_z_rms(z[:-1]),
+        z_rms=combined_z_rms(z[:-1][noisy]),
         z_rms_threshold=z_rms_limit(count, alpha),
         difference=float((total_a.mean() - total_b.mean()) / scale),
         relative_error=float(np.hypot(stats.sem(total_a), stats.sem(total_b)) / scale),

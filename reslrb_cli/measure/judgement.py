@@ -24,7 +24,6 @@ from functools import cached_property
 import numpy as np
 
 from reslrb_cli.measure.comparison import (
-    ROUNDING,
     STOCK_ROUNDING,
     TAIL,
     Family,
@@ -167,11 +166,9 @@ class MethodSamples:
         steps, repeats, squared = np.transpose(known)
         return float(0.5 * np.polyfit(np.log(steps), np.log(squared), 1, w=np.sqrt(repeats))[0])
 
-    def efficiency(self, biased: bool = False) -> JackknifeEstimate | None:
-        """Return the logarithm of 1 / (relative variance * seconds of a step). Without noise or with too few turns,
-        return None.
-
-        If `biased`, the squared bias is added to the variance.
+    def efficiency(self) -> JackknifeEstimate | None:
+        """Return the logarithm of 1 / ((relative variance + squared relative bias) * seconds of a step). Without noise
+        or with too few turns, return None. An estimate of the squared bias below 0 counts as 0.
         """
         turns, reference = int(self.turns.max()) + 1, self.reference
         if turns < FEWEST or len(self.seconds) != turns or self.variance <= 0 or reference.signal <= 0:
@@ -185,16 +182,14 @@ class MethodSamples:
         total = sums.sum(0)
         left_sums = total @ total - 2 * sums @ total + np.square(sums).sum(1)
         seconds = (self.seconds.sum() - self.seconds) / (turns - 1)
-        own = _error(squares.sum() - squares, left_sums, counts, reference.noise, biased)
-        whole = _error(squares.sum(), total @ total, self.count, reference.noise, biased)
+        own = _error(squares.sum() - squares, left_sums, counts, reference.noise)
+        whole = _error(squares.sum(), total @ total, self.count, reference.noise)
         moved, noises, signals = reference.without
         if min(float(own.min()), float(whole), float(signals.min())) <= 0:
             return None
-        other = np.full(len(moved), float(whole))
-        if biased:
-            variance = self.variance * reference.signal
-            distance = np.square(total / self.count - moved).sum(1) - variance / self.count - noises
-            other = np.maximum(distance, 0.0) + variance
+        variance = self.variance * reference.signal
+        distance = np.square(total / self.count - moved).sum(1) - variance / self.count - noises
+        other = np.maximum(distance, 0.0) + variance
         value = np.log(reference.signal) - np.log(float(whole)) - np.log(self.step_s)
         left = np.log(reference.signal) - np.log(own) - np.log(seconds)
         right = np.log(signals) - np.log(other) - np.log(self.step_s)
@@ -216,14 +211,12 @@ class MethodSamples:
         return steps * self.step_s, bool(steps > self.count or floor is None or error < floor)
 
 
-def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, noise: float, biased: bool) -> np.ndarray:
-    """Return the variance of a step and, if `biased`, the squared bias.
+def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, noise: float) -> np.ndarray:
+    """Return the sum of the variance of a step and the squared bias.
 
     `squares` are sums of |deviation|^2, and `sums` are |sum of deviations|^2.
     """
     variance = (squares - sums / counts) / (counts - 1)
-    if not biased:
-        return np.asarray(variance)
     return np.asarray(np.maximum(sums / np.square(counts) - variance / counts - noise, 0.0) + variance)
 
 
@@ -359,7 +352,7 @@ class Judgement:
             self._family(),
             shape=tuple(self._session.facts["shapes"][key]),
             paired=False,
-            rounding=ROUNDING if _kin(judge) == _kin(member) else STOCK_ROUNDING,
+            reference_error=0.0 if _kin(judge) == _kin(member) else STOCK_ROUNDING,
         )
         biased = {Verdict.HOLDS: False, Verdict.FAILS: True}.get(figures.verdict)
         message = figures.message or ("gradient and reference differ" if biased else "")
@@ -398,7 +391,7 @@ class Judgement:
         if not message and tail_weight(samples.deviations) > TAIL:
             message = HEAVY
         times = {f"{target:g}": magnitude.seconds_to(target, biased) for target in TARGETS}
-        efficiency = magnitude.efficiency(biased)
+        efficiency = magnitude.efficiency()
         return MethodRecord(
             method=member.method,
             parameter=key,
@@ -410,6 +403,7 @@ class Judgement:
             reference_rmse=samples.reference.floor,
             slope=samples.slope(),
             efficiency=None if efficiency is None else efficiency.exponential(),
+            efficiency_freedom=None if efficiency is None else efficiency.freedom,
             bias=float(np.sqrt(magnitude.squared_bias)) if biased else None,
             seconds_to={name: seconds for name, (seconds, _) in times.items()},
             extrapolated=[name for name, (_, beyond) in times.items() if beyond],

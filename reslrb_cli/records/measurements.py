@@ -153,8 +153,8 @@ class MethodRecord(Line):
         seconds per step.
     - `cold_s` are the seconds of the first step in a new process, including compilation.
     - `slope` is d log error / d log seconds.
-    - `efficiency` is 1 / (relative variance * seconds). For a `biased` method, squared bias + variance replaces the
-        variance.
+    - `efficiency` is 1 / ((relative variance + squared relative bias) * seconds). `efficiency_freedom` are the degrees
+        of freedom of its interval.
     - `bias_z` is the largest deviation from `bias_reference` in standard errors. `bias_z_limit` is the limit for
         `bias_z`. By chance, any value in the table exceeds its limit with probability 1e-4.
     - `bias` is the relative bias, if there is one. `biased` is None if the bias is undecided. `message` then gives the
@@ -178,6 +178,7 @@ class MethodRecord(Line):
     reference_rmse: float | None = None
     slope: float | None = field(default=None, metadata=_column("slope", 7))
     efficiency: Range | None = field(default=None, metadata=_column("efficiency", 24))
+    efficiency_freedom: float | None = None
     bias_z: float | None = field(default=None, metadata=_column("max |z| (limit)", 16))
     bias_z_limit: float | None = None
     bias: float | None = None

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields
 
 from reslrb_cli.measure.bench import BenchResult
-from reslrb_cli.measure.judgement import ConvergenceResults
+from reslrb_cli.measure.comparison import MOST_FREEDOM
+from reslrb_cli.measure.judgement import CONFIDENCE, ConvergenceResults
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
     TARGETS,
@@ -23,6 +24,7 @@ from reslrb_cli.records.measurements import (
     Verdict,
 )
 from reslrb_cli.report.format import Columns, interval, number, shorten
+from reslrb_cli.statistics import special
 
 
 def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
@@ -234,6 +236,8 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
     parameters together, the only parameter, or the image.
 
     A biased method is always called biased. A lead counts only if the interval of the efficiency ratio lies above 1.
+    The intervals of all pairs of methods hold together with a probability of 95 % (Bonferroni): the best of many
+    equal methods leads by chance.
     """
     together = [r for r in records if r.parameter == records[-1].parameter and r.efficiency is not None]
     if not together:
@@ -242,20 +246,20 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
     biased = sorted((r for r in together if r.biased is True), key=_efficiency, reverse=True)
     if not sound:
         return f"All methods are biased; of them the biased {biased[0].method.label} has the highest efficiency."
-    best = sound[0]
+    best, pairs = sound[0], math.comb(len(sound), 2)
     sentence = f"Best for this scene: {best.method.label}"
     if best.biased is None:
         sentence += " (whether it is biased is open)"
     if len(sound) == 1:
         sentence += "; of all others a bias was found" if biased else ", the only one that was measured"
     else:
-        level = [record for record in sound[1:] if _efficiency_ratio(best, record)[1] <= 1]
+        level = [record for record in sound[1:] if _efficiency_ratio(best, record, pairs)[1] <= 1]
         if level:
-            names = ", ".join(f"{record.method.label} ({_times(best, record)})" for record in level)
+            names = ", ".join(f"{record.method.label} ({_times(best, record, pairs)})" for record in level)
             sentence += f"; not told apart from it: {names}"
         beaten = next((record for record in sound[1:] if record not in level), None)
         if beaten is not None:
-            sentence += f"; {_times(best, beaten)} times as efficient as {beaten.method.label}"
+            sentence += f"; {_times(best, beaten, pairs)} times as efficient as {beaten.method.label}"
     sentence += "."
     if biased and _efficiency(biased[0]) > _efficiency(best):
         first, times = biased[0], _efficiency(biased[0]) / _efficiency(best)
@@ -269,16 +273,21 @@ def _efficiency(record: MethodRecord) -> float:
     return record.efficiency.value
 
 
-def _efficiency_ratio(one: MethodRecord, other: MethodRecord) -> tuple[float, float, float]:
-    """Return the ratio of efficiencies and its interval. Half widths of the logarithms add in quadrature."""
-    a, b = one.efficiency, other.efficiency
-    assert a is not None, "others are left out"
-    assert b is not None, "others are left out"
-    ratio = a.value / b.value
-    down = math.hypot(math.log(a.value / a.low), math.log(b.high / b.value))
-    up = math.hypot(math.log(a.high / a.value), math.log(b.value / b.low))
-    return ratio, ratio * math.exp(-down), ratio * math.exp(up)
+def _efficiency_ratio(one: MethodRecord, other: MethodRecord, pairs: int) -> tuple[float, float, float]:
+    """Return the ratio of efficiencies and its interval by Student's t, if it is one of `pairs` ratios."""
+    variances, freedoms, tail = [], [], (1 - CONFIDENCE) / 2
+    for record in (one, other):
+        assert record.efficiency is not None, "others are left out"
+        freedoms.append(min(record.efficiency_freedom or MOST_FREEDOM, MOST_FREEDOM))
+        half = math.log(record.efficiency.high / record.efficiency.value)
+        variances.append((half / float(special().stdtrit(freedoms[-1], 1 - tail))) ** 2)
+    total = sum(variances)
+    spread = sum(variance**2 / freedom for variance, freedom in zip(variances, freedoms, strict=True))
+    freedom = total**2 / spread if spread else MOST_FREEDOM
+    factor = math.exp(float(special().stdtrit(freedom, 1 - tail / pairs)) * math.sqrt(total))
+    ratio = _efficiency(one) / _efficiency(other)
+    return ratio, ratio / factor, ratio * factor
 
 
-def _times(one: MethodRecord, other: MethodRecord) -> str:
-    return interval(*_efficiency_ratio(one, other), 2)
+def _times(one: MethodRecord, other: MethodRecord, pairs: int) -> str:
+    return interval(*_efficiency_ratio(one, other, pairs), 2)

@@ -18,7 +18,7 @@ from conformance.edge_cases import ball, split_box
 from conformance.moving import Latents, Moving, mesh
 from scipy import stats
 
-from reslrb_cli.measure.comparison import z_scores
+from reslrb_cli.measure.comparison import Deviation
 from reslrb_cli.measure.gradients import integrator, seeds, smooth_weights
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, look_at, rgb, transform
 
@@ -235,7 +235,7 @@ def _summary(samples: np.ndarray) -> str:
 
 def _z(samples: np.ndarray, reference: np.ndarray) -> float:
     """Return the difference of the means in standard errors."""
-    return float(z_scores(samples[:, None, None], reference[:, None, None])[0, 0])
+    return float(Deviation.of(samples, reference, 1e-5).z())
 
 
 def _samples(case: Translation, count: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

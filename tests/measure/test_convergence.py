@@ -4,6 +4,7 @@ scenes.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,9 @@ from reslrb_cli.report.tables import closing_sentence, method_cells, method_colu
 
 def test_cost_error_slope_and_efficiency_match_the_methods(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4, 0.5), case_reslrb_stack=Pretence(0.1, 0.6),
-                  case_reslrb_event=Pretence(0.05, 1.2))  # fmt: skip
+                  case_reslrb_event=Pretence(0.05, 1.0))  # fmt: skip
     _, results, _ = play(tmp_path, stage, plan())
-    for label, step_s, noise in (("ptracer", 0.4, 0.5), ("reslrb:stack", 0.1, 0.6), ("reslrb:event", 0.05, 1.2)):
+    for label, step_s, noise in (("ptracer", 0.4, 0.5), ("reslrb:stack", 0.1, 0.6), ("reslrb:event", 0.05, 1.0)):
         record = of(results, label)
         assert (record.status, record.biased, record.cold_s) == (BenchStatus.OK, False, 1.0)
         assert record.step_s == pytest.approx(step_s)
@@ -131,8 +132,8 @@ def test_the_noise_of_one_image_is_not_a_bias(tmp_path: Path) -> None:
     """With the configuration's loss, dL/dI is fixed at several images, and the reference's error includes the noise of
     these images.
     """
-    quiet = Pretence(0.1, 0.02, image_noise=0.1)
-    stage = Stage(reference_reslrb_stack=quiet, independent_ptracer=Pretence(0.1, 0.02, image_noise=0.1),
+    quiet = Pretence(0.1, 0.02, image_noise=0.05)
+    stage = Stage(reference_reslrb_stack=quiet, independent_ptracer=Pretence(0.1, 0.02, image_noise=0.05),
                   case_reslrb_stack_adjoint_batched_=Pretence(0.1, 0.05),
                   case_reslrb_stack_adjoint_correlated_=Pretence(0.1, 0.05, bias=0.5))  # fmt: skip
     cases = "reslrb:stack(adjoint=batched),reslrb:stack(adjoint=correlated)"
@@ -140,7 +141,7 @@ def test_the_noise_of_one_image_is_not_a_bias(tmp_path: Path) -> None:
     assert [m.method.adjoint for m in session.members] == ["batched", "correlated", None, None]
     assert [r.biased for r in results.methods if r.parameter == "all"] == [False, True]
     reference = next(r for r in results.references if r.parameter == "all")
-    assert reference.reference_rmse == pytest.approx(0.1 / np.sqrt(8), rel=0.3)
+    assert reference.reference_rmse == pytest.approx(0.05 / np.sqrt(8), rel=0.3)
     assert of(results, "reslrb:stack(adjoint=batched)").method.estimator == "stack"
 
 
@@ -274,13 +275,44 @@ def test_the_interval_of_a_biased_method_has_its_coverage() -> None:
     bias = 0.6
     truth, covered = SIGNAL / (VARIANCE + bias**2 * SIGNAL) / SECONDS, 0
     for seed in range(REPETITIONS):
-        estimate = make(seed, bias=bias).efficiency(biased=True)
+        estimate = make(seed, bias=bias).efficiency()
         assert estimate is not None
         covered += estimate.exponential().low <= truth <= estimate.exponential().high
     assert LEAST <= covered <= MOST
-    unbiased = make(0, bias=bias).efficiency(biased=False)
-    assert unbiased is not None
-    assert unbiased.exponential().low > truth
+
+
+def test_a_method_with_a_flat_error_is_biased_and_its_efficiency_says_so(tmp_path: Path) -> None:
+    """The method has hardly any noise, and an error that no number of steps lowers: more than a reference's rounding,
+    and less than three times that.
+    """
+    flat = Pretence(0.1, 1e-5, bias=0.0024)
+    sound = {name: Pretence(0.1, 1e-4) for name in ("case_ptracer", "case_reslrb_stack", "reference_reslrb_stack")}
+    _, results, _ = play(tmp_path, Stage(case_reslrb_event=flat, **sound), plan())
+    record = of(results, "reslrb:event")
+    assert record.biased is True
+    assert record.efficiency.value == pytest.approx(1 / (0.1 * 0.0024**2), rel=0.2)
+
+
+def test_equal_methods_seldom_have_a_best() -> None:
+    """Of 400 sessions with equal methods, a lead is claimed in at most 5 %. A real lead of 3 is claimed in most."""
+    random, claimed, found = np.random.default_rng(9), 0, 0
+    for methods in [2, 5, 9, 12] * 100:
+        records = []
+        for number in range(methods):
+            reference = ReferenceMean(1 + 0.05 * random.standard_normal((8, 20)))
+            values, seconds = 1 + random.standard_normal((32, 20)), random.gamma(40, SECONDS / 40, 16)
+            estimate = MethodSamples(values, np.arange(32) // 2, seconds, reference).efficiency()
+            assert estimate is not None
+            records.append(MethodRecord(
+                replace(METHOD, label=str(number)), KEY, BenchStatus.OK, biased=False,
+                efficiency=estimate.exponential(), efficiency_freedom=estimate.freedom,
+            ))  # fmt: skip
+        claimed += "times as efficient" in closing_sentence(records)
+        first, own = records[0], records[0].efficiency
+        better = replace(first, efficiency=Range(*(3 * value for value in (own.value, own.low, own.high))))
+        found += "times as efficient" in closing_sentence([better, *records[1:]])
+    assert claimed <= 20
+    assert found >= 360
 
 
 def test_a_bias_flattens_the_slope() -> None:

@@ -208,7 +208,7 @@ def test_own_integrators_need_permission_and_unchanged_files(capsys: pytest.Capt
     with Path("own_replay.py").open("a") as file:
         file.write("\n# changed\n")
     assert ended("optimize", "--resume", "runs/own", "--set", "run.iterations=4", "--allow-code") == ExitCode.USAGE
-    assert "integrator.file: has changed since runs/own began" in capsys.readouterr().err
+    assert "own_replay.py has changed since runs/own began" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

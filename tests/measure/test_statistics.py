@@ -10,6 +10,8 @@ import pytest
 from agreement import blocks, compare
 
 from reslrb_cli.measure.comparison import (
+    TAIL_SEEDS,
+    Deviation,
     Family,
     combined_z_rms,
     compare_equal_seeds,
@@ -18,12 +20,10 @@ from reslrb_cli.measure.comparison import (
     effective_entries,
     entry_count,
     overall,
-    paired_z_scores,
     parts,
     sidak,
     tail_weight,
     z_rms_limit,
-    z_scores,
 )
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
 
@@ -36,7 +36,7 @@ def noise(seed: int, shape=(12, 32, 32, 3), mean: float = 1.0) -> np.ndarray:
 
 def test_z_is_standard_normal_even_for_few_renders():
     rng = np.random.default_rng(1)
-    z = z_scores(rng.normal(size=(5, 20000)), 3 * rng.normal(size=(7, 20000)))
+    z = Deviation.of(rng.normal(size=(5, 20000)), 3 * rng.normal(size=(7, 20000)), 1e-5).z()
     assert z.mean() == pytest.approx(0, abs=0.03)
     assert z.std() == pytest.approx(1, abs=0.03)
     assert (np.abs(z) > 3).mean() < 0.005
@@ -50,9 +50,89 @@ def test_rounding_does_not_make_the_variance_of_three_samples_certain(rounding, 
     a, b = rng.normal(size=(2, 3, 200_000))
     a = a + 1
     b = b + 1 if not paired else np.zeros_like(b)
-    z = paired_z_scores(a - 1, rounding) if paired else z_scores(a, b, rounding)
+    z = (Deviation.paired(a - 1, rounding) if paired else Deviation.of(a, b, rounding)).z()
     assert (np.abs(z) > 4).sum() <= 30  # 13 are expected of normal deviates
     assert np.abs(z).max() < 5.5
+
+
+DISTRIBUTIONS = {
+    "normal": lambda random, shape: 1 + random.normal(size=shape),
+    "heavy": lambda random, shape: 1 + random.standard_t(3, size=shape),
+    "skewed": lambda random, shape: random.gamma(0.5, 2, size=shape),
+    "fireflies": lambda random, shape: np.where(random.random(shape) < 0.02, 50, 1) * random.random(shape),
+}
+
+
+@pytest.mark.parametrize("kind", DISTRIBUTIONS)
+@pytest.mark.parametrize("paired", [True, False])
+def test_equal_expectations_seldom_fail(kind, paired):
+    """Some entries have no noise. A row of a correct table fails with a probability of at most 1e-3, for any number of
+    seeds.
+    """
+    random, failed = np.random.default_rng(4), 0
+    for count in (3, 4, 8, 16, 64):
+        for entries in (3, 100):
+            for _ in range(50):
+                a, b = (DISTRIBUTIONS[kind](random, (count, entries)) for _ in range(2))
+                a[:, ::3] = b[:, ::3] = 1
+                result = compare_expectations(a, b, Family(1, entries), paired=paired)
+                assert (result.verdict is Verdict.UNRESOLVED) or count >= TAIL_SEEDS
+                failed += result.verdict is Verdict.FAILS
+    assert failed <= 2  # of 500; at 1e-3, three have a probability of 0.014
+
+
+@pytest.mark.parametrize("count", [8, 16, 64])
+@pytest.mark.parametrize("paired", [True, False])
+def test_the_detectable_deviation_is_detected(count, paired):
+    """One entry. Where several entries deviate, more deviations are detected."""
+    random = np.random.default_rng(5)
+
+    def result(deviation):
+        a, b = 1 + 0.2 * random.normal(size=(2, count, 1))
+        return compare_expectations(a + deviation, b, Family(), paired=paired)
+
+    stated = np.median([result(0.0).detectable for _ in range(100)])
+    found, twice = (np.mean([result(k * stated).verdict is Verdict.FAILS for _ in range(300)]) for k in (1, 2))
+    assert 0.87 < found < 0.98
+    assert twice > 0.96
+
+
+@pytest.mark.parametrize("count", [3, 4, 8, 16, 64])
+@pytest.mark.parametrize("factor", [0.0, 0.9])
+def test_a_wrong_factor_holds_only_if_it_is_not_detectable(count, factor):
+    random = np.random.default_rng(6)
+    for _ in range(20):
+        a, b = 1 + 0.02 * random.normal(size=(2, count, 30))
+        result = compare_expectations(factor * a, b, Family(1, 30))
+        assert result.verdict is not Verdict.HOLDS or result.detectable > 1 - factor
+
+
+def test_entries_without_noise_do_not_dilute_the_root_mean_square():
+    """Every lit tile is wrong by two standard errors."""
+    random = np.random.default_rng(7)
+    noise, lit = 0.5 * random.normal(size=(2, 64, 192)), np.arange(192) < 48
+    a, b = (np.where(lit, 1 + each, 0) for each in noise)
+    assert compare_expectations(a, b, Family(1, 192), paired=False).verdict is Verdict.HOLDS
+    a = np.where(lit, a + 2 * 0.5 * np.sqrt(2 / 64), 0)
+    assert compare_expectations(a, b, Family(1, 192), paired=False).verdict is Verdict.FAILS
+    assert not compare(a[:, :, None], b[:, :, None], block=None)
+
+
+def test_a_wrong_entry_without_noise_fails_beside_fireflies():
+    random = np.random.default_rng(8)
+    a, b = DISTRIBUTIONS["fireflies"](random, (2, 16, 5))
+    a[:, 0], b[:, 0], a[3, 1:] = 2, 1, 1e4
+    assert compare_expectations(a, b, Family(1, 5), paired=False).verdict is Verdict.FAILS
+    a[:, 0] = 1
+    assert compare_expectations(a, b, Family(1, 5), paired=False).verdict is Verdict.HEAVY_TAILED
+
+
+def test_a_known_error_of_the_reference_is_no_noise():
+    a, b = (np.full((16, 3), value) for value in (1.0024, 1.0))
+    for error, verdict in ((1e-3, Verdict.FAILS), (2.5e-3, Verdict.HOLDS)):
+        result = compare_expectations(a, b, Family(1, 3), paired=False, reference_error=error)
+        assert result.verdict is verdict
+        assert result.detectable > error
 
 
 def test_equal_expectations_agree():
@@ -253,7 +333,7 @@ def test_a_rarely_hit_texture_is_compared_in_larger_tiles():
     shape, tiled, coarser = (16, 16, 3), [], []
     for k in range(30):
         rng = np.random.default_rng(k)
-        ours, reference = (rng.exponential(1, (10, 768)) * (rng.random((10, 768)) < p) / p for p in (0.05, 1))
+        ours, reference = (rng.exponential(1, (20, 768)) * (rng.random((20, 768)) < p) / p for p in (0.05, 1))
         coarser.append(compare_expectations(ours, reference, FAMILY, shape=shape).verdict)
         tiled.append(compare_expectations(parts(ours, shape, 8), parts(reference, shape, 8), FAMILY).verdict)
     assert tiled.count(Verdict.FAILS) > 10
