@@ -13,6 +13,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -31,10 +32,11 @@ from reslrb_cli.optimization.nonfinite import (
     why_end,
     zero_nonfinite,
 )
+from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import measure_curvatures
 from reslrb_cli.optimization.shards import add_gradient, scaled
-from reslrb_cli.optimization.state import State, put, standing
+from reslrb_cli.optimization.state import State, held_tables, put, standing
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
@@ -137,15 +139,15 @@ DISPLACEMENT, PART, MOST = 0.02, 4, 1.0
 def measure_curvature(problem: Problem, iteration: int) -> None:
     """Measure the curvature for `auto`, if it is due. The gradient of `iteration` must be accumulated.
 
-    The curvature of large parameters is measured in the iterations 0, 2, 6, 14, 30 and so on, with the samples of the
-    iteration. The joint curvature of small parameters is measured when `is_due` is true.
+    The curvature of large parameters is measured with the samples of the iteration (`bends_large`), and the joint
+    curvature of small parameters by images with their own samples (`payment`).
     """
     optimizer = problem.optimizer
-    if optimizer.block.at and is_due(iteration):
+    if optimizer.block.at and payment(iteration) is not None:
         measure_block(problem, iteration)
-    if optimizer.has_large and (iteration + 2) & (iteration + 1) == 0:
+    if bends_large(optimizer, iteration):
         random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
-        with optimizer.displaced(random):
+        with optimizer.displaced(random), held_tables(problem):
             problem.apply()
             _, _, counts, refused, _ = gradient(problem, iteration)
         problem.apply()
@@ -155,18 +157,28 @@ def measure_curvature(problem: Problem, iteration: int) -> None:
             problem.left_out[f"measured dL/dI of sensor {sensor}"] += int(each.count[0])
 
 
-def is_due(iteration: int, cost: float = 0.0) -> bool:
-    """Return True if the joint curvature is measured in `iteration`. A measurement has `cost` times the samples of a
-    step. Without a cost, all candidates are measured.
+def bends_large(optimizer: Optimizer, iteration: int) -> bool:
+    """Return True if the curvature of large parameters is measured: with `auto`, in the iterations 0, 2, 6, 14, 30 and
+    so on. Tables of guided emission then do not learn, because both gradients need the same samples.
+    """
+    return optimizer.has_large and (iteration + 2) & (iteration + 1) == 0
+
+
+def payment(iteration: int, cost: float = 0.0, least: float = 0.0) -> float | None:
+    """Return the cost of the joint measurement in `iteration`, in samples of a step, or None if there is none.
 
     The candidates are the iterations 0, 1, 2, 4, 7, 11 and so on. A candidate is left out if measuring would take more
-    than its share of the samples. The first `LEAST_ITERATIONS` steps count from the start.
+    than its share of the samples. The first `LEAST_ITERATIONS` steps count from the start. A measurement usually has
+    the `cost`. If that is too much, the first one may cost less, but not less than `least`.
     """
-    due, made, fits = 0, 0, True
-    while due < iteration:
-        made, due = made + fits, due + due // 2 + 1
-        fits = (made + 1) * cost <= MOST * (due + LEAST_ITERATIONS)
-    return due == iteration and fits
+    due, spent = 0, 0.0
+    while due <= iteration:
+        left = MOST * (due + LEAST_ITERATIONS) - spent
+        paid = cost if cost <= left else left if not spent and least <= left else None
+        if due == iteration:
+            return paid
+        spent, due = spent + (paid or 0.0), due + due // 2 + 1
+    return None
 
 
 def measure_block(problem: Problem, iteration: int) -> None:
@@ -176,10 +188,17 @@ def measure_block(problem: Problem, iteration: int) -> None:
         return
     scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
               else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
-    changes, part = plan_changes(problem, scales, DISPLACEMENT), part_of_samples(problem)
-    views = len(problem.trained) / len(problem.drawn(iteration))
-    if not is_due(iteration, views * 2 * (len(changes) + 1) * part / problem.config.run.spp):
+    changes, part, unit = (
+        plan_changes(problem, scales, DISPLACEMENT),
+        part_of_samples(problem),
+        problem.samples_per_pass or 1,
+    )
+    images = 2 * (len(changes) + 1) * len(problem.trained) / len(problem.drawn(iteration))
+    cost, least = (images * spp / problem.config.run.spp for spp in (part, unit))
+    paid = payment(iteration, cost, least)
+    if paid is None:
         return
+    part = max(int(part * paid / cost) // unit, 1) * unit
     curvature = LossCurvature(problem, part, of_target=False)
     directions, *_ = curvature.along(changes, lambda: True)
     # A texture has no entries, but channels.
@@ -296,13 +315,13 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
     clock = StepClock(state.elapsed_s)
     scaling = state.scaling
     if config.optimizer.scale != "none" and scaling is None:
-        with clock.counted():
+        with clock.counted(), held_tables(problem):
             scaling = measure_curvatures(problem)
     errors = problem.meter.errors(problem.selection.array)
     held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
     elapsed = time_share(problem.limit_s, state)
     set_blur(problem, iteration, elapsed)
-    with clock.step() as times:
+    with clock.step() as times, held_tables(problem) if bends_large(optimizer, iteration) else nullcontext():
         loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)

@@ -22,7 +22,6 @@ step from separate samples. The update uses dL/dI at the mean image of all shard
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
@@ -35,7 +34,7 @@ from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import NONE, Refused, derivative_of, given_step, gradient_step, render_image
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.state import guiding_of
+from reslrb_cli.optimization.state import guiding_of, held_tables
 from reslrb_cli.optimization.views import View, to_tensor
 from reslrb_cli.records.tree import like, to_array
 from reslrb_cli.seeds import seed
@@ -118,7 +117,7 @@ def make_tasks(problem: Problem, iteration: int, images: bool = False) -> list[T
 def shard_image(problem: Problem, task: Task) -> Array:
     """Return the image of a shard of one view as float32, (H, W, C)."""
     [part] = task.parts
-    with _held(problem):
+    with held_tables(problem):
         return np.array(render_image(problem.integrator, problem.scene, part.sensor, part.seed, task.spp))
 
 
@@ -130,7 +129,7 @@ def shard_gradient(problem: Problem, task: Task, delta: Array | None = None) -> 
     """
     config = problem.config
     found: list[tuple[float, tuple[int, int, tuple[int, ...]], Array | None]] = []
-    with _held(problem):
+    with held_tables(problem):
         _clear(problem)
         views = {view.sensor: view for view in problem.views}
         for part in task.parts:
@@ -164,20 +163,6 @@ def _tensor(image: Array) -> mi.TensorXf:
 def _clear(problem: Problem) -> None:
     for key in problem.optimizer.keys():  # noqa: SIM118 (not a mapping)
         problem.optimizer.clear_gradient(key)
-
-
-@contextmanager
-def _held(problem: Problem) -> Iterator[None]:
-    """Keep tables from learning."""
-    guiding = guiding_of(problem)
-    before = guiding is not None and guiding.held
-    if guiding is not None:
-        guiding.held = True
-    try:
-        yield
-    finally:
-        if guiding is not None:
-            guiding.held = before
 
 
 # --- sums of shards ---------------------------------------------------------------------------------------------------

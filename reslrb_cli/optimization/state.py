@@ -13,7 +13,8 @@ guided emission. A state determines all data that are changed in place. `put` wr
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -118,6 +119,20 @@ def load(problem: Problem, stored: Stored) -> State:
 def guiding_of(problem: Problem) -> Guiding | None:
     """Return the tables of guided emission of the run's integrator, or None."""
     return problem.integrator.preparation.guiding if isinstance(problem.integrator, Reslrb) else None
+
+
+@contextmanager
+def held_tables(problem: Problem) -> Iterator[None]:
+    """Keep the tables of guided emission from learning, so that equal seeds give equal samples."""
+    guiding = guiding_of(problem)
+    before = guiding is not None and guiding.held
+    if guiding is not None:
+        guiding.held = True
+    try:
+        yield
+    finally:
+        if guiding is not None:
+            guiding.held = before
 
 
 def noted_of(problem: Problem) -> dict[str, Array]:

@@ -497,7 +497,7 @@ def test_unclear_results_are_measured_longer() -> None:
     assert part.rounds < SIZES.rounds
 
 
-@pytest.mark.parametrize("world", [World(0.7, 1.0, walk=0.1), World(1.0, 1.0), World(0.1, 1.0), World(4.0, 1.0)])
+@pytest.mark.parametrize("world", [World(0.7, 1.0, walk=0.1), World(1.0, 1.0), World(0.1, 1.0), World(0.1, 10.0)])
 def test_a_race_that_its_limit_ended_is_open_unless_it_is_clear(world: World) -> None:
     """More time may decide it otherwise. A race that ends by itself is decided."""
     whole = replace(world, calls=[], spent_s=0.0)

@@ -10,19 +10,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from cli.tiny import manifest, write_experiment
+from cli.tiny import KEY, manifest, write_experiment
 from optimization.toy import make_problem
 from runs.going_on import begin_alone, optimize
 
 from reslrb_cli.backend.memory import flat
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.optimization import loop, optimizers, sensitivity
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.block import SHIFT, Block, JointState
 from reslrb_cli.optimization.newton import GAIN, LONGEST, NEAR, SHORTER, _steepness, fine_part
 from reslrb_cli.optimization.optimizers import Optimizer
-from reslrb_cli.optimization.state import standing
+from reslrb_cli.optimization.state import guiding_of, standing
 from reslrb_cli.optimization.uncertainty.curvature import raise_eigenvalues
 from reslrb_cli.optimization.variables import make_transform
 
@@ -570,16 +570,86 @@ def test_a_measurement_has_the_samples_of_its_step(tmp_path, steps):
     assert [a == b for a, b in itertools.pairwise(seeds)].count(True) == 3
 
 
-@pytest.mark.parametrize("cost", [0.5, 4.5, 15.5, 40.0])
-def test_measuring_takes_at_most_its_share_of_the_samples(cost):
-    measured = [iteration for iteration in range(300) if loop.is_due(iteration, cost)]
-    assert measured[0] == 0
-    for number, iteration in enumerate(measured[1:], start=2):
-        assert number * cost <= loop.MOST * (iteration + loop.LEAST_ITERATIONS)
+@pytest.mark.parametrize(
+    ("adjoint", "shards"),
+    [("batched", 1), *(pytest.param(*one, marks=pytest.mark.long)
+                       for one in (("correlated", 1), ("independent", 1), ("batched", 4)))],
+)  # fmt: skip
+@pytest.mark.parametrize("kind", ["auto", "sgd, scale: curvature"])
+def test_measurements_by_differences_have_the_same_guided_samples(kind, adjoint, shards, llvm, tmp_path, monkeypatch):
+    """Without a displacement, both gradients are then equal. The tables still learn in other iterations."""
+    begin_alone(tmp_path, monkeypatch)
+    monkeypatch.setattr(optimizers, "DISPLACEMENT", 0.0)
+    monkeypatch.setattr(sensitivity, "_like", lambda value, row: dr.zeros(type(value), dr.shape(value)))
+    sets = [f"optimizer={{type: {kind}}}", "integrator.guiding=on", "integrator.paths=light", "run.spp=16",
+            f"run.adjoint={adjoint}", f"run.shards={shards}"]  # fmt: skip
+    problem = assemble(load("tiny.yaml", sets))
+    problem.truth.clear()
+    guiding, found, gradient, sample = guiding_of(problem), [], loop.gradient, sensitivity.sample_gradient
+    brightness = itertools.count(1.0, 0.03)
+    monkeypatch.setattr(sensitivity, "see_images", lambda problem: [np.full((8, 8, 3), next(brightness))])
+
+    def record(function):
+        def call(problem, *others):
+            result = function(problem, *others)
+            found.append(np.array(problem.optimizer.gradient(KEY)))
+            return result
+
+        return call
+
+    monkeypatch.setattr(loop, "gradient", record(gradient))
+    monkeypatch.setattr(sensitivity, "sample_gradient", record(sample))
+    state = standing(problem)
+    for lessons in (0, 1) if kind == "auto" else (1,):
+        found.clear()
+        state, _ = loop.step(problem, state)
+        assert (guiding.lessons > 0) == (lessons > 0)
+        if kind == "auto":
+            assert len(found) == 2 - lessons
+        else:
+            assert found.pop().any()  # the gradient of the iteration
+            assert len(found) >= 3
+        for other in found[1:]:
+            np.testing.assert_array_equal(other, found[0])
+        assert found[0].any()
+
+
+@pytest.mark.parametrize("cost", [0.5, 4.5, 15.5, 40.0, 1e9])
+@pytest.mark.parametrize("fewest", [1.0, 0.1, 1e-9])
+def test_measuring_takes_at_most_its_share_of_the_samples(cost, fewest):
+    """If the first measurement is too expensive, it has fewer samples, or waits."""
+    least = fewest * cost
+    found = {iteration: loop.payment(iteration, cost, least) for iteration in range(300)}
+    measured = {iteration: paid for iteration, paid in found.items() if paid is not None}
+    for iteration in measured:
+        total = sum(paid for earlier, paid in measured.items() if earlier <= iteration)
+        assert total <= loop.MOST * (iteration + loop.LEAST_ITERATIONS)
+    first = next(iter(measured), None)
+    assert (first == 0) == (least <= loop.LEAST_ITERATIONS)
+    assert first is None or least <= measured.pop(first) <= cost
+    assert all(paid == cost for paid in measured.values())
     if cost < 5:
-        assert measured[:7] == [0, 1, 2, 4, 7, 11, 17]
-    else:
-        assert len(measured) >= 0.5 * loop.MOST * 200 / cost
+        assert first == 0
+        assert list(measured)[:6] == [1, 2, 4, 7, 11, 17]
+    elif cost < 100:
+        assert len(measured) >= 0.5 * loop.MOST * 200 / cost - 1
+
+
+@pytest.mark.parametrize(("directions", "samples"), [(10, 16), (39, 16), (79, 8), (400, 1), (4000, None)])
+def test_the_first_measurement_fits_its_budget(directions, samples, tmp_path, monkeypatch):
+    """Its two sets of images have at most the samples of 20 steps. Without time for one sample, it waits."""
+    problem, used = make_problem(tmp_path, sets=[AUTO, "run.spp=64"]), []
+
+    def measure(problem, spp, of_target):
+        used.append(spp)
+        raise LookupError
+
+    monkeypatch.setattr(loop, "plan_changes", lambda *given: [None] * directions)
+    monkeypatch.setattr(loop, "LossCurvature", measure)
+    with contextlib.suppress(LookupError):
+        loop.measure_block(problem, 0)
+    assert used == ([] if samples is None else [samples])
+    assert samples is None or 2 * (directions + 1) * samples <= loop.LEAST_ITERATIONS * 64
 
 
 def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
