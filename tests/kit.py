@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -89,3 +90,33 @@ def shape(kind: str, id: str, *parts: str, place: str = "") -> str:
     """Return a shape. `place` contains the steps of its `to_world`, in the order of execution."""
     moved = f'<transform name="to_world">{place}</transform>' if place else ""
     return f'<shape type="{kind}"{named(id)}>{moved}{"".join(parts)}</shape>'
+
+
+def profile_of(space: str, gamma: float) -> bytes:
+    """Return an ICC profile with the primaries of an RGB space of colour-science, and a power as its curve."""
+    import colour
+
+    to_xyz = colour.RGB_COLOURSPACES[space].matrix_RGB_to_XYZ
+    white = to_xyz.sum(axis=1)
+    adapted = colour.adaptation.matrix_chromatic_adaptation_VonKries(white, [0.9642, 1, 0.8249], "Bradford") @ to_xyz
+
+    def fixed(numbers: Iterable[float]) -> bytes:
+        numbers = list(numbers)
+        return struct.pack(f">{len(numbers)}i", *(round(65536 * number) for number in numbers))
+
+    text = space.encode() + b"\0"
+    tags = {b"desc": b"desc\0\0\0\0" + struct.pack(">I", len(text)) + text + bytes(78)}
+    for name, column in zip((b"rXYZ", b"gXYZ", b"bXYZ"), adapted.T, strict=True):
+        tags[name] = b"XYZ \0\0\0\0" + fixed(column)
+    tags |= {b"wtpt": b"XYZ \0\0\0\0" + fixed([0.9642, 1, 0.8249])}
+    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(256 * gamma)) + b"\0\0"
+    tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)
+    table, body, start = b"", b"", 132 + 12 * len(tags)
+    for name, content in tags.items():
+        content += bytes(-len(content) % 4)
+        table += name + struct.pack(">II", start + len(body), len(content))
+        body += content
+    body = struct.pack(">I", len(tags)) + table + body
+    head = struct.pack(">I4sI4s4s4s", 128 + len(body), b"lcms", 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+    head = head + bytes(12) + b"acsp" + bytes(28) + fixed([0.9642, 1, 0.8249]) + bytes(48)
+    return head + body

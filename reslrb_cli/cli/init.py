@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.scene.proposal import Photograph, Proposal
+    from reslrb_cli.scene.images import StoredImage
+    from reslrb_cli.scene.proposal import Proposal
     from reslrb_cli.scene.xml.read import Description
 
 
@@ -194,15 +195,13 @@ def command(
     set_variant(given.variant)
 
     from reslrb_cli.optimization.views import own_channels
-    from reslrb_cli.scene.images import turned_line
+    from reslrb_cli.scene.images import photo_lines, read_stored
     from reslrb_cli.scene.load import load_scene
     from reslrb_cli.scene.parameters import select_parameters
-    from reslrb_cli.scene.proposal import find_movable_in_view, open_photograph, propose, write_smaller
+    from reslrb_cli.scene.proposal import find_movable_in_view, propose, write_smaller
     from reslrb_cli.scene.visibility import find_depth
 
-    photo = None if target is None else open_photograph(target)
-    if target is not None and (turned := turned_line(target)) is not None:
-        echo(turned)
+    photo = None if target is None else read_stored(target, upright=True)
     described: list[Description] = []
     scene = load_scene(scene_file, options, look=described.append)
     [description] = described
@@ -212,17 +211,18 @@ def command(
     sensor = scene.sensors()[index]
     film = sensor.film()
     own, whole = ((int(size[0]), int(size[1])) for size in (film.crop_size(), film.size()))
-    size = choose_size(own, photo, fixed=own != whole)
+    size, is_raw = choose_size(own, photo, fixed=own != whole), bool(own_channels(film))
+    for line in () if target is None else photo_lines(target, color_space="linear" if is_raw else "auto"):
+        echo(line)
     reason = _why_camera(scene, sensor, hides, scene_file)
-    is_integer = photo is not None and photo.is_integer
+    is_integer = photo is not None and photo.white is not None
     proposals = propose(scene, index, lamps=not is_integer and not hides)
     if not proposals:
         raise ConfigError(scene_file, "", "has no recoverable parameter; reslrb inspect --all says why")
     image, copied = target, photo is not None and photo.size != size
     if photo is not None and copied:
-        image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
+        image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if is_integer else '.exr'}")
         _check_free(image)
-    is_raw = bool(own_channels(film))
     depth, missing = find_depth(scene, index)
     text = _first_config(
         path, options, description.variables, sensors, index, proposals, find_movable_in_view(scene, index),
@@ -247,7 +247,7 @@ def command(
     echo(f"next: check it, then run `reslrb optimize {path}`" + ("" if target is not None else " with a target"))
 
 
-def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Size:
+def choose_size(film: Size, photo: StoredImage | None, fixed: bool = False) -> Size:
     """Return the (width, height) of a film that is small enough for a run of minutes. The film has the photograph's
     aspect ratio. Without a photograph, the film keeps its own aspect ratio.
 

@@ -26,23 +26,21 @@ _OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distanc
 
 
 def read_luminance(path: Path) -> np.ndarray:
-    """Return the linear luminance (H, W) of an image file, upright. Raises ConfigError.
+    """Return the linear luminance (H, W) of an image file, upright. Print its conversions. Raises ConfigError.
 
     Transparent parts are white, as in image viewers. If the whole image would then be white, transparent parts are
     black.
     """
-    import numpy as np
-
     from reslrb_cli.lens.surface import is_even
     from reslrb_cli.records.images import luminance
-    from reslrb_cli.scene.images import read_bitmap, read_photo
+    from reslrb_cli.scene.images import photo_lines, read_photo
 
-    image = luminance(read_photo(path).image)
-    bitmap = read_bitmap(path, upright=True)
-    if bitmap.has_alpha():
-        raw = np.array(bitmap)[:, :, -1]
-        alpha = np.clip(raw / np.iinfo(raw.dtype).max if raw.dtype.kind in "ui" else raw, 0.0, 1.0)
-        image = image if bitmap.premultiplied_alpha() else alpha * image
+    photo = read_photo(path)
+    image, alpha = luminance(photo.image), photo.alpha
+    for line in photo_lines(path):
+        echo(line)
+    if alpha is not None:
+        image = alpha * image if photo.is_integer else image
         image = image if is_even(image + 1 - alpha) else image + 1 - alpha
     return image
 

@@ -58,7 +58,7 @@ IN_MEMORY = "<mi.Scene>"
 class SceneConfig(Section):
     """The scene and its cameras."""
 
-    file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.5 to 3), relative to the config file.")
+    file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.4 to 3), relative to the config file.")
     options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(default={})
     """Values of the scene file's `$name` variables."""
     size: Annotated[Size, few("pixels")] | None = None

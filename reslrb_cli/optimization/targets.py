@@ -28,7 +28,7 @@ from reslrb_cli.optimization.loading import (
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import Array, Masked, View, color_channels, own_channels
 from reslrb_cli.records.images import luminance
-from reslrb_cli.scene.images import Photo, read_photo, turned_line
+from reslrb_cli.scene.images import Photo, photo_lines, read_photo
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.rays import visible
@@ -133,9 +133,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
             )  # fmt: skip
         except ConfigError as error:
             raise ConfigError(config.source, view.file_key, str(error)) from None
-        line = turned_line(view.file, upright)
-        if line is not None:
-            remarks.append(line)
+        remarks += photo_lines(view.file, upright, config.target.color_space)
         image = photo.image
         if balance is not None:
             image = (image @ _adapted(balance, film).T).astype(np.float32)

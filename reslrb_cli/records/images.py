@@ -151,24 +151,31 @@ def write_layers(path: Path, layers: Mapping[str, Array]) -> None:
     write_atomically(path, lambda file: file.write(stream.getbuffer()))
 
 
+def read_planes(path: Path) -> dict[str, Array]:
+    """Return the channels of all parts of an EXR by name, each (H, W) float32. Raises the errors of `read_layers`."""
+    import OpenEXR
+
+    content = io.BytesIO(path.read_bytes())
+    try:
+        parts = OpenEXR.File(content, separate_channels=True).parts
+        return {
+            name: np.asarray(channel.pixels, dtype=np.float32)
+            for part in reversed(parts)  # the first part with a name wins
+            for name, channel in part.channels.items()
+        }
+    except Exception as error:  # damaged files raise many types
+        raise ValueError(f"{path}: {error}") from None
+
+
 def read_layers(path: Path) -> dict[str, Array]:
     """Return the layers of an EXR by name, each (H, W, C) float32. Channels without a layer form the layer "".
 
     Raises OSError if there is no file, and ValueError if the file is damaged or not an EXR.
     """
-    import OpenEXR
-
-    content = io.BytesIO(path.read_bytes())
-    try:
-        planes = {
-            name: channel.pixels for name, channel in OpenEXR.File(content, separate_channels=True).channels().items()
-        }
-    except Exception as error:  # damaged files raise many types
-        raise ValueError(f"{path}: {error}") from None
     groups: dict[str, dict[str, Array]] = {}
-    for full, pixels in planes.items():
+    for full, pixels in read_planes(path).items():
         name, _, letter = full.rpartition(".")
-        groups.setdefault(name, {})[letter] = np.asarray(pixels, dtype=np.float32)
+        groups.setdefault(name, {})[letter] = pixels
     return {
         name: np.stack([group[letter] for letter in sorted(group, key=_place)], -1) for name, group in groups.items()
     }

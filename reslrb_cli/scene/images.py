@@ -1,25 +1,34 @@
 """Image files, read as images to compare with or as textures.
 
-Cameras and phones store pixels in the sensor's orientation. JPEG and PNG files store the rotation to an upright image
-as EXIF metadata. Mitsuba's reader ignores this metadata.
+`_FORMATS` is the table of formats. Each reader finds the size in the header, so that a wrong image is refused before
+its pixels are decoded. Mitsuba decodes PNG, EXR and HDR. Its other decoders ignore the byte order and the maximum of
+PPM, the palette of BMP, and missing data of JPEG.
+
+Cameras and phones store pixels in the sensor's orientation and in the sensor's colours. JPEG and PNG files store the
+rotation to an upright image as EXIF metadata, and the colours as an ICC profile.
 """
 
 from __future__ import annotations
 
+import functools
+import io
 import logging
+import math
+import re
 import struct
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.files import open_file, read_file
-from reslrb_cli.errors import ConfigError, is_out_of_memory
+from reslrb_cli.config.files import PIXELS, open_file
+from reslrb_cli.errors import ConfigError, is_out_of_memory, one_line
+from reslrb_cli.records.images import read_planes
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
@@ -29,7 +38,10 @@ FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
 _NO_IMAGE = f"is not a readable image ({FORMATS}): damaged, truncated, or in another format, such as CMYK"
 #: EXIF's tag of the camera's orientation.
 _ORIENTATION = 0x0112
+#: Bytes that hold the header of an EXR, HDR, PPM or PFM file.
+_HEADER = 2**16
 Size = tuple[int, int]
+Image = np.ndarray[Any, Any]
 
 #: Operations that turn the pixels upright, by EXIF's orientation number; 1 is upright.
 TURNS = {
@@ -43,37 +55,112 @@ TURNS = {
 }
 
 
-def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> mi.Bitmap:
+@dataclass(frozen=True)
+class StoredImage:
+    """Pixels (H, W, C) as the file `path` stores them, and the names of their channels.
+
+    `white` is the maximum of a file of integers, or None for floats. `profile` are the bytes of an ICC profile, or b"".
+    """
+
+    path: Path
+    pixels: Image
+    names: tuple[str, ...]
+    white: int | None
+    profile: bytes = b""
+
+    @property
+    def size(self) -> Size:
+        """(width, height) in pixels."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    def colours(self) -> Image:
+        """Return the pixels' red, green and blue (H, W, 3), or their luminance (H, W, 1). Raises ConfigError."""
+        return self.pixels[:, :, self._colours()]
+
+    def alpha(self) -> Image | None:
+        """Return the alpha (H, W) that belongs to `colours`, or None. Raises ConfigError."""
+        layer = self.names[self._colours()[0]].rpartition(".")[0]
+        name = f"{layer}.A" if layer else "A"
+        return self.pixels[:, :, self.names.index(name)] if name in self.names else None
+
+    def only(self, names: Sequence[str]) -> Image:
+        """Return the channels with these names, in this order. Raises ConfigError if one is missing."""
+        if missing := [name for name in names if name not in self.names]:
+            reason = f"has the channels {', '.join(self.names)}; the film also needs {', '.join(missing)}"
+            raise ConfigError(self.path, "", reason)
+        return self.pixels[:, :, [self.names.index(name) for name in names]]
+
+    def _colours(self) -> list[int]:
+        try:
+            return find_colours(self.names)
+        except ValueError as error:
+            raise ConfigError(self.path, "", str(error)) from None
+
+    def in_srgb(self) -> StoredImage:
+        """Return the image with colours of sRGB in place of those of its ICC profile. Raises ConfigError."""
+        if not self.profile or (name := foreign_profile(self.profile)) is None:
+            return self
+        if self.white != 255:
+            advice = "convert it to sRGB, or set color_space: linear if its values are linear"
+            raise ConfigError(self.path, "", f"has the colour profile {name} in 16 bits; {advice}")
+        colours, alpha = self.colours(), self.alpha()
+        converted = _converted(colours, self.profile)
+        # A clipped channel stays clipped, so that it is found.
+        converted = np.where(colours == 255, np.uint8(255), converted)
+        if alpha is not None:
+            converted = np.concatenate([converted, alpha[:, :, None]], axis=2)
+        return StoredImage(self.path, converted, tuple("RGB" if alpha is None else "RGBA"), 255)
+
+
+def find_colours(names: Sequence[str]) -> list[int]:
+    """Return the places of the channels R, G and B, or of a single channel.
+
+    Channels without a layer come first. Otherwise, the only layer with R, G and B is read, or the one that renderers
+    name `Combined`. Raises ValueError if there is none, or more than one.
+    """
+    layers: dict[str, dict[str, int]] = {}
+    for place, name in enumerate(names):
+        layer, _, letter = name.rpartition(".")
+        layers.setdefault(layer, {})[letter.upper()] = place
+    found = {layer: [places[letter] for letter in "RGB"] for layer, places in layers.items() if {*"RGB"} <= {*places}}
+    if "" in found:
+        return found[""]
+    if len(found) > 1:
+        whole = {layer: places for layer, places in found.items() if layer.rpartition(".")[2].lower() in _WHOLE}
+        if len(whole) != 1:
+            raise ValueError(f"has the layers {', '.join(sorted(found))}; save the one of the image alone")
+        found = whole
+    if found:
+        return next(iter(found.values()))
+    if "Y" in layers.get("", {}):
+        return [layers[""]["Y"]]
+    if len(names) == 1:
+        return [0]
+    raise ValueError(f"has the channels {', '.join(names)}; use an image with R, G and B, or with Y")
+
+
+#: Names of the layer with the image itself, in lower case.
+_WHOLE = ("combined", "beauty", "rgba", "rgb", "color")
+
+
+def read_stored(path: Path, size: Size | None = None, upright: bool = False) -> StoredImage:
     """Decode the image file `path`. `size` is the required (width, height), or None for any.
 
     Pixels are as stored. If `upright`, pixels and size are rotated or mirrored by EXIF (`TURNS`). Raises a ConfigError
-    that names the file if the file is unreadable, no image, of another size, damaged or truncated.
+    that names the file if the file is unreadable, no image, too large, of another size, damaged or truncated.
     """
-    orientation = orientation_of(path) if upright else 1
-    with _photograph(path) as photograph:
-        try:
-            if photograph is not None and photograph.format != "PNG":
-                photograph.load()  # Mitsuba's reader would fill missing data of a JPEG with grey
-                data = read_file(path)  # zeros in place of missing data have no end of image (FF D9) after a scan
-                if data.rfind(b"\xff\xd9") <= data.rfind(b"\xff\xda"):
-                    raise ConfigError(path, "", _NO_IMAGE)
-            bitmap = mi.Bitmap(str(path))
-        except Exception as error:
-            if is_out_of_memory(error):
-                raise
-            raise ConfigError(path, "", _NO_IMAGE) from None
-    if orientation > 1:
-        turned_bitmap = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
-        turned_bitmap.set_srgb_gamma(bitmap.srgb_gamma())
-        turned_bitmap.set_premultiplied_alpha(bitmap.premultiplied_alpha())
-        bitmap = turned_bitmap
-    width, height = (int(n) for n in bitmap.size())
-    if min(width, height) < 1:
-        raise ConfigError(path, "", _NO_IMAGE)
-    if size is not None and (width, height) != size:
-        turned = f", {TURNS[orientation]} as its EXIF orientation says" if orientation > 1 else ""
-        raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
-    return bitmap
+    with _opened(path) as header:
+        orientation = header.orientation if upright else 1
+        width, height = header.size if orientation < 5 else header.size[::-1]
+        if size is not None and (width, height) != size:
+            turned = f", {TURNS[orientation]} as its EXIF orientation says" if orientation > 1 else ""
+            raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
+        if width * height > PIXELS:
+            raise ConfigError(path, "", f"is {width}x{height} pixels; an image has at most {PIXELS} pixels")
+        found = header.decode()
+        if found.size != header.size:
+            raise ConfigError(path, "", _NO_IMAGE)
+    return replace(found, pixels=turn(found.pixels, orientation), profile=header.profile)
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -87,47 +174,283 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return pixels
 
 
-@contextmanager
-def _photograph(path: Path) -> Iterator[ImageFile | None]:
-    """Open a PNG or JPEG file by Pillow, which reads the head only. Yields None for a file of another format. Raises
-    ConfigError if the file cannot be read.
-    """
-    from PIL import Image  # late, because few commands read such files
+# --- the table of formats ---------------------------------------------------------------------------------------------
 
+
+@dataclass(frozen=True)
+class _Header:
+    """Size of an image file, (width, height), and a function that decodes its pixels.
+
+    `wrong` is the reason why Mitsuba's own textures would show other values, or "".
+    """
+
+    size: Size
+    decode: Callable[[], StoredImage]
+    orientation: int = 1
+    profile: bytes = b""
+    wrong: str = ""
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Header]:
+    """Read the header of an image file. The file stays open for `decode`. Raises ConfigError for a file that is no
+    image, also from `decode`.
+    """
     with open_file(path) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # damaged EXIF data rotates nothing
         try:
-            found = Image.open(file, formats=("JPEG", "PNG"))
-        except (OSError, ValueError, Image.DecompressionBombError):
-            found = None
-        yield found
+            start = file.read(8)
+            reader = next(reader for begin, reader in _FORMATS.items() if start.startswith(begin))
+            file.seek(0)
+            header = reader(path, file)
+            if min(header.size) < 1:
+                raise ValueError("has no pixels")
+            yield header
+        except Exception as error:
+            if is_out_of_memory(error) or isinstance(error, ConfigError):
+                raise
+            raise ConfigError(path, "", _NO_IMAGE) from None
 
 
-def orientation_of(path: Path) -> int:
-    """Return the EXIF orientation (1 to 8) of an image file, or 1 if the file has none. Raises ConfigError if the file
-    cannot be read.
-    """
+def _pillow(path: Path, file: BinaryIO) -> _Header:
+    """Read PNG, JPEG and BMP files. JPEG files may have further images or a video after their image."""
+    from PIL import Image  # late, because few commands read such files
+
+    try:
+        image = Image.open(file, formats=("PNG", "JPEG", "BMP"))
+    except Image.DecompressionBombError:
+        raise ConfigError(path, "", f"has too many pixels; an image has at most {PIXELS} pixels") from None
+    decode = (
+        functools.partial(_by_mitsuba, path, file)
+        if image.format == "PNG"
+        else functools.partial(_by_pillow, path, file, image)
+    )
+    is_palette = image.format == "BMP" and image.mode == "P"
+    wrong = "has a palette, which Mitsuba's textures ignore; save it as PNG" if is_palette else ""
+    return _Header(image.size, decode, _orientation(image), image.info.get("icc_profile") or b"", wrong)
+
+
+def _orientation(image: ImageFile) -> int:
     from PIL.Image import Exif
 
     exif, orientation = Exif(), None
-    with _photograph(path) as photograph:
-        if photograph is not None:
-            with suppress(SyntaxError, ValueError, struct.error):
-                exif.load(photograph.info.get("exif", b""))
-                orientation = exif.get(_ORIENTATION)
+    with suppress(SyntaxError, ValueError, struct.error):
+        exif.load(image.info.get("exif", b""))
+        orientation = exif.get(_ORIENTATION)
     return orientation if orientation in TURNS else 1
+
+
+def _by_pillow(path: Path, file: BinaryIO, image: ImageFile) -> StoredImage:
+    if image.format != "BMP":
+        file.seek(0)
+        if not _ends(file.read()):  # Pillow fills missing data with grey
+            raise ValueError("has no end")
+    mode = {"1": "L", "P": "RGB"}.get(image.mode, image.mode)
+    return StoredImage(path, _as_pixels(np.array(image.convert(mode))), tuple(_NAMES[mode]), 255)
+
+
+#: Names of the channels by Pillow's mode or Mitsuba's pixel format.
+_NAMES = {"L": "Y", "LA": "YA", "RGB": "RGB", "RGBA": "RGBA", "Y": "Y", "YA": "YA"}
+#: Marker in a JPEG file. Zeros follow other bytes 0xff.
+_MARKER = re.compile(rb"\xff+([^\x00\xff])")
+
+
+def _ends(jpeg: bytes) -> bool:
+    """Whether the first image of a JPEG file has an end. Other images or a video may follow."""
+    place = 2
+    while (marker := _MARKER.search(jpeg, place)) is not None:
+        place, kind = marker.end(), marker[1][0]
+        if kind == 0xD9:
+            return True
+        if not 0xD0 <= kind <= 0xD7:  # restarts have no content
+            place += int.from_bytes(jpeg[place : place + 2], "big")
+    return False
+
+
+def _by_mitsuba(path: Path, file: BinaryIO) -> StoredImage:
+    bitmap = mi.Bitmap(str(path))
+    pixels, kind = _as_pixels(np.array(bitmap)), bitmap.pixel_format().name
+    if kind == "XYZ":
+        pixels, kind = _from_xyz(pixels), "RGB"
+    names = tuple(_NAMES[kind]) if kind in _NAMES else tuple(field.name for field in bitmap.struct_())
+    return StoredImage(path, pixels, names, np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else None)
+
+
+def _exr(path: Path, file: BinaryIO) -> _Header:
+    head = file.read(_HEADER)
+    [window] = re.findall(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", head, re.DOTALL)[:1]
+    left, top, right, bottom = struct.unpack("<4i", window)
+
+    def decode() -> StoredImage:
+        found = _by_mitsuba(path, file)  # refuses truncated files
+        has_parts = head[5] & 0x10
+        if not has_parts and {*found.names} <= {*"RGBAY"}:
+            return found
+        # Mitsuba reads one part, converts all channels to one type, and leaves primaries of layers.
+        planes = {name: plane for name, plane in read_planes(path).items() if plane.shape == found.pixels.shape[:2]}
+        names = tuple(planes)
+        pixels = np.stack(list(planes.values()), axis=-1)
+        primaries = re.search(rb"chromaticities\0chromaticities\0 \0\0\0(.{32})", head, re.DOTALL)
+        with suppress(ValueError):  # no colours, but channels of a film
+            colours = find_colours(names)
+            if primaries is not None and len(colours) == 3:
+                to_xyz = _to_xyz(struct.unpack("<8f", primaries[1]))
+                pixels[:, :, colours] = _from_xyz(pixels[:, :, colours] @ to_xyz.T)
+        return StoredImage(path, pixels, names, None)
+
+    return _Header((right - left + 1, bottom - top + 1), decode)
+
+
+def _to_xyz(primaries: Sequence[float]) -> Image:
+    """Return the matrix from linear RGB to CIE XYZ. `primaries` are x and y of red, green, blue and white."""
+    columns = [[x / y, 1.0, (1 - x - y) / y] for x, y in zip(primaries[::2], primaries[1::2], strict=True)]
+    red_green_blue, white = np.array(columns[:3]).T, np.array(columns[3])
+    return np.asarray(red_green_blue * np.linalg.solve(red_green_blue, white))
+
+
+def _from_xyz(pixels: Image) -> Image:
+    """Convert pixels (H, W, 3) from CIE XYZ to linear Rec. 709."""
+    bitmap = mi.Bitmap(np.ascontiguousarray(pixels, dtype=np.float32), mi.Bitmap.PixelFormat.XYZ)
+    return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB))
+
+
+def _hdr(path: Path, file: BinaryIO) -> _Header:
+    [(height, width)] = re.findall(rb"\n-Y\s+(\d+)\s+\+X\s+(\d+)\n", file.read(_HEADER))[:1]
+    return _Header((int(width), int(height)), functools.partial(_by_mitsuba, path, file))
+
+
+_SPACE = rb"(?:\s|#[^\n]*\n)+"
+_NETPBM = re.compile(rb"P([2356fF])" + 3 * (_SPACE + rb"([^\s#]+)") + rb"\s")
+
+
+def _netpbm(path: Path, file: BinaryIO) -> _Header:
+    """Read PGM, PPM and PFM files. PGM and PPM files of more than 8 bits have the most significant byte first."""
+    found = _NETPBM.match(file.read(_HEADER))
+    assert found is not None
+    kind, width, height, limit = found[1], int(found[2]), int(found[3]), float(found[4])
+    shape = height, width, 1 if kind in b"25f" else 3
+    names = tuple("Y" if shape[2] == 1 else "RGB")
+
+    def decode() -> StoredImage:
+        file.seek(found.end())
+        if kind in b"fF":
+            data = file.read(4 * math.prod(shape))
+            pixels = np.frombuffer(data, "<f4" if limit < 0 else ">f4").reshape(shape)[::-1] * np.float32(abs(limit))
+            return StoredImage(path, pixels.astype(np.float32), names, None)
+        if not 1 <= limit <= 65535:
+            raise ValueError("has no maximum")
+        coded, plain = (">u2", np.uint16) if limit > 255 else ("u1", np.uint8)
+        if kind in b"56":
+            data = file.read(np.dtype(coded).itemsize * math.prod(shape))
+            pixels = np.frombuffer(data, coded).astype(plain)
+        else:
+            pixels = np.array(file.read().split()[: math.prod(shape)], dtype=np.int64)
+        if pixels.max(initial=0) > limit:
+            raise ValueError("has values above its maximum")
+        return StoredImage(path, pixels.astype(plain).reshape(shape), names, int(limit))
+
+    is_other = kind not in b"fF" and (kind != b"6" or limit != 255)
+    wrong = "is no binary PPM file with a maximum of 255, the only kind that Mitsuba's textures read; save it as PNG"
+    return _Header((width, height), decode, wrong=wrong if is_other else "")
+
+
+#: Readers of the formats, by the first bytes of a file.
+_FORMATS: dict[bytes, Callable[[Path, BinaryIO], _Header]] = {
+    b"\x89PNG\r\n\x1a\n": _pillow,
+    b"\xff\xd8\xff": _pillow,
+    b"BM": _pillow,
+    b"\x76\x2f\x31\x01": _exr,
+    b"#?": _hdr,
+    b"P": _netpbm,
+}
+
+
+def _as_pixels(array: Image) -> Image:
+    return array if array.ndim == 3 else array[:, :, None]
+
+
+# --- colours ----------------------------------------------------------------------------------------------------------
+
+
+@functools.lru_cache(maxsize=8)
+def foreign_profile(profile: bytes) -> str | None:
+    """Return the name of an ICC profile, or None if its colours are those of sRGB, or if it is damaged."""
+    from PIL import ImageCms
+
+    levels = np.arange(0, 256, 51, dtype=np.uint8)
+    probes = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(1, -1, 3)
+    try:
+        opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if opened.profile.xcolor_space.strip() == "GRAY":
+            probes = np.arange(256, dtype=np.uint8).reshape(1, -1, 1)
+        moved = _converted(probes, profile).astype(int) - probes
+        name = ImageCms.getProfileDescription(opened).strip()
+    except (OSError, ImageCms.PyCMSError):
+        return None
+    return (one_line(name, 60) or "without a name") if np.abs(moved).max() > _ROUNDING else None
+
+
+#: Difference of two profiles of sRGB, which round differently, in steps of 8 bits.
+_ROUNDING = 1
+
+
+def _converted(colours: Image, profile: bytes) -> Image:
+    """Convert bytes (H, W, 3 or 1) from the colours of an ICC profile to those of sRGB, (H, W, 3)."""
+    from PIL import Image, ImageCms
+
+    opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+    is_grey = opened.profile.xcolor_space.strip() == "GRAY"
+    pixels = colours[:, :, 0] if is_grey else np.broadcast_to(colours, (*colours.shape[:2], 3))
+    image = ImageCms.profileToProfile(
+        Image.fromarray(np.ascontiguousarray(pixels)), opened, ImageCms.createProfile("sRGB"),
+        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC, outputMode="RGB",
+    )  # fmt: skip
+    return np.array(image)
 
 
 def image_size(path: Path) -> Size:
     """Return the stored (width, height) of an image. Raises a ConfigError that names the file if the file is not an
     image.
     """
-    with _photograph(path) as photograph:
-        width, height = read_bitmap(path).size() if photograph is None else photograph.size
-    return int(width), int(height)
+    with _opened(path) as header:
+        return header.size
 
 
-Image = np.ndarray[Any, Any]
+def orientation_of(path: Path) -> int:
+    """Return the EXIF orientation (1 to 8) of an image file, or 1 if the file has none. Raises ConfigError if the file
+    is not an image.
+    """
+    with _opened(path) as header:
+        return header.orientation
+
+
+def texture_problems(path: Path) -> tuple[str, str]:
+    """Return the reason why Mitsuba's textures cannot show an image file, or "", and the name of its ICC profile, which
+    they ignore, or "". Files of other formats are left to Mitsuba.
+    """
+    with suppress(ConfigError), _opened(path) as header:
+        return header.wrong, (foreign_profile(header.profile) if header.profile else None) or ""
+    return "", ""
+
+
+def photo_lines(path: Path, upright: bool = True, color_space: str = "auto") -> list[str]:
+    """Return lines for the user about the EXIF orientation and the ICC profile of an image.
+
+    `upright` tells whether the image is read upright or as stored. With `color_space` linear, the profile is ignored.
+    """
+    with _opened(path) as header:
+        turned = TURNS.get(header.orientation)
+        profile = foreign_profile(header.profile) if header.profile else None
+    lines = []
+    if turned is not None and upright:
+        lines.append(f"{path}: {turned}, as its EXIF orientation says")
+    elif turned is not None:
+        lines.append(f"{path}: not {turned} as its EXIF orientation says: cameras of files use the stored orientation")
+    if profile is not None and color_space == "linear":
+        lines.append(f"{path}: its colour profile {profile} is ignored, as color_space is linear")
+    elif profile is not None:
+        lines.append(f"{path}: colours are converted from its profile {profile} to sRGB")
+    return lines
 
 
 @dataclass(frozen=True)
@@ -135,24 +458,17 @@ class Photo:
     """Image file as linear Rec. 709, (H, W, 3) float32, or with the channels that were asked for. Booleans (H, W) mark
     the defects of the pixels.
 
-    `clipped` pixels have a channel at the maximum value of an 8-bit or 16-bit file. `transparent` pixels have alpha 0.
-    `nonfinite` pixels have a non-finite channel.
+    `clipped` pixels have a channel at the maximum value of a file of integers. `transparent` pixels have alpha 0.
+    `nonfinite` pixels have a non-finite channel. `alpha` (H, W) is in [0, 1], or None. Files of floats store colours
+    that are multiplied by it.
     """
 
     image: Image
     clipped: np.ndarray
     transparent: np.ndarray
     nonfinite: np.ndarray
-
-
-def turned_line(path: Path, upright: bool = True) -> str | None:
-    """Return a line for the user about an image with an EXIF orientation. `upright` tells whether the image is read
-    upright or as stored. For other images, return None.
-    """
-    turned = TURNS.get(orientation_of(path))
-    if turned is None or upright:
-        return None if turned is None else f"{path}: {turned}, as its EXIF orientation says"
-    return f"{path}: not {turned} as its EXIF orientation says: cameras of files use the stored orientation"
+    alpha: np.ndarray | None
+    is_integer: bool
 
 
 def read_image(path: Path, color_space: str = "auto", size: Size | None = None, signed: bool = False) -> Image:
@@ -187,23 +503,18 @@ def read_photo(
     negative values, and `nonfinite` allows non-finite values. `channels` are the names of the channels to read, if the
     image is not RGB. Raises ConfigError, located in the file.
     """
-    bitmap = read_bitmap(path, size, upright)
-    if channels:
-        bitmap = _choose(bitmap, channels, path)
-    elif bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-        raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; use an image with only R, G, B or Y")
-    width, height = (int(n) for n in bitmap.size())
-    raw = np.array(bitmap).reshape(height, width, -1)
-    alpha = raw[:, :, -1] if bitmap.has_alpha() else None
-    colors = raw if alpha is None else raw[:, :, :-1]
-    is_integer = raw.dtype.kind in "ui"
-    bitmap.set_srgb_gamma(False)  # values as stored in the file; decoded below
-    kind = bitmap.pixel_format() if channels else mi.Bitmap.PixelFormat.RGB
-    bitmap = bitmap.convert(kind, mi.Struct.Type.Float32, False)
-    image = np.array(bitmap, dtype=np.float32).reshape(height, width, -1)
+    stored = read_stored(path, size, upright)
+    is_integer = stored.white is not None
+    if not channels and (color_space == "srgb" or (color_space == "auto" and is_integer)):
+        stored = stored.in_srgb()
+    colours = stored.only(channels) if channels else stored.colours()
+    alpha = None if channels else stored.alpha()
+    image = colours.astype(np.float32) / np.float32(stored.white or 1)
     if color_space == "srgb" or (color_space == "auto" and is_integer):
         image = decode_srgb(image)
-    finite, nothing = np.isfinite(image), np.zeros((height, width), dtype=bool)
+    if not channels:
+        image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
+    finite = np.isfinite(image)
     for bad, what in ((~finite & (not nonfinite), "not finite"), (finite & (image < 0) & (not signed), "negative")):
         if bad.any():
             y, x, channel = (int(n) for n in np.argwhere(bad)[0])
@@ -211,21 +522,13 @@ def read_photo(
             where = f"pixel ({x}, {y}), channel {(channels or 'RGB')[channel]}"
             raise ConfigError(path, "", f"{where}, is {value}: {what} ({count} pixels in all)")
     return Photo(
-        image,
-        clipped=(colors == np.iinfo(raw.dtype).max).any(axis=2) if is_integer else nothing,
-        transparent=nothing if alpha is None else alpha == 0,
+        np.ascontiguousarray(image),
+        clipped=(colours == stored.white).any(axis=2) if is_integer else np.zeros(image.shape[:2], dtype=bool),
+        transparent=np.zeros(image.shape[:2], dtype=bool) if alpha is None else alpha == 0,
         nonfinite=np.logical_not(finite.all(axis=2)),
+        alpha=None if alpha is None else np.clip(alpha / np.float32(stored.white or 1), 0.0, 1.0),
+        is_integer=is_integer,
     )
-
-
-def _choose(bitmap: mi.Bitmap, channels: Sequence[str], path: Path) -> mi.Bitmap:
-    """Return the channels of a bitmap with these names, in this order. Raises ConfigError if one is missing."""
-    names = [field.name for field in bitmap.struct_()]
-    if missing := [name for name in channels if name not in names]:
-        reason = f"has the channels {', '.join(names)}; the film also needs {', '.join(missing)}"
-        raise ConfigError(path, "", reason)
-    pixels = np.array(bitmap).reshape(*bitmap.size()[::-1], -1)[:, :, [names.index(name) for name in channels]]
-    return mi.Bitmap(np.ascontiguousarray(pixels), mi.Bitmap.PixelFormat.MultiChannel)
 
 
 def decode_srgb(encoded: Image) -> Image:

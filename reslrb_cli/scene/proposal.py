@@ -22,33 +22,14 @@ from reslrb_cli.scene.deformation import list_movable, where_moved
 from reslrb_cli.scene.dispersion import COEFFICIENT
 from reslrb_cli.scene.export import LOBES
 from reslrb_cli.scene.graph import SceneGraph
-from reslrb_cli.scene.images import decode_srgb, read_bitmap
+from reslrb_cli.scene.images import StoredImage, decode_srgb
 from reslrb_cli.scene.needs import surfaces_met
 from reslrb_cli.scene.rays import grid, sensor_rays
 
 Image = np.ndarray[Any, Any]
 
 
-@dataclass(frozen=True)
-class Photograph:
-    """Image file, rotated upright by EXIF, with its (width, height) in pixels. `is_integer` is true if the file holds
-    integers, which clip bright parts.
-    """
-
-    path: Path
-    size: tuple[int, int]
-    is_integer: bool
-    bitmap: mi.Bitmap
-
-
-def open_photograph(path: Path) -> Photograph:
-    """Read an image file. Raises a ConfigError that names the file if the file is not an image."""
-    bitmap = read_bitmap(path, upright=True)
-    width, height = (int(n) for n in bitmap.size())
-    return Photograph(path, (width, height), np.array(bitmap).dtype.kind in "ui", bitmap)
-
-
-def write_smaller(photo: Photograph, size: tuple[int, int], path: Path, is_raw: bool = False) -> None:
+def write_smaller(photo: StoredImage, size: tuple[int, int], path: Path, is_raw: bool = False) -> None:
     """Write the photograph to `path` with fewer pixels. `size` is the new (width, height). Each new pixel is a mean of
     linear values. Integers are encoded in sRGB, or linear if the photograph `is_raw`.
 
@@ -56,26 +37,25 @@ def write_smaller(photo: Photograph, size: tuple[int, int], path: Path, is_raw: 
     clipped. A PNG pixel is transparent (alpha 0) if any photograph pixel within its area is transparent. Floats become
     an EXR, which keeps non-finite values. Raises OSError.
     """
-    raw = np.array(photo.bitmap)
-    raw = raw.reshape(*raw.shape[:2], -1)
-    if not photo.is_integer:
-        pixels = np.ascontiguousarray(_means(raw, size))
-        if (kind := photo.bitmap.pixel_format()) == mi.Bitmap.PixelFormat.MultiChannel:
-            write_bitmap(path, mi.Bitmap(pixels, kind, [field.name for field in photo.bitmap.struct_()]))
-        else:
-            write_bitmap(path, mi.Bitmap(pixels))
+    if is_raw and photo.white is None:
+        pixels, kind = _means(photo.pixels, size), mi.Bitmap.PixelFormat.MultiChannel
+        write_bitmap(path, mi.Bitmap(np.ascontiguousarray(pixels), kind, list(photo.names)))
         return
-    greatest = float(np.iinfo(raw.dtype).max)
-    colours, alpha = (raw[:, :, :-1], raw[:, :, -1:]) if photo.bitmap.has_alpha() else (raw, None)
-    values = colours.astype(np.float32) / np.float32(greatest)
+    photo = photo if is_raw else photo.in_srgb()
+    colours, alpha = photo.colours(), photo.alpha()
+    if photo.white is None:
+        raw = colours if alpha is None else np.concatenate([colours, alpha[:, :, None]], axis=2)
+        write_bitmap(path, mi.Bitmap(np.ascontiguousarray(_means(raw, size))))
+        return
+    values = colours.astype(np.float32) / np.float32(photo.white)
     linear = _means(values if is_raw else decode_srgb(values), size)
-    clipped = _means(colours == greatest, size) > 0
+    clipped = _means(colours == photo.white, size) > 0
     encoded = mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32)).convert(
         component_format=mi.Struct.Type.UInt16, srgb_gamma=not is_raw
     )
     pixels = np.where(clipped, np.uint16(65535), np.array(encoded).reshape(linear.shape)).astype(np.uint16)
     if alpha is not None:
-        opaque = (_means(alpha == 0, size) == 0) * np.uint16(65535)
+        opaque = (_means(alpha[:, :, None] == 0, size) == 0) * np.uint16(65535)
         pixels = np.concatenate([pixels, opaque.astype(np.uint16)], axis=2)
     bitmap = mi.Bitmap(np.ascontiguousarray(pixels))
     bitmap.set_srgb_gamma(not is_raw)

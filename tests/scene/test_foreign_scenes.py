@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,15 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from kit import profile_of
 
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.catalog import list_parameters
+from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.xml.mend import upsample_bitmaps
+from reslrb_cli.scene.xml.read import read_description
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -235,10 +241,67 @@ def test_objects_with_one_name_are_all_kept(tmp_path):
 
 def test_paths_with_backslashes_are_found(tmp_path):
     (tmp_path / "textures").mkdir()
+    file = tmp_path / "scene.xml"
     mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "textures" / "t.exr"))
     texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="textures\\t.exr"/></texture>'
     scene = load_scene(write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>'))
     assert values(scene)["paint.reflectance.data"].shape == (2, 2, 3)
+    config = tmp_path / "a.yaml"
+    config.write_text("scene: {file: scene.xml}\ntarget: {render: {}}\nparameters: [{key: paint.reflectance.data}]")
+    before = file_digests(files_of(load(config)))
+    assert "scene.file (textures/t.exr)" in before
+    mi.Bitmap(np.full((2, 2, 3), 0.25, np.float32)).write(str(tmp_path / "textures" / "t.exr"))
+    after = file_digests(files_of(load(config)))
+    assert {key for key in before if before[key] != after[key]} == {"scene.file (textures/t.exr)"}
+    assert file.is_file()
+
+
+@pytest.mark.parametrize("word", ["".join(letters) for letters in itertools.product("tT", "rR", "uU", "eE")])
+def test_booleans_may_have_any_case(word, tmp_path):
+    integrator = f'<integrator type="path"><boolean name="hide_emitters" value="{word}"/></integrator>'
+    assert read_description(write(tmp_path, integrator=integrator), {}).hides_emitters
+
+
+def test_raw_bitmaps_are_found_with_any_case(tmp_path):
+    mi.Bitmap(np.full((2, 2, 3), 100, np.uint8)).write(str(tmp_path / "t.png"))
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="t.png"/>{}</texture>'
+    for word in ("true", "True", "TRUE"):
+        paint = texture.format(f'<boolean name="raw" value="{word}"/>')
+        description = read_description(write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{paint}</bsdf>'), {})
+        with pytest.raises(ConfigError, match="is not a file of linear colours; remove `raw`"):
+            upsample_bitmaps(description)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("palette.bmp", "`palette.bmp` has a palette, which Mitsuba's textures ignore; save it as PNG"),
+        ("deep.ppm", "`deep.ppm` is no binary PPM file with a maximum of 255"),
+    ],
+)
+def test_images_that_mitsuba_misreads_are_refused(name, reason, tmp_path):
+    from PIL import Image
+
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).quantize(4).save(tmp_path / "palette.bmp")
+    (tmp_path / "deep.ppm").write_bytes(b"P6 1 1 65535\n" + bytes(6))
+    texture = f'<texture type="bitmap" name="reflectance"><string name="filename" value="{name}"/></texture>'
+    file = write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>')
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value).startswith(f"{file}:{LINES['paint']}: filename: {reason}")
+
+
+def test_a_colour_profile_of_a_texture_is_named(tmp_path, caplog):
+    from PIL import Image
+
+    Image.new("RGB", (2, 2), "red").save(tmp_path / "t.png", icc_profile=profile_of("Display P3", 2.2))
+    name, raw = '<string name="filename" value="t.png"/>', '<boolean name="raw" value="true"/>'
+    for more in ("", raw):
+        caplog.clear()
+        texture = f'<texture type="bitmap" name="reflectance">{name}{more}</texture>'
+        load_scene(write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>'))
+        line = "`t.png` has the colour profile `Display P3`, which Mitsuba's textures ignore: read as sRGB; convert"
+        assert (line in caplog.text) is (more == "")
 
 
 @pytest.mark.parametrize("text", ["<!-- - -- what a -- rule -->", "<!-- \n -->", "<!DOCTYPE scene>"])

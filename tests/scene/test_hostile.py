@@ -171,3 +171,15 @@ def test_elements_nested_too_deeply_are_one_line(tmp_path, text):
     file = write(tmp_path, f"{HEAD}{text}</scene>")
     with pytest.raises(ConfigError, match=f"{file}: elements or includes are nested too deeply"):
         load_scene(file)
+
+
+@pytest.mark.parametrize("depth", [90, 110, 300, 600, 850, 900, 950, 990])
+def test_every_depth_of_elements_loads_or_is_one_line(tmp_path, depth):
+    """Every pass over the elements has its own limit of recursion."""
+    nested = '<bsdf type="mask">\n' * depth + '<bsdf type="diffuse"/>' + "</bsdf>" * depth
+    file = write(tmp_path, f"{HEAD}<shape type='sphere'>{nested}</shape></scene>")
+    if depth < 100:
+        load_scene(file)
+        return
+    with pytest.raises(ConfigError, match=rf"{file}.*: (is|elements or includes are) nested too deeply"):
+        load_scene(file)

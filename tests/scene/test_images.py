@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import os
 import struct
 import zlib
@@ -10,10 +12,11 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from kit import profile_of
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene.images import decode_srgb, orientation_of, read_bitmap, read_image
-from reslrb_cli.scene.proposal import open_photograph, write_smaller
+from reslrb_cli.scene.images import decode_srgb, orientation_of, photo_lines, read_image, read_photo, read_stored
+from reslrb_cli.scene.proposal import write_smaller
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -74,13 +77,14 @@ def test_a_truncated_file_is_refused(image, share, capfd):
     assert capfd.readouterr() == ("", "")  # libjpeg's messages do not reach the terminal
 
 
-def png(width, height, data=b""):
-    """Return a PNG file whose header gives the size `width` x `height`."""
+def chunk(kind, content):
+    """Return a chunk of a PNG file."""
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
-    def chunk(kind, content):
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+def png(width, height, depth=8, kind=2, data=b"", more=b""):
+    """Return a PNG file with this header. `data` are its rows, and `more` are chunks before them."""
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)) + more
     return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
 
 
@@ -148,17 +152,17 @@ def test_orientation_matches_pillow(name, channels, orientation, tmp_path):
     from PIL import Image, ImageOps
 
     path = with_orientation(tmp_path / name, orientation, channels)
-    raw, seen = read_bitmap(path), read_bitmap(path, upright=True)
-    expected = np.array(ImageOps.exif_transpose(Image.open(path))).reshape(*seen.size()[::-1], channels)
+    raw, seen = read_stored(path), read_stored(path, upright=True)
+    expected = np.array(ImageOps.exif_transpose(Image.open(path))).reshape(*seen.size[::-1], channels)
     assert orientation_of(path) == orientation
-    assert np.array_equal(np.array(seen).reshape(expected.shape), expected)
-    assert list(raw.size()) == [7, 5]
-    assert (seen.pixel_format(), seen.srgb_gamma()) == (raw.pixel_format(), raw.srgb_gamma())
+    assert np.array_equal(seen.pixels, expected)
+    assert raw.size == (7, 5)
+    assert seen.names == raw.names
     size = (5, 7) if orientation >= 5 else (7, 5)
-    assert list(read_bitmap(path, size, upright=True).size()) == list(size)
+    assert read_stored(path, size, upright=True).size == size
     if orientation >= 5:
         with pytest.raises(ConfigError, match=r"is 5x7 pixels, turned by 90 degrees .* it must be 7x5"):
-            read_bitmap(path, (7, 5), upright=True)
+            read_stored(path, (7, 5), upright=True)
 
 
 def orientation(value):
@@ -184,7 +188,7 @@ def test_damaged_exif_rotates_nothing(name, data, expected, tmp_path, recwarn):
 
     Image.new("RGB", (7, 5)).save(tmp_path / name, exif=b"Exif\0\0" + data)
     assert orientation_of(tmp_path / name) == expected
-    assert list(read_bitmap(tmp_path / name, upright=True).size()) == ([5, 7] if expected == 6 else [7, 5])
+    assert read_stored(tmp_path / name, upright=True).size == ((5, 7) if expected == 6 else (7, 5))
     assert not recwarn.list
 
 
@@ -257,7 +261,7 @@ def image_with(value):
         (image_with(np.nan), r"pixel \(5, 2\), channel G, is nan: not finite \(1 pixels in all\)"),
         (image_with(np.inf), "is inf: not finite"),
         (image_with(-0.5), "is -0.5: negative"),
-        (np.ones((4, 6, 7), np.float32), "has 7 channels"),
+        (np.ones((4, 6, 7), np.float32), "has the channels ch0, ch1, .*; use an image with R, G and B"),
     ],
 )
 def test_refused(tmp_path, array, what):
@@ -278,6 +282,225 @@ def test_missing_and_unreadable(tmp_path):
             read_image(tmp_path / name)
 
 
+# Every kind of file, written by other programs or by the specification: depth, maximum, byte order, colour type.
+
+HEIGHT, WIDTH = 3, 5
+
+
+def fractions(channels, seed=0):
+    """Return random values in [0, 1], (H, W, C), with the ends 0 and 1."""
+    values = np.random.default_rng(seed).uniform(0, 1, (HEIGHT, WIDTH, channels))
+    values[0, 0], values[0, 1] = 0, 1
+    return values
+
+
+def whole(channels, limit):
+    return np.round(fractions(channels) * limit).astype(int)
+
+
+def netpbm(kind, limit):
+    """Return a PGM or PPM file, binary or plain, and its values."""
+    values = whole(1 if kind in "25" else 3, limit)
+    text = " ".join(map(str, values.ravel())).encode()
+    body = text if kind in "23" else values.astype(">u2" if limit > 255 else "u1").tobytes()
+    return f"P{kind}\n# a comment\n{WIDTH} {HEIGHT}\n{limit}\n".encode() + body, values / limit
+
+
+def pfm(kind, order):
+    values = fractions(3 if kind == "F" else 1).astype(np.float32)
+    head = f"P{kind}\n{WIDTH} {HEIGHT}\n{'-1.0' if order == '<' else '1.0'}\n".encode()
+    return head + values[::-1].astype(f"{order}f4").tobytes(), values
+
+
+def png_of(depth, kind):
+    """Return a PNG file. `kind` is its colour type: 0 grey, 2 RGB, 3 palette, 4 and 6 with alpha."""
+    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[kind]
+    values = whole(channels, 2**depth - 1)
+    bits = (values.reshape(HEIGHT, -1, 1) >> np.arange(depth)[::-1]) & 1
+    rows = np.packbits(bits.reshape(HEIGHT, -1).astype(np.uint8), axis=1)
+    colours = np.random.default_rng(5).integers(0, 256, (2**depth, 3), dtype=np.uint8) if kind == 3 else None
+    data = b"".join(b"\0" + row.tobytes() for row in rows)
+    header = (WIDTH, HEIGHT, depth, kind)
+    if colours is not None:
+        return png(*header, data, chunk(b"PLTE", colours.tobytes())), colours[values[:, :, 0]] / 255
+    seen = values[:, :, : channels - (kind in (4, 6))] / (2**depth - 1)
+    return png(*header, data), seen
+
+
+def bmp(mode):
+    from PIL import Image
+
+    values = whole(4 if mode == "RGBA" else 3, 255).astype(np.uint8)
+    if mode == "RGBA":
+        image = Image.fromarray(values)
+    else:
+        image = Image.fromarray(values).quantize(7) if mode == "P" else Image.fromarray(values).convert(mode)
+    stream = io.BytesIO()
+    image.save(stream, "BMP")
+    seen = np.array(image.convert("RGB"))
+    return stream.getvalue(), seen / 255
+
+
+def exr_of(names, type_, primaries=None):
+    """Return an EXR file with channels of these names by OpenEXR. Red is .25, green .5 and blue .75."""
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header |= {} if primaries is None else {"chromaticities": primaries}
+    values = {"R": 0.25, "G": 0.5, "B": 0.75, "Y": 0.25}
+    planes = {name: np.full((HEIGHT, WIDTH), values.get(name[-1].upper(), 9), type_) for name in names}
+    stream = io.BytesIO()
+    OpenEXR.File(header, planes).write(stream)
+    is_grey = not any(name.endswith(("B", "b")) for name in names)
+    return stream.getvalue(), np.full((HEIGHT, WIDTH, 3), 0.25 if is_grey else [0.25, 0.5, 0.75])
+
+
+LAYERS = ["ViewLayer.Combined.R", "ViewLayer.Combined.G", "ViewLayer.Combined.B", "ViewLayer.Combined.A"]
+KINDS = {
+    **{f"P{kind}-{limit}": (netpbm, kind, limit)
+       for kind, limit in itertools.product("2356", (1, 100, 255, 1023, 65535))},
+    **{f"P{kind}{order}": (pfm, kind, order) for kind, order in itertools.product("Ff", "<>")},
+    **{f"png-{depth}-{kind}": (png_of, depth, kind)
+       for depth, kind in itertools.product((1, 2, 4, 8, 16), (0, 2, 3, 4, 6))
+       if depth in {0: (1, 2, 4, 8, 16), 3: (1, 2, 4, 8)}.get(kind, (8, 16))},
+    **{f"bmp-{mode}": (bmp, mode) for mode in ("1", "L", "P", "RGB", "RGBA")},
+    **{f"exr-{' '.join(names)}-{type_.__name__}": (exr_of, names, type_)
+       for names in ("RGB", "RGBA", "rgb", "RGBZ", "Y", "YA", ["V"], LAYERS, [*LAYERS, "ViewLayer.Depth.Z"],
+                     [*LAYERS, "ViewLayer.Albedo.R", "ViewLayer.Albedo.G", "ViewLayer.Albedo.B"])
+       for type_ in (np.float16, np.float32) if names != ["V"]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_file_has_its_values(kind, tmp_path, capfd):
+    make, *options = KINDS[kind]
+    data, expected = make(*options)
+    path = tmp_path / "image"
+    path.write_bytes(data)
+    found = read_image(path, "linear", size=(WIDTH, HEIGHT))
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=1e-6)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_channels_of_an_exr_have_their_own_types(tmp_path):
+    import OpenEXR
+
+    planes = {"Albedo.R": np.zeros((2, 2), np.float16)}
+    planes |= {name: np.full((2, 2), 1e6 + place, np.float32) for place, name in enumerate("RGB")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, planes).write(str(tmp_path / "a.exr"))
+    assert read_image(tmp_path / "a.exr")[0, 0].tolist() == [1e6, 1e6 + 1, 1e6 + 2]
+
+
+def test_primaries_of_an_exr_are_converted_with_or_without_other_channels(tmp_path):
+    acescg = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+    for name, channels in (("a.exr", "RGB"), ("b.exr", "RGBZ")):
+        (tmp_path / name).write_bytes(exr_of(channels, np.float32, acescg)[0])
+    alone = np.array(mi.Bitmap(str(tmp_path / "a.exr")))
+    np.testing.assert_allclose(read_image(tmp_path / "a.exr"), alone, rtol=1e-6)
+    np.testing.assert_allclose(read_image(tmp_path / "b.exr"), alone, rtol=1e-3)
+    assert abs(alone[0, 0] - [0.25, 0.5, 0.75]).max() > 0.02
+
+
+def test_several_layers_are_refused(tmp_path):
+    (tmp_path / "a.exr").write_bytes(exr_of(["a.R", "a.G", "a.B", "b.R", "b.G", "b.B"], np.float32)[0])
+    assert refused(tmp_path / "a.exr") == "has the layers a, b; save the one of the image alone"
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_photograph_with_a_video_behind_it_is_read(seed, tmp_path):
+    """Phones append a second image, or a video of arbitrary bytes."""
+    from PIL import Image
+
+    path = tmp_path / "a.jpg"
+    Image.fromarray((255 * picture()).astype(np.uint8)).save(path)
+    data, video = path.read_bytes(), np.random.default_rng(seed).bytes(20000)
+    path.write_bytes(data + video)
+    assert read_image(path).shape == (96, 128, 3)
+    path.write_bytes(data[: len(data) // 2])
+    assert refused(path).startswith("is not a readable image")
+
+
+def test_the_first_of_several_images_is_read(tmp_path):
+    from PIL import Image
+
+    first, second = (Image.new("RGB", (8, 4), colour) for colour in ("red", "blue"))
+    first.save(tmp_path / "a.jpg", "MPO", save_all=True, append_images=[second])
+    assert read_image(tmp_path / "a.jpg", size=(8, 4))[0, 0, 0] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("name", "size"), [("png", None), ("png", (8, 8)), ("ppm", None), ("exr", None), ("hdr", None)]
+)
+def test_the_size_is_checked_before_pixels_are_decoded(name, size, tmp_path, monkeypatch):
+    data = {
+        "png": png(12000, 12000, 8, 2),
+        "ppm": b"P6 12000 12000 255\n",
+        "exr": exr(11999, 11999),
+        "hdr": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 12000 +X 12000\n",
+    }
+    path = tmp_path / "a"
+    path.write_bytes(data[name])
+    monkeypatch.setattr(mi, "Bitmap", None)
+    wanted = "it must be 8x8" if size else "an image has at most 134217728 pixels"
+    assert refused(path, size=size) == f"is 12000x12000 pixels; {wanted}"
+    path.write_bytes(png(30000, 30000, 8, 2))
+    assert "too many pixels; an image has at most 134217728 pixels" in refused(path, size=size)
+
+
+# Colour profiles. The expected colours come from colour-science.
+
+
+@pytest.mark.parametrize("space", ["Display P3", "Adobe RGB (1998)"])
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_colour_profiles_are_converted(space, suffix, tmp_path):
+    import colour
+    from PIL import Image
+
+    values = np.tile(np.array([[[90, 140, 100], [200, 180, 170], [60, 60, 60]]], np.uint8).repeat(16, 1), (16, 1, 1))
+    path, options = tmp_path / f"a.{suffix}", {"quality": 100, "subsampling": 0} if suffix == "jpg" else {}
+    Image.fromarray(values).save(path, icc_profile=profile_of(space, 2.2), **options)
+    linear = colour.RGB_to_RGB((values / 255) ** 2.2, space, "sRGB", chromatic_adaptation_transform="Bradford")
+    seen = read_image(path)
+    np.testing.assert_allclose(seen, linear, atol=0.006)  # bytes
+    assert abs(decode_srgb(values / 255.0) - linear).max() > 0.03
+    assert photo_lines(path) == [f"{path}: colours are converted from its profile {space} to sRGB"]
+    raw = read_image(path, "linear")
+    np.testing.assert_allclose(raw, values / 255, atol=0.01)
+    assert photo_lines(path, color_space="linear") == [
+        f"{path}: its colour profile {space} is ignored, as color_space is linear"
+    ]
+
+
+def test_profiles_of_srgb_change_nothing_and_damaged_ones_neither(tmp_path):
+    from PIL import Image, ImageCms
+
+    values = whole(3, 255).astype(np.uint8)
+    own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for profile in (own, b"no profile", profile_of("Display P3", 2.2)[:200]):
+        Image.fromarray(values).save(tmp_path / "a.png", icc_profile=profile)
+        assert np.array_equal(read_image(tmp_path / "a.png", "linear"), np.float32(values) / np.float32(255))
+        np.testing.assert_allclose(read_image(tmp_path / "a.png"), decode_srgb(values / 255.0), atol=1e-6)
+        assert photo_lines(tmp_path / "a.png") == []
+
+
+def test_a_profile_of_16_bits_is_refused_unless_values_are_linear(tmp_path):
+    profile = chunk(b"iCCP", b"P3\0\0" + zlib.compress(profile_of("Display P3", 2.2)))
+    (tmp_path / "a.png").write_bytes(png(1, 1, 16, 2, b"\0" + struct.pack(">3H", 100, 200, 300), profile))
+    assert refused(tmp_path / "a.png").startswith("has the colour profile Display P3 in 16 bits; convert it to sRGB")
+    assert read_image(tmp_path / "a.png", "linear")[0, 0, 2] == np.float32(300 / 65535)
+
+
+def test_clipped_and_transparent_pixels_of_a_profile_stay_marked(tmp_path):
+    from PIL import Image
+
+    values = np.full((2, 2, 4), 100, np.uint8)
+    values[0, 0, 1], values[1, 1, 3] = 255, 0
+    Image.fromarray(values).save(tmp_path / "a.png", icc_profile=profile_of("Display P3", 2.2))
+    photo = read_photo(tmp_path / "a.png")
+    assert (np.argwhere(photo.clipped).tolist(), np.argwhere(photo.transparent).tolist()) == ([[0, 0]], [[1, 1]])
+
+
 # Photographs at the size of a film: pixels are means of light, and marks of clipped or transparent pixels stay.
 
 
@@ -287,8 +510,8 @@ def smaller(path: Path, values: np.ndarray, size: tuple[int, int]) -> Path:
     bitmap.set_srgb_gamma(values.dtype.kind == "u")
     source = path / ("photo.png" if values.dtype.kind == "u" else "photo.exr")
     bitmap.write(str(source))
-    photo = open_photograph(source)
-    assert photo.is_integer is (values.dtype.kind == "u")
+    photo = read_stored(source, upright=True)
+    assert (photo.white is not None) is (values.dtype.kind == "u")
     written = path / f"small{source.suffix}"
     write_smaller(photo, size, written)
     return written

@@ -17,9 +17,12 @@ import mitsuba as mi
 
 from reslrb_cli.backend.installation import is_known, likely_parameters, looking_in, nearest_plugin, plugin_type
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene.images import texture_problems
 from reslrb_cli.scene.xml.mend import Note
-from reslrb_cli.scene.xml.read import Description, Element, floats, quoted, tag_lines
+from reslrb_cli.scene.xml.read import Description, Element, floats, is_true, quoted, tag_lines
 
+#: Plugins that read an image file.
+_IMAGES = ("bitmap", "envmap")
 #: Mitsuba's class for each tag.
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Texture"}
 
@@ -99,10 +102,12 @@ REFUSED_PLUGINS = {
 }
 
 
-def _check(description: Description) -> None:
+def _check(description: Description) -> list[Note]:
     """Raise ConfigError with file and line for a plugin that is not Mitsuba's own, for a number that is NaN, and for a
-    file that is missing or never ends.
+    file that is missing, never ends, or shows other pixels in Mitsuba. Return notes on colour profiles.
     """
+    notes: list[Note] = []
+    images = {child: item for item in description.root.walk() if item.type in _IMAGES for child in item.children}
     for element in description.root.walk():
         if element.is_object:
             _check_plugin(element)
@@ -116,6 +121,14 @@ def _check(description: Description) -> None:
             raise element.fail("filename", f"{quoted(name)}: no such file{looked}")
         if not path.is_file():
             raise element.fail("filename", f"{path} is not a regular file")
+        if element in images:
+            wrong, profile = texture_problems(path)
+            if wrong:
+                raise element.fail("filename", f"{quoted(name)} {wrong}")
+            if profile and not is_true(images[element].find("raw")):
+                ignored = f"{quoted(name)} has the colour profile {quoted(profile)}, which Mitsuba's textures ignore"
+                notes.append(Note(element, ignored, done="read as sRGB; convert the file to sRGB"))
+    return notes
 
 
 def _check_plugin(element: Element) -> None:
@@ -175,12 +188,13 @@ def _place_textures(root: Element) -> None:
 
 
 def build(description: Description) -> tuple[Any, list[Note]]:
-    """Build the Mitsuba object of a description. Return the object, and notes on parameters that no plugin uses.
+    """Build the Mitsuba object of a description. Return the object, and notes on parameters that no plugin uses and on
+    colour profiles.
 
     Nothing is merged, so all parameters keep their names. Raises ConfigError with a location if a plugin is not
     Mitsuba's own, a file is missing, or Mitsuba refuses the scene.
     """
-    _check(description)
+    notes = _check(description)
     _place_textures(description.root)
     text = _Text(description.root)
     config = mi.parser.ParserConfig(mi.variant())
@@ -193,7 +207,8 @@ def build(description: Description) -> tuple[Any, list[Note]]:
             built = mi.parser.instantiate(config, state)
         except Exception as error:
             raise text.located(str(error)) from None
-    return built, [note for node in state.nodes for note in _unused(node.props, text.element_at(node.offset))]
+    unused = [note for node in state.nodes for note in _unused(node.props, text.element_at(node.offset))]
+    return built, notes + unused
 
 
 class _Text:

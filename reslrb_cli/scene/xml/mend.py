@@ -28,8 +28,8 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.installation import is_known
-from reslrb_cli.scene.images import decode_srgb
-from reslrb_cli.scene.xml.read import Description, Element, floats, quoted
+from reslrb_cli.scene.images import decode_srgb, read_stored
+from reslrb_cli.scene.xml.read import Description, Element, floats, is_true, quoted
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def mend(description: Description) -> list[Note]:
     Materials, lights and shapes keep their meaning. Materials, lights and shapes that Mitsuba 3 lacks stay unchanged,
     and a later check refuses them. Unused parameters are found only when the scene is built.
     """
-    mender, root = _Mender(description), description.root
+    mender, root = _Mender(), description.root
     mender.notes += _name_objects(root)
     root.attributes.pop("version", None)
     if root.is_object:
@@ -210,8 +210,7 @@ def mend(description: Description) -> list[Note]:
 
 
 class _Mender:
-    def __init__(self, description: Description) -> None:
-        self.find_file = description.find_file
+    def __init__(self) -> None:
         self.notes: list[Note] = []
 
     def mend_below(self, element: Element) -> None:
@@ -273,9 +272,6 @@ class _Mender:
             return True
         if owner.type == "hdrfilm" and name == "pixel_format":
             value = value.partition(",")[0].strip()  # a list has one format per image; keep the first
-        if name == "filename" and "\\" in value and self.find_file(value) is None:
-            slashed = value.replace("\\", "/")
-            value = slashed if self.find_file(slashed) is not None else value
         element.attributes["value"] = VALUES.get((owner.type, name), {}).get(value, value)
         # Films write no files here, and Mitsuba 3 does not have all formats of earlier versions.
         return owner.type != "hdrfilm" or name not in ("file_format", "component_format")
@@ -322,12 +318,12 @@ def upsample_bitmaps(description: Description) -> None:
         for child in owner.children:
             bitmap = named.get(child.id, child) if child.tag == "ref" else child
             raw = bitmap.find("raw") if bitmap.type == "bitmap" else None
-            if raw is None or raw.value != "true" or not _COLOURS.search(child.name or bitmap.name):
+            if raw is None or not is_true(raw) or not _COLOURS.search(child.name or bitmap.name):
                 continue
             file = bitmap.find("filename")
             path = None if file is None else description.find_file(file.value)
             if file is not None and path is not None and not file.value.lower().endswith(_LINEAR):
-                if mi.Bitmap(str(path)).channel_count() <= 2:
+                if read_stored(path).pixels.shape[2] <= 2:
                     continue
                 why = "is not a file of linear colours; remove `raw`, or use an EXR file"
                 raise bitmap.fail("raw", f"{quoted(file.value)} {why}")

@@ -45,6 +45,11 @@ def floats(text: str) -> list[float]:
         return []
 
 
+def is_true(parameter: Element | None) -> bool:
+    """Whether a boolean parameter is given and true. Mitsuba accepts any case."""
+    return parameter is not None and parameter.value.strip().lower() == "true"
+
+
 @dataclass(slots=True, eq=False)
 class Element:
     """An XML element with its attributes and children in their order.
@@ -232,12 +237,17 @@ def read_description(file: Path, options: Mapping[str, Any]) -> Description:
         root = reader.read(file, folders, None)
     except RecursionError:
         raise ConfigError(file, "", "elements or includes are nested too deeply") from None
+    _check_depth(root)
+    for element in root.walk():
+        key = element.file_attribute
+        if key and (slashed := _with_slashes(element.attributes[key], folders)) is not None:
+            element.attributes[key] = slashed
     if reader.unused:
         names = quoted(", ".join(f"${name}" for name in options if name in reader.unused), "")
         raise ConfigError(file, names, "is set in scene.options, but the scene file does not use it")
     said = [value for child in root.children if child.tag == "integrator" for value in child.walk()]
     # Accept the spelling of any version.
-    hides = any(each.name in ("hide_emitters", "hideEmitters") and each.value.strip() == "true" for each in said)
+    hides = any(each.name in ("hide_emitters", "hideEmitters") and is_true(each) for each in said)
     return Description(root, folders, reader.values, hides, reader.files)
 
 
@@ -337,8 +347,30 @@ def _required(element: Element, attribute: str) -> str:
 
 
 def _find(name: str, folders: Sequence[Path]) -> Path | None:
+    name = _with_slashes(name, folders) or name
     places = [*(folder / name for folder in folders), Path(name)]
     return next((path for path in places if os.path.exists(path)), None)  # False for too long names, too
+
+
+def _with_slashes(name: str, folders: Sequence[Path]) -> str | None:
+    """Return the name of a file with slashes if only this spelling is found. Windows writes names with backslashes."""
+    slashed = name.replace("\\", "/")
+    if slashed == name or any(os.path.exists(folder / name) for folder in (*folders, Path())):
+        return None
+    return slashed if _find(slashed, folders) is not None else None
+
+
+#: Maximum depth of elements. Scenes of exporters have fewer than 20 levels, and Mitsuba's parser recurses.
+_DEEPEST = 100
+
+
+def _check_depth(root: Element) -> None:
+    waiting = [(root, 1)]
+    while waiting:
+        element, depth = waiting.pop()
+        if depth > _DEEPEST:
+            raise element.fail("", f"is nested too deeply, in more than {_DEEPEST} elements")
+        waiting += ((child, depth + 1) for child in element.children)
 
 
 def _folder(element: Element, folders: list[Path]) -> Path:
