@@ -85,8 +85,8 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Plain:
-    """Mark of a setting that a run may decide (`optimization/autotune/sampling.py`), with its plain value: the value
-    where no run decides, as in Mitsuba's plugin.
+    """Mark of a setting that a run may decide (`optimization/autotune/sampling.py`), with its plain value: the default
+    beside an estimator that the user names.
     """
 
     value: str | float

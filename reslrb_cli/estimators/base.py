@@ -165,9 +165,9 @@ def differentiate_passage(
 ) -> mi.Spectrum:  # fmt: skip
     """Return the transmittance (C,) of the masks between a vertex and the sensor, and add its derivative.
 
-    A mask with zero transmission ends the segment. A mask is therefore never the zero factor of a product. The
-    transmittance value is needed only if another factor of the contribution is zero. If neither value nor derivative is
-    needed, nothing is traced.
+    The transmission of a mask is never zero here (`transmission_of`), so a mask is never the zero factor of a product.
+    The transmittance value is needed only if another factor of the contribution is zero. If neither value nor
+    derivative is needed, nothing is traced.
     """
     if not p.plan.passage_in_gradient:
         return mi.Spectrum(1)

@@ -8,6 +8,7 @@ tracer therefore gives the results of a new tracer. `Renewal` updates plans afte
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from numbers import Integral
 from typing import Any
@@ -33,7 +34,8 @@ from reslrb_cli.integrators.plans import (
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.edges import EdgeSet, has_edges
 from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
-from reslrb_cli.scene.needs import check_paths, is_bent, scene_needs
+from reslrb_cli.scene.load import warn_once
+from reslrb_cli.scene.needs import blend_warning, check_paths, is_bent, scene_needs, usual_paths
 from reslrb_cli.scene.upsampling import values_of
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
@@ -112,12 +114,6 @@ def sensors_in_words(count: int) -> str:
     return "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
 
 
-def sensor_number(scene: mi.Scene, sensor: mi.Sensor) -> int:
-    """Return a sensor's number in a scene. For a sensor that is not in the scene, return the sensor count."""
-    known = [one.ptr for one in scene.sensors()]
-    return known.index(sensor.ptr) if sensor.ptr in known else len(known)
-
-
 @dataclass
 class AboutParameters:
     """Facts of parameters that are differentiated together."""
@@ -142,8 +138,12 @@ class AboutScene:
     """Facts of one scene. The object holds the sensors, so no other sensor gets the address of a freed sensor."""
 
     sensors: list[mi.Sensor]
+    #: Sensors that are not part of the scene, in the order in which they were used.
+    others: list[mi.Sensor] = field(default_factory=list)
     #: Plans of images, by sensor, kind of paths, and whether something moves.
     plans: dict[tuple[mi.Sensor, str, bool], Plan] = field(default_factory=dict)
+    #: The paths for `paths: auto`, by sensor and whether shapes move.
+    usual: dict[tuple[mi.Sensor, bool], str] = field(default_factory=dict)
     #: BSDFs of its surfaces that use a node; the entry None has all of them.
     owners: dict[mi.Object | None, list[mi.BSDF]] = field(default_factory=dict)
     #: By parameters and the objects that have them.
@@ -188,13 +188,13 @@ class Preparation:
 
     def plan(
         self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None, spp: int | None = None,
-        image: bool = False,
+        image: bool = False, forward: bool = False,
     ) -> Plan:  # fmt: skip
         """Return the plan to differentiate `params` in this scene. For None, nothing is differentiated.
 
         `spp` is the number of samples per pixel of one pass, if the plan is for a pass. With `image`, the plan is for
         the image of a step that differentiates `params`. The image's plan has the gradient's paths, but no derivatives.
-        Raises UnsupportedScene.
+        `forward` tells whether the plan is for forward mode. Raises UnsupportedScene.
         """
         self._turn_to(scene)
         if self.guiding is not None and spp is not None:
@@ -202,6 +202,8 @@ class Preparation:
         about = None if params is None else self._look_through(params)
         moves = about is not None and (about.which.moves_light or self._motion.attached is True)
         paths, whole = self.sampling.paths, self.sampling.whole
+        if paths == "auto":
+            paths = self._usual_paths(scene, sensor, about, forward)
         if about is not None and moves and (self._motion.sampling == "follow" or not about.only_shapes_move):
             paths, whole = "light", whole and paths == "light"
         key = sensor, paths, moves
@@ -218,6 +220,8 @@ class Preparation:
         plan = replace(plan, evened_lamps=drawn, sampled_spectra=about.which.sampled_spectra)
         if moves:
             edged, motion = self._edges(which, scene) if "edges" in self.sampling.on else None, self._motion
+            if edged is not None and self.sampling.chosen["edges"] == "auto":
+                edged = self._possible_edges(edged, forward)
             if edged is not None:
                 if motion.sampling == "follow":
                     why = "follow has no derivatives of edges between two surfaces; use auto, or edges: off"
@@ -250,6 +254,15 @@ class Preparation:
             made[key] = PixelShares.of(known.ravel(), paths)
         return made[key]
 
+    def sensor_number(self, scene: mi.Scene, sensor: mi.Sensor) -> int:
+        """Return a sensor's number in the last scene. Sensors that are not part of it have the numbers that follow."""
+        self._turn_to(scene)
+        known = self._found.sensors + self._found.others
+        if sensor not in known:
+            self._found.others.append(sensor)
+            return len(known)
+        return known.index(sensor)
+
     def entries(self, plan: Plan, params: mi.SceneParameters) -> list[int]:
         """Return the number of differentiated entries of each group of BSDFs (`bsdf_groups`) and of emission."""
         which = self._look_through(params).which
@@ -275,6 +288,18 @@ class Preparation:
             made[key] = EdgeSet(moving, scene, lamps_move=bool(which.emitters))
         return made[key] if moving or made[key].occluders else None
 
+    def _possible_edges(self, edged: EdgeSet, forward: bool) -> EdgeSet | None:
+        """Return the edges for `edges: auto`: all that are supported. Warn, once, if none are."""
+        if not forward and self._motion.sampling != "follow":
+            return edged
+        lacking = "forward mode" if forward else "attached_sampling: follow"
+        warnings.warn(
+            f"reslrb: {lacking} has no derivatives of edges, so the light that moving outlines and shadows cover and "
+            "uncover is missing (edges: auto); edges: off silences this line",
+            stacklevel=2,
+        )
+        return None
+
     def emitters(self, plan: Plan, scene: mi.Scene) -> EmitterDensities:
         """Return the current densities of the scene's emitters, for a plan of the scene."""
         made, weights = self._found.emitters, tuple(float(emitter.sampling_weight()) for emitter in scene.emitters())
@@ -285,11 +310,25 @@ class Preparation:
             made[key] = EmitterDensities.of(plan, scene)
         return made[key]
 
+    def _usual_paths(
+        self, scene: mi.Scene, sensor: mi.Sensor, about: AboutParameters | None, forward: bool
+    ) -> str:  # fmt: skip
+        """Return the kinds of paths for `paths: auto`: those of a run that measures nothing."""
+        moves = about is not None and about.which.moves_light
+        if about is not None and moves and (forward or not about.only_shapes_move):
+            return "light"  # other paths have no such derivatives
+        made, key = self._found.usual, (sensor, moves)
+        if key not in made:
+            made[key] = usual_paths(scene, [sensor], self._depths[0], self._hide_emitters, moves)
+        return made[key]
+
     def _first_plan(self, sensor: mi.Sensor, paths: str, moves: bool, scene: mi.Scene, whole: bool) -> Plan:
         """Return the first image plan for a sensor and a kind of paths. `moves` is true if something moves."""
         check_paths(scene, sensor, paths, self._hide_emitters)
-        lit = self.sampling.lit.get(sensor_number(scene, sensor))
+        lit = self.sampling.lit.get(self.sensor_number(scene, sensor))
         needs = scene_needs(scene, sensor, lit)
+        if not self._found.plans and (warning := blend_warning(SceneGraph.of(scene), needs.blends)) is not None:
+            warn_once(warning)
         renewal = self._found.renewal = self._found.renewal or Renewal(scene)
         set_up(scene)
         plan = make_plan(needs, *self._depths, self._hide_emitters)
@@ -328,7 +367,7 @@ class Preparation:
             pixels = max((int(dr.prod(one.film().size())) for one in sensors), default=samples.width)
             grid = self.guiding.grid_of(samples, spp * pixels or None)
             if worthwhile(plan.needs, plan.max_depth):
-                number = sensor_number(samples.scene, samples.sensor)
+                number = self.sensor_number(samples.scene, samples.sensor)
                 aims = self.guiding.aims(number, film_blocks(samples.sensor))
         plan = replace(plan, aims=aims)
         if "sequence" not in plan.on:

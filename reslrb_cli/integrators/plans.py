@@ -147,8 +147,8 @@ class AttachedOptions:
 class SamplingOptions:
     """Options of a light tracer for its choice of paths. Raises ValueError, which names the option, for a wrong value.
 
-    - `paths` are light paths, camera paths, or both. `light_share` is the share of light paths. With a share of 0 or 1,
-        only one kind of paths remains.
+    - `paths` are light paths, camera paths, both, or `auto`: the scene decides (`usual_paths`). `light_share` is the
+        share of light paths. With a share of 0 or 1, only one kind of paths remains.
     - `chosen` has the values of the other settings that a run may decide (`AUTO_VALUES`). A setting without an entry is
         plain. Camera paths alone are never guided.
     - If `whole` is true, images of light paths alone have the same film border as images with camera paths.
@@ -167,7 +167,7 @@ class SamplingOptions:
     expected: int | None = None
 
     def __post_init__(self) -> None:
-        one_of("paths", self.paths, ("light", "camera", "both"))
+        one_of("paths", self.paths, ("auto", "light", "camera", "both"))
         if not 0 <= self.light_share <= 1:
             raise ValueError(f'"light_share" must lie in [0, 1], not {self.light_share}')
         paths = traced_paths(self.paths, self.light_share)

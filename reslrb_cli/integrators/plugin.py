@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.llvm import loaded_fault
 from reslrb_cli.backend.variant import check_variant, works_under
-from reslrb_cli.config.integrators import AUTO_VALUES, PLAIN
+from reslrb_cli.config.integrators import AUTO_ESTIMATOR, AUTO_VALUES, PLAIN
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS, make_estimator, options_of
 from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import Trajectory, WalkAd
@@ -30,15 +30,17 @@ from reslrb_cli.scene import dispersion
 TRACERS = ("reslrb", "walk_ad", "trajectory")
 _registered_with_callback = False
 
-#: Options of `reslrb` and their defaults. The estimator has more (`options_of`).
+#: Options of `reslrb` and their defaults. The estimator has more (`options_of`). With an estimator that the user names,
+#: the defaults of the settings in PLAIN are their plain values.
 OPTIONS: dict[str, Any] = {
     **LightTracer.OPTIONS,
-    "estimator": "reservoir",
+    "estimator": "auto",
     "freeze": False,
     "attached": "auto",
     "filter_normalization": "attached",
     "attached_sampling": "auto",
     **PLAIN,
+    **dict.fromkeys(AUTO_VALUES, "auto"),
 }
 
 
@@ -96,11 +98,11 @@ def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Traj
 
 def make_reslrb(**given: Any) -> Reslrb:
     """Make `reslrb` from its options, including those of the estimator. Raises ValueError if one is wrong."""
-    options = {**OPTIONS, **given}
-    if options["paths"] == "camera" and "estimator" not in given:
-        options["estimator"] = "stack"
+    named = given.get("estimator", "auto") != "auto"
+    options = {**OPTIONS, **(PLAIN if named else {}), **given}
     estimator = options.pop("estimator")
-    one_of("estimator", estimator, tuple(ESTIMATORS))
+    estimator = AUTO_ESTIMATOR if estimator == "auto" else estimator
+    one_of("estimator", estimator, ("auto", *ESTIMATORS))
     if options["paths"] == "camera" and estimator != "stack":
         raise ValueError(
             f'"estimator" {estimator} needs the connections of light paths, and paths: camera has none; remove it, '
@@ -114,7 +116,8 @@ def make_reslrb(**given: Any) -> Reslrb:
         )
     light_share, chosen = options.pop("light_share"), {name: options.pop(name) for name in AUTO_VALUES}
     for name, value in chosen.items():
-        one_of(name, value, AUTO_VALUES[name])
+        one_of(name, value, ("auto", *AUTO_VALUES[name]))
+    chosen = _without_measuring(chosen)
     motion = AttachedOptions(
         options.pop("attached"),
         options.pop("filter_normalization"),
@@ -124,6 +127,21 @@ def make_reslrb(**given: Any) -> Reslrb:
     sampling = SamplingOptions(chosen.pop("paths"), light_share, chosen)
     own = {name: options.pop(name) for name in options_of(estimator) if name in options}
     return Reslrb(make_estimator(estimator, own), motion=motion, sampling=sampling, **options)
+
+
+def _without_measuring(chosen: dict[str, str]) -> dict[str, str]:
+    """Return the settings with decisions in place of `auto`, as far as they need neither a scene nor a measurement.
+
+    `paths` and `edges` may stay `auto`: they depend on the scene and on its differentiated parameters.
+    """
+    open_ = [name for name in ("guiding", "pixels") if chosen[name] == "auto"]
+    if open_:
+        plain = ", ".join(f"{name} {PLAIN[name]}" for name in open_)
+        mi.Log(mi.LogLevel.Info, f"reslrb: {plain}, because only `reslrb optimize` measures whether it pays")
+    found = chosen | {name: PLAIN[name] for name in open_}
+    if found["sequence"] == "auto":
+        found["sequence"] = "low_discrepancy" if found["guiding"] == "off" else "independent"
+    return found
 
 
 def _on_variant(old: str | None, new: str) -> None:
@@ -206,7 +224,7 @@ def _option_names(type: str, estimator: str | None) -> list[str]:
     """Return the names of an integrator's options, including those of its estimator."""
     if type != "reslrb":
         return list(WalkAd.OPTIONS if type == "walk_ad" else Trajectory.OPTIONS)
-    name = OPTIONS["estimator"] if estimator is None else estimator
+    name = AUTO_ESTIMATOR if estimator in (None, "auto") else estimator
     return [*OPTIONS, *(options_of(name) if name in ESTIMATORS else ())]
 
 

@@ -32,7 +32,7 @@ from reslrb_cli.guiding.collect import collect
 from reslrb_cli.guiding.pixels import wanted
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.context import Preparation, sensor_number
+from reslrb_cli.integrators.context import Preparation
 from reslrb_cli.integrators.forward import tangent_of
 from reslrb_cli.integrators.plans import AttachedOptions, SamplingOptions
 from reslrb_cli.integrators.protocol import Derivative, Job, StepIntegrator
@@ -146,24 +146,27 @@ class LightTracer(StepIntegrator):
         """Return the plan for tracing this scene, with derivatives of `params` if given. Raises UnsupportedScene."""
         return self.preparation.plan(scene, sensor, params)
 
-    def passes(self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
+    def passes(
+        self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None, forward: bool = False
+    ) -> list[Samples]:  # fmt: skip
         """Return the samples of a job. If the job's `spp` is 0, the job uses the sensor's own sample count.
 
         `purpose` selects the table of guided samples. If `purpose` is None, the samples use the gradient's table, or
         the image's table if there is no gradient. If `delta` is given, `delta` also guides the samples. `delta` is
-        dL/dI (H, W, C), and must come from other samples. Raises ValueError for a negative `spp`.
+        dL/dI (H, W, C), and must come from other samples. `forward` tells whether the samples are for forward mode.
+        Raises ValueError for a negative `spp`.
         """
         if job.spp < 0:
             raise ValueError(f'"spp" must be 0 (the sensor\'s own sample count) or more, not {job.spp}')
         spp = job.spp or job.sensor.sampler().sample_count()
         unit = min(self.samples_per_pass or spp, spp)
         purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
-        asked = self.preparation, purpose is Purpose.IMAGE, unit
+        asked = self.preparation, unit, purpose is Purpose.IMAGE, forward
         if asked not in job.plans:  # once per step, not once per batch
-            job.plans[asked] = self.preparation.plan(job.scene, job.sensor, job.params, unit, asked[1])
+            job.plans[asked] = self.preparation.plan(job.scene, job.sensor, job.params, *asked[1:])
         plan, table = job.plans[asked], None
         if (guiding := self.preparation.guiding) is not None:
-            table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
+            table = guiding.table(self.preparation.sensor_number(job.scene, job.sensor), purpose, delta)
         given = job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table
         parts = passes(plan, *given, *self._sides(plan, job.scene), self._shares(job, plan))
         if not plan.has_edges or purpose is Purpose.IMAGE:
@@ -196,7 +199,7 @@ class LightTracer(StepIntegrator):
         preparation = self.preparation
         if "pixels" not in plan.on:
             return None
-        number = sensor_number(job.scene, job.sensor)
+        number = preparation.sensor_number(job.scene, job.sensor)
         known = preparation.sampling.given
         if job.params is not None and number not in known:
             known = preparation.noted(job.params)
@@ -221,7 +224,7 @@ class LightTracer(StepIntegrator):
         Call this method after a gradient. The next gradient uses the result.
         """
         guiding = self.preparation.guiding
-        if guiding is not None and guiding.due(sensor_number(job.scene, job.sensor)):
+        if guiding is not None and guiding.due(self.preparation.sensor_number(job.scene, job.sensor)):
             self.learn_now(job, gradient)
 
     def learn_now(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -234,7 +237,7 @@ class LightTracer(StepIntegrator):
                 collected = self.preparation.recordings.call("collect", samples, collect, gradient)
             else:
                 collected = collect(samples, gradient)
-            guiding.learn(sensor_number(job.scene, job.sensor), samples.width, collected)
+            guiding.learn(self.preparation.sensor_number(job.scene, job.sensor), samples.width, collected)
 
     def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
         """Return the image (H, W, C), without derivatives."""
@@ -249,7 +252,7 @@ class LightTracer(StepIntegrator):
     def tangent(self, job: Job) -> mi.TensorXf:
         """Return the derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
         with dr.suspend_grad():
-            return tangent_of(self.passes(job))
+            return tangent_of(self.passes(job, forward=True))
 
     def launch(
         self, kind: str, parts: list[Samples], work: Callable[..., Any], *inputs: Any,

@@ -420,7 +420,11 @@ def seeds(count: int, block: int = 0) -> range:
 
 
 def integrator(name: str, max_depth: int = 4, rr_depth: int = 1000, **options: Any) -> Any:
-    """Create an integrator for `gradient_step`, by default without roulette."""
+    """Create an integrator for `gradient_step`, by default without roulette. Without an `estimator`, `reslrb` has no
+    automatic settings: it traces light paths for the reservoir, unless other `paths` are given.
+    """
+    if name == "reslrb":
+        options = {"estimator": "stack" if options.get("paths") == "camera" else "reservoir", **options}
     return make_integrator(name, max_depth=max_depth, rr_depth=rr_depth, **options)
 
 

@@ -160,6 +160,8 @@ def ptracer_image(at: Situation) -> str | None:
     """
     if any(_is_turned(emitter) for emitter in at.scene.emitters()):
         return "it has wrong emission from a rotated environment map"
+    if (wrong := _wrong_everywhere(at)) is not None:
+        return wrong
     if any(sensor.film().class_name() == "SpecFilm" for sensor in at.scene.sensors()):
         return "it does not splat on a specfilm"
     if at.needs.has_null:
@@ -198,8 +200,21 @@ def path_image(at: Situation) -> str | None:
     return prb_image(at)
 
 
+def _wrong_everywhere(at: Situation) -> str | None:
+    """Return a part of the scene that all stock integrators render wrongly, as a reason, or None."""
+    if at.needs.blends:
+        return "it renders blends of singular and smooth lobes wrongly"
+    if any(lamp.shared for lamp in at.needs.lamps):
+        return "it samples only one of the points of a textured lamp that have the same texture coordinates"
+    return None
+
+
 def prb_image(at: Situation) -> str | None:
     """Return the reason against the integrator `prb` as reference for the image, or None."""
+    if (wrong := _wrong_everywhere(at)) is not None:
+        return wrong
+    if at.hide_emitters and at.view.emission > 0 and any(not shape.is_mesh() for shape in at.graph.shapes()):
+        return "it takes spheres, disks and cylinders behind hidden emitters for nearer than they are"
     if any(emitter.class_name() == "DirectionalArea" for emitter in at.scene.emitters()):
         return "camera paths cannot find a `directionalarea` emitter"
     if at.has_pointlike and at.needs.has_null:

@@ -30,16 +30,7 @@ from reslrb_cli.scene.cameras import repeat_sensors
 from reslrb_cli.scene.deformation import Moves, where_moved
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.load import INSTEAD, load_scene, warn_once
-from reslrb_cli.scene.needs import (
-    camera_finds_all,
-    camera_finds_nothing,
-    check_paths,
-    light_finds_all,
-    paths_obstacle,
-    scaled_emitter,
-    scene_needs,
-    stock_clip,
-)
+from reslrb_cli.scene.needs import check_paths, scene_needs, stock_clip, usual_paths
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.seeds import seed
@@ -225,18 +216,8 @@ def paths_of(
         return "light"  # naive differentiation and `follow` have no derivatives of camera paths
     if integrator.paths != "auto":
         return traced_paths(integrator.paths, integrator.light_share)
-    if camera_finds_nothing(scene) or scaled_emitter(scene) is not None:
-        return "light"
     looked = [scene.sensors()[sensor] for sensor in sensors]
-    kinds = ["both", "camera"]
-    if moves:
-        kinds = ["camera"]
-        if not camera_finds_all(scene, integrator.max_depth, gloss=True):
-            kinds = [] if light_finds_all(scene, looked, integrator.hide_emitters) else ["both"]
-    for kind in kinds:
-        if all(paths_obstacle(scene, sensor, kind) is None for sensor in looked):
-            return kind
-    return "light"
+    return usual_paths(scene, looked, integrator.max_depth, integrator.hide_emitters, bool(moves))
 
 
 def check_integrator(

@@ -81,8 +81,11 @@ class SceneGraph:
             shape, parallel = emitter.get_shape(), emitter.class_name() == "DirectionalArea"
             if shape is not None:
                 own = [texture for texture in textures if emitter in self.parents[texture]]
-                varying = [texture for texture in own if texture.is_spatially_varying()]
-                found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
+                varying = [texture for texture in own if texture.is_spatially_varying() and not parallel]
+                shared = bool(varying) and _shares_coordinates(shape)
+                found.append(
+                    Lamp(shape, emitter, index, parallel, None if shared or not varying else varying[0], shared)
+                )
         return tuple(found)
 
     def surface_bsdfs(self) -> list[Any]:
@@ -120,7 +123,9 @@ class Lamp:
     """Emitting shape. `emitter` is the shape's emitter, and `index` is the emitter's place in `scene.emitters()`.
 
     `parallel` tells whether light leaves only along the normal (`directionalarea`). `texture` is the texture from which
-    points on the shape are sampled. `texture` is None if points are uniform over the shape's area.
+    points on the shape are sampled. `texture` is None if points are uniform over the shape's area. `shared` tells
+    whether the shape has a texture, but several of its points have the same texture coordinates (`cube`). Mitsuba would
+    sample only one of them, so the points are uniform over the area.
     """
 
     shape: mi.Shape
@@ -128,6 +133,7 @@ class Lamp:
     index: int
     parallel: bool
     texture: mi.Texture | None
+    shared: bool = False
 
     @cached_property
     def is_sphere(self) -> bool:
@@ -152,6 +158,38 @@ class Lamp:
     def has_faces(self) -> bool:
         """Whether the shape is a mesh whose vertices can move."""
         return self.shape.is_mesh() and self.shape.class_name() != "Rectangle"
+
+
+#: Points on each face, and points in all, that decide whether faces share texture coordinates.
+FACE_POINTS, MOST_POINTS = 16, 2**20
+
+
+def _shares_coordinates(shape: mi.Shape) -> bool:
+    """True if the texture coordinates of some point of a mesh do not lead back to it: faces overlap in the texture, or
+    lie outside of it, or have no texture coordinates.
+    """
+    if not shape.is_mesh() or shape.class_name() == "Rectangle":
+        return False  # other shapes have one point for each coordinate
+    if not shape.has_vertex_texcoords():
+        return True
+    faces = shape.face_count()
+    each = max(min(FACE_POINTS, MOST_POINTS // max(faces, 1)), 1)
+    with dr.suspend_grad():
+        lane = dr.arange(mi.UInt32, faces * each)
+        number = lane % each
+        place = mi.Point2f((mi.Float(number) + 0.5) / each, mi.Float(dr.brev(number)) * 2**-32 + 2**-6)
+        a, b, c = (vertex for vertex in shape.face_indices(lane // each))
+        weights = mi.warp.square_to_uniform_triangle(place)
+
+        def at(corner: Any) -> Any:
+            first = corner(a)
+            return first + weights.x * (corner(b) - first) + weights.y * (corner(c) - first)
+
+        p, uv = at(shape.vertex_position), at(shape.vertex_texcoord)
+        there = shape.eval_parameterization(uv, mi.RayFlags.All, True)
+        size = dr.norm(shape.bbox().extents())
+        found = there.is_valid() & (dr.norm(there.p - p) < 1e-3 * size) & dr.all((uv >= 0) & (uv <= 1))
+        return not bool(dr.all(found))
 
 
 def look_up(texture: mi.Texture) -> mi.Spectrum:
@@ -219,9 +257,9 @@ def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def is_one_of(shape: mi.ShapePtr, shapes: Sequence[mi.Shape]) -> mi.Bool:
-    """Return the lanes in which the pointer `shape` is one of `shapes`."""
-    return reduce(or_, (shape == mi.ShapePtr(other) for other in shapes), mi.Bool(False))
+def is_one_of(pointer: mi.ShapePtr | mi.BSDFPtr, objects: Sequence[mi.Object]) -> mi.Bool:
+    """Return the lanes in which the pointer is one of `objects`."""
+    return reduce(or_, (pointer == type(pointer)(other) for other in objects), mi.Bool(False))
 
 
 def interpolates_normals(shape: mi.Shape) -> bool:

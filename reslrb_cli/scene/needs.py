@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import permutations, product
 from typing import Any
 
 import drjit as dr
@@ -89,6 +89,7 @@ class SceneNeeds:
     near_clip: bool
     lens_clip: bool
     unfollowed: tuple[mi.BSDF, ...] = ()  # BSDFs of surfaces whose sampling cannot be differentiated
+    blends: tuple[mi.BSDF, ...] = ()  # BSDFs of surfaces with a blend of singular and smooth lobes
     lamps: tuple[Lamp, ...] = ()  # shapes that emit
     small_lamps: tuple[Lamp, ...] = ()  # emitting shapes smaller than a pixel in view
 
@@ -149,9 +150,40 @@ def scene_needs(scene: Any, sensor: Any, lit: Sequence[int] | None = None) -> Sc
         near_clip=near_clip,
         lens_clip=lens_clip,
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in unfollowed),
+        blends=uneven_blends(graph),
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
     )
+
+
+def uneven_blends(graph: SceneGraph) -> tuple[Any, ...]:
+    """Return the BSDFs of surfaces that contain a blend of singular and smooth lobes (delta or null lobes in one half,
+    smooth lobes in the other half). Mitsuba's samples of such blends are wrong (`transport.bsdf.sample_bsdf`).
+    """
+    singular, smooth = int(mi.BSDFFlags.Delta), int(mi.BSDFFlags.Smooth)
+    found: set[Any] = set()
+    for blend in graph.of_type(mi.BSDF):
+        if blend.class_name() == "BlendBSDF":
+            flags = [int(half.flags()) for half in graph.children[blend] if isinstance(half, mi.BSDF)]
+            if any(a & singular and b & smooth for a, b in permutations(flags, 2)):
+                found |= set(graph.owning_bsdfs(blend))
+    return tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in found)
+
+
+def blend_warning(graph: SceneGraph, blends: Iterable[Any]) -> str | None:
+    """Return a warning of a blend whose singular lobes stay wrong, or None.
+
+    Singular and smooth lobes of one half must be sampled apart from those of the other half. In `plastic`, and in a
+    mask over a BSDF with smooth transmission, one half has both in the same direction, and only Mitsuba knows the half.
+    """
+    through = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
+    for bsdf in blends:
+        for nested in graph.nested_bsdfs(bsdf):
+            name = nested.class_name()
+            if name == "SmoothPlastic" or (name == "MaskBSDF" and int(nested.flags()) & through):
+                what = "plastic" if name == "SmoothPlastic" else "a mask over a BSDF that transmits light"
+                return f"bsdf {bsdf.id()} blends {what} with other lobes, which Mitsuba samples slightly wrongly"
+    return None
 
 
 def is_bent(mesh: Any) -> bool:
@@ -249,6 +281,23 @@ def light_finds_all(scene: Any, sensors: Sequence[Any], hide_emitters: bool) -> 
         paths_obstacle(scene, sensor, "light", hide_emitters) is None and not look(scene, sensor).specular
         for sensor in sensors
     )
+
+
+def usual_paths(scene: Any, sensors: Sequence[Any], max_depth: int, hide_emitters: bool, moves: bool) -> str:
+    """Return the kinds of paths for `paths: auto` without a measurement: `both`, or the only kind that can render
+    `scene` for these sensors. If shapes move (`moves`), it is the kind with the least noise.
+    """
+    if camera_finds_nothing(scene) or scaled_emitter(scene) is not None:
+        return "light"
+    kinds = ["both", "camera"]
+    if moves:
+        kinds = ["camera"]
+        if not camera_finds_all(scene, max_depth, gloss=True):
+            kinds = [] if light_finds_all(scene, sensors, hide_emitters) else ["both"]
+    for kind in kinds:
+        if all(paths_obstacle(scene, sensor, kind) is None for sensor in sensors):
+            return kind
+    return "light"
 
 
 def camera_finds_nothing(scene: Any) -> bool:

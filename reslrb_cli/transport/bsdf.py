@@ -27,6 +27,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.scene.graph import is_one_of
 from reslrb_cli.transport.connection import Connection, shading_correction
 from reslrb_cli.transport.plan import Plan
 
@@ -81,11 +82,14 @@ def _singular_factor(
         sample_1 = _defensive(scattering.sample_1)[1] if mixes(plan) else scattering.sample_1
         bs, weight = bsdf.sample(context_of(plan), si, sample_1, scattering.sample_2, delta)
         pdf = bs.pdf
+        smooth = mi.Spectrum(0)
+        if plan.needs.blends:
+            smooth = bsdf.eval(context_of(plan), si, bs.wo, delta & is_one_of(bsdf, plan.needs.blends))
         if plan.differentiate_null:
             # A mask's weight and density both carry the derivative of its opacity. Other BSDFs divide by a density that
             # may depend on their parameters (plastic).
             pdf = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), dr.detach(pdf), pdf)
-        f = dr.select(delta, weight * pdf, f)
+        f = dr.select(delta, weight * pdf - smooth, f)
     if plan.differentiate_null:
         null = active & scattering.is_null
         f = dr.select(null, bsdf.eval_null_transmission(si, null), f)
@@ -179,6 +183,30 @@ class Ways:
     ahead_valid: mi.Bool
 
 
+def sample_bsdf(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, sample_1: mi.Float, sample_2: mi.Point2f,
+    active: mi.Bool,
+) -> Sample:  # fmt: skip
+    """Return Mitsuba's sample of a BSDF, with the right density and weight of singular lobes in blends.
+
+    If a blend samples a delta or null lobe of one half, Mitsuba adds the density and the value of the other half's
+    smooth lobes in this direction. But densities per solid angle cannot be added to a discrete probability. The smooth
+    lobes are therefore subtracted. The remainder is the probability and the value of the singular lobe.
+    """
+    context, blends = context_of(plan), plan.needs.blends
+    bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
+    sample = Sample(bs.wo, bs.pdf, weight, bs.eta, bs.sampled_type)
+    is_concrete = isinstance(bsdf, mi.BSDF)
+    if not blends or (is_concrete and bsdf not in blends):
+        return sample
+    singular = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)  # includes Null
+    singular = singular if is_concrete else singular & is_one_of(bsdf, blends)
+    f, smooth = bsdf.eval_pdf(context, si, bs.wo, singular)
+    pdf = bs.pdf - smooth
+    own = replace(sample, pdf=pdf, weight=dr.select(pdf > 0, (weight * bs.pdf - f) / pdf, 0))
+    return dr.select(singular, own, sample)
+
+
 def mixes(plan: Plan) -> bool:
     """Whether directions are sampled from a mixture. Light paths sample directions from a mixture at perturbed
     normals.
@@ -239,7 +267,7 @@ def scatter(
     the BSDF's density of the target direction. If paths are weighted, the function also computes the densities
     of `Ways`.
     """
-    si, bsdf, context = hit.si, hit.bsdf, context_of(plan)
+    si, bsdf = hit.si, hit.bsdf
     sample_1, sample_2 = numbers.bsdf_1d, numbers.bsdf_2d
     ways_asked = plan.camera or plan.weighs
     connection_wo = mi.Vector3f(0) if connection is None else connection.wo
@@ -252,17 +280,16 @@ def scatter(
         self: mi.BSDF, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, sample_1: mi.Float, sample_2: mi.Point2f,
         connected: mi.Bool, active: mi.Bool, any_: mi.Bool,
     ) -> tuple[Any, ...]:  # fmt: skip
-        bs, weight = self.sample(context, si, sample_1, sample_2, active)
+        own = sample_bsdf(plan, si, self, sample_1, sample_2, active)
         here = None if weighed is None else connected  # without variables from outside the call
-        ways = _ways(plan, si, self, wo, here, bs.wo, bs.pdf, active) if ways_asked and not later else ()
-        return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight, *ways
+        ways = _ways(plan, si, self, wo, here, own.wo, own.pdf, active) if ways_asked and not later else ()
+        return evaluate(plan, si, self, wo, connected), own.wo, own.pdf, own.eta, own.lobe, own.weight, *ways
 
     with dr.suspend_grad(when=not attached):
         if mixes(plan):
             defensive, sample_1 = _defensive(sample_1)
         if connected is None:
-            bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
-            f_connection, sample = None, Sample(bs.wo, bs.pdf, weight, bs.eta, bs.sampled_type)
+            f_connection, sample = None, sample_bsdf(plan, si, bsdf, sample_1, sample_2, active)
         else:
             # The last argument is used as the mask of the whole call.
             f_connection, wo, pdf, eta, lobe, weight, *densities = dr.dispatch(

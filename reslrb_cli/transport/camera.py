@@ -55,8 +55,7 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
     time = samples.time(sampler.next_1d)
     if samples.width < n_pixels:
         per_pixel = mi.Float(count) / n_pixels
-        pixel = dr.minimum(mi.UInt32((mi.Float(lane) + sampler.next_1d()) / per_pixel), n_pixels - 1)
-        number = lane // n_pixels
+        pixel, number = one_of_group(lane, count, n_pixels, sampler.next_1d()), mi.UInt32(0)
     elif samples.shares is not None:
         pixel, number = samples.shares.draw(lane)
         per_pixel = samples.shares.count(pixel)
@@ -71,6 +70,18 @@ def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
         weight = keep_one(ray, weight)
     weight = weight * (samples.fraction * dr.rcp(per_pixel))
     return FilmRay(dr.detach(ray), u, dr.detach(weight))
+
+
+def one_of_group(lane: mi.UInt32, count: mi.UInt32, n_pixels: int, sample: mi.Float) -> mi.UInt32:
+    """Return a random pixel of each lane's group, if `n_pixels` pixels are divided into `count` groups of equal size.
+
+    The lane's group begins at pixel lane n / count. In integers, because floats do not tell large numbers of lanes or
+    pixels apart.
+    """
+    begin, whole = mi.UInt64(lane) * n_pixels, mi.UInt64(count)
+    rest = mi.Float(mi.UInt32(begin % whole))
+    behind = mi.UInt32((rest + sample * n_pixels) / mi.Float(count))
+    return dr.minimum(mi.UInt32(begin // whole) + behind, n_pixels - 1)
 
 
 def _within_pixel(samples: Samples, number: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
@@ -356,7 +367,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
             p_D *= dr.gather(mi.Float, samples.emitters.choice, number, indirect)
         spheres = _spheres(samples)
         for lamp in plan.needs.lamps:
-            if lamp.surrounds or lamp in spheres:
+            if lamp.surrounds or lamp.shared or lamp in spheres:
                 area = lamp.shape.surface_area()
                 if lamp in spheres:
                     area = 0.5 * area * (1 - _sphere_seen_from(mi.traverse(lamp.shape)["to_world"], path.before)[3])
@@ -435,8 +446,9 @@ def sample_lamp(
     """
     scene, unseen = samples.scene, _unseen(samples)
     spheres = {lamp.emitter: lamp.shape for lamp in _spheres(samples)}
+    shared = {lamp.emitter: lamp.shape for lamp in samples.plan.needs.lamps if lamp.shared}
     with dr.suspend_grad():
-        if not (unseen or spheres or samples.plan.lit):
+        if not (unseen or spheres or shared or samples.plan.lit):
             return scene.sample_emitter_direction(si, numbers, False, active)
         index, weight, reused = samples.choose_emitter(numbers.x, active)
         emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
@@ -448,6 +460,11 @@ def sample_lamp(
                 return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
             if self in spheres:
                 return _sample_sphere(self, spheres[self], si, sample, active)
+            if self in shared:
+                ds = shared[self].sample_direction(si, sample, active)
+                ds.emitter = mi.EmitterPtr(self)
+                radiance = self.eval_direction(si, ds, active)
+                return ds, dr.select(ds.pdf > 0, radiance / ds.pdf, 0)
             return self.sample_direction(si, sample, active)
 
         ds, radiance = dr.dispatch(emitter, sample, si, mi.Point2f(reused, numbers.y), active)

@@ -22,7 +22,7 @@ from reslrb_cli.transport.factors import MAY_LACK
 from reslrb_cli.transport.film import AdjointImage, Colours
 from reslrb_cli.transport.lamp_light import moving_splats, small_splat
 from reslrb_cli.transport.lamps import environment_ray, keep_one, lamp_ray
-from reslrb_cli.transport.masks import forward_derivatives
+from reslrb_cli.transport.masks import forward_derivatives, transmission_of
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import VISIBLE_STREAM, Samples
 
@@ -249,7 +249,7 @@ def _look(
         hit = state.active & si.is_valid()
         with dr.resume_grad(when=tangents):
             Le = _radiance(samples, si, state.active)
-            transmission = si.bsdf().eval_null_transmission(si, hit) if plan.needs.has_null else mi.Spectrum(0)
+            transmission = transmission_of(plan, si, hit) if plan.needs.has_null else mi.Spectrum(0)
             if tangents:
                 d_Le, d_transmission = forward_derivatives(Le, transmission)
                 Le, transmission = dr.detach(Le), dr.detach(transmission)

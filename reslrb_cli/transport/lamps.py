@@ -1,6 +1,6 @@
 """Points on lamps (shapes that emit), the rays that leave them, and the rays of environment maps.
 
-`lamp_ray` samples light in five cases in which Mitsuba's own samples are wrong, or lack a derivative.
+`lamp_ray` samples light in six cases in which Mitsuba's own samples are wrong, or lack a derivative.
 
 - Sphere: Mitsuba rotates a sphere's points with the sphere's `to_world`, but does not rotate the normals.
 - `directionalarea`: Mitsuba keeps the area that the shape had when it was loaded.
@@ -8,6 +8,7 @@
     both areas as constants. The density on face f is P_f / A_f(theta), and only P_f is constant.
 - Textured moving mesh: Mitsuba finds points by a ray in the plane of texture coordinates. Mitsuba differentiates the
     points as if they moved along this ray.
+- Textured mesh whose faces share texture coordinates: Mitsuba finds only one of the points with given coordinates.
 - Differentiated texture: Mitsuba samples texels in proportion to their radiance. Mitsuba never samples black texels,
     although their derivatives are as large as any.
 """
@@ -58,6 +59,9 @@ def lamp_point(
         there = lamp.shape.eval_parameterization(uv, mi.RayFlags.All, active)
         there.time = time
         ps, weight = mi.PositionSample3f(there), _weight(there, density, active)
+    elif lamp.shared:
+        ps = lamp.shape.sample_position(time, sample, active)
+        weight = dr.rcp(ps.pdf)
     else:
         ps, weight = lamp.emitter.sample_position(time, sample, active)
     if lamp.is_sphere:

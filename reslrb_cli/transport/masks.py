@@ -25,6 +25,28 @@ def forward_derivatives(*values: mi.Spectrum) -> list[mi.Spectrum]:
     return [dr.detach(dr.grad(value)) if dr.grad_enabled(value) else dr.zeros(type(value)) for value in values]
 
 
+#: Least transmission of a pane, where a factor with a derivative may be zero.
+FLOOR = 1e-8
+
+
+def transmission_of(plan: Plan, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+    """Return the transmission (C,) straight through the surface at `si`.
+
+    A transmission of 0 has a derivative, which is the product of the path's other factors. If parameters of panes may
+    be 0, the transmission is therefore at least FLOOR. Every product and quotient of transmissions then exists. The
+    error of an image is at most FLOOR of the light that a clear pane would let through. A mask that is opaque stays so,
+    because no path that scatters there passes it, either.
+    """
+    bsdf = si.bsdf()
+    transmission = bsdf.eval_null_transmission(si, active)
+    if not (plan.track_zeros and plan.differentiate_null):
+        return transmission
+    flags = bsdf.flags()
+    is_pane = dr.any(transmission > 0) | ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
+    is_pane = active & mi.has_flag(flags, mi.BSDFFlags.Null) & is_pane
+    return transmission + dr.select(is_pane, dr.maximum(FLOOR - dr.detach(transmission), 0), 0)
+
+
 @dataclass
 class Passage:
     """Loop state of a ray on its way through null surfaces.
@@ -60,7 +82,7 @@ def transmittance(
         si = scene.ray_intersect(ray, passage.active)
         hit = passage.active & si.is_valid()
         with dr.resume_grad(when=tangents):
-            transmission = si.bsdf().eval_null_transmission(si, hit)
+            transmission = transmission_of(plan, si, hit)
             if tangents:
                 [d_transmission], transmission = forward_derivatives(transmission), dr.detach(transmission)
         if on_crossing is not None:

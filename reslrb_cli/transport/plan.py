@@ -236,6 +236,7 @@ class Plan:
             for lamp in self.needs.lamps
             if lamp.parallel
             or lamp.is_sphere
+            or lamp.shared
             or lamp in self.evened_lamps
             or (lamp.has_faces and lamp.shape in self.moving_shapes)
         )

@@ -301,12 +301,16 @@ class Samples:
         return dr.gather(mi.Float, self.emitters.choice, number)
 
     def sampler(self) -> mi.Sampler:
-        """Return a sampler at the beginning of these samples' random number stream."""
-        if self.plan.paths != "light":  # any number of paths works; the sensor's sampler may require a number per pixel
+        """Return a sampler at the beginning of these samples' random number stream.
+
+        Light paths alone use the sensor's sampler if it can make this number of samples. A stratified sampler, for
+        example, makes only square numbers. Otherwise the random numbers are independent.
+        """
+        sampler = self.sensor.sampler().clone()
+        sampler.set_sample_count(self.spp)
+        if self.plan.paths != "light" or sampler.sample_count() != self.spp:
             sampler = mi.load_dict({"type": "independent"})
         else:
-            sampler = self.sensor.sampler().clone()
-            sampler.set_sample_count(self.spp)
             sampler.set_samples_per_wavefront(self.spp)
         sampler.seed(self.seed, self.width)
         return sampler

@@ -190,6 +190,7 @@ PHASES = {
 }  # fmt: skip
 INTEGRATORS = ("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "prb",
                "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic", "direct_projective")  # fmt: skip
+STOCK_IS_WRONG = "by `reslrb`; wrong by Mitsuba's `path`, `prb` and `ptracer`"
 OWN = "a plugin of `reslrb`"
 OWN_INDEX = f"{OWN}; without wavelengths, its index is that at 587.6 nm"
 OWN_GLASS = f'<bsdf type="{GLASS}"><string name="material" value="N-BK7"/>{{}}</bsdf>'
@@ -203,6 +204,9 @@ ROWS: tuple[Row, ...] = (
     Row("bsdf", GLASS, "with `alpha`", thing(OWN_GLASS.format('<float name="alpha" value="0.3"/>')), note=OWN_INDEX),
     Row("bsdf", "twosided", "with a blend of rough BSDFs",
         thing(f'<bsdf type="twosided">{MATERIALS["blendbsdf"]}</bsdf>')),
+    Row("bsdf", "blendbsdf", "of a mirror and a rough BSDF",
+        thing(f'<bsdf type="blendbsdf"><float name="weight" value="0.4"/>{WHITE}<bsdf type="conductor"/></bsdf>'),
+        note=STOCK_IS_WRONG),
     Row("bsdf", "roughconductor", "with spectra", thing(
         '<bsdf type="roughconductor"><spectrum name="eta" value="400:1.5, 700:0.2"/>'
         '<spectrum name="k" filename="spectrum.spd"/></bsdf>')),
@@ -239,6 +243,8 @@ ROWS: tuple[Row, ...] = (
     Row("shape", "blender", scene='<shape type="blender"/>', loading="reads the memory of a running Blender"),
     Row("emitter", "area", scene=lit(RADIANCE)),
     Row("emitter", "area", "with an image", lit(bitmap("radiance"))),
+    Row("emitter", "area", "with an image, on a `cube`", LIGHT.replace("rectangle", "cube").format(bitmap("radiance")),
+        note=STOCK_IS_WRONG),
     Row("emitter", "area", "with a texture other than an image", lit(CHECKS), light=NO_RAYS),
     Row("emitter", "point", scene='<emitter type="point"><point name="position" x="0" y="1" z="0"/></emitter>'),
     Row("emitter", "constant", scene='<emitter type="constant"/>'),

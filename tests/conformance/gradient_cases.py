@@ -56,6 +56,11 @@ def _pane(bsdf: dict, **to_world: Any) -> dict:
 _IN_VIEW = {"translate": [0.2, -0.1, 1.2], "rotate": ([0, 1, 0], 15), "scale": 0.4}
 
 
+def black_pane(color: tuple[float, float, float], **to_world: Any) -> dict:
+    """Return a pane of thin glass that lets light of this colour through."""
+    return _pane({"type": "thindielectric", "specular_transmittance": rgb(*color)}, **to_world)
+
+
 def _ball(bsdf: dict) -> dict:
     return {"type": "sphere", "center": [0.1, 0.0, 0.1], "radius": 0.35, "bsdf": bsdf}
 
@@ -192,6 +197,8 @@ CASES = [
                  lambda: room(pane=_pane({"type": "thindielectric", "specular_transmittance": rgb(0.9, 0.7, 0.5),
                                           "specular_reflectance": rgb(0.7, 0.8, 0.9)})),
                  ("pane.bsdf.specular_transmittance.value", "pane.bsdf.specular_reflectance.value"), "fd", spp=256),
+    GradientCase("black_pane", lambda: room(pane=black_pane((0, 0.6, 0.7), **_IN_VIEW)),
+                 ("pane.bsdf.specular_transmittance.value", "floor.brdf_0.reflectance.value"), "fd", spp=256),
     # ---- Emitters ----
     GradientCase("area", room, ("lamp.emitter.radiance.value", "wall.brdf_0.reflectance.value"), "ptracer"),
     GradientCase("area_texture", lambda: room(lamp=lamp(radiance=_tiles(2, 6))),

@@ -39,6 +39,7 @@ from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import interface_of, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.transport.camera import one_of_group
 from reslrb_cli.transport.pixel_shares import EVEN, MOST_SLOTS, PixelShares
 
 pytestmark = pytest.mark.usefixtures("samples")
@@ -129,6 +130,21 @@ def test_distributed_paths_have_the_requested_number_per_pixel(paths: int):
         assert EVEN <= even / paths < EVEN + MOST_SLOTS * density.size / paths
         expected = even / density.size + (paths - even) * density / density.sum()
         np.testing.assert_allclose(counts, expected, atol=int(shares.rounds[0]) + 1)
+
+
+@pytest.mark.parametrize(("count", "n"), [(3, 7), (2**24 - 3, 2**25), (2**25 + 1, 2**25 + 4)])
+def test_fewer_paths_than_pixels_reach_every_pixel(count: int, n: int):
+    """Each path belongs to its own group of pixels, also beyond 2^24, where floats are even numbers only."""
+    lanes = np.unique(np.concatenate([np.arange(min(count, 50)), np.arange(max(count - 200, 0), count)]))
+    low, high = lanes * n // count, -(-(lanes + 1) * n // count)
+    drawn = np.stack([
+        np.array(one_of_group(mi.UInt32(lanes.astype(np.uint32)), mi.UInt32(count), n, mi.Float(sample)))
+        for sample in np.linspace(0, 1, 16, endpoint=False)
+    ]).astype(int)  # fmt: skip
+    assert (drawn >= low).all()
+    assert (drawn < high).all()
+    last = drawn[:, -100:]
+    assert set(range(max(n - 50, 0), n)) <= set(last.ravel())
 
 
 UNEVEN = ["mirror", "gaussian", "crop", "sphere"]
@@ -435,7 +451,7 @@ def test_a_share_of_0_or_1_compiles_only_one_side():
     [
         ({"paths": "camera", "estimator": "gather"}, "needs the connections of light paths"),
         ({"paths": "both", "light_share": 1.5}, "must lie in"),
-        ({"paths": "sideways"}, "must be one of light, camera, both"),
+        ({"paths": "sideways"}, "must be one of auto, light, camera, both"),
     ],
 )
 def test_impossible_options(options: dict[str, Any], words: str):

@@ -21,6 +21,7 @@ from conformance.gradient_cases import (
     IN_EXPECTATION,
     GradientCase,
     _mask,
+    black_pane,
     floor,
 )
 from conformance.scenes import plugin
@@ -327,6 +328,41 @@ def test_zero(case: ZeroCase):
     print(case.name, result)
     assert result
     assert (np.abs(ours.mean(0)) > 3 * ours.std(0) / np.sqrt(count)).mean() > 0.5, "zero within noise"
+
+
+# A pane with a black channel, or a black pane, at each place of a path: before the sensor, before a lamp, and between
+# the sensor and a lamp in view.
+
+
+def panes() -> dict[str, dict[str, Any]]:
+    """Return the place of the pane, and objects in addition to the room, by the name of the place."""
+    behind = transform(translate=[0.1, -0.2, 0.6], rotate=([0, 1, 0], 15), scale=0.3)
+    return {
+        "sensor": {"place": _IN_VIEW},
+        "lamp": {"place": {}},
+        "visible lamp": {"place": _IN_VIEW, "sign": lamp(radiance=rgb(2, 1, 3)) | {"to_world": behind}},
+    }
+
+
+PANES = ("sensor", "lamp", "visible lamp")
+PANE_CASES = [
+    f"{place}-{color}-{paths}" for place in PANES for color in ("one", "all") for paths in ("light", "camera", "both")
+]
+
+
+@pytest.mark.parametrize("name", a_few(PANE_CASES, ["sensor-one-both", "lamp-all-light"]))
+def test_a_black_pane_keeps_its_derivative(name: str):
+    """At equal seeds, the gradient equals differences into the domain. Paths do not depend on the colour."""
+    place, color, paths = name.split("-")
+    things = panes()[place]
+    pane = black_pane((0, 0.6, 0.7) if color == "one" else (0, 0, 0), **things.pop("place"))
+    case = Case(room(pane=pane, **things), ("pane.bsdf.specular_transmittance.value",))
+    tracer = integrator("reslrb", 5, estimator="stack", paths=paths)
+    expected = np.array([case.difference(tracer, direction, 3, 64, 0.1, "up") for direction in np.eye(3)])
+    assert np.abs(expected).min() > 0.1
+    for name in ("stack", "gather") if paths == "light" else ("stack",):
+        found = case.gradient(integrator("reslrb", 5, estimator=name, paths=paths), 3, 64)
+        np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
 # `trajectory`, which is Dr.Jit's own reversal of the walk, has the gradient of `walk_ad` at equal seeds.

@@ -45,7 +45,7 @@ def test_renders_of_a_script_learn_from_each_other() -> None:
         scene.release(leaves)
     assert plugin.tracer.preparation.guiding.learned[0].calls == 3
     assert strength(plugin.tracer) > 1.2
-    with pytest.raises(RuntimeError, match='"guiding" must be one of off, on, not "maybe"'):
+    with pytest.raises(RuntimeError, match='"guiding" must be one of auto, off, on, not "maybe"'):
         mi.load_dict({"type": "reslrb", "guiding": "maybe"})
 
 

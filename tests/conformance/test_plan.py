@@ -213,9 +213,9 @@ def test_a_step_makes_two_plans(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     original, asked = Preparation.plan, []
 
-    def noting(self: Preparation, scene: Any, sensor: Any, params: Any, spp: int, image: bool) -> Any:
+    def noting(self: Preparation, scene: Any, sensor: Any, params: Any, spp: int, image: bool, forward: bool) -> Any:
         asked.append(not image)
-        return original(self, scene, sensor, params, spp, image)
+        return original(self, scene, sensor, params, spp, image, forward)
 
     monkeypatch.setattr(Preparation, "plan", noting)
     case, ours = Case(plain(), (FLOOR,)), integrator("reslrb", 5, estimator="stack", guiding="on")

@@ -14,12 +14,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from agreement import compare
+from agreement import compare, renders
 from conformance.gradient_cases import FLOOR, _mask, _textured
 from conformance.scenes import plugin
 from turns import a_few
 
 from reslrb_cli import step
+from reslrb_cli.config.integrators import AUTO_VALUES
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import gradient_step, render_image
@@ -129,6 +130,101 @@ def test_defaults_match_ptracer():
     assert default.samples_per_pass is None
     assert f"max_depth = {default.max_depth}" in stock.replace("4294967295", "-1")
     assert f"rr_depth = {default.rr_depth}" in str(mi.load_dict({"type": "ptracer"}))
+
+
+def test_the_default_renders_and_differentiates_what_glass_shows():
+    """Without options, the plugin shows a glass ball as `path` does, and its gradient agrees with differences."""
+    ball = {"type": "sphere", "center": [0.1, 0.0, 0.1], "radius": 0.35, "bsdf": {"type": "dielectric"}}
+    case = Case(_textured(ball=ball), ("wall.brdf_0.reflectance.value",))
+    ours, stock = (mi.load_dict({"type": name, "max_depth": 4, "rr_depth": 100}) for name in ("reslrb", "path"))
+    images = [
+        renders(
+            lambda seed, each=each: mi.render(case.scene, integrator=each, seed=seed, spp=64), range(first, first + 8)
+        )
+        for first, each in ((0, ours), (50, stock))
+    ]
+    assert compare(*images)
+    along, tracer = np.ones(3), ours.tracer
+    differences = [case.difference(tracer, along, seed, 64, 0.1, "both") for seed in seeds(8, 1)]
+    assert compare(case.gradients(tracer, seeds(8), 64) @ along[:, None], np.array(differences)[:, None], block=None)
+
+
+AUTO = {"paths": "both", "guiding": "off", "sequence": "low_discrepancy", "pixels": "even"}
+
+
+@pytest.mark.parametrize("given", [{}, {"estimator": "auto"}, dict.fromkeys(AUTO_VALUES, "auto")], ids=len)
+def test_the_default_is_a_run_that_measures_nothing(case: Case, given: dict[str, str]):
+    """`auto` is accepted for each setting that a run decides, and is the default if no estimator is named."""
+    tracer = mi.load_dict({"type": "reslrb", **given}).tracer
+    assert type(tracer.estimator).__name__ == "Stack"
+    chosen = tracer.preparation.sampling.chosen
+    assert {"paths": tracer.plan(case.scene, case.scene.sensors()[0]).paths, **chosen, "edges": "on"} == AUTO | {
+        "edges": "on"
+    }
+    moving = Case(_textured(camera=camera("gaussian")), ())
+    for key, paths in (("wall_shape.to_world", "camera"), ("lamp.to_world", "light")):
+        dr.enable_grad(moving.params[key])
+        moving.params.update()
+        plan = tracer.plan(moving.scene, moving.scene.sensors()[0], moving.params)
+        assert plan.paths == paths
+        assert plan.has_edges
+        dr.disable_grad(moving.params[key])
+        moving.params.update()
+
+
+def test_a_named_estimator_has_plain_settings():
+    sampling = mi.load_dict({"type": "reslrb", "estimator": "stack"}).tracer.preparation.sampling
+    assert (sampling.paths, sampling.on) == ("light", frozenset())
+
+
+def test_auto_leaves_out_edges_that_do_not_exist_and_says_so():
+    moving = Case(_textured(camera=camera("gaussian")), ())
+    sensor = moving.scene.sensors()[0]
+    dr.enable_grad(moving.params["floor_shape.to_world"])
+    moving.params.update()
+    follows = mi.load_dict({"type": "reslrb", "attached_sampling": "follow"}).tracer
+    with pytest.warns(UserWarning, match="attached_sampling: follow has no derivatives of edges"):
+        assert not follows.plan(moving.scene, sensor, moving.params).has_edges
+    usual = mi.load_dict({"type": "reslrb"}).tracer
+    with pytest.warns(UserWarning, match="forward mode has no derivatives of edges"):
+        plan = usual.preparation.plan(moving.scene, sensor, moving.params, forward=True)
+    assert (plan.paths, plan.has_edges) == ("light", False)
+    assert usual.plan(moving.scene, sensor, moving.params).has_edges
+
+
+SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
+COUNTS = [f"{paths}-{spp}" for paths in ("light", "both") for spp in (1, 2, 3, 7, 12, 16)]
+
+
+@pytest.mark.parametrize("count", a_few(COUNTS, ["light-7"]))
+def test_every_sampler_makes_any_number_of_samples(count: str):
+    """Samplers round the number of samples up, for example to a square number. `ptracer` then traces more paths."""
+    paths, spp = count.split("-")
+    tracer, means = integrator("reslrb", 2, estimator="stack", paths=paths), []
+    for name in SAMPLERS:
+        view = camera(size=4) | {"sampler": {"type": name}}
+        scene = mi.load_dict({"type": "scene", **_textured(camera=view)})
+        means.append(renders(lambda seed: render_image(tracer, scene, 0, seed, int(spp)), range(8)).mean())  # noqa: B023
+    assert means == pytest.approx([means[0]] * len(means), rel=0.6 / int(spp) ** 0.5)
+
+
+def test_sensors_beside_the_scene_have_facts_of_their_own(case: Case):
+    """Two sensors that are no part of the scene have films of different sizes. Each has its own distribution of camera
+    paths, so the second one has the gradient that it has alone.
+    """
+    small, large = (mi.load_dict(camera(size=size)) for size in (6, 16))
+    found = []
+    for sensors in ([large], [small, large]):
+        tracer = integrator("reslrb", estimator="stack", paths="camera", pixels="measured")
+        for sensor in sensors:
+            dr.enable_grad(case.params[FLOOR])
+            case.params.update()
+            step(tracer, case.scene, sensor, lambda image: dr.sum(image, axis=None), seed=1, spp=16, params=case.params)
+            gradient = np.array(dr.grad(case.params[FLOOR]))
+            case.set(case.initial)
+        found.append(gradient)
+    assert np.abs(found[0]).max() > 0
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
 
 
 @pytest.mark.parametrize(

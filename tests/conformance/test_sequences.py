@@ -107,7 +107,9 @@ def test_the_plugin_has_the_option() -> None:
     plugin = mi.load_dict({"type": "reslrb", "max_depth": 4, **LOW_DISCREPANCY})
     scene = Case(BY_NAME["point"].scene(), [])
     assert plugin.tracer.plan(scene.scene, scene.scene.sensors()[0]).sequence is not None
-    with pytest.raises(RuntimeError, match='"sequence" must be one of independent, low_discrepancy, not "halton"'):
+    with pytest.raises(
+        RuntimeError, match='"sequence" must be one of auto, independent, low_discrepancy, not "halton"'
+    ):
         mi.load_dict({"type": "reslrb", "sequence": "halton"})
 
 

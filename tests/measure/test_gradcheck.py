@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from agreement import compare, renders
 from conformance.gradient_cases import CASES, IN_EXPECTATION
 from measure.faults import checked, estimators_of
 from measure.faults import room as room_moving
@@ -373,6 +375,31 @@ def test_moving_light_has_only_light_paths():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
     with pytest.raises(ConfigError, match="only light paths have derivatives of moving light"):
         Gradcheck(CheckSettings(config, estimators_of("stack(paths=both)"), 0, 3))
+
+
+@pytest.mark.parametrize("shape", a_few(["sphere", "disk", "cylinder", "cube", "rectangle"], ["sphere", "cube"]))
+def test_stock_camera_paths_are_no_reference_behind_hidden_lamps(shape: str):
+    """A hidden lamp stands in front of a shape. Stock `path` and `prb` start behind the lamp, and take the distance of
+    an analytic shape from there for its distance from the sensor. The rules refuse them exactly where they are wrong.
+    """
+    behind = {"type": shape, "to_world": transform(translate=[0.1, 0, 0.1], scale=0.35), "bsdf": {
+        "type": "twosided", "bsdf": diffuse(0.5, 0.3, 0.2)}}  # fmt: skip
+    sign = lamp(radiance=rgb(1, 1, 1)) | {"to_world": transform(translate=[0.5, 0.2, 1.6], scale=0.5)}
+    made = Case(room(thing=behind, sign=sign), [])
+    for paths in ("light", "camera", "both"):
+        at = Situation.of(made.scene, made.scene.sensors()[0], made.params, 4, False, paths=paths)
+        assert path_image(at) is prb_image(at) is None
+        at = replace(at, hide_emitters=True)
+        reasons = [path_image(at), prb_image(at), prb_gradient(at, "wall.brdf_0.reflectance.value")]
+        assert all(reason is None for reason in reasons) == (paths != "light" and shape in ("cube", "rectangle"))
+        assert paths != "light" or all(reasons)
+    options = {"max_depth": 3, "hide_emitters": True}
+    ours = integrator("reslrb", paths="camera", **options)
+    images = [
+        renders(lambda seed, each=each: made.image(each, seed, 64), range(first, first + 8))
+        for first, each in ((0, ours), (100, integrator("path", **options)))
+    ]
+    assert bool(compare(*images)) == (shape in ("cube", "rectangle"))
 
 
 def _lit(view: str, **more: Any) -> Situation:
