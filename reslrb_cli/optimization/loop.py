@@ -38,6 +38,7 @@ from reslrb_cli.optimization.sensitivity import measure_curvatures
 from reslrb_cli.optimization.shards import add_gradient, scaled
 from reslrb_cli.optimization.state import State, held_tables, put, standing
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
+from reslrb_cli.optimization.views import View
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record, Regularized
 from reslrb_cli.seeds import seed
@@ -217,8 +218,8 @@ def part_of_samples(problem: Problem) -> int:
     return max(problem.config.run.spp // PART // unit, 1) * unit
 
 
-#: Most halvings of a step, and the ratio of the losses after and before a step above which n is halved too.
-HALVINGS, RISE = 3, 1.1
+#: Most halvings of a step, and the rise of the loss, as a share of the loss, above which n is halved too.
+HALVINGS, RISE = 3, 0.1
 
 
 def update(problem: Problem, iteration: int, factor: float, held: Collection[str]) -> dict[str, int]:
@@ -240,7 +241,7 @@ def update(problem: Problem, iteration: int, factor: float, held: Collection[str
             break
         for key, value in before.items():
             optimizer.set_value(key, 0.5 * (value + dr.detach(optimizer[key])))
-        if now > RISE * loss:
+        if now - loss > RISE * abs(loss):
             optimizer.block.distrust()
         problem.apply()
     return updates
@@ -274,14 +275,13 @@ def blurred_losses(problem: Problem, iteration: int, *images: Sequence[mi.Tensor
 
 
 #: The moments are set to zero each time a large loss has fallen to this fraction. A first loss is large if the loss of
-#: a black image is below this fraction of it.
+#: a black image is below this fraction of it. Losses count from the loss of the target itself.
 FALL = 0.1
 
 
-def black_loss(problem: Problem) -> float:
-    """Return the loss of black images in the first iteration."""
-    views = problem.drawn(0)
-    return sum(scale * float(view.objective(dr.zeros(mi.TensorXf, view.target.shape))[0]) for view, scale in views)
+def loss_of(problem: Problem, iteration: int, image: Callable[[View], mi.TensorXf]) -> float:
+    """Return the loss of `iteration` if the views had these exposed images."""
+    return sum(scale * view.share * float(view.judge(image(view))[0]) for view, scale in problem.drawn(iteration))
 
 
 #: Iterations between two evaluations of held-out views.
@@ -307,7 +307,8 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
 
     A first loss is large if it exceeds ten times the loss of a black image. After a large first loss, the step sets the
     optimiser's moments to zero each time the loss has fallen by another factor of ten. Otherwise, the large first
-    gradients would shorten the steps for a hundred iterations or more.
+    gradients would shorten the steps for a hundred iterations or more. Losses count from that of the target itself
+    (`loss_of`), because your own losses may be negative.
     """
     config, optimizer, iteration, level = problem.config, problem.optimizer, state.iteration, state.level
     if optimizer.stands_at is not state:
@@ -342,9 +343,11 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
             on_nonfinite(found)
         held = held_back(config.run.on_nonfinite, found, optimizer.keys())
         if iteration == 0:
-            level = value if FALL * value > black_loss(problem) else 0.0
-        elif value < FALL * state.level:
-            level = value
+            black = loss_of(problem, 0, lambda view: dr.zeros(mi.TensorXf, view.target.shape))
+            best = loss_of(problem, 0, lambda view: view.target)
+            level = value - best if FALL * (value - best) > black - best else 0.0
+        elif level > 0 and (above := value - loss_of(problem, iteration, lambda view: view.target)) < FALL * level:
+            level = above
             optimizer.forget()
         for key in found.gradients if config.run.on_nonfinite == "zero" else ():
             zero_nonfinite(optimizer[key])

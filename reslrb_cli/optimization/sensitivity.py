@@ -129,29 +129,40 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
 
 def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequence[Array]) -> float:
     """Return the loss's largest curvature in `v`, the optimiser's variable of `key`. Return 0 if `v` has no visible
-    effect.
+    effect. The images `base` show the start.
     """
     size = math.sqrt(sum(float(np.square(finite(image)).sum()) for image in base))
     direction = gradient / (np.linalg.norm(gradient) or 1.0)
     step = 0.01 * (rms(np.array(v)) or 1.0) * math.sqrt(gradient.size)
     variable = problem.optimizer.variable(key)
+
+    def ends() -> tuple[list[Any], float]:
+        """Return both ends of a difference, within the bounds, and their distance."""
+        pair = [variable.clamp(v + _like(v, side * step * direction)) for side in (1, -1)]
+        return pair, float(np.linalg.norm(np.array(pair[0] - pair[1], dtype=np.float64)))
+
+    far = 0.0
     for _ in range(TRIALS):
-        problem.apply({key: variable.to_scene(v + _like(v, step * direction))})
-        images = zip(see_images(problem), base, strict=True)
-        change = math.sqrt(sum(float(np.square(finite(a - b)).sum()) for a, b in images)) / (size or 1.0)
+        images, (pair, wide) = [], ends()
+        for end in pair:
+            problem.apply({key: variable.to_scene(end)})
+            images.append(see_images(problem))
+        halves = (0.5 * finite(a - b) for a, b in zip(*images, strict=True))
+        change = math.sqrt(sum(float(np.square(half).sum()) for half in halves)) / (size or 1.0)
         if not 0 < change < math.inf:
             step *= 1e3 if change == 0 else 1e-3
             continue
-        if LEAST <= change <= MOST:
+        if LEAST <= change <= MOST or (change < LEAST and wide == far):  # the bounds are no further apart
             break
-        step *= AIM / change
+        step, far = step * AIM / change, wide
     else:
         return 0.0
     found = 0.0
     for _ in range(POWER_ITERATIONS):
-        ends = [_gradient_at(problem, key, v + _like(v, side * step * direction)) for side in (1, -1)]
-        bent = finite(ends[0] - ends[1]) / (2 * step)
-        if not np.isfinite(ends).all(axis=0).any():  # this pair of gradients tells nothing
+        pair, wide = ends()
+        rows = [_gradient_at(problem, key, end) for end in pair]
+        bent = finite(rows[0] - rows[1]) / (wide or 1.0)
+        if not np.isfinite(rows).all(axis=0).any():  # this pair of gradients tells nothing
             continue
         before, found = found, float(np.linalg.norm(bent))
         if not 0 < found < math.inf:

@@ -45,7 +45,8 @@ class State:
     - `stopped` is the reason why the run ends as finished. `end` is the reason why the run fails. Without a reason, the
         field is "".
     - `first_s` is `elapsed_s` after the first iteration.
-    - `level` is the loss at which the moments were last zero, or 0 if the first loss was not large (`loop.step`).
+    - `level` is the loss at which the moments were last zero, above that of the targets, or 0 if the first loss was not
+        large (`loop.step`).
     - `gradients` are the gradients of the previous step, in the form of `values`.
     """
 

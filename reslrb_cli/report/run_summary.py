@@ -376,7 +376,7 @@ def image_ratio(results: Mapping[str, Any]) -> float | None:
     """
     losses = results.get("image_loss") or {}
     initial, final = losses.get("initial"), losses.get("final")
-    if initial is None or final is None:
+    if initial is None or final is None or min(initial, final) < 0:  # your own losses may be negative
         return None
     return float(final / initial) if initial else math.inf if final else 1.0
 

@@ -12,6 +12,7 @@ from optimization.toy import make_problem
 
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import loop
+from reslrb_cli.optimization.losses import make_loss
 from reslrb_cli.optimization.nonfinite import PATIENCE, count_nonfinite, finite_square_norm
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.records.clock import StepClock
@@ -69,23 +70,43 @@ def test_the_time_limit_ends_a_run_and_its_schedule(tmp_path, steps, monkeypatch
     assert (last[1].lr, last[0].stopped) == (pytest.approx(0.02), "")
 
 
+@pytest.mark.parametrize("shift", [0.0, -0.3, -50.0, 4.0])
 @pytest.mark.parametrize(("target", "is_large"), [(0.05, True), (0.8, False)])
-def test_moments_of_a_large_first_loss_are_dropped_as_the_loss_falls(tmp_path, steps, target, is_large):
+def test_moments_of_a_large_first_loss_are_dropped_as_the_loss_falls(tmp_path, steps, target, is_large, shift):
     """The value starts at 0.5. For a target of 0.05, the image is worse than a black one. Adam's moments then contain
-    only the steps since the loss last fell to a tenth.
+    only the steps since the loss last fell to a tenth. A constant in the loss changes nothing.
     """
     problem = steps.problem = make_problem(tmp_path, sets=["optimizer={type: adam, learning_rate: 0.02}"])
     problem.views[0].made = dr.full(mi.TensorXf, target, (2, 2, 3))
+    problem.views[0].loss = lambda *images: make_loss("l2")(*images) + shift
     found = list(loop.iterate(problem, standing(problem)))
-    losses = [record.loss for _, record in found]
+    losses = [record.loss - shift for _, record in found]
     assert losses[-1] < 0.1 * losses[0]
     level, since, expected = losses[0] if is_large else 0, 0, []
     for loss in losses:
         level, since = (loss, 1) if loss < 0.1 * level else (level, since + 1)
-        expected.append((level, since))
+        expected.append((pytest.approx(level, abs=1e-5), since))
     steps_since = [int(np.array(state.moments["albedo"]["0"]).item()) for state, _ in found]
     assert [(state.level, count) for (state, _), count in zip(found, steps_since, strict=True)] == expected
     assert (steps_since[-1] < len(losses)) is is_large
+
+
+@pytest.mark.parametrize(("kind", "rate"), [("-PSNR", 0.005), ("log-likelihood", 0.005), ("-correlation", 0.02)])
+def test_negative_losses_keep_their_moments(kind, rate, tmp_path, steps):
+    """The loss falls in each iteration. At the target, it is not finite, or below 0, or not the smallest one."""
+
+    def loss(image, target):
+        square = make_loss("l2")(image, target)
+        product = dr.mean(image * target, axis=None).array
+        return {"-PSNR": 10 * dr.log2(square), "log-likelihood": 50 * square - 30, "-correlation": -product}[kind]
+
+    problem = steps.problem = make_problem(tmp_path, sets=[f"optimizer={{type: adam, learning_rate: {rate}}}"])
+    problem.views[0].loss = loss
+    found = list(loop.iterate(problem, standing(problem)))
+    losses = [record.loss for _, record in found]
+    assert max(losses) < 0
+    assert np.all(np.diff(losses) < 0)
+    assert [int(np.array(state.moments["albedo"]["0"]).item()) for state, _ in found] == [*range(1, 21)]
 
 
 def test_time_between_records_is_not_counted(tmp_path, steps):

@@ -652,6 +652,19 @@ def test_the_first_measurement_fits_its_budget(directions, samples, tmp_path, mo
     assert samples is None or 2 * (directions + 1) * samples <= loop.LEAST_ITERATIONS * 64
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("rise", "distrusted"), [(0.05, 0), (0.2, loop.HALVINGS)])
+def test_only_a_large_rise_of_the_loss_is_distrusted(rise, distrusted, sign, tmp_path, monkeypatch):
+    """A loss may be negative."""
+    problem, calls = make_problem(tmp_path, sets=[AUTO]), []
+    problem.optimizer.extents = {"albedo": 1.0}
+    monkeypatch.setattr(loop, "exposed_images", lambda *given: [])
+    monkeypatch.setattr(loop, "blurred_losses", lambda *given: (10.0 * sign, 10.0 * (sign + rise)))
+    monkeypatch.setattr(problem.optimizer.block, "distrust", lambda: calls.append(1))
+    loop.update(problem, 0, 1.0, problem.optimizer.keys())
+    assert len(calls) == distrusted
+
+
 def test_what_needs_a_rate_is_refused(llvm, tmp_path, monkeypatch):
     begin_alone(tmp_path, monkeypatch)
     for sets, where in (

@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
+from optimization.toy import make_problem
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization import loop
+from reslrb_cli.optimization import loop, sensitivity
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
@@ -59,6 +62,27 @@ def test_a_rate_of_one_converges_and_a_rate_of_three_diverges(rate, ends):
     problem = find_reached(problem)
     losses = [record.loss for record in optimize(problem)]
     assert losses[-1] < 0.2 * losses[0] if ends == "below" else losses[-1] > losses[0]
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 1.0), (0.499, 0.501), (0.0, np.inf)])
+@pytest.mark.parametrize("start", ["inside", "low", "high", "mixed"])
+@pytest.mark.parametrize("target", [0.1, 0.8])
+def test_the_curvature_is_the_same_at_bounds(start, bounds, target, llvm, tmp_path, steps, monkeypatch):
+    """The loss is quadratic, so its curvature depends neither on the start nor on the direction of the gradient."""
+    problem = make_problem(tmp_path, sets=[DESCENT])
+    low, high = bounds[0], min(bounds[1], 1.0)
+    values = {"inside": 0.5 * (low + high), "low": low, "high": high,
+              "mixed": np.where(np.arange(12).reshape(2, 2, 3) % 2, low, high)}  # fmt: skip
+    problem.optimizer._bounds["albedo"] = bounds
+    problem.optimizer.set_value("albedo", mi.TensorXf(np.full((2, 2, 3), values[start], np.float32)))
+    problem.views[0].made = dr.full(mi.TensorXf, target, (2, 2, 3))
+    problem.apply()
+    monkeypatch.setattr(sensitivity, "gradient_step", loop.gradient_step)
+    shown = lambda *given: dr.detach(mi.TensorXf(problem.selection.params["albedo"]))  # noqa: E731
+    monkeypatch.setattr(sensitivity, "render_image", shown)
+    (row,) = measure_curvatures(problem)
+    assert row.curvature == pytest.approx(2 / 12, rel=0.01)
+    np.testing.assert_array_equal(np.array(problem.optimizer["albedo"]), np.float32(values[start]))
 
 
 def test_only_gradient_descent_uses_curvature():

@@ -117,6 +117,7 @@ def test_statements_about_the_loss():
     assert lower.startswith("the loss fell by no more than its noise (")
     images = {"initial": 0.01, "final": 0.008}
     assert warnings(results(loss_trend=trend("flat"), image_loss=images)) == []
+    assert warnings(results(image_loss={"initial": -20.0, "final": -30.0})) == []  # a ratio of 1.5 of a negative loss
     assert warnings(results(loss_trend=trend("flat"), image_loss={"initial": 0.01, "final": None})) == [flat]
 
 
