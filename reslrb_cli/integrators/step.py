@@ -224,7 +224,8 @@ def _batched(
     No path uses a dL/dI that contains it. The gradient of an L2 loss is therefore unbiased, as with `independent`, but
     needs only half the paths. The first batch contributes only to the image.
     """
-    if job.spp < 1 or job.spp % batches:
+    job = replace(job, spp=job.spp or int(job.sensor.sampler().sample_count()))
+    if job.spp % batches:
         raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches})")
     parts = [replace(job, seed=seed, spp=job.spp // batches) for seed in batch_seeds(job.seed, batches)]
     share = 1 / (batches - 1)  # the gradient is the mean over the batches that have a dL/dI

@@ -31,6 +31,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors
 from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, OwnLoss, blur, l2, make_loss, weighted
+from reslrb_cli.records.run_folder import exposed
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.visibility import sees_specular
@@ -65,12 +66,6 @@ class Exposure:
             factor = dr.select(channel == 0, value.x, dr.select(channel == 1, value.y, value.z))
             return mi.TensorXf(image.array * factor, image.shape)
         return mi.TensorXf(image.array * value, image.shape)
-
-    def of_array(self, image: Array) -> Array:
-        """Return E I for an image (H, W, C or more), without changing its alpha."""
-        factor = np.ones(image.shape[2], np.float32)
-        factor[: 1 if image.shape[2] <= 2 else 3] = np.array(self.now(), np.float32).ravel()
-        return image * factor
 
     def add_gradient(self, leaf: Any, channels: int, image: mi.TensorXf, gradient: mi.TensorXf) -> None:
         """Add dL/dE to the gradient of `leaf`, for an image (H, W, `channels` or more) and its dL/dI."""
@@ -202,6 +197,10 @@ class View:
     def exposed(self, image: mi.TensorXf) -> mi.TensorXf:
         """Return an image (H, W, C) without alpha, with the view's exposure."""
         return self.exposure.applied(first_channels(image, self.target.shape[2]))
+
+    def exposed_array(self, image: Array) -> Array:
+        """Return an image (H, W, C or more) with the view's exposure. Channels beyond the target's are unchanged."""
+        return exposed(image, np.array(self.exposure.now(), np.float32).ravel(), self.target.shape[2])
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
         """Return the attached loss of an image (H, W, C), with width 1. The view's exposure is applied."""

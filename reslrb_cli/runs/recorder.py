@@ -368,7 +368,7 @@ class Recording:
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:
             image = self.problem.render(view.sensor, spp, self.done, "saved image")
-            exposed = view.exposure.of_array(image)
+            exposed = view.exposed_array(image)
             self._write_image(name, view.sensor, exposed)
             self.course.results.see(name, view, image)
             if name == "final":

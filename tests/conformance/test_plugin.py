@@ -8,7 +8,7 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +23,7 @@ from reslrb_cli import step
 from reslrb_cli.config.integrators import AUTO_VALUES
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plugin import make_integrator
-from reslrb_cli.integrators.step import gradient_step, render_image
+from reslrb_cli.integrators.step import Adjoint, gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import camera, lamp, rgb, room, transform
 
@@ -277,7 +277,6 @@ def test_samples_that_passes_do_not_divide_raise(case: Case):
         ({"adjoint": "batches"}, '"adjoint" must be one of correlated, independent, batched, not "batches"'),
         ({"adjoint": "batched", "batches": 1}, '"batches" must be an integer from 2 to'),
         ({"adjoint": "batched", "batches": 3}, r"the samples per pixel \(4\) must be a multiple of the batches \(3\)"),
-        ({"adjoint": "batched", "spp": 0}, r"the samples per pixel \(0\) must be a multiple"),
     ],
     ids=str,
 )
@@ -285,6 +284,16 @@ def test_a_step_with_arguments_out_of_range_raises(case: Case, options: dict[str
     given = {"sensor": 0, "seed": 1, "spp": 4} | options
     with pytest.raises(ValueError, match=message):
         step(plugin("reslrb"), case.scene, given.pop("sensor"), case.objective, params=case.params, **given)
+
+
+@pytest.mark.parametrize("adjoint", get_args(Adjoint))
+@pytest.mark.parametrize("name", ["reslrb", "prb"])
+def test_zero_samples_are_those_of_the_sensor(case: Case, adjoint: str, name: str):
+    count = case.scene.sensors()[0].sampler().sample_count()
+    options = {"adjoint": adjoint, "batches": min(count, 4)}
+    found, expected = (case.gradients(plugin(name), [1], spp, **options) for spp in (0, count))
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+    assert expected.any()
 
 
 def test_a_step_accepts_numpy_numbers(case: Case):

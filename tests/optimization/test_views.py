@@ -16,6 +16,7 @@ from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
+from reslrb_cli.optimization.views import Exposure, View, make_loss
 from reslrb_cli.report.perceptual import ciede2000
 
 CHART = "ColorChecker N Ohta"
@@ -36,6 +37,22 @@ def make(folder, *sets):
 def gradient(problem, round=0):
     sample_gradient(problem, problem.integrator, round, "test", 4)
     return take_gradient(problem)[KEY]
+
+
+@pytest.mark.parametrize("alpha", [0, 1])
+@pytest.mark.parametrize("channels", [1, 2, 3, 5])
+@pytest.mark.parametrize("colours", [1, 3])
+def test_an_exposure_scales_all_channels_but_alpha(channels, colours, alpha):
+    """For images in Dr.Jit and in NumPy. An exposure for each channel needs three of them."""
+    values = {1: mi.Float(2.0), 3: mi.Color3f(2.0, 3.0, 4.0)}[colours]
+    if colours == 3 != channels:
+        return
+    made, exposure = dr.ones(mi.TensorXf, (4, 4, channels)), Exposure(key="e", values={"e": values})
+    view = View(0, make_loss("l2"), made=made, exposure=exposure)
+    image = np.random.default_rng(0).uniform(size=(4, 4, channels + alpha)).astype(np.float32)
+    expected = image * np.array([*([2.0] * channels if colours == 1 else [2.0, 3.0, 4.0]), *[1.0] * alpha], np.float32)
+    np.testing.assert_allclose(view.exposed_array(image), expected)
+    np.testing.assert_allclose(np.array(view.exposed(mi.TensorXf(image))), expected[:, :, :channels])
 
 
 def test_a_weight_is_a_share_of_the_loss(folder):

@@ -445,7 +445,7 @@ class LossCurvature:
         problem = self.problem
         for place, view in enumerate(problem.trained):
             channels = int(problem.scene.sensors()[view.sensor].film().base_channels_count())
-            v = view.exposure.of_array(gradients[place])
+            v = view.exposed_array(gradients[place])
             v = np.pad(v, ((0, 0), (0, 0), (0, channels - v.shape[2]))).astype(np.float32)
             gradient = mi.TensorXf(v) + dr.opaque(mi.Float, 0)
             dr.make_opaque(gradient)
