@@ -25,6 +25,7 @@ from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.step import Refused, interface_of, make_job, second_seed
 from reslrb_cli.runs.loggers import package
 from reslrb_cli.scene.parameters import matching_keys
+from reslrb_cli.scene.plastic import with_tables
 from reslrb_cli.scene.values import ParameterValue, Place, settle
 
 if TYPE_CHECKING:
@@ -165,7 +166,8 @@ class _Step:
         dr.eval(adjoint_image, refused)
         tracked = {key: value for key, value in self._values.items() if dr.grad_enabled(value)}
         dr.clear_grad(tracked)
-        self._integrator.backward(replace(self._job, seed=seed), adjoint_image)
+        with with_tables(params):
+            self._integrator.backward(replace(self._job, seed=seed), adjoint_image)
         found = {key: dr.grad(value) for key, value in tracked.items()}
         dr.eval(found)
         dr.clear_grad(tracked)

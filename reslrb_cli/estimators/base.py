@@ -125,7 +125,7 @@ def differentiate_emission(p: Pass, adjoint: Callable[[mi.Spectrum], mi.Spectrum
     if p.plan.differentiate_emission:
         with dr.resume_grad(), dr.isolate_grad():
             E = p.emission().E
-            dr.backward_from(dr.dot(adjoint(dr.detach(E)), E))
+            dr.backward_from(dr.dot(adjoint(dr.detach(E)), E), flags=MAY_LACK)
 
 
 @dataclass

@@ -30,7 +30,7 @@ from reslrb_cli.estimators.base import (
 )
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, KnownVisibility, stand_in
-from reslrb_cli.transport.factors import NO_ZERO, Product, showing
+from reslrb_cli.transport.factors import MAY_LACK, NO_ZERO, Product, showing
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -222,7 +222,8 @@ class Taking(Revisiting):
         connected, scattered = connected & useful, scattering.active & useful
         with dr.resume_grad():
             f_c, f_s = tracked_factors(plan, vertex.si, vertex.bsdf, connection.wo, connected, scattering, scattered)
-            dr.backward_from(dr.select(connected, adjoint_c * f_c, 0) + dr.select(scattered, adjoint_s * f_s, 0))
+            objective = dr.select(connected, adjoint_c * f_c, 0) + dr.select(scattered, adjoint_s * f_s, 0)
+            dr.backward_from(objective, flags=MAY_LACK)
         return S
 
 

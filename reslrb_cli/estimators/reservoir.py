@@ -43,7 +43,7 @@ from reslrb_cli.estimators.selection import (
 )
 from reslrb_cli.transport.bsdf import Scattering, tracked_factor
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.factors import MAY_LACK, Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -131,7 +131,7 @@ class ReservoirReplay(SlotReplay):
             weight += dr.select(slot.last >= depth, adjoint_of_factor(adjoint, depth, scattering.f, rest), 0)
         with dr.resume_grad():
             f = tracked_factor(plan, vertex.si, bsdf, scattering, active)
-            dr.backward_from(dr.select(active, weight * f, 0))
+            dr.backward_from(dr.select(active, weight * f, 0), flags=MAY_LACK)
         return state
 
 

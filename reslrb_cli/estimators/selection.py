@@ -29,7 +29,7 @@ from reslrb_cli.estimators.base import (
 )
 from reslrb_cli.transport.bsdf import Scattering, tracked_factor
 from reslrb_cli.transport.connection import Connection, connect, stand_in
-from reslrb_cli.transport.factors import Product, showing
+from reslrb_cli.transport.factors import MAY_LACK, Product, showing
 from reslrb_cli.transport.film import Colours
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
@@ -200,4 +200,4 @@ def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.B
     active &= plan.differentiates(bsdf)
     with dr.resume_grad():
         f = tracked_factor(plan, si, bsdf, event(kept.wo, kept.lobe), active)
-        dr.backward_from(dr.select(active, dr.dot(weight, f), 0))
+        dr.backward_from(dr.select(active, dr.dot(weight, f), 0), flags=MAY_LACK)

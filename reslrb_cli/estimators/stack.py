@@ -70,7 +70,7 @@ from reslrb_cli.estimators.base import lobe as lobe_of
 from reslrb_cli.estimators.gather import Gathering, Visibility
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, KnownVisibility
-from reslrb_cli.transport.factors import Product, showing
+from reslrb_cli.transport.factors import MAY_LACK, Product, showing
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -303,7 +303,8 @@ class Frame:
         with dr.resume_grad():
             sampled = event(self.wo_s, self.lobe)
             f_c, f_s = tracked_factors(p.plan, si, bsdf, self.wo_c, connected, sampled, scattered)
-            dr.backward_from(dr.select(connected, adjoint_c * f_c, 0) + dr.select(scattered, adjoint_s * f_s, 0))
+            objective = dr.select(connected, adjoint_c * f_c, 0) + dr.select(scattered, adjoint_s * f_s, 0)
+            dr.backward_from(objective, flags=MAY_LACK)
         return self.own + self.onward * B
 
 

@@ -25,6 +25,7 @@ from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.integrators.step import interface_of
 from reslrb_cli.scene import dispersion
+from reslrb_cli.scene.plastic import PlasticTables, with_tables
 
 #: Our integrators by the names of their plugins.
 TRACERS = ("reslrb", "walk_ad", "trajectory")
@@ -205,11 +206,15 @@ def _plugin_class() -> type[mi.CppADIntegrator]:
 
         def render_forward(self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0,
                            spp: int = 0) -> mi.TensorXf:  # fmt: skip
-            return self.tracer.tangent(_job(scene, params, sensor, seed, spp))
+            job = _job(scene, params, sensor, seed, spp)
+            PlasticTables(job.params).push()
+            return self.tracer.tangent(job)
 
         def render_backward(self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: mi.Sensor | int = 0,
                             seed: mi.UInt32 | int = 0, spp: int = 0) -> None:  # fmt: skip
-            self.tracer.backward(_job(scene, params, sensor, seed, spp), grad_in)
+            job = _job(scene, params, sensor, seed, spp)
+            with with_tables(job.params):
+                self.tracer.backward(job, grad_in)
 
         def aov_names(self) -> list[str]:
             return []

@@ -28,6 +28,7 @@ from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.baselines import NaiveAD, Projective, Replayed
 from reslrb_cli.integrators.context import resolve_sensor
 from reslrb_cli.integrators.protocol import Job, StepIntegrator
+from reslrb_cli.scene.plastic import with_tables
 
 Adjoint = Literal["correlated", "independent", "batched"]
 Objective: TypeAlias = "Callable[[mi.TensorXf], mi.Float | mi.TensorXf]"
@@ -135,6 +136,13 @@ def gradient_step(
     one_of("adjoint", adjoint, get_args(Adjoint))
     _check_number("batches", batches, 2 if adjoint == "batched" else 1, PASSES)
     work = interface_of(integrator)
+    with with_tables(job.params):
+        return _step(work, job, objective, adjoint, batches, on_samples)
+
+
+def _step(
+    work: StepIntegrator, job: Job, objective: Objective, adjoint: Adjoint, batches: int, on_samples: OnSamples | None
+) -> StepResult:
     if adjoint == "batched":
         return _batched(work, job, objective, batches, on_samples)
     refused = Refused()
@@ -168,7 +176,9 @@ def known_step(
     """
     refused = Refused()
     gradient = refused.take(dr.detach(gradient))
-    image = interface_of(integrator).known(make_job(scene, sensor, seed, spp, params), gradient)
+    job = make_job(scene, sensor, seed, spp, params)
+    with with_tables(job.params):
+        image = interface_of(integrator).known(job, gradient)
     return StepResult(image, dr.sum((image * gradient).array), refused)
 
 
@@ -180,7 +190,9 @@ def given_step(
 
     `gradient` must be finite and come from other samples. The other arguments are those of `gradient_step`.
     """
-    _differentiate(interface_of(integrator), make_job(scene, sensor, seed, spp, params), gradient, on_samples)
+    job = make_job(scene, sensor, seed, spp, params)
+    with with_tables(job.params):
+        _differentiate(interface_of(integrator), job, gradient, on_samples)
 
 
 def _check_number(name: str, value: object, least: int, most: int) -> None:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -33,6 +33,28 @@ _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "ver
 COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
 #: Uniform emission of lamps.
 EMISSION = re.compile(r"\b(radiance|irradiance|intensity)(\.values?)?$")
+#: Ranges at whose ends Mitsuba's derivative is not that of the image, by the class of the BSDF and the name of the
+#: parameter. At the ends Mitsuba leaves a lobe out, or differentiates a square root or a ratio at 0.
+_OPEN: dict[str, dict[str, tuple[float, float]]] = {
+    "Principled": {"spec_trans": (0, 1), "metallic": (-np.inf, 1), "clearcoat": (0, np.inf), "sheen": (0, np.inf),
+                   "base_color": (0, np.inf), "specular": (0, np.inf)},
+    "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2), "sheen": (0, np.inf), "base_color": (0, np.inf)},
+    "BlendBSDF": {"weight": (0, 1)},
+    "MaskBSDF": {"opacity": (0, 1)},
+    "SmoothConductor": {"eta": (0, np.inf), "k": (0, np.inf)},
+    "RoughConductor": {"eta": (0, np.inf), "k": (0, np.inf)},
+}  # fmt: skip
+#: Distance from such a bound. Paths find a lobe of this weight, and images do not show it.
+MARGIN = 1e-3
+#: Parameters without effect while a weight is 0, by class and name of the parameter.
+_WEIGHTS = {
+    ("Principled", "clearcoat_gloss"): "clearcoat",
+    ("Principled", "sheen_tint"): "sheen",
+    ("PrincipledThin", "sheen_tint"): "sheen",
+    **{("PrincipledThin", name): "spec_trans" for name in ("eta", "anisotropic", "spec_tint")},
+}
+#: Parameters that only change polarised light, by class and name.
+_POLARISED = {("LinearPolarizer", "theta"), ("LinearRetarder", "theta"), ("LinearRetarder", "delta")}
 #: Maximum number of printed values; larger arrays show mean and range.
 _FEW = 4
 
@@ -78,7 +100,24 @@ class ParameterInfo:
 
 def list_parameters(params: Any, values: bool = False) -> list[ParameterInfo]:
     """Describe every entry of a `mi.traverse` result in order, with its value if `values` is set."""
-    return [describe(params, key, values) for key in params.properties]
+    infos = [describe(params, key, values) for key in params.properties]
+    return [replace(info, obstacle=info.obstacle or unused(params, info.key)) for info in infos]
+
+
+def unused(params: Any, key: str, recovered: Container[str] = ()) -> str | None:
+    """Return the reason why a parameter has no effect at the scene's values, or None if it has an effect. Weights in
+    `recovered` leave 0.
+    """
+    weight = _WEIGHTS.get(owner_of(params, key))
+    if weight is None:
+        return None
+    names = key.split(".")
+    start = ".".join(names[: -1 if isinstance(params.properties[key][2], mi.BSDF) else -2])
+    others = [other for other in params.properties if other.startswith(f"{start}.{weight}.")]
+    zero = all(np.all(as_numbers(entry_value(params, other)) == 0) for other in others)
+    if not zero or any(other in recovered for other in others):
+        return None
+    return f"has no effect while `{start}.{weight}` is 0; give it a positive value in the scene file, or recover both"
 
 
 def describe(params: Any, key: str, values: bool = False) -> ParameterInfo:
@@ -93,10 +132,30 @@ def describe(params: Any, key: str, values: bool = False) -> ParameterInfo:
         shape=value_shape(value, halo(node, value)),
         differentiable=differentiable,
         discontinuous=flags & int(mi.ParamFlags.Discontinuous) != 0,
-        obstacle=_obstacle(kind, key, value, differentiable, node, bits),
+        obstacle=_wrong_derivative(params, key) or _obstacle(kind, key, value, differentiable, node, bits),
         value=_current_value(params, key) if values else None,
         bits=bits,
     )
+
+
+def owner_of(params: Any, key: str) -> tuple[str, str]:
+    """Return the class of the object to which a parameter belongs, and the parameter's name there.
+
+    A texture or spectrum belongs to the object that uses it: `ball.bsdf.sheen.value` is the `sheen` of a Principled.
+    """
+    node, names = params.properties[key][2], key.split(".")
+    if isinstance(node, mi.Texture) and len(names) > 1:
+        node, names = params.hierarchy[node][0], names[:-1]
+    return node.class_name(), names[-1]
+
+
+def open_domain(params: Any, key: str) -> tuple[float, float]:
+    """Return the range in which a parameter has a derivative, a `MARGIN` inside of its bounds. The range is infinite
+    where Mitsuba's derivative is right at the bound.
+    """
+    kind, name = owner_of(params, key)
+    low, high = _OPEN.get(kind, {}).get(name, (-np.inf, np.inf))
+    return low + MARGIN, high - MARGIN
 
 
 def coarse_bits(params: Any, key: str) -> int | None:
@@ -174,6 +233,19 @@ def parameter_kind(params: Any, key: str) -> str:
                 return "attribute" if is_attribute and isinstance(node, mi.Mesh) else kind.lower()
         node = params.hierarchy[node][0]
     return "scene"
+
+
+def _wrong_derivative(params: Any, key: str) -> str | None:
+    """Return the reason why a derivative that Mitsuba offers cannot be used, or None."""
+    kind, name = owner_of(params, key)
+    if (kind, name) in _POLARISED and not mi.is_polarized:
+        return "only changes polarised light, which this variant does not trace"
+    node: Any = params.properties[key][2]
+    while (kind, name) == ("Principled", "spec_trans") and node is not None:
+        if node.class_name() == "TwoSidedBRDF":
+            return "lets light through a `twosided` BSDF, which Mitsuba does not load; remove the `twosided`"
+        node = params.hierarchy[node][0]
+    return None
 
 
 def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, coarse: int | None) -> str | None:

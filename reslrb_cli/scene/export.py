@@ -75,12 +75,6 @@ _OTHER_PLACES = {"shape": ("center", "radius", "p0", "p1"), "emitter": ("directi
 #: BSDFs whose `eta` is the index inside divided by that outside.
 _RELATIVE_INDEX = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
 
-#: Features that Mitsuba leaves out of a `principled` BSDF permanently if they start at 0.
-LOBES = (
-    *("anisotropic", "clearcoat", "diff_trans", "flatness", "metallic"),
-    *("sheen", "sheen_tint", "spec_tint", "spec_trans"),
-)
-
 _CONDUCTORS = ("conductor", "roughconductor")
 #: Spectra that Mitsuba reads as values by wavelength.
 _SPECTRA = ("regular", "irregular", "d65", "illuminant")
@@ -188,11 +182,6 @@ class Replacing:
     def _put_spectrum(self, owner: Element, name: str, key: str) -> None:
         if owner.type == "spot" and name == "texture":
             raise self._fail(key, "Mitsuba requires an image as a spot's texture; recover the spot's intensity instead")
-        if owner.type in ("principled", "principledthin") and name in LOBES and self._array(key).any():
-            given = owner.find(name)
-            if given is None or (given.tag == "float" and float(given.value) == 0):
-                why = f"a {owner.type} has no such lobe if its file has no {name}, or 0, so the value had no effect"
-                raise self._fail(key, why)
         value, kind = self._array(key), parameter_kind(self.params, key)
         if kind == "emitter" and value.size == 1 and mi.is_spectral:  # a <float> would be multiplied by D65
             replace(owner, owner.new("spectrum", name=name, value=numbers(value)))

@@ -90,6 +90,8 @@ class SceneNeeds:
     lens_clip: bool
     unfollowed: tuple[mi.BSDF, ...] = ()  # BSDFs of surfaces whose sampling cannot be differentiated
     blends: tuple[mi.BSDF, ...] = ()  # BSDFs of surfaces with a blend of singular and smooth lobes
+    # BSDFs of surfaces that are masks, with their opacity, and BSDFs with a mask nested in them, with None.
+    masks: tuple[tuple[mi.BSDF, mi.Texture | None], ...] = ()
     lamps: tuple[Lamp, ...] = ()  # shapes that emit
     small_lamps: tuple[Lamp, ...] = ()  # emitting shapes smaller than a pixel in view
 
@@ -151,6 +153,7 @@ def scene_needs(scene: Any, sensor: Any, lit: Sequence[int] | None = None) -> Sc
         lens_clip=lens_clip,
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in unfollowed),
         blends=uneven_blends(graph),
+        masks=_masks(graph),
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
     )
@@ -184,6 +187,14 @@ def blend_warning(graph: SceneGraph, blends: Iterable[Any]) -> str | None:
                 what = "plastic" if name == "SmoothPlastic" else "a mask over a BSDF that transmits light"
                 return f"bsdf {bsdf.id()} blends {what} with other lobes, which Mitsuba samples slightly wrongly"
     return None
+
+
+def _masks(graph: SceneGraph) -> tuple[tuple[Any, Any], ...]:
+    found: dict[Any, Any] = {}
+    for mask in (bsdf for bsdf in graph.of_type(mi.BSDF) if bsdf.class_name() == "MaskBSDF"):
+        opacity = next(child for child in graph.children[mask] if isinstance(child, mi.Texture))
+        found |= {owner: opacity if owner is mask else None for owner in graph.owning_bsdfs(mask)}
+    return tuple((bsdf, found[bsdf]) for bsdf in graph.surface_bsdfs() if bsdf in found)
 
 
 def is_bent(mesh: Any) -> bool:

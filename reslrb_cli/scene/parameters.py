@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -18,10 +19,21 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings, Thickness
-from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
+from reslrb_cli.scene.catalog import MARGIN, ParameterInfo, describe, list_parameters, open_domain, unused
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
+from reslrb_cli.scene.load import warn_once
+from reslrb_cli.scene.plastic import PlasticTables
 from reslrb_cli.scene.upsampling import Upsampling
-from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
+from reslrb_cli.scene.values import (
+    Array,
+    ParameterValue,
+    Place,
+    check_bounds,
+    check_transform,
+    first_entry,
+    initial_array,
+    settle,
+)
 
 
 @dataclass(frozen=True)
@@ -120,6 +132,7 @@ class Selection:
         """Propagate tangents to the scene from the values that move objects, and from colours."""
         self.deformation.push()
         self.colours.push()
+        PlasticTables(self.params).push()
 
     def shown(self, key: str, value: Any) -> np.ndarray[Any, Any]:
         """Convert `value`, a Dr.Jit value of the parameter `key`, to the form that `array` returns."""
@@ -169,22 +182,44 @@ def select_parameters(scene: mi.Scene, specs: Sequence[ParameterSpec], source: o
         at = functools.partial(specs[origin[key]].at, word=settings.word)
         place = Place(source, f"parameters[{origin[key]}]", at)
         slot = selection.slot(key)
-        value = initial_array(slot, settings.initial, settings.resolution, place)
+        value = known = initial_array(slot, settings.initial, settings.resolution, place)
         if settings.bounds is not None:
             plate = any(isinstance(each, Thickness) for each in settings.regularizers)
             held = Place(place.source, place.key, lambda _: "regularizers") if plate else place
             check_bounds(slot, value, settings.bounds, held)
         check_transform(slot, value, settings, place)
+        value = _moved_inside(selection, key, value, place)
         # The sides of an environment map meet.
         is_map = slot.is_texture and not slot.halo and min(slot.get().shape[:2]) > 1
         if settings.smoothing is not None and not is_map:
             instead = "; recover a `heightmap` of the mesh instead" if key.endswith(".vertex_positions") else ""
             raise place.fail("precondition", f"smooths textures and heightmaps, but not `{key}`{instead}")
         selection.check_regularizers(key, place)
-        if settings.initial != "scene" or settings.resolution is not None:
+        if settings.initial != "scene" or settings.resolution is not None or value is not known:
             slot.set(value)
     selection.update()
     return selection
+
+
+def _moved_inside(selection: Selection, key: str, value: Array, place: Place) -> Array:
+    """Return `value` inside of the range in which `key` has a derivative, and bound `key` to this range.
+
+    Exported scenes have weights of exactly 0. Such a weight would never change.
+    """
+    keys = [each for each in (key, *selection.tied.get(key, ())) if each in selection.params.properties]
+    ranges = [open_domain(selection.params, each) for each in keys] or [(-np.inf, np.inf)]
+    settings = selection.specs[key]
+    low, high = settings.bounds or (-np.inf, np.inf)
+    inner = max(low, *(each[0] for each in ranges)), min(high, *(each[1] for each in ranges))
+    if settings.transform != "none" or inner == (low, high) or inner[0] >= inner[1]:
+        return value
+    selection.specs[key] = replace(settings, bounds=inner)
+    moved = np.clip(value, np.float32(inner[0]), np.float32(inner[1]))
+    if (at := first_entry(value, moved != value)) is None:
+        return value
+    why = f"starts {MARGIN:g} inside of its range, because Mitsuba has no derivative at {at}"
+    warn_once(f"{place.source}: {place.key}: `{key}` {why}", logging.INFO)
+    return moved
 
 
 def set_values(
@@ -263,6 +298,11 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
         if is_tied:
             tied[keys[0]], keys = keys[1:], keys[:1]
         chosen |= dict.fromkeys(keys, spec.settings())
+    for key in [key for key in chosen if key in params.properties]:
+        if (why := unused(params, key, chosen)) is not None:
+            del chosen[key]  # a glob may select others
+            if origin[key] not in {origin[other] for other in chosen if other in origin}:
+                raise Place(source, f"parameters[{origin[key]}]").fail("key", f"`{key}` {why}")
     colours = Upsampling(params)
     for key in chosen:
         colours.add(key, tied.get(key, ()))

@@ -20,13 +20,18 @@ from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters
 from reslrb_cli.scene.deformation import list_movable, where_moved
 from reslrb_cli.scene.dispersion import COEFFICIENT
-from reslrb_cli.scene.export import LOBES
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.images import StoredImage, decode_srgb
 from reslrb_cli.scene.needs import surfaces_met
 from reslrb_cli.scene.rays import grid, sensor_rays
 
 Image = np.ndarray[Any, Any]
+
+#: Lobes of `principled` and `principledthin` that a scene does not have if their weight is 0.
+_LOBES = (
+    *("anisotropic", "clearcoat", "diff_trans", "flatness", "metallic"),
+    *("sheen", "sheen_tint", "spec_tint", "spec_trans"),
+)
 
 
 def write_smaller(photo: StoredImage, size: tuple[int, int], path: Path, is_raw: bool = False) -> None:
@@ -150,7 +155,7 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     placed = {moved.key for moved in where_moved(params, keys)}  # recovered by a motion
     emitters = [info.key for info, _ in found if info.kind == "emitter" and info.key not in placed]
     first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
-    return [Proposal(info, share, _bounds(info), _resolution(info), info.key in first) for info, share in found]
+    return [Proposal(info, share, usual_bounds(info), _resolution(info), info.key in first) for info, share in found]
 
 
 def find_movable_in_view(scene: mi.Scene, sensor: int) -> list[tuple[str, float, str, str]]:
@@ -185,10 +190,10 @@ def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
 
 
 def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
-    """True if Mitsuba has left out the lobe of a parameter, so that the parameter's value has no effect."""
+    """True for the weight of a lobe that the scene does not have. Users can still recover it."""
     owner, name = params.hierarchy[params.properties[info.key][2]][0], info.key.split(".")[-2]
     is_principled = owner is not None and owner.class_name().startswith("Principled")
-    return is_principled and name in LOBES and info.value is not None and info.value.high == 0
+    return is_principled and name in _LOBES and info.value is not None and info.value.high == 0
 
 
 def _above(params: mi.SceneParameters, key: str) -> list[Any]:
@@ -240,7 +245,7 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     return shares
 
 
-def _bounds(info: ParameterInfo) -> str | None:
+def usual_bounds(info: ParameterInfo) -> str | None:
     text = next((bounds for pattern, bounds in _BOUNDS if re.search(pattern, info.key)), None)
     if (name := COEFFICIENT.search(info.key)) and info.value is not None:
         # The index stays above 1, and the poles stay outside of the visible wavelengths.

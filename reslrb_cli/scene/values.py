@@ -109,7 +109,7 @@ def initial_array(
         array = _from_file(slot, current, initial, resizable, place)
     if resolution is not None and array.shape[:2] != resolution[::-1]:
         array = resample(array, resolution)
-    if (bad := _first(array, ~np.isfinite(array))) is not None:
+    if (bad := first_entry(array, ~np.isfinite(array))) is not None:
         raise place.fail("initial", f"`{slot.key}` has {bad}; all values must be finite")
     return array
 
@@ -117,7 +117,7 @@ def initial_array(
 def check_bounds(slot: ParameterValue, array: Array, bounds: tuple[float, float], place: Place) -> None:
     """Raise ConfigError at `place` if an entry of `array` lies outside of `bounds`."""
     low, high = np.float32(bounds[0]), np.float32(bounds[1])
-    if (outside := _first(array, (array < low) | (array > high))) is not None:
+    if (outside := first_entry(array, (array < low) | (array > high))) is not None:
         raise place.fail("bounds", f"exclude the initial value of `{slot.key}`, {outside}")
 
 
@@ -132,7 +132,7 @@ def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: P
         # Between close bounds, rounding may have moved a run's value onto one; the optimiser starts at the nearest
         # value that the transform can represent.
         outside = (array < np.float32(low)) | (array > np.float32(high))
-    if (value := _first(array, outside)) is not None:
+    if (value := first_entry(array, outside)) is not None:
         yields = f"values between its bounds, {low:g} and {high:g}" if bounded else "positive values"
         problem = f"`{slot.key}` starts at {value}; transform: {spec.transform} yields only {yields}"
         raise place.fail("initial", problem)
@@ -217,7 +217,7 @@ def _size(image: Array) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
 
 
-def _first(array: Array, mask: Array) -> str | None:
+def first_entry(array: Array, mask: Array) -> str | None:
     """Return, in words, the first entry of `array` in `mask` with its index, or None if there is none."""
     if not mask.any():
         return None

@@ -85,10 +85,13 @@ def _singular_factor(
         smooth = mi.Spectrum(0)
         if plan.needs.blends:
             smooth = bsdf.eval(context_of(plan), si, bs.wo, delta & is_one_of(bsdf, plan.needs.blends))
-        if plan.differentiate_null:
-            # A mask's weight and density both carry the derivative of its opacity. Other BSDFs divide by a density that
-            # may depend on their parameters (plastic).
-            pdf = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), dr.detach(pdf), pdf)
+        for mask, opacity in plan.needs.masks:  # a mask's weight and density both carry the derivative of its opacity
+            here = delta & (bsdf == mi.BSDFPtr(mask))
+            once = dr.detach(pdf)
+            if opacity is not None:
+                o = dr.clip(opacity.eval_1(si, here), 0, 1)
+                once = pdf * (dr.detach(o) / o)
+            pdf = dr.select(here, once, pdf)
         f = dr.select(delta, weight * pdf - smooth, f)
     if plan.differentiate_null:
         null = active & scattering.is_null

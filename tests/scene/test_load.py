@@ -16,7 +16,7 @@ from turns import a_few
 import reslrb_cli
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene.catalog import list_parameters
+from reslrb_cli.scene.catalog import MARGIN, list_parameters
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
 
@@ -108,6 +108,15 @@ def test_missing_meshes(tmp_path, text, what):
         load(tmp_path, LIT_SPHERE.replace("</scene>", f"{mesh}</scene>"), radius=1)
     assert what in str(error.value)
     assert "scene.xml:" in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["plastic", "roughplastic", "pplastic"])
+def test_textures_without_a_mean_are_refused_with_a_remedy(tmp_path, kind):
+    name = '<string name="name" value="vertex_color"/>'
+    colour = f'<texture type="mesh_attribute" name="diffuse_reflectance">{name}</texture>'
+    text = LIT_SPHERE.replace("/></shape>", f"/><bsdf type='{kind}'>{colour}</bsdf></shape>")
+    with pytest.raises(ConfigError, match=r"needs the mean of each texture.*use a bitmap, or the bsdf `principled`"):
+        load(tmp_path, text, radius="1")
 
 
 def test_missing_file(tmp_path):
@@ -225,22 +234,23 @@ def test_a_selected_8_bit_texture_has_the_values_of_mitsuba_as_floats(walls):
     [key, other] = sorted(before, key=lambda key: key.startswith("ball"))
     assert (before[key].obstacle, before[other].obstacle) == (None, None)
     scene = load_scene(walls, keys=["wall.*"])
-    spec = ParameterSpec(key=key, bounds=(0.0, 1.0))
-    selection = select_parameters(scene, [spec], "c.yaml")
-    [after] = [info for info in list_parameters(selection.params, values=True) if info.key == key]
+    params = mi.traverse(scene)
+    [after] = [info for info in list_parameters(params, values=True) if info.key == key]
     assert (after.bits, after.type, after.shape) == (None, "TensorXf", before[key].shape)
-    assert int(selection.params.flags(key)) & int(mi.ParamFlags.NonDifferentiable) == 0
-    assert type(selection.params[other]).__name__ == "TensorXu8", "what is not selected takes four times the memory"
+    assert int(params.flags(key)) & int(mi.ParamFlags.NonDifferentiable) == 0
+    assert type(params[other]).__name__ == "TensorXu8", "what is not selected takes four times the memory"
     exact = before[key].bits == 8
     assert np.allclose(_numbers(after.value), _numbers(before[key].value), atol=1e-6 if exact else 1e-3)
     text = walls.read_text().replace('<string name="format" value="fp16"/>', "")
     file = text.index("<string name=", text.index('"wall"'))
     walls.with_name("variant.xml").write_text(text[:file] + '<string name="format" value="variant"/>' + text[file:])
     theirs = mi.traverse(mi.load_file(str(walls.with_name("variant.xml")), optimize=False))
-    assert np.array_equal(np.array(theirs[key]), np.array(selection.params[key]))
+    assert np.array_equal(np.array(theirs[key]), np.array(params[key]))
     images = [np.array(mi.render(each, integrator=mi.load_dict({"type": "path"}), spp=4, seed=0))
               for each in (own, scene)]  # fmt: skip
     assert np.allclose(*images, atol=1e-5 if exact else 2e-3)
+    selection = select_parameters(scene, [ParameterSpec(key=key, bounds=(0.0, 1.0))], "c.yaml")
+    assert np.allclose(selection.array(key), np.array(theirs[key]), atol=MARGIN)  # an opacity of 1 starts inside
 
 
 def _numbers(value):

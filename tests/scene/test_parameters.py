@@ -211,3 +211,87 @@ def test_index_of_refraction(make_scene):
     scene = make_scene(glass={"type": "dielectric"}, ball={"type": "sphere", "bsdf": {"type": "ref", "id": "glass"}})
     with pytest.raises(ConfigError, match=r"`glass.eta` is not differentiable \(SmoothDielectric\)"):
         select(scene, {"key": "glass.eta"})
+
+
+# Values at which Mitsuba leaves out a lobe.
+
+
+def with_bsdf(make_scene, **bsdf):
+    return make_scene(plane={"type": "rectangle", "bsdf": {**bsdf, "id": "floor"}}, floor=None)
+
+
+@pytest.mark.parametrize(("bsdf", "key", "given", "starts"), [
+    ({"type": "principled"}, "spec_trans.value", None, 0.001),
+    ({"type": "principled"}, "metallic.value", 1.0, 0.999),
+    ({"type": "principled"}, "metallic.value", 0.0, 0.0),
+    ({"type": "principled", "specular": 0.5}, "specular", 0.0, 0.001),
+    ({"type": "principledthin"}, "diff_trans.value", 2.0, 1.999),
+    ({"type": "principledthin"}, "diff_trans.value", 0.4, 0.4),
+    ({"type": "roughconductor"}, "eta.value", None, 0.001),
+    ({"type": "mask", "opacity": 1.0, "inside": {"type": "diffuse"}}, "opacity.value", None, 0.999),
+])  # fmt: skip
+def test_starts_and_bounds_are_where_a_derivative_exists(make_scene, caplog, bsdf, key, given, starts):
+    caplog.set_level("INFO")
+    spec = {"key": f"plane.bsdf.{key}"} | ({} if given is None else {"initial": given})
+    selection = select(with_bsdf(make_scene, **bsdf), spec)
+    assert selection.array(spec["key"]) == pytest.approx(starts)
+    low, high = selection.specs[spec["key"]].bounds
+    assert (low if starts < 0.5 else high) == pytest.approx(starts) or starts in (0.0, 0.4)
+    moved = "c.yaml: parameters[0]: `plane.bsdf" in caplog.text
+    assert moved == (starts not in (0.0, 0.4))
+
+
+def test_bounds_of_the_user_stay_inside(make_scene):
+    scene = with_bsdf(make_scene, type="principled", sheen=0.5)
+    key = "plane.bsdf.sheen.value"
+    assert select(scene, {"key": key, "bounds": [0, 0.7]}).specs[key].bounds == (0.001, 0.7)
+    assert select(scene, {"key": key, "bounds": [0.2, 0.7]}).specs[key].bounds == (0.2, 0.7)
+    narrow = select(scene, {"key": key, "initial": 0.0004, "bounds": [0, 0.0005]})
+    assert narrow.specs[key].bounds == (0, 0.0005)
+    assert narrow.array(key) == pytest.approx(0.0004)
+
+
+UNUSED = [
+    ("principled", "clearcoat_gloss", "clearcoat"),
+    ("principled", "sheen_tint", "sheen"),
+    ("principledthin", "sheen_tint", "sheen"),
+    ("principledthin", "eta", "spec_trans"),
+    ("principledthin", "anisotropic", "spec_trans"),
+    ("principledthin", "spec_tint", "spec_trans"),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "weight"), UNUSED)
+def test_a_parameter_without_effect_is_refused(make_scene, kind, name, weight):
+    key, other = f"plane.bsdf.{name}.value", f"plane.bsdf.{weight}.value"
+    scene = with_bsdf(make_scene, type=kind)
+    why = rf"parameters\[0\].key: `{key}` has no effect while `plane.bsdf.{weight}` is 0"
+    with pytest.raises(ConfigError, match=why):
+        select(scene, {"key": key})
+    listed = {info.key: info.obstacle for info in list_parameters(mi.traverse(scene))}
+    assert "has no effect" in listed[key]
+    assert listed[other] is None
+    assert select(scene, {"key": key}, {"key": other}).keys == [key, other]
+    positive = with_bsdf(make_scene, type=kind, **{weight: 0.5})
+    assert select(positive, {"key": key}).keys == [key]
+
+
+def test_a_glob_leaves_out_parameters_without_effect(make_scene):
+    both = select(with_bsdf(make_scene, type="principled"), {"key": "plane.bsdf.*clearcoat*.value"}).keys
+    assert both == ["plane.bsdf.clearcoat.value", "plane.bsdf.clearcoat_gloss.value"]
+    others = select(with_bsdf(make_scene, type="principled"), {"key": "plane.bsdf.*ss*.value"}).keys
+    assert others == ["plane.bsdf.roughness.value", "plane.bsdf.flatness.value"]
+    with pytest.raises(ConfigError, match=r"parameters\[0\].key: `plane.bsdf.clearcoat_gloss.value` has no effect"):
+        select(with_bsdf(make_scene, type="principled"), {"key": "plane.bsdf.*gloss*"})
+
+
+@pytest.mark.parametrize(("kind", "name"), [("polarizer", "theta"), ("retarder", "theta"), ("retarder", "delta")])
+def test_polarisation_is_refused_without_polarised_light(make_scene, kind, name):
+    with pytest.raises(ConfigError, match="only changes polarised light"):
+        select(with_bsdf(make_scene, type=kind), {"key": f"plane.bsdf.{name}.value"})
+
+
+def test_light_through_a_twosided_bsdf_is_refused(make_scene):
+    scene = with_bsdf(make_scene, type="twosided", inside={"type": "principled"})
+    with pytest.raises(ConfigError, match="lets light through a `twosided` BSDF"):
+        select(scene, {"key": "plane.bsdf.brdf_0.spec_trans.value"})

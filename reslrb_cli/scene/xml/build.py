@@ -163,6 +163,10 @@ _PLACE = re.compile(r"\(line (\d+), col \d+\)")
 _TRACEBACK = re.compile(r"Traceback \(most recent call last\):.*\n\w+: ", re.DOTALL)
 #: Mitsuba's message about a mesh without faces.
 _NO_FACES = re.compile(r"Storing new normals in a Mesh that didn't have normals.*")
+#: Mitsuba's message about a texture without a mean, and the reason.
+_NO_MEAN = "Texture::mean(): not implemented!"
+_MEANS = "its plugin needs the mean of each texture, which mesh_attribute and volume do not have; use a bitmap, or the \
+bsdf `principled` with a base_color"
 
 
 def _place_textures(root: Element) -> None:
@@ -237,6 +241,7 @@ class _Text:
         text = _TRACEBACK.sub("", _ORIGIN.sub("", message)).strip()
         while _PREAMBLE.match(text):
             text = _PREAMBLE.sub("", text).strip()
+        text = text.replace(_NO_MEAN, _MEANS)
         text = _NO_FACES.sub("the mesh has no faces", text)
         text = _PLACE.sub(lambda other: f"({self._elements[int(other[1]) - 1].place})", text)
         return ConfigError(element.place if element else self._root.file, "", text)

@@ -1,0 +1,154 @@
+"""Derivatives of `roughplastic` by its roughness and by its index of refraction.
+
+The diffuse lobe of this BSDF has tables: the transmittance T of the rough boundary, by the cosine of a direction, and
+the diffuse reflectance r inside of the boundary. Its value towards wo is
+
+    f = d / (pi eta^2 (1 - d' r)) T(cos wi) T(cos wo) cos wo        d: diffuse reflectance; d' = d if nonlinear, or 1
+
+T and r depend on alpha and eta. Mitsuba 3.9 computes both tables anew for each value, but without derivatives.
+`with_tables` puts leaves with the same numbers in their place while an integrator differentiates. The gradient then
+also reaches the tables, and goes on to alpha and eta by the slopes of the tables. The slopes are central differences
+between the tables of two BSDFs that Mitsuba makes for neighbouring values.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.scene.catalog import entry_value
+
+Array = np.ndarray[Any, Any]
+
+#: Parameters on which the tables depend, and the largest step of their differences. A step is at most a tenth of the
+#: value. Mitsuba adds up thousands of numbers in single precision, so shorter steps have larger errors.
+_STEPS = {"alpha": 0.02, "eta": 0.02}
+
+
+@dataclass
+class _Tables:
+    """Tables T (64,) and r (1,) of one BSDF as leaves, and their slopes by tracked parameters. `keys` are the keys of
+    its alpha and eta.
+    """
+
+    node: mi.BSDF
+    keys: dict[str, str]
+    leaves: tuple[mi.Float, ...] = ()
+    slopes: dict[str, tuple[mi.Float, mi.Float]] = field(default_factory=dict)
+
+
+class PlasticTables:
+    """Tables of all `roughplastic` BSDFs among `params`, the result of `mi.traverse` for a scene or a BSDF."""
+
+    def __init__(self, params: mi.SceneParameters) -> None:
+        self.params = params
+        found: dict[mi.BSDF, _Tables] = {}
+        for key, (_, _, node, _) in params.properties.items():
+            if node.class_name() == "RoughPlastic" and (name := key.rpartition(".")[2]) in _STEPS:
+                found.setdefault(node, _Tables(node, {})).keys[name] = key
+        self._found = list(found.values())
+
+    def place(self) -> None:
+        """Put leaves in place of the tables of BSDFs whose alpha or eta tracks derivatives."""
+        for each in self._found:
+            with dr.resume_grad():
+                values = {name: entry_value(self.params, key) for name, key in each.keys.items()}
+                tracked = [name for name, value in values.items() if dr.grad_enabled(value)]
+                each.leaves, each.slopes = (), {}
+                if not tracked:
+                    continue
+                each.leaves = tuple(mi.Float(dr.detach(table)) + dr.opaque(mi.Float, 0) for table in tables(each.node))
+                dr.make_opaque(each.leaves)
+                dr.enable_grad(each.leaves)
+                _put(each.node, each.leaves)
+            now = {name: float(value[0]) for name, value in values.items()}
+            each.slopes = {name: _slopes(each.node, now, name) for name in tracked}
+
+    def collect(self) -> None:
+        """Add the gradient at the tables to the gradient of alpha and eta. Clear the gradient of the tables."""
+        for each in self._found:
+            gradients = [dr.grad(leaf) for leaf in each.leaves]
+            for name, slopes in each.slopes.items():
+                parts = [dr.sum(gradient * slope) for gradient, slope in zip(gradients, slopes, strict=True)]
+                dr.accum_grad(entry_value(self.params, each.keys[name]), parts[0] + parts[1])
+            dr.clear_grad(each.leaves)
+
+    def push(self) -> None:
+        """Place the tables, and propagate tangents of alpha and eta to them, for forward mode."""
+        self.place()
+        for each in self._found:
+            for number, leaf in enumerate(each.leaves):
+                dr.set_grad(leaf, 0)
+                for name, slopes in each.slopes.items():
+                    dr.accum_grad(leaf, slopes[number] * dr.grad(entry_value(self.params, each.keys[name])))
+                dr.enqueue(dr.ADMode.Forward, leaf)
+        if any(each.leaves for each in self._found):
+            dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+
+
+@contextmanager
+def with_tables(params: mi.SceneParameters | None) -> Iterator[None]:
+    """Add the part of the gradient of `params` that a step in this context sends to the tables."""
+    if params is None:
+        yield
+        return
+    found = PlasticTables(params)
+    found.place()
+    yield
+    found.collect()
+
+
+def tables(node: mi.BSDF) -> tuple[mi.Float, mi.Float]:
+    """Return the current tables T (64,) and r (1,) of a `roughplastic`, which `mi.traverse` does not list."""
+    made = dr.detail.update_indices([mi.Float(0), mi.Float(0)], _arrays(node)[-2:])
+    return made[0], made[1]
+
+
+def _put(node: mi.BSDF, arrays: tuple[mi.Float, ...]) -> None:
+    """Replace the tables of a `roughplastic`."""
+    indices = iter([*_arrays(node)[:-2], *dr.detail.collect_indices(list(arrays))])
+    with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal):
+        node._traverse_1_cb_rw(lambda *_: next(indices))
+
+
+def _arrays(node: mi.BSDF) -> list[int]:
+    """Return the indices of all arrays of an object. Dr.Jit records launches by this traversal. The tables of a
+    `roughplastic` come last.
+    """
+    indices: list[int] = []
+    with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal):
+        node._traverse_1_cb_ro(lambda index, *_: indices.append(index))
+    return indices
+
+
+def _slopes(node: mi.BSDF, values: dict[str, float], name: str) -> tuple[mi.Float, mi.Float]:
+    """Return the derivatives of the tables by the parameter `name` at `values`."""
+    kind = re.search(r"distribution = (\w+)", str(node))
+    T, r = _differences(kind[1] if kind else "beckmann", values["alpha"], values["eta"], name)
+    slopes = mi.Float(T) + dr.opaque(mi.Float, 0), mi.Float(r) + dr.opaque(mi.Float, 0)
+    dr.make_opaque(slopes)
+    return slopes
+
+
+@functools.lru_cache(maxsize=64)
+def _differences(distribution: str, alpha: float, eta: float, name: str) -> tuple[Array, Array]:
+    at = {"alpha": alpha, "eta": eta}
+    step = min(_STEPS[name], abs(at[name]) / 10)
+    ends = []
+    for side in (1, -1):
+        value = at | {name: at[name] + side * step}
+        properties = mi.Properties("roughplastic")
+        properties["distribution"] = distribution
+        properties["alpha"], properties["int_ior"], properties["ext_ior"] = value["alpha"], value["eta"], 1.0
+        made = tables(mi.PluginManager.instance().create_object(properties))
+        ends.append([np.array(table, np.float64) for table in made])
+    (T_up, r_up), (T_down, r_down) = ends
+    return ((T_up - T_down) / (2 * step)).astype(np.float32), ((r_up - r_down) / (2 * step)).astype(np.float32)

@@ -1,0 +1,91 @@
+"""The derivatives of a `roughplastic` by its roughness and its index reach the tables that Mitsuba makes of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from reslrb_cli.integrators.plugin import register
+from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.scenes.small import rgb, room
+from reslrb_cli.scene.plastic import PlasticTables, tables, with_tables
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+#: Rounding of Mitsuba's tables, divided by the step.
+STEP, ROUNDING = 0.02, 4e-3
+
+
+def plastic(**options: Any) -> mi.BSDF:
+    return mi.load_dict({"type": "roughplastic", "diffuse_reflectance": rgb(0.6, 0.3, 0.2), **options})
+
+
+def value(bsdf: mi.BSDF) -> Any:
+    """Return the sum of the BSDF's values for some pairs of directions."""
+    si = dr.zeros(mi.SurfaceInteraction3f, 3)
+    si.wi = dr.normalize(mi.Vector3f([0.1, 0.7, -0.9], 0.2, [0.9, 0.5, 0.1]))
+    wo = dr.normalize(mi.Vector3f([0.3, -0.6, 0.2], [-0.3, 0.4, 0.8], [0.8, 0.2, 0.5]))
+    return dr.sum(dr.sum(bsdf.eval(mi.BSDFContext(), si, wo)))
+
+
+def differences(bsdf: mi.BSDF, name: str) -> float:
+    params = mi.traverse(bsdf)
+    now, found = float(params[name][0]), []
+    for side in (1, -1, 0):
+        params[name] = mi.Float(now + side * STEP)
+        params.update()
+        found.append(float(value(bsdf)[0]))
+    return (found[0] - found[1]) / (2 * STEP)
+
+
+@pytest.mark.parametrize(("name", "options"), [
+    ("alpha", {"alpha": 0.4}),
+    ("eta", {"alpha": 0.3}),
+    ("alpha", {"alpha": 0.3, "nonlinear": True, "distribution": "ggx"}),
+    ("eta", {"alpha": 0.2, "nonlinear": True, "distribution": "ggx"}),
+])  # fmt: skip
+def test_gradients_reach_the_tables(name: str, options: dict[str, Any]) -> None:
+    bsdf = plastic(**options)
+    params, expected = mi.traverse(bsdf), differences(bsdf, name)
+    before = [np.array(table) for table in tables(bsdf)]
+    leaf = dr.opaque(mi.Float, float(params[name][0]))
+    dr.enable_grad(leaf)
+    params[name] = leaf
+    params.update()
+    made = PlasticTables(params)
+    made.place()
+    assert all(np.array_equal(old, np.array(new)) for old, new in zip(before, tables(bsdf), strict=True))
+    dr.backward(value(bsdf))
+    plain = float(dr.grad(leaf)[0])
+    made.collect()
+    assert float(dr.grad(leaf)[0]) == pytest.approx(expected, rel=ROUNDING, abs=ROUNDING)
+    assert plain != pytest.approx(expected, rel=0.05, abs=ROUNDING)  # Mitsuba's own derivative
+
+
+def test_without_derivatives_the_tables_are_mitsubas() -> None:
+    bsdf = plastic(alpha=0.3)
+    before = tables(bsdf)
+    with with_tables(mi.traverse(bsdf)):
+        assert dr.detail.collect_indices(tables(bsdf)) == dr.detail.collect_indices(before)
+
+
+def test_users_loops_get_the_same_derivative() -> None:
+    register()
+    case = Case(room(floor={"type": "roughplastic", "alpha": 0.3}), ["floor.alpha"])
+    ours = integrator("reslrb", 2, paths="camera", estimator="stack")
+    expected = case.gradient(ours, 1, 16, step=case.known_step)[0]
+    assert case.tangent(ours, np.ones(1), 1, 16) == pytest.approx(expected, rel=1e-3)
+    params = mi.traverse(case.scene)
+    leaf = dr.opaque(mi.Float, float(params["floor.alpha"][0]))
+    dr.enable_grad(leaf)
+    params["floor.alpha"] = leaf
+    params.update()
+    plugin = mi.load_dict({"type": "reslrb", "max_depth": 2, "rr_depth": 1000, "paths": "camera", "estimator": "stack"})
+    image = mi.render(case.scene, params, integrator=plugin, spp=16, seed=1)
+    dr.backward(dr.sum((image * case.adjoint).array))
+    found = float(dr.grad(leaf)[0])
+    assert found == pytest.approx(expected, rel=0.2)  # mi.render has samples of its own for the gradient
