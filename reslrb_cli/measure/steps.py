@@ -18,7 +18,7 @@ import numpy as np
 from reslrb_cli.config.loader import told
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.protocol import first_channels
-from reslrb_cli.integrators.step import gradient_step, known_step, render_image
+from reslrb_cli.integrators.step import StepResult, given_step, gradient_step, known_step, render_image
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.processes import Begun
@@ -44,10 +44,10 @@ class TimedSteps:
         self.sensor = self.problem.sensors[0]
 
     def gradient(
-        self, seed: int, given: mi.TensorXf | Callable[[mi.TensorXf], mi.Float], spp: int
+        self, seed: int, given: mi.TensorXf | Callable[[mi.TensorXf], mi.Float], spp: int, with_image: bool = True
     ) -> tuple[dict[str, Any], StepTimes]:
         """Return the gradients by key, and times of the step alone. `given` is dL/dI, or the loss as a function of the
-        image.
+        image. Without `with_image`, a step with a known dL/dI renders no image.
         """
         problem = self.problem
         problem.apply()
@@ -56,12 +56,15 @@ class TimedSteps:
         seen = problem.integrator, problem.scene, self.sensor
         common: dict[str, Any] = {"seed": seed, "spp": spp, "params": problem.selection.params}
         with self.clock.step() as times:
+            result: StepResult | None = None
             if callable(given):
                 result = gradient_step(*seen, given, **(problem.config.step_options() | common))
-            else:
+            elif with_image:
                 result = known_step(*seen, given, **common)
+            else:
+                given_step(*seen, given, **common)
             gradients = problem.gradients()
-            dr.eval(result.image, result.loss, gradients)
+            dr.eval(gradients, () if result is None else (result.image, result.loss))
         return gradients, times
 
     def told(self, answer: dict[str, Any], cold: bool, release: bool) -> dict[str, Any]:
@@ -297,7 +300,7 @@ class Sampler(TimedSteps):
                 dr.eval(picture)
             return (np.array(picture, np.float32) * self.inside).ravel(), times
         if self.mode == "fixed":
-            gradients, times = self.gradient(seed, self.adjoints[image % len(self.adjoints)], spp)
+            gradients, times = self.gradient(seed, self.adjoints[image % len(self.adjoints)], spp, with_image=False)
         else:
             gradients, times = self.gradient(seed, lambda seen: masked_loss(self.view, seen, self.mask), spp)
         row = [np.array(gradients[key], np.float32).ravel() for key in problem.selection.keys]

@@ -438,7 +438,7 @@ def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
     such record. Keys that the class does not have are left out, because a later version may have written them.
     """
     try:
-        found: R = _reader(kind).validate_python(entry)
+        found: R = _reader(kind).validate_python(entry)  # type: ignore[arg-type]  # types are hashable
     except ValidationError:
         return None
     return found

@@ -19,7 +19,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.measure import steps
 from reslrb_cli.measure.convergence import Role
 from reslrb_cli.measure.judgement import HEAVY, Judgement, MethodSamples, ReferenceMean
-from reslrb_cli.measure.methods import IMAGES
+from reslrb_cli.measure.methods import DEFAULTS, IMAGES, parse_cases
 from reslrb_cli.measure.steps import Sampler, survey
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import BenchStatus, Method, MethodRecord, Range
@@ -451,3 +451,22 @@ def test_steps_are_repeatable_and_the_border_does_not_count(tmp_path: Path, mode
         assert (row.reshape(8, 8, 3)[arrays["mask"][:, :, 0] == 0] == 0).all()
     if mode == "fixed":
         assert not np.allclose(sampler.step(3, 4, 1)[0], row, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("name", a_few([case.label for case in parse_cases(DEFAULTS["fixed"])],
+                                       ["ptracer", "prb", "reslrb:stack(paths=both)"]))  # fmt: skip
+def test_a_fixed_gradient_is_not_charged_for_an_image(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No method renders an image that nobody uses, beside the paths of its gradient."""
+    what = problem(tmp_path)
+    [case] = parse_cases(name)
+    sampler = Sampler(case.at(what.config, 3, known=True), "fixed", survey(what, "fixed")[1])
+    tracer = type(sampler.problem.integrator)
+
+    def image(self: Any, *job: Any) -> None:
+        raise AssertionError("an image is rendered")
+
+    monkeypatch.setattr(tracer, "image", image)
+    monkeypatch.setattr(tracer, "known", image)
+    assert sampler.step(3, 4, 0)[0].any()
