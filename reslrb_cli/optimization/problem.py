@@ -23,6 +23,7 @@ from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
 from reslrb_cli.optimization.variables import Smoother, make_transform
 from reslrb_cli.optimization.views import SHARED, View, slope, to_tensor
 from reslrb_cli.records.decisions import Decision
+from reslrb_cli.records.images import luminance
 from reslrb_cli.scene.catalog import COLOUR, EMISSION
 from reslrb_cli.scene.deformation import Moves
 from reslrb_cli.scene.parameters import Selection
@@ -53,20 +54,29 @@ class ErrorMeter:
     `truth`, `masks` and `quantities` are the fields of a `Problem`. Each error has the unit of its parameter. Only
     errors with a common unit can be combined. Reflectance and roughness have no unit, but the intensity of a lamp is in
     W/sr, and the radiance of an area light in W/(m² sr). If units differ, errors are divided by the true values.
+
+    Colours of textures are compared by their luminance if `monochrome`, because the image depends on nothing else.
     """
 
     def __init__(
-        self, truth: Mapping[str, Array], masks: Mapping[str, Array], quantities: Mapping[str, str] | None = None
-    ) -> None:
+        self, truth: Mapping[str, Array], masks: Mapping[str, Array], quantities: Mapping[str, str] | None = None,
+        monochrome: bool = False,
+    ) -> None:  # fmt: skip
+        self._monochrome = monochrome
         self._masks = {key: masks[key] for key in truth if masks[key].any()}
-        self._truth = {key: truth[key].astype(np.float64)[mask] for key, mask in self._masks.items()}
+        self._truth = {key: self._seen(truth[key])[mask] for key, mask in self._masks.items()}
         #: Root mean square of each truth over the same entries; a truth of zeros has none.
         self.scales = {key: scale for key, true in self._truth.items() if (scale := rms(true)) > 0}
         self.one_unit = len({(quantities or {}).get(key, "") for key in self._truth}) <= 1
 
     def errors(self, value: Callable[[str], Array]) -> dict[str, float]:
         """Return the root mean square error of each parameter with a true value. `value` returns a current value."""
-        return {key: rms(value(key).astype(np.float64)[self._masks[key]] - true) for key, true in self._truth.items()}
+        return {key: rms(self._seen(value(key))[self._masks[key]] - true) for key, true in self._truth.items()}
+
+    def _seen(self, value: Array) -> Array:
+        """Return the numbers of a value that its error counts."""
+        is_colour = value.ndim == 3 and value.shape[2] == 3
+        return luminance(value) if self._monochrome and is_colour else value.astype(np.float64)
 
     def total(self, errors: Mapping[str, float]) -> float | None:
         """Return the root mean square error over the entries of all parameters. Return None if units differ or nothing
@@ -295,7 +305,7 @@ class Problem:
     @functools.cached_property
     def meter(self) -> ErrorMeter:
         """Meter of the errors of parameters relative to `truth`."""
-        return ErrorMeter(self.truth, self.masks, self.quantities)
+        return ErrorMeter(self.truth, self.masks, self.quantities, bool(mi.is_monochromatic))
 
 
 def make_optimizer(config: Config, selection: Selection) -> Optimizer:

@@ -44,21 +44,27 @@ def _mean_and_max(differences: Array) -> dict[str, float]:
 SIGMA, WINDOW = 1.5, 11
 
 
-def image_errors(image: Array, target: Array, exposure: float, adapted: Array | None = None) -> dict[str, Any]:
-    """Return the errors of an image (H, W, C) of linear values. Only channels shared with `target` count, without
-    alpha. For CIEDE2000, colours are multiplied by the matrix `adapted`, which makes white surfaces white.
+def image_errors(
+    image: Array, target: Array, exposure: float, adapted: Array | None = None, bands: int = 0
+) -> dict[str, Any]:
+    """Return the errors of an image (H, W, C) of linear values. Only colours that `target` has, too, count, without
+    alpha. For CIEDE2000, colours are multiplied by the matrix `adapted`, which makes white surfaces white. The channels
+    of a film with its own responses, such as those of a camera, are `bands`, and have no CIEDE2000.
 
     Image and target are multiplied by `exposure`, clipped to [0, 1] and encoded in sRGB, as on a screen. `psnr_db` is
     None if both look the same. `ssim` is None for images smaller than its window. `ciede2000` holds the mean and the
     maximum over the pixels. `not_finite` is the number of image pixels that are not finite. Pixels that are not finite
     are treated as black.
     """
-    colors = 3 if min(image.shape[2], target.shape[2]) >= 3 else 1
+    both = min(image.shape[2], target.shape[2])
+    colors = min(bands, both) if bands else 3 if both >= 3 else 1
     bad = int(np.sum(~np.isfinite(image[:, :, :colors]).all(axis=2)))
     pair = [np.nan_to_num(array[:, :, :colors].astype(np.float64), posinf=0.0, neginf=0.0) for array in (image, target)]
     found: dict[str, Any] = {"not_finite": bad} if bad else {}
     shown = [encode(np.clip(array * exposure, 0.0, 1.0)) for array in pair]
     found |= {"psnr_db": psnr(*shown), "ssim": ssim(*shown)}
+    if bands:
+        return found
     # CIEDE2000 needs three channels, so grey is repeated.
     rgb = [np.broadcast_to(array * exposure, (*array.shape[:2], 3)) for array in pair]
     if adapted is not None:
@@ -89,8 +95,7 @@ def seen_errors(folder: Path, views: Sequence[Mapping[str, Any]] | None) -> dict
     """Return the perceptual errors of the images of the run in `folder`, for `results.seen` in its manifest.
 
     Each sensor (`""`, `"-0"`, ...) has the `exposure` for viewing the target, and the `image_errors` of the `initial`
-    and the `final` image. `views` comes from the run's manifest. Missing and damaged files are left out. The colours of
-    a film with its own responses, such as those of a camera, have no CIEDE2000.
+    and the `final` image. `views` comes from the run's manifest. Missing and damaged files are left out.
     """
     images = {}
     by_sensor = {f"-{view.get('sensor')}": view for view in views or ()}
@@ -104,9 +109,7 @@ def seen_errors(folder: Path, views: Sequence[Mapping[str, Any]] | None) -> dict
         for moment in ("initial", "final"):
             image = load_image(folder / "images" / f"{moment}{suffix}.exr")
             if image is not None and image.shape[:2] == target.shape[:2]:
-                found[moment] = image_errors(image, target, exposure, adapted)
-                if "channels" in view:
-                    del found[moment]["ciede2000"]
+                found[moment] = image_errors(image, target, exposure, adapted, len(view.get("channels") or ()))
         if found:
             images[suffix] = {"exposure": exposure} | found
     return images

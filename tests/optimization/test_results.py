@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -17,6 +18,7 @@ from reslrb_cli.optimization import loading, loop
 from reslrb_cli.optimization.assemble import assemble_scene, quantity
 from reslrb_cli.optimization.problem import ErrorMeter
 from reslrb_cli.optimization.results import Results, summary
+from reslrb_cli.records.images import luminance
 from reslrb_cli.scene.dispersion import register
 
 # Parameters summarised in a few numbers, and results that exist whenever a run ends.
@@ -114,6 +116,25 @@ def test_errors_are_measured_within_the_mask(tmp_path):
     meter = replace(problem).meter
     assert meter.errors(problem.selection.array) == {}
     assert meter.total({}) is None
+
+
+def test_colours_of_a_monochrome_run_are_compared_by_luminance(tmp_path, monkeypatch):
+    """The luminance is all that such a run can recover. Its error is 0 for any colours of the right luminance."""
+    truth = np.random.default_rng(3).uniform(0.1, 0.9, (4, 4, 3))
+    grey = np.repeat(luminance(truth)[:, :, None], 3, axis=2)
+    masks = {key: everything(truth) for key in ("colour", "map")}
+    given = {"colour": truth, "map": truth[:, :, :1]}
+    meter = ErrorMeter(given, masks, monochrome=True)
+    assert meter.errors({"colour": grey, "map": given["map"]}.__getitem__) == {"colour": pytest.approx(0), "map": 0}
+    off = meter.errors({"colour": grey + 0.1, "map": given["map"] + 0.2}.__getitem__)
+    assert off == {"colour": pytest.approx(0.1, rel=1e-4), "map": pytest.approx(0.2)}
+    assert meter.total(off) == pytest.approx(np.sqrt((0.1**2 + 0.2**2) / 2), rel=1e-4)
+    assert ErrorMeter(given, masks).errors({"colour": grey, "map": given["map"]}.__getitem__)["colour"] > 0.1
+    problem = make_problem(tmp_path)
+    for monochrome in (True, False):
+        monkeypatch.setattr("reslrb_cli.optimization.problem.mi", SimpleNamespace(is_monochromatic=monochrome))
+        problem = replace(problem, truth={"albedo": truth}, masks={"albedo": masks["colour"]})
+        assert (problem.meter.errors(lambda key: grey)["albedo"] < 1e-6) == monochrome
 
 
 def test_the_error_of_several_parameters_counts_their_entries():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from report.measured import make_run, texture
 
-from reslrb_cli.records.images import load_image
+from reslrb_cli.records.images import load_image, write_image
 from reslrb_cli.report.perceptual import (
     ciede2000,
     image_errors,
@@ -68,6 +68,23 @@ def test_non_finite_pixels_are_counted_and_black():
     found = image_errors(image, target, 1.0)
     assert found["not_finite"] == 3
     assert found["psnr_db"] is None
+
+
+@pytest.mark.parametrize("bands", [2, 3, 4, 5])
+def test_all_bands_of_a_film_count(bands, tmp_path):
+    """The channels of a camera are not colours. Each of them counts, also if the others are black."""
+    run = make_run(tmp_path / "a")
+    view = {"sensor": 0, "shown": 1.0, "channels": [f"band{number}" for number in range(bands)]}
+    for lit in range(bands):
+        target = np.zeros((16, 16, bands), np.float32)
+        target[:, :, lit] = texture(16, 16)[:, :, 0]
+        for name, part in (("target", 1.0), ("initial", 1.0), ("final", 0.5)):
+            write_image(run / "images" / name, target * np.float32(part))
+        found = seen_errors(run, [view])[""]
+        assert found["initial"]["psnr_db"] is None
+        expected = image_errors(target[:, :, [lit]] / 2, target[:, :, [lit]], 1.0)["psnr_db"] + 10 * np.log10(bands)
+        assert found["final"]["psnr_db"] == pytest.approx(expected)
+        assert "ciede2000" not in found["final"]
 
 
 def test_grey_images_and_alpha():
