@@ -12,7 +12,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
@@ -213,8 +213,19 @@ SECONDS_PER_LINE = 10.0
 BAR, BAR_COLUMNS = "{percentage:3.0f}%|{bar}| {desc}, {n_fmt}/{total_fmt}, {remaining} left", 38
 
 
+def _columns(stream: TextIO) -> int:
+    """Return the width of a terminal. It is 0 on some terminals of containers and scripts. Return 1 if the width is
+    unknown.
+    """
+    try:
+        return os.get_terminal_size(stream.fileno()).columns
+    except (OSError, ValueError):
+        return 1
+
+
 class Progress:
-    """Progress of a run with `total` iterations on standard error: a bar on a terminal, plain lines otherwise.
+    """Progress of a run with `total` iterations on standard error: a bar on a terminal that has a width, plain lines
+    otherwise.
 
     As a context manager, `Progress` closes the bar at the end. `done` iterations were finished before the run was
     resumed. `meter` measures the errors of the parameters.
@@ -226,7 +237,7 @@ class Progress:
         self._total, self._meter = total, meter
         self._bar: Any = None
         self._last_line, self._tenth = time.monotonic(), 10 * done // total
-        if not self._quiet and self._stream.isatty():
+        if not self._quiet and self._stream.isatty() and _columns(self._stream) > 0:
             from tqdm import tqdm
 
             self._bar = tqdm(

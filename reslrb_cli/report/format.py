@@ -12,13 +12,19 @@ from reslrb_cli.errors import printable
 #: Replaces the middle of a shortened key.
 ELLIPSIS = "..."
 
+#: Numbers of at least this size are written with an exponent.
+LEAST_WITH_EXPONENT = 1e6
+
 #: Remark on comparisons of camera paths with light paths.
 WITHOUT_BORDER = "without the film's border, where light paths lose what camera paths see"
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Return a number with `digits` significant digits. The result is empty for None."""
-    return "" if value is None else f"{value:.{digits}g}"
+    """Return a number with `digits` significant digits. Numbers from a million on have an exponent. The result is empty
+    for None.
+    """
+    text = "" if value is None else f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(float(text)) < LEAST_WITH_EXPONENT else text
 
 
 def with_error(value: float, error: float, sign: str = "+-") -> str:
@@ -35,8 +41,10 @@ def with_error(value: float, error: float, sign: str = "+-") -> str:
 
 def interval(value: float, low: float, high: float, digits: int | str) -> str:
     """Return a value and its interval. `digits` is the number of significant digits, or a format."""
-    spec = digits if isinstance(digits, str) else f".{digits}g"
-    return f"{value:{spec}} [{low:{spec}}, {high:{spec}}]"
+    first, *ends = (
+        number(each, digits) if isinstance(digits, int) else f"{each:{digits}}" for each in (value, low, high)
+    )
+    return f"{first} [{', '.join(ends)}]"
 
 
 def count(amount: int, what: str) -> str:

@@ -263,7 +263,7 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
     sentence += "."
     if biased and _efficiency(biased[0]) > _efficiency(best):
         first, times = biased[0], _efficiency(biased[0]) / _efficiency(best)
-        sentence += f" The biased {first.method.label} has {times:.2g} times its efficiency"
+        sentence += f" The biased {first.method.label} has {number(times, 2)} times its efficiency"
         sentence += f", but its error stays above {first.bias:.2g}." if first.bias else "."
     return sentence
 

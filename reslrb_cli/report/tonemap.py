@@ -16,6 +16,7 @@ import numpy as np
 
 from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.images import read_layers, write_layers
+from reslrb_cli.report.format import number
 
 Array = np.ndarray[Any, Any]
 
@@ -84,7 +85,7 @@ def exposure_words(exposure: float, target: Array | None = None) -> str:
     """
     words = []
     if exposure != 1:
-        times = f"{exposure:.2g} times brighter" if exposure > 1 else f"{1 / exposure:.2g} times darker"
+        times = f"{number(exposure, 2)} times brighter" if exposure > 1 else f"{number(1 / exposure, 2)} times darker"
         words.append(f"shown {times}")
     if target is not None and target.size:
         clipped = float((_brightest(target) * exposure > 1).mean())

@@ -4,6 +4,7 @@ continues if the terminal cannot be written.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import io
@@ -129,6 +130,25 @@ def test_losing_the_terminal_does_not_end_a_run(monkeypatch: pytest.MonkeyPatch)
             stream.there = False
             progress.show(record(1, 1))
             progress.show(record(9, 1))
+
+
+@pytest.mark.parametrize("columns", [0, 1, 80])
+def test_progress_is_shown_on_terminals_of_any_size(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Terminals of containers and scripts may have no size, so that a bar has no room."""
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 0 if columns == 0 else 24, columns, 0, 0))
+    with os.fdopen(theirs, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        with Progress(10, quiet=False, meter=make_meter(1)) as progress:
+            for number in range(10):
+                progress.show(record(number, 1))
+    shown = ""
+    with contextlib.suppress(OSError):  # the end of the terminal
+        while part := os.read(ours, 10_000):
+            shown += part.decode()
+    os.close(ours)
+    assert ("10/10: loss" in shown) == (columns == 0)
+    assert shown.strip()
 
 
 # Progress on terminals of any width: a bar, the percentage, the loss, and no truncated number.

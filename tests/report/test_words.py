@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 
 from reslrb_cli.config.files import duration
 from reslrb_cli.errors import printable
-from reslrb_cli.report.format import count, number, shorten, with_error
+from reslrb_cli.report.format import count, interval, number, shorten, with_error
 from reslrb_cli.report.run_summary import last_line, parameter_lines, warnings
 
 # Numbers, times, keys and results in words.
@@ -46,6 +47,14 @@ def test_times(seconds, text):
 def test_numbers():
     assert [count(amount, "iteration") for amount in (0, 1, 2)] == ["0 iterations", "1 iteration", "2 iterations"]
     assert (number(None), number(0.123456), number(1e6), number(0.5, 3)) == ("", "0.1235", "1e+06", "0.5")
+    assert interval(420, 150, 1200, 2) == "420 [150, 1200]"
+    assert interval(1.234, 0.5, 20, ".2f") == "1.23 [0.50, 20.00]"
+    for size in 10.0 ** np.arange(-12, 12, 0.25):
+        for digits in range(1, 6):
+            for value in (size, -size):
+                text = number(value, digits)
+                assert float(text) == float(f"{value:.{digits}g}")
+                assert ("e+" in text) == (abs(float(text)) >= 1e6)
 
 
 def test_keys_are_shortened_in_the_middle():
@@ -81,7 +90,7 @@ def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut(width):
     lines = parameter_lines(found, width)
     assert max(map(len, lines)) <= width
     words = " ".join(" ".join(lines).split())
-    assert len(re.findall(r"0\.123 0\.456 0\.789 \(-0\.00123 to 1\.23e\+05\)", words)) == 3
+    assert len(re.findall(r"0\.123 0\.456 0\.789 \(-0\.00123 to 123000\)", words)) == 3
     assert re.search(r"0\.123 to 0\.456, worse", words)
 
 
