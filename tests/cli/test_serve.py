@@ -209,9 +209,13 @@ def test_damage_is_one_line(served, runs):
     (runs / "b").rename(runs / "ä€")
     (runs / "ä€" / "metrics.jsonl").write_text("damaged\n")
     assert ask(served)[0].status == 200
-    answer, text = ask(served, f"/compare?run={quote('ä€')}&run=a+%3Cb%3E")
+    address = f"/compare?run={quote('ä€')}&run=a+%3Cb%3E"
+    assert ask(served, address)[0].status == 200  # damaged lines are left out
+    (runs / "ä€" / "metrics.jsonl").unlink()
+    (runs / "ä€" / "metrics.jsonl").mkdir()
+    answer, text = ask(served, address)
     assert answer.status == 500
-    assert "metrics.jsonl: line 1: is damaged" in text
+    assert "metrics.jsonl: " in text
 
 
 def test_the_command(llvm, tmp_path, monkeypatch):
@@ -251,7 +255,7 @@ def test_the_pages_in_a_browser(served, runs, chromium, monkeypatch):
         chromium.evaluate("window.seen = 1")
         assert chromium.wait_for(f"window.seen != 1 && {loaded} && scrollY == 500", 10)
     monkeypatch.setattr(page_module, "REFRESH_SECONDS", 3600)  # no page reloads while its links are clicked
-    assert chromium.wait_for(f"document.querySelector('meta[http-equiv=refresh]')?.content == 3600 && {loaded}", 10)
+    assert chromium.wait_for(f"document.body?.dataset.reload == 3600 && {loaded}", 10)
     click = "[...document.querySelectorAll('a')].find(a => decodeURI(a.href).includes('%s')).click()"
     chromium.evaluate(click % "with=b")
     assert chromium.wait_for(f"document.body?.textContent.includes('to compare with b') && {loaded}", 10)

@@ -8,6 +8,7 @@ import html.parser
 import io
 import json
 import re
+import time
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from report.measured import (
     LAMP,
     SCALING,
     make_run,
+    texture,
     write_bench,
     write_convergence,
     write_gradcheck,
@@ -26,7 +28,8 @@ from reslrb_cli.records.images import read_layers
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
-from reslrb_cli.report.page.values import texture_pictures
+from reslrb_cli.report.page.values import hatched, texture_pictures
+from reslrb_cli.report.plots import COLORS
 from reslrb_cli.report.sources import ShownRun, read_sources
 from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
@@ -410,9 +413,50 @@ def test_a_slider_compares_the_images_of_each_sensor(chromium, pages):
         return document.querySelector('.stage img:last-child').src
             == document.querySelector('img[data-moment=target]').src })()"""
     assert chromium.evaluate(choose)
+    # Each picture is shown once, and its maps beside the slider.
+    shown = "[...document.querySelectorAll('figure')].filter(f => f.checkVisibility()).length"
+    assert chromium.evaluate("[...document.querySelectorAll('img[data-moment]')].every(i => !i.checkVisibility())")
+    figures = chromium.evaluate(shown)
     chromium.open(pages["three sensors"], 1280, scripts=False)
+    assert chromium.evaluate(shown) == figures + 9
     assert chromium.evaluate("document.querySelectorAll('.compare').length") == 0
     assert chromium.evaluate("document.querySelectorAll('img[data-moment]').length") == 9
+
+
+#: A drag on the picture from the middle to a fifth of its width, and a click, as events of a pointer.
+POINTER = """(() => { const stage = document.querySelector('.stage'), box = stage.getBoundingClientRect();
+    stage.setPointerCapture = () => {};
+    const at = (type, share) => stage.dispatchEvent(new (type == 'click' ? MouseEvent : PointerEvent)(type,
+        {bubbles: true, pointerId: 1, clientX: box.x + share * box.width, clientY: box.y + 5}));
+    for (const [type, share] of EVENTS) at(type, share);
+    return [document.querySelector('.compare input').value, document.querySelectorAll('dialog').length] })()"""
+
+
+def test_the_border_is_dragged_on_the_picture_and_a_click_enlarges_it(chromium, pages):
+    chromium.open(pages["three sensors"], 1280)
+    drag = "[['pointerdown', .5], ['pointermove', .3], ['pointermove', .2], ['pointerup', .2], ['click', .2]]"
+    assert chromium.evaluate(POINTER.replace("EVENTS", drag)) == ["20", 0]
+    click = "[['pointerdown', .1], ['pointerup', .1], ['click', .1]]"
+    assert chromium.evaluate(POINTER.replace("EVENTS", click)) == ["20", 1]
+    left = "document.querySelector('dialog img').src == document.querySelector('.stage img:last-child').src"
+    assert chromium.evaluate(left)
+    chromium.evaluate("document.querySelector('dialog').click()")
+    assert chromium.wait_for("document.querySelectorAll('dialog').length == 0", 10)
+
+
+def test_a_page_in_progress_keeps_the_reader_s_place(chromium, tmp_path, monkeypatch):
+    """It reloads itself, but not while a picture is enlarged, and keeps the border of the pictures."""
+    monkeypatch.setattr("reslrb_cli.report.page.REFRESH_SECONDS", 1)
+    page = write_report(make_run(tmp_path / "run"), {"status": "running", "views": [{"sensor": 0, "shown": 1.0}]})
+    chromium.open(page, 1280)
+    chromium.evaluate("document.querySelector('.compare input').value = 30")
+    chromium.evaluate("document.querySelector('.compare input').dispatchEvent(new Event('input'))")
+    chromium.evaluate("window.seen = 1; document.querySelector('.stage').click()")
+    time.sleep(2.5)
+    assert chromium.evaluate("[window.seen, document.querySelectorAll('dialog').length]") == [1, 1]
+    chromium.evaluate("document.querySelector('dialog').click()")
+    assert chromium.wait_for("window.seen != 1 && document.readyState == 'complete'", 10)
+    assert chromium.evaluate("document.querySelector('.compare input').value") == "30"
 
 
 def test_only_a_reliable_result_is_green(chromium, pages, tmp_path):
@@ -457,3 +501,27 @@ def test_text_has_contrast_with_its_background(chromium, pages, dark):
         assert chromium.evaluate(contrast) == []
         background = chromium.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (background == "rgb(255, 255, 255)") == (not dark)
+
+
+def test_losses_of_saved_images_are_drawn(tmp_path):
+    """Noise of the iterations' images can hide that the loss falls."""
+    losses = {"image_loss": {"initial": 0.3, "final": 0.01}}
+    with_saved, without = (render(read_sources([make_run(tmp_path / name, results=found)]))
+                           for name, found in (("a", losses), ("b", {})))  # fmt: skip
+    assert "saved images, with less noise" in with_saved
+    assert "saved images, with less noise" not in without
+    drawn = [[markup.partition("</svg>")[0].count(f"stroke: {colour}") for colour in COLORS[:2]]
+             for markup in (with_saved, without)]  # fmt: skip
+    assert [all(drawn[0]), drawn[1][1]] == [True, 0]
+
+
+def test_texels_that_nothing_sees_are_hatched(tmp_path):
+    """Their values are the initial ones, or those of their neighbours."""
+    array = texture(8, 8)
+    where = np.zeros((8, 8), bool)
+    where[:2] = True
+    shown = hatched(array, where)
+    assert np.array_equal(shown[2:], array[2:])
+    assert set(np.unique(shown[:2])) == {np.float32(0.15), np.float32(0.5)}
+    page = Page(render(read_sources([make_run(tmp_path / "a")])))
+    assert "the other texels are not recovered, and hatched at the end" in page.sections["Textures"]

@@ -72,17 +72,27 @@ def texture_pictures(run: ShownRun) -> Markup:
         if not arrays:
             continue
         arrays, words = visible(arrays, about.get("quantity") in PLACES)
+        mask = read_mask(folder, name)
+        if mask is not None and "final" in arrays and mask.shape == arrays["final"].shape[:2]:
+            arrays["final"] = hatched(arrays["final"], ~mask)
         shown = []
         for moment, array in arrays.items():
             value = [lay_out("run.value", about[moment])] if about.get(moment) else []
             size = lay_out("titled", titles[moment], f", {array.shape[1]}×{array.shape[0]}")
             shown.append(show(array, f"{titles[moment]}: {name}", size, *value))
-        mask = read_mask(folder, name)
         if mask is not None and mask.ndim == 2 and not mask.all():
-            share = lay_out("titled", "reached", f" by light and sensor (white): {100 * mask.mean():.3g} %")
+            share = lay_out("titled", "reached", f" by light and sensor (white): {number(100 * mask.mean(), 3)} %; the "
+                            f"other texels are not recovered, and hatched at the {titles['final']}")  # fmt: skip
             shown.append(show(mask[:, :, None].astype(np.float32), f"reached: {name}", share))
         parts += lay_out("gallery", shown, key(name), words)
     return parts
+
+
+def hatched(array: Array, where: Array) -> Array:
+    """Return an image (H, W, C) in which the pixels `where` (H, W) alternate between two greys."""
+    y, x = np.indices(where.shape)
+    grey = np.where((x + y) % 2, 0.5, 0.15).astype(array.dtype)
+    return np.where(where[:, :, None], grey[:, :, None], array)
 
 
 def visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Array], str]:
@@ -139,13 +149,30 @@ def convergence(run: ShownRun) -> Markup:
     names = sorted(known, key=lambda name: -known[name])
     drawn = names[:MOST_CURVES]
     what = "relative error" if relative else "RMSE"
-    curves = _both(run, "loss", {"loss": run.column("loss")})
+    curves = _losses(run)
     curves += _both(run, f"{what} by parameter", {name: errors[name] for name in drawn})
     curves += lay_out("legend", drawn)
     more, together = len(names) - len(drawn), points_together(len(run.records))
     words = f"The {MOST_CURVES} parameters that are the farthest off at the end; {more} more are not drawn."
     return curves + soft(words if more else "") + soft(
         f"Each point is the mean of {together} iterations." if together > 1 else "")  # fmt: skip
+
+
+def _losses(run: ShownRun) -> Markup:
+    """Return diagrams of the loss of the iterations. The noise of their images can hide that it falls, so the losses of
+    the saved images, which have more samples, are drawn, too, if they are known.
+    """
+    saved = run.results.get("image_loss") or {}
+    ends: Figures = [saved.get("initial"), saved.get("final")]
+    if len(run.records) < 2 or None in ends:
+        return _both(run, "loss", {"loss": run.column("loss")})
+    drawn = []
+    for name, caption in ABSCISSAE:
+        xs = run.column(name)
+        iterations = Curve("iterations", xs, run.column("loss"), 0)
+        drawn.append(("", diagram([iterations, Curve("saved images", [xs[0], xs[-1]], ends, 1, points=True)],
+                                  caption, "loss")))  # fmt: skip
+    return lay_out("diagrams", drawn) + lay_out("legend", ["iterations", "saved images, with less noise"])
 
 
 def _both(run: ShownRun, label: str, curves: Mapping[str, Figures]) -> Markup:
