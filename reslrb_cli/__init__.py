@@ -6,6 +6,7 @@ chooses the libLLVM that Dr.Jit loads.
 - `load` reads an experiment.
 - `optimize` recovers parameters in your own loop.
 - `render`, `gradient`, `gradcheck`, `convergence` and `export` run the commands of the same name on an experiment.
+- `ReslrbError` is the base class of the errors that these raise.
 - `Callback` receives the progress of a run; `TensorBoard`, `MLflow` and `WandB` log it.
 - `register` registers the plugins with Mitsuba.
 - `register_estimator` adds an estimator of your own to the integrator `reslrb`, and `check_estimator` checks it.
@@ -38,7 +39,15 @@ if TYPE_CHECKING:
     from reslrb_cli.api.experiment import check_estimator, convergence, export, gradcheck, gradient, load, render
     from reslrb_cli.api.run import Run, optimize
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.errors import ConfigError, ReslrbError
+    from reslrb_cli.errors import (
+        BackendError,
+        ConfigError,
+        MachineError,
+        NonFinite,
+        OutOfMemory,
+        ReslrbError,
+        UnsupportedScene,
+    )
     from reslrb_cli.estimators import register_estimator
     from reslrb_cli.integrators.plugin import register
     from reslrb_cli.integrators.step import gradient_step as step
@@ -48,15 +57,20 @@ if TYPE_CHECKING:
     from reslrb_cli.scene.load import load_for_script as load_scene
 
 __all__ = [
+    "BackendError",
     "Callback",
     "Config",
     "ConfigError",
     "MLflow",
+    "MachineError",
+    "NonFinite",
+    "OutOfMemory",
     "Record",
     "ReslrbError",
     "Run",
     "RunInfo",
     "TensorBoard",
+    "UnsupportedScene",
     "WandB",
     "__version__",
     "check_estimator",
@@ -83,7 +97,8 @@ _LAZY = {
     **{name: ("reslrb_cli.runs.loggers", name) for name in ("MLflow", "TensorBoard", "WandB")},
     **{name: ("reslrb_cli.runs.callbacks", name) for name in ("Callback", "RunInfo")},
     "Config": ("reslrb_cli.config.schema", "Config"),
-    "ConfigError": ("reslrb_cli.errors", "ConfigError"),
+    **{name: ("reslrb_cli.errors", name)
+       for name in ("BackendError", "ConfigError", "MachineError", "NonFinite", "OutOfMemory", "UnsupportedScene")},
     "Record": ("reslrb_cli.records.metrics", "Record"),
     "ReslrbError": ("reslrb_cli.errors", "ReslrbError"),
     "Run": ("reslrb_cli.api.run", "Run"),

@@ -8,6 +8,7 @@ import functools
 import logging
 import os
 import signal
+import sys
 import threading
 import weakref
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -95,7 +96,7 @@ class Run:
     also end the script, with the exit code 143 or 129. The end of the script completes the folder of an open iterator.
 
     Runs in one process share only the device. You can alternate between them: `zip(run_a, run_b)`. Runs in different
-    threads take turns, one iteration at a time.
+    threads take turns, one iteration at a time. A run and its loop belong to one thread.
     """
 
     def __init__(
@@ -111,6 +112,7 @@ class Run:
         self._failure: BaseException | None = None
         self._loop: weakref.ref[Generator[Record, None, None]] | None = None
         self._uses = self._scene_uses()
+        self._thread = threading.current_thread()
         if folder is not None and writes:
             _waiting.add(self)
 
@@ -125,6 +127,8 @@ class Run:
         return loop
 
     def _iterations(self) -> Generator[Record, None, None]:
+        if threading.current_thread() is not self._thread:  # Dr.Jit would end the process
+            raise RuntimeError("this run was made in another thread; call optimize in the thread of its loop")
         made = self._made()
         _waiting.discard(self)
         with _completed_at_the_end(self):
@@ -133,6 +137,7 @@ class Run:
                     if self._scene_uses() != self._uses:
                         reason = "has been used by another run or call since; load it once for each run"
                         raise ConfigError("scene", "", reason)
+                    self._check_variant()
                     with held():
                         record = next(made, None)
                     if record is None:
@@ -152,6 +157,12 @@ class Run:
                     made.close()
                     if self.config.own_scene is not None:
                         self._leave_values()
+
+    def _check_variant(self) -> None:
+        now, own = sys.modules["mitsuba"].variant(), self._begun.manifest.variant
+        if now != own:
+            reason = f"is {own}, but the script has set {now} during the loop; set {own} again before it continues"
+            raise ConfigError(self.config.source, "variant", reason)
 
     def _scene_uses(self) -> int:
         own = self.config.own_scene

@@ -125,7 +125,7 @@ def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[Bench
         for rows in session.run():
             show(rows)
             keeper.refresh()
-        keeper.finish()
+        keeper.finish(interrupts.requested)
         for note in notes:
             echo(note)
         return session.results(), interrupts.requested

@@ -114,7 +114,7 @@ def _run(plan: ConvergencePlan, json_file: Path | None, began: float) -> tuple[C
             for member in session.of(Role.CASE):
                 if judgement.ready and member.refusal is None:
                     echo(table.line(method_cells(judgement.overall(member), f"{rounds} rounds")))
-        keeper.finish()
+        keeper.finish(interrupts.requested)
         results = Judgement(session).results()
         table = _table(session)
         echo(table.head())

@@ -90,7 +90,7 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
     with Interrupts() as interrupts:
         for record in check.run(lambda: interrupts.requested, keeper.refresh):
             echo(record.line())
-        keeper.finish()
+        keeper.finish(interrupts.requested)
         return ExitCode.INTERRUPTED if interrupts.requested else ExitCode.DONE
 
 
@@ -124,7 +124,7 @@ def run_suite(options: GradcheckOptions) -> int:
             keeper.refresh()
             echo(_case_line(name, rows))
         interrupted = interrupts.requested
-        keeper.finish()
+        keeper.finish(interrupts.requested)
     for line in summary_lines(records):
         echo(line)
     return ExitCode.INTERRUPTED if interrupted else _exit_code(records)
@@ -244,5 +244,5 @@ def _run(check: Gradcheck, variant: str, options: GradcheckOptions) -> tuple[lis
             keeper.refresh()
             if record.verdict is not Verdict.NOT_MEASURED:  # the last lines say how many there are
                 echo(table.line(cells(record)))
-        keeper.finish()
+        keeper.finish(interrupts.requested)
     return records, interrupts.requested

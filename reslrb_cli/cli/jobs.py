@@ -79,11 +79,11 @@ class Jobs:
         cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
         gpus = visible_gpus() if number > 1 and variant.startswith("cuda") else []
         self.number = min(number, len(cores) or os.cpu_count() or 1, len(gpus) or number)
-        share = len(cores) // self.number
         self.slots = [RunSlot(show=self.show) for _ in range(self.number)]
         if self.number > 1:
             for n, slot in enumerate(self.slots):
-                slot.cores, slot.gpu = set(cores[n * share : (n + 1) * share]), gpus[n] if gpus else ""
+                first, end = (place * len(cores) // self.number for place in (n, n + 1))
+                slot.cores, slot.gpu = set(cores[first:end]), gpus[n] if gpus else ""
         self._free = list(self.slots)
         self._ended: dict[Future[End], tuple[str, RunSlot]] = {}
         self._pool = ThreadPoolExecutor(self.number)
@@ -137,14 +137,13 @@ class Jobs:
             click.echo(f"\r\x1b[K{text}", err=True, nl=False)
 
     def end(self) -> None:
-        """End all runs at once with a repeated signal. The manifests of the runs then record the end."""
-        processes, latest = (
-            [slot.process for slot in self.slots if slot.process is not None],
-            time.monotonic() + END_SECONDS,
-        )
-        for process in 2 * processes:
-            with contextlib.suppress(OSError):
-                process.send_signal(signal.SIGTERM)
+        """End all runs at once with two signals. The manifests of the runs then record the end."""
+        processes = [slot.process for slot in self.slots if slot.process is not None]
+        latest = time.monotonic() + END_SECONDS
+        for number in (signal.SIGTERM, signal.SIGINT):  # the same signal would count once
+            for process in processes:
+                with contextlib.suppress(OSError):
+                    process.send_signal(number)
         for process in processes:
             with contextlib.suppress(OSError, subprocess.TimeoutExpired):
                 process.wait(max(latest - time.monotonic(), 0))

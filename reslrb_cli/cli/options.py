@@ -6,6 +6,7 @@ then has one object per line. The file is updated while the command runs.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import functools
 import os
@@ -42,13 +43,16 @@ class Keeper:
     """Writer of a JSON file. If the process is killed, only seconds of work are lost.
 
     `origin` is the first line. `lines` returns the current state of all other lines. Without a file, the writer does
-    nothing.
+    nothing. An earlier file is only replaced at the end: until then, `FILE.partial` has the lines.
     """
 
     def __init__(self, json_file: Path | None, origin: Line, lines: Callable[[], Sequence[Line]]) -> None:
-        self._file, self._is_live = json_file, json_file is not None and not is_stream(json_file)
+        self._file = self._partial = json_file
+        self._is_live = json_file is not None and not is_stream(json_file)
+        if json_file is not None and self._is_live and json_file.exists() and json_file.stat().st_size:
+            self._partial = json_file.with_name(f"{json_file.name}.partial")
         self._origin, self._lines = origin, lines
-        self._live = LivePage(self._write, "the file of --json")
+        self._live = LivePage(lambda: self._write(self._partial), "the file of --json")
 
     def refresh(self) -> None:
         """Write the file every few seconds. Writing takes only a small share of the time. Call this method between
@@ -57,14 +61,22 @@ class Keeper:
         if self._is_live:  # a stream gets only the final lines
             self._live.refresh()
 
-    def finish(self) -> None:
-        """Write all lines in their final state. Raises OSError."""
-        if self._file is not None:
-            self._write()
+    def finish(self, interrupted: bool) -> None:
+        """Write all lines in their final state. If the measurement was `interrupted`, keep an earlier file. Raises
+        OSError.
+        """
+        self._write(self._partial if interrupted else self._file)
+        if self._file is None or self._partial == self._file:
+            return
+        if interrupted:
+            echo(f"--json: {self._file} has not changed; the interrupted measurement is in {self._partial}")
+        elif self._partial is not None:
+            with contextlib.suppress(OSError):
+                self._partial.unlink()
 
-    def _write(self) -> None:
-        assert self._file is not None
-        write_lines(self._file, [self._origin, *self._lines()])
+    def _write(self, file: Path | None) -> None:
+        if file is not None:
+            write_lines(file, [self._origin, *self._lines()])
 
 
 A = TypeVar("A", bound="Arena[Any, Any, Any]")

@@ -7,6 +7,7 @@ pages that were found in the folder, without following links.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import threading
@@ -23,7 +24,7 @@ import click
 from reslrb_cli.cli.options import FOLDER
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.files import tail
-from reslrb_cli.errors import ConfigError, ReslrbError, one_line
+from reslrb_cli.errors import ConfigError, describe
 
 #: Names of this machine in the header `Host`.
 LOCAL = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?", re.IGNORECASE)
@@ -49,6 +50,13 @@ class Served:
     file: Path | None
     page: str
     is_run: bool
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing: the browser has left before its answer was complete."""
 
 
 @click.command("serve")
@@ -78,10 +86,9 @@ def command(folder: Path, port: int) -> int:
 def make_server(folder: Path, port: int) -> ThreadingHTTPServer:
     """Return a server of the runs in `folder`. Raises ConfigError if the port is in use."""
     try:
-        server = ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, folder.resolve()))
+        server = _Server(("127.0.0.1", port), partial(_Handler, folder.resolve()))
     except OSError as error:
         raise ConfigError("--port", "", f"{port}: {error.strerror}; give another port, or 0 for a free one") from None
-    server.daemon_threads = True
     return server
 
 
@@ -100,7 +107,7 @@ def find_served(root: Path) -> list[Served]:
         is_run = MANIFEST_FILE in files
         folders[:] = [] if is_run or depth >= DEPTH else sorted(name for name in folders if not name.startswith("."))
         inside = (path for path in (folder.rglob("*") if is_run else folder.iterdir()) if path.is_symlink())
-        if (is_run or SWEEP_FILE in files) and all(path.resolve().is_relative_to(root) for path in inside):
+        if (is_run or SWEEP_FILE in files) and all(_stays(path, root) for path in inside):
             page = folder / ("report.html" if is_run else PAGE_FILE)
             file = page if page.is_file() and not page.is_symlink() else None
             address = "" if file is None else quote(f"/{file.relative_to(root).as_posix()}", errors=_BYTES)
@@ -109,17 +116,35 @@ def find_served(root: Path) -> list[Served]:
     return found
 
 
+def _stays(link: Path, root: Path) -> bool:
+    """Whether a link leads into `root`. False for links that form a loop."""
+    try:
+        return link.resolve(strict=True).is_relative_to(root)
+    except FileNotFoundError:
+        return link.resolve().is_relative_to(root)
+    except (OSError, RuntimeError):  # Python before 3.13 raises a RuntimeError for loops
+        return False
+
+
+def _number(value: Any) -> float | int | None:
+    """Return `value` if it is a finite number, and None for the content of a damaged file."""
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return value if is_number else None
+
+
 def _row(run: Served, first: str) -> dict[str, Any]:
     """Return the line of a run on the list. `first` is the run to compare with, or empty."""
     from reslrb_cli.records.manifest import read_manifest
 
     manifest = read_manifest(run.folder, mend=False) or {}
-    last = _last_record(run.folder)
+    last = {key: _number(value) for key, value in _last_record(run.folder).items()}
+    iteration = last.get("iteration")
     query = {"run": [first, run.name]} if first else {"with": run.name}
     target = "compare" if first else ""
     return {
-        "name": run.name, "page": run.page, "status": manifest.get("status", ""), "started": manifest.get("started"),
-        "iterations": last.get("iteration", -1) + 1, "loss": last.get("loss"), "error": last.get("parameter_rmse"),
+        "name": run.name, "page": run.page, "status": str(manifest.get("status", "")),
+        "started": str(manifest.get("started") or ""), "iterations": 0 if iteration is None else int(iteration) + 1,
+        "loss": last.get("loss"), "error": last.get("parameter_rmse"),
         "compare": "" if run.name == first else f"/{target}?{urlencode(query, doseq=True, errors=_BYTES)}",
     }  # fmt: skip
 
@@ -133,7 +158,7 @@ def _last_record(folder: Path) -> dict[str, Any]:
     try:
         with (folder / METRICS_FILE).open("rb") as file:
             found = json.loads(tail(file, LAST_BYTES).rpartition(b"\n")[0].rpartition(b"\n")[2])
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 
@@ -168,8 +193,8 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             page = self._page()
-        except (ReslrbError, OSError) as error:
-            self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR, explain=one_line(error))
+        except Exception as error:  # files of users can have any content
+            self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR, explain=describe(error))
             return
         if page is None:
             self.send_error(HTTPStatus.NOT_FOUND)
@@ -194,7 +219,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _page(self) -> bytes | None:
         """Return the page at the requested address, or None if there is none."""
-        address = urlsplit(self.path)
+        try:
+            address = urlsplit(self.path)
+        except ValueError:  # http://[
+            return None
         path, query = unquote(address.path, errors=_BYTES), parse_qs(address.query, errors=_BYTES)
         served = find_served(self._root)
         runs = [each for each in served if each.is_run]
@@ -215,7 +243,7 @@ class _Handler(BaseHTTPRequestHandler):
 
         first = first if any(each.name == first for each in served) else ""
         rows = [_row(each, first) for each in served if each.is_run]
-        rows.sort(key=lambda row: str(row["started"] or ""), reverse=True)
+        rows.sort(key=lambda row: str(row["started"]), reverse=True)
         sweeps = [each for each in served if not each.is_run and each.file is not None]
         parts = [("Sweeps", lay_out("served.sweeps", sweeps)), ("Runs", lay_out("served.runs", rows, first))]
         title = self._root.name or "/"

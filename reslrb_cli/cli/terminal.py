@@ -24,6 +24,7 @@ import select
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
@@ -37,16 +38,19 @@ from reslrb_cli.records.atomic import remove_unfinished
 
 #: Signals of Ctrl-C, of `kill` and batch systems, and of a terminal that closes.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+#: Seconds within which the same signal counts once. A terminal that closes sends SIGHUP twice: the kernel sends it to
+#: the foreground processes, and the shell to its jobs.
+SAME_S = 0.5
 _LEAVE = b"\0"  # no signal has the number 0
 
 
 class Interrupts:
     """Context manager in which `requested` is True after a signal.
 
-    More signals than `tolerated` end the process. A thread calls `last_act`, removes unfinished files, prints
-    `interrupted`, and exits with 130. The context prints `notice` at the first tolerated signal. Signals that were
-    ignored at the start of the program (`nohup`) stay ignored. An inner context replaces an outer one. Outside of the
-    main thread, the context does nothing.
+    More signals than `tolerated` end the process. The same signal counts once within `SAME_S` seconds. A thread calls
+    `last_act`, removes unfinished files, prints `interrupted`, and exits with 130. The context prints `notice` at the
+    first tolerated signal. Signals that were ignored at the start of the program (`nohup`) stay ignored. An inner
+    context replaces an outer one. Outside of the main thread, the context does nothing.
     """
 
     def __init__(
@@ -55,6 +59,7 @@ class Interrupts:
         self.requested = False
         self.last_act = last_act
         self._tolerated, self._notice, self._count = tolerated, notice, 0
+        self._last = (0, 0.0)
         self._before: dict[int, Any] = {}
         self._pipe: tuple[int, int] | None = None
         self._wakeup_before = -1
@@ -107,10 +112,13 @@ class Interrupts:
                 if number == _LEAVE[0]:
                     return
                 if number in self._before:
-                    self._see()
+                    self._see(number)
 
-    def _see(self) -> None:
-        self.requested = True
+    def _see(self, number: int) -> None:
+        now = time.monotonic()
+        if number == self._last[0] and now - self._last[1] < SAME_S:
+            return
+        self.requested, self._last = True, (number, now)
         self._count += 1
         if self._count > self._tolerated:
             self._end()

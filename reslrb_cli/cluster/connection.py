@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reslrb_cli.errors import ConfigError, MachineError, one_line
+from reslrb_cli.records.atomic import unfinished
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -120,8 +121,10 @@ def connected(place: Cluster) -> Iterator[tuple[Client, Path]]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         folder = Path(tempfile.mkdtemp(prefix="reslrb-cluster-"))
+        unfinished.add(folder)  # a second signal ends the process at once
+        stack.callback(unfinished.discard, folder)
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
-        stack.enter_context(dask.config.set(SETTINGS))
+        stack.enter_context(dask.config.set({**SETTINGS, "temporary-directory": str(folder)}))
         if place.address is None:
             stack.enter_context(dask.config.set(OWN_SETTINGS))
             address, security = stack.enter_context(_started(place.workers, folder))

@@ -19,6 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from typing_extensions import Self
 
 from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.records.lock import FolderLock, InUse
 
 
 class Jsonable:
@@ -104,13 +105,14 @@ class DecisionCache:
 
     def put(self, key: str, decision: Decision) -> None:
         """Store a decision as the newest entry."""
-        entries = {name: value for name, value in self._read().items() if name != key}
-        entries = {**dict(list(entries.items())[1 - MOST :]), key: decision.to_json()}
-        text = json.dumps(entries, indent=1)
-        with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: no home folder
+        with contextlib.suppress(OSError, RuntimeError, InUse):  # RuntimeError: no home folder
             path = self._path()
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, lambda file: file.write(text.encode() + b"\n"))
+            with FolderLock(Path(os.path.realpath(path.parent))):  # other runs store theirs, too
+                entries = {name: value for name, value in self._read().items() if name != key}
+                entries = {**dict(list(entries.items())[1 - MOST :]), key: decision.to_json()}
+                text = json.dumps(entries, indent=1)
+                write_atomically(path, lambda file: file.write(text.encode() + b"\n"))
 
     def _path(self) -> Path:
         return (self._given or cache_folder()) / CACHE_FILE

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from reslrb_cli.config.files import read_file
-from reslrb_cli.errors import ConfigError, printable
+from reslrb_cli.errors import ConfigError, is_machine_fault, printable
 from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.manifest import now, versions
 from reslrb_cli.records.metrics import Line
@@ -63,12 +63,17 @@ def is_stream(path: Path) -> bool:
 
 
 def write_lines(path: Path, lines: Sequence[Line]) -> None:
-    """Write a file with one object per line, atomically. A stream is written in place. Raises OSError."""
+    """Write a file with one object per line, atomically. A stream is written in place, and so is a file that cannot be
+    replaced: a mount of its own, or a file in a folder without write permission. Raises OSError.
+    """
     text = "".join(line.to_json() + "\n" for line in lines).encode()
-    if is_stream(path):
-        path.write_bytes(text)
-    else:  # the target of a link is replaced, not the link
-        write_atomically(Path(os.path.realpath(path)), lambda file: file.write(text))
+    try:
+        if not is_stream(path):  # the target of a link is replaced, not the link
+            return write_atomically(Path(os.path.realpath(path)), lambda file: file.write(text))
+    except OSError as error:
+        if is_machine_fault(error):
+            raise
+    path.write_bytes(text)
 
 
 def _command() -> list[str]:

@@ -1,11 +1,12 @@
 """Callbacks of a run: the protocol, and the calls.
 
 An error of a callback ends the run as an error of any other user code does: one line that names the callback and its
-line, and a complete run folder.
+line, and a complete run folder. After an error of an `optional` callback, the run goes on without it.
 """
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,11 +16,14 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config.code import guarded
+from reslrb_cli.errors import describe
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.tonemap import shown_exposures
 
 Array = np.ndarray[Any, Any]
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,11 @@ class Callback:
     """Receiver of the progress of a run. Derive from it, and override the methods that you need.
 
     Pass callbacks to `optimize(..., callbacks=[...])`. The run calls the methods between iterations, on its own thread.
-    An error in a method ends the run with one line, and with a complete run folder.
+    An error in a method ends the run with one line, and with a complete run folder. If `optional` is True, an error
+    after `begin` is a warning, and the run goes on without the callback.
     """
+
+    optional = False
 
     def begin(self, run: RunInfo) -> None:
         """Receive the start of a loop. A loop that continues the run calls `begin` again."""
@@ -113,5 +120,11 @@ class Calls:
     def _call(self, callback: Callback, name: str, *arguments: Any) -> None:
         kind = type(callback)
         file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-        with guarded("callbacks", kind.__name__, None if file is None else Path(file), f"`{name}`"):
-            getattr(callback, name)(self._run, *arguments)
+        try:
+            with guarded("callbacks", kind.__name__, None if file is None else Path(file), f"`{name}`"):
+                getattr(callback, name)(self._run, *arguments)
+        except Exception as error:
+            if not callback.optional or name == "begin":
+                raise
+            self._callbacks = [each for each in self._callbacks if each is not callback]
+            logger.warning("%s; the run goes on without this callback", describe(error))

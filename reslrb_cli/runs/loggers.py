@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -41,13 +42,18 @@ def package(name: str, extra: str) -> Any:
 class _Logger(Callback):
     """Common part of the loggers. `_done` is the number of finished iterations, the place of an image."""
 
+    optional = True
     _done = 0
+    _run_before: tuple[str, Path | None] | None = None
 
     def begin(self, run: RunInfo) -> None:
         self._done = run.done
-        self._open(run)
+        which = run.name, run.folder
+        self._open(run, again=run.done > 0 and which == self._run_before)
+        self._run_before = which
 
-    def _open(self, run: RunInfo) -> None:
+    def _open(self, run: RunInfo, again: bool) -> None:
+        """Start to log. `again` is True for another loop over the run that this logger has logged before."""
         raise NotImplementedError
 
     def _scalars(self, values: dict[str, float], iteration: int) -> None:
@@ -95,11 +101,12 @@ class TensorBoard(_Logger):
         self._folder = folder
         self._writer: Any = None
 
-    def _open(self, run: RunInfo) -> None:
+    def _open(self, run: RunInfo, again: bool) -> None:
         place = run.folder if self._folder is None else Path(self._folder)
         if place is None:
             raise ConfigError("callbacks", "TensorBoard", "needs a folder: give the run one, or TensorBoard(FOLDER)")
-        self._writer = self._writers.SummaryWriter(str(place))
+        # TensorBoard hides what an earlier process wrote of the iterations that are computed again.
+        self._writer = self._writers.SummaryWriter(str(place), purge_step=run.done or None)
         self._writer.add_text("settings", "\n".join(f"    {key}: {value}" for key, value in run.settings.items()))
 
     def _scalars(self, values: dict[str, float], iteration: int) -> None:
@@ -127,31 +134,44 @@ class MLflow(_Logger):
 
     def __init__(self) -> None:
         self._mlflow = package("mlflow", "mlflow")
-        self._owns = self._runs = False
+        self._client: Any = None
+        self._id, self._owns = "", False
 
-    def _open(self, run: RunInfo) -> None:
-        self._owns = self._mlflow.active_run() is None
+    def _open(self, run: RunInfo, again: bool) -> None:
+        self._client = self._mlflow.MlflowClient()
+        active, name = self._mlflow.active_run(), run.name if run.folder is None else run.folder.name
+        if again:
+            self._client.update_run(self._id, status="RUNNING")
+            return
+        self._owns = active is None
+        if self._owns:  # not left active, because other runs of the process would log to it
+            with self._mlflow.start_run(run_name=name) as active:
+                pass
+        self._id = active.info.run_id
         if self._owns:
-            self._mlflow.start_run(run_name=run.name if run.folder is None else run.folder.name)
-        self._runs = True
-        if run.done and not self._owns:
+            self._client.update_run(self._id, status="RUNNING")
+        elif run.done:
             return  # MLflow refuses to change a parameter
         # MLflow allows some characters only in names, and 6000 in values.
-        self._mlflow.log_params({_plain(key): str(value)[:6000] for key, value in run.settings.items()})
+        for key, value in run.settings.items():
+            self._client.log_param(self._id, _plain(key), str(value)[:6000])
 
     def _scalars(self, values: dict[str, float], iteration: int) -> None:
-        self._mlflow.log_metrics({_plain(name): value for name, value in values.items()}, step=iteration)
+        Metric, now = self._mlflow.entities.Metric, int(1000 * time.time())
+        metrics = [Metric(_plain(name), value, now, iteration) for name, value in values.items()]
+        self._client.log_batch(self._id, metrics)
 
     def _image(self, name: str, pixels: Array, iteration: int) -> None:
-        self._mlflow.log_image(pixels, f"{_plain(name)}.png")
+        self._client.log_image(self._id, pixels, f"{_plain(name)}.png")
 
     def end(self, run: RunInfo, status: str) -> None:
-        if not self._runs:
+        if self._client is None:
             return
         super().end(run, status)
-        self._runs = False
         if self._owns:
-            self._mlflow.end_run({"finished": "FINISHED", "interrupted": "KILLED"}.get(status, "FAILED"))
+            ended = {"finished": "FINISHED", "interrupted": "KILLED"}.get(status, "FAILED")
+            self._client.set_terminated(self._id, ended)
+        self._client = None
 
 
 class WandB(_Logger):
@@ -163,16 +183,22 @@ class WandB(_Logger):
 
     def __init__(self) -> None:
         self._wandb = package("wandb", "wandb")
-        self._owns = False
+        self._owns, self._id = False, ""
         self._run: Any = None
 
-    def _open(self, run: RunInfo) -> None:
+    def _open(self, run: RunInfo, again: bool) -> None:
         self._owns = self._wandb.run is None
-        if self._owns:
-            place = {} if run.folder is None else {"dir": str(run.folder)}
-            project = os.environ.get("WANDB_PROJECT", "reslrb")
-            self._wandb.init(project=project, name=run.name, config=dict(run.settings), **place)
-        self._run = self._wandb.run
+        if not self._owns:
+            self._run = self._wandb.run
+            return
+        place = {} if run.folder is None else {"dir": str(run.folder)}
+        earlier = {"id": self._id, "resume": "allow"} if again and self._id else {}
+        # `create_new` does not become the active run, to which other runs of the process would log.
+        self._run = self._wandb.init(
+            project=os.environ.get("WANDB_PROJECT", "reslrb"), name=run.name, config=dict(run.settings),
+            reinit="create_new", **place, **earlier,
+        )  # fmt: skip
+        self._id = self._run.id
 
     def _scalars(self, values: dict[str, float], iteration: int) -> None:
         self._run.log(values, step=iteration)
@@ -203,13 +229,14 @@ Callbacks: TypeAlias = "Sequence[Callback | str]"
 def callbacks_of(config: Config, more: Callbacks, source: str) -> list[Callback]:
     """Return the callbacks of `run.callbacks`, then those that `more` adds. A variant must be set.
 
-    A name in both counts once. Raises ConfigError, located in the configuration, or in `source` for `more`.
+    A repeated name counts once. Raises ConfigError, located in the configuration, or in `source` for `more`.
     """
     if isinstance(more, str) or not isinstance(more, Sequence):
         raise ConfigError(source, "", f"is {one_line(repr(more), 60)}, not a list of callbacks")
     check_code(config, config.run.code_callbacks)
     places = [(each, config.source, f"run.callbacks[{n}]") for n, each in enumerate(config.run.callbacks)]
     found = []
+    more = [each for n, each in enumerate(more) if not isinstance(each, str) or more.index(each) == n]
     for each, where, key in [*places, *((each, source, "") for each in more if each not in config.run.callbacks)]:
         one = _named(each, where, key) if isinstance(each, str) else each
         if not isinstance(one, Callback):

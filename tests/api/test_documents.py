@@ -20,9 +20,26 @@ from kit import work_in
 from make_reference import DOCS
 
 import reslrb_cli
+from reslrb_cli import errors
 
 PAGE = DOCS / "python.md"
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+
+
+def test_errors_in_the_reference_are_public() -> None:
+    """A script can catch each error that a docstring names, by its name in `rl`."""
+    import builtins
+
+    text = PAGE.read_text(encoding="utf-8")
+    kinds = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)}
+    classes = {name for name in kinds if re.search(rf"\b{name}\b", text)}
+    assert {"ConfigError", "NonFinite", "OutOfMemory", "MachineError"} <= classes
+    assert [name for name in classes if getattr(reslrb_cli, name, None) is not getattr(errors, name)] == []
+    raised = set(re.findall(r"\b[A-Z][A-Za-z]+(?:Error|Interrupt)\b", text))
+    assert [name for name in raised if not hasattr(reslrb_cli, name) and not hasattr(builtins, name)] == []
+    places = [*DOCS.glob("*.md"), ROOT / "README.md"]
+    used = {name for page in places for name in re.findall(r"\brl\.([A-Za-z]\w*)", page.read_text(encoding="utf-8"))}
+    assert [name for name in used if not hasattr(reslrb_cli, name)] == []
 
 
 @pytest.fixture

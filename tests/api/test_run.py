@@ -155,6 +155,37 @@ def test_runs_in_two_threads_take_turns(experiment: Path) -> None:
     assert set(order[:4]) == {0, 1}
 
 
+def test_a_loop_in_another_thread_is_refused(experiment: Path) -> None:
+    """Dr.Jit would end the process."""
+    run, found = rl.optimize("tiny.yaml", overrides=SET), []
+
+    def work() -> None:
+        with pytest.raises(RuntimeError, match="made in another thread; call optimize in the thread of its loop"):
+            list(run)
+        found.append(run.iteration)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join(20)
+    assert found == [0]
+    assert next(iter(run)).iteration == 0
+
+
+def test_a_change_of_variant_is_named(experiment: Path) -> None:
+    import mitsuba as mi
+
+    before, run = mi.variant(), rl.optimize("tiny.yaml", overrides=SET)
+    loop = iter(run)
+    next(loop)
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(
+        rl.ConfigError, match=f"variant: is {before}, but the script has set scalar_rgb during the loop"
+    ):
+        next(loop)
+    mi.set_variant(before)
+    assert [record.iteration for record in run] == [1, 2, 3, 4, 5]
+
+
 def test_no_thread_waits_for_a_loop_to_end() -> None:
     """A thread in a loop gives way to a thread that waits, and a thread does not wait for itself."""
     done, waiting = [0, 0], threading.Event()

@@ -19,7 +19,7 @@ from cli.tiny import COMPLETE, KEY, ROOT, RUN, failing_last, faults, files, full
 from compilation import search_path
 
 from reslrb_cli.cli import main
-from reslrb_cli.cli.terminal import SIGNALS, Interrupts
+from reslrb_cli.cli.terminal import SAME_S, SIGNALS, Interrupts
 from reslrb_cli.records.manifest import read_content
 from reslrb_cli.runs import recorder as recording
 
@@ -275,10 +275,22 @@ with Interrupts():
     process = start(script)
     started = time.monotonic()
     for _ in range(2):
-        time.sleep(0.2)
+        time.sleep(1.2 * SAME_S)
         process.send_signal(signal.SIGINT)
     assert end(process) == (130, "", "interrupted\n")
     assert time.monotonic() - started < 20
+
+
+def test_a_closed_terminal_sends_one_signal():
+    """The kernel and the shell both send SIGHUP. Another signal still ends the process."""
+    script = WITHIN + "with Interrupts(notice='stopping') as seen: print('ready', flush=True); time.sleep(60)"
+    process = start(script)
+    for _ in range(3):
+        process.send_signal(signal.SIGHUP)
+        time.sleep(SAME_S / 10)
+    assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    assert end(process) == (130, "", "stopping\ninterrupted\n")
 
 
 def test_without_tolerance_the_first_signal_ends_the_process():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import math
 import os
@@ -9,6 +10,7 @@ import shlex
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +21,11 @@ from cli.tiny import reslrb
 from reslrb_cli.cli import jobs, sweep
 from reslrb_cli.config.loader import load
 from reslrb_cli.records.manifest import PROGRAM, Status
-from reslrb_cli.records.sweeps import read_sweep
+from reslrb_cli.records.sweeps import Combination, SweepPlan, read_sweep
 from reslrb_cli.report.page.sweep import best_records, ranked, run_records
 from reslrb_cli.report.sources import read_sweep_runs
+from reslrb_cli.runs.search import propose
+from reslrb_cli.runs.sweep import parse_vary
 
 RATE, SPP = "optimizer.learning_rate", "run.spp"
 SPACE = (f"{RATE}={{low: 0.001, high: 1, log: true}}", f"{SPP}={{low: 2, high: 40}}", "optimizer.type=[adam, sgd]")
@@ -322,6 +326,46 @@ def test_each_run_has_a_gpu(folder, monkeypatch, four_cores):
     assert [slot.gpu for slot in jobs.Jobs(1, "cuda_ad_rgb").slots] == [""]
     monkeypatch.setattr(jobs, "_PROGRAM", f"import os; print(os.environ[{jobs.GPUS!r}])")
     assert jobs.call([], sweep.Interrupts(), jobs.RunSlot(gpu="GPU-b")) == (0, "GPU-b")
+
+
+@pytest.mark.parametrize(("cores", "number"), [(5, 2), (7, 3), (8, 4), (3, 9)])
+def test_no_core_is_left_over(monkeypatch, cores, number):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(10, 10 + cores)), raising=False)
+    found = [slot.cores for slot in jobs.Jobs(number, "llvm_ad_rgb").slots]
+    assert sorted(core for each in found for core in each) == list(range(10, 10 + cores))
+    assert max(map(len, found)) - min(map(len, found)) <= 1
+
+
+def test_a_fresh_run_has_no_caches(monkeypatch):
+    """Neither kernels of LLVM, OptiX and CUDA nor decisions. Other runs have the caches of the user."""
+    names = ("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE", "CUDA_CACHE_DISABLE")
+    monkeypatch.setattr(jobs, "_PROGRAM", f"import os; print([os.environ.get(name) for name in {names}])")
+    for name in names:
+        monkeypatch.setenv(name, "the user's")
+    code, line = jobs.call([], sweep.Interrupts(), jobs.RunSlot(), fresh=True)
+    *folders, disabled = ast.literal_eval(line)
+    assert (code, disabled, len(set(folders))) == (0, "1", 1)
+    assert Path(folders[0]).name.startswith("reslrb-sweep-")
+    assert not Path(folders[0]).exists()
+    assert jobs.call([], sweep.Interrupts(), jobs.RunSlot()) == (0, str(["the user's"] * 4))
+
+
+def test_trials_at_work_are_avoided(folder):
+    """Among the trials are enough results for a proposal near the best one. Where trials are at work, none is made."""
+    space = [parse_vary("optimizer.learning_rate={low: 0.0, high: 1.0}", search=True)]
+    rates = [0.02 + n / 25 for n in range(25)]
+    known = [Combination(f"t{n}", {RATE: rate}) for n, rate in enumerate(rates)]
+    values = {each.name: (each.settings[RATE] - 0.5) ** 2 for each in known}
+    at_work = [Combination(f"w{n}", {RATE: 0.45 + 0.01 * n}) for n in range(11)]
+
+    def proposals(combinations):
+        plan = SweepPlan("tiny.yaml", [], combinations, [0])
+        return [propose(space, replace(plan, seeds=[seed]), values)[RATE] for seed in range(12)]
+
+    alone, beside = (np.mean([abs(rate - 0.5) < 0.06 for rate in proposals(each)]) for each in (known, known + at_work))
+    print(alone, beside)
+    assert alone > 0.6
+    assert beside < 0.3
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs affinities")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
 import threading
+import time
 from pathlib import Path
 from urllib.parse import quote
 
@@ -210,12 +212,107 @@ def test_damage_is_one_line(served, runs):
     (runs / "ä€" / "metrics.jsonl").write_text("damaged\n")
     assert ask(served)[0].status == 200
     address = f"/compare?run={quote('ä€')}&run=a+%3Cb%3E"
-    assert ask(served, address)[0].status == 200  # damaged lines are left out
+    assert ask(served, address)[0].status == 200  # without the line
     (runs / "ä€" / "metrics.jsonl").unlink()
     (runs / "ä€" / "metrics.jsonl").mkdir()
+    assert ask(served)[0].status == 200
     answer, text = ask(served, address)
     assert answer.status == 500
-    assert "metrics.jsonl: " in text
+    assert re.search(r"Error code explanation: .*metrics\.jsonl: ", text)
+
+
+def test_one_bad_folder_leaves_the_others(served, runs):
+    """Folders with damaged files, and links that form a loop."""
+    for name, line in {
+        "null": '{"iteration": null, "loss": 1}', "words": '{"iteration": "3", "loss": {}}', "list": "[1]",
+        "nest": "[" * 50_000, "huge": '{"iteration": Infinity, "parameter_rmse": NaN}', "flag": '{"loss": true}',
+    }.items():  # fmt: skip
+        shutil.copytree(runs / "b", runs / name)
+        (runs / name / "metrics.jsonl").write_text(line + "\n")
+        change_manifest(runs / name, status=[name], started={"a": 1}, process=[3], results=["no"], views=7)
+    shutil.copytree(runs / "b", runs / "loop")
+    for name, other in (("one", "two"), ("two", "one")):
+        (runs / "loop" / name).symlink_to(other)
+    answer, text = ask(served)
+    assert answer.status == 200
+    assert text.count(">compare</a>") == 9
+    assert "/loop/" not in text
+    answer, text = ask(served, "/compare?run=null&run=b")
+    assert (answer.status, "is not iterable" in text) == (500, True)
+    assert ask(served)[0].status == 200
+
+
+@pytest.mark.parametrize("line", [b"GET http://[/ HTTP/1.1", b"GET //[::1 HTTP/1.1", b"GET /?with=%ff%00[ HTTP/1.0"])
+def test_an_odd_address_has_no_page(served, line, capfd):
+    with socket.create_connection(("127.0.0.1", served), timeout=20) as connection:
+        connection.sendall(line + b"\r\nHost: localhost\r\n\r\n")
+        status = connection.makefile("rb").readline()
+    assert status.split()[1] in (b"404", b"200")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_browser_that_leaves_is_no_error(served, capfd, monkeypatch):
+    left, seen = threading.Event(), threading.Event()
+
+    def page(self):
+        left.wait(20)
+        return b"x" * 2**24
+
+    finish = serve._Server.shutdown_request
+    monkeypatch.setattr(serve._Handler, "_page", page)
+    monkeypatch.setattr(serve._Server, "shutdown_request", lambda *given: (finish(*given), seen.set())[0])
+    with socket.create_connection(("127.0.0.1", served)) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset
+    left.set()
+    assert seen.wait(20)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_silent_connection_is_closed(served, monkeypatch):
+    """Otherwise each connection would keep a thread for ever."""
+    assert 1 <= serve._Handler.timeout <= 60
+    monkeypatch.setattr(serve._Handler, "timeout", 0.1)
+    with socket.create_connection(("127.0.0.1", served), timeout=20) as connection:
+        assert connection.recv(100) == b""
+
+
+def test_pages_are_drawn_one_at_a_time(served, monkeypatch):
+    from reslrb_cli.report.page import compare
+
+    at_work, most = [], []
+
+    def parts(shown):
+        at_work.append(1)
+        most.append(len(at_work))
+        time.sleep(0.1)
+        at_work.pop()
+        return {}
+
+    monkeypatch.setattr(compare, "compare_parts", parts)
+    address = "/compare?run=b&run=a+%3Cb%3E"
+    threads = [threading.Thread(target=ask, args=(served, address)) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert most == [1, 1, 1]
+
+
+def test_a_page_that_becomes_a_link_is_not_followed(served, runs, monkeypatch):
+    """Between the search for pages and the reading of one."""
+    find = serve.find_served
+
+    def turning(root):
+        found = find(root)
+        (runs / "a <b>" / "report.html").unlink(missing_ok=True)
+        (runs / "a <b>" / "report.html").symlink_to(runs.parent / "outside" / "report.html")
+        return found
+
+    monkeypatch.setattr(serve, "find_served", turning)
+    answer, text = ask(served, "/a%20%3Cb%3E/report.html")
+    assert answer.status == 500
+    assert SECRET not in text
 
 
 def test_the_command(llvm, tmp_path, monkeypatch):

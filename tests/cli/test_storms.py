@@ -4,6 +4,7 @@ continuation.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -60,9 +61,10 @@ def wait_for(process: subprocess.Popen[str], folder: Path, moment: str) -> str:
 
 
 def hit(process: subprocess.Popen[str], number: int, times: int) -> tuple[int, str]:
-    """Send a signal once or `times` times, and return the exit code and standard error."""
+    """Send a signal, then SIGTERM until there were `times` signals. Return the exit code and standard error."""
     for _ in range(times):
         process.send_signal(number)
+        number = signal.SIGTERM  # the same signal would count once
         time.sleep(random.uniform(0, 0.1) if times > 1 else 0)
     _, err = process.communicate(timeout=120)
     return process.returncode, err
@@ -99,8 +101,8 @@ def test_many_signals(experiment: Path, number: int, count: int, times: int) -> 
         time.sleep(chance.uniform(0, 1))
         code, err = hit(process, number, times)
         assert code in (0, 130, -number)
-        # In the first moments after its start, Python itself handles a signal.
-        begun = "KeyboardInterrupt" not in err or "reslrb_cli" in err
+        # In the first moments after its start, Python itself handles a signal. Later, a traceback is a fault.
+        begun = stages[index % len(stages)] != "" or "KeyboardInterrupt" not in err or "reslrb_cli" in err
         assert faults(run, code if begun else 130, err if begun else "") == [], (index, code, err)
         if number != signal.SIGKILL and code == 130 and times == 1 and run.exists():
             assert COMPLETE - {"metrics.jsonl"} <= files(run), (index, code, err)
@@ -203,16 +205,55 @@ def test_the_file_is_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(measurement_files, "PAGE_SECONDS", 0.0)
     monkeypatch.setattr(measurement_files, "PAGE_SHARE", 0.0)
     file = tmp_path / "c.jsonl"
-    file.write_text("old\n")
     measured = Measurement(file)
-    assert file.read_text() == "old\n"  # the old file stays until there is a new result
     measured.lines = lines("a")
     measured.keeper.refresh()
     assert read(file) == ["a"]
     measured.lines = lines("a", "c")
-    measured.keeper.finish()
+    measured.keeper.finish(interrupted=True)
     assert read(file) == ["a", "c"]
     assert [path.name for path in tmp_path.iterdir()] == ["c.jsonl"]
+
+
+def test_an_earlier_file_is_replaced_at_the_end_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(measurement_files, "PAGE_SECONDS", 0.0)
+    monkeypatch.setattr(measurement_files, "PAGE_SHARE", 0.0)
+    file, partial = tmp_path / "c.jsonl", tmp_path / "c.jsonl.partial"
+    file.write_text("old\n")
+    for interrupted in (True, False):
+        measured = Measurement(file)
+        measured.lines = lines("a")
+        measured.keeper.refresh()
+        assert (file.read_text(), read(partial)) == ("old\n", ["a"])  # killed now, it leaves both
+        measured.lines = lines("a", "c")
+        measured.keeper.finish(interrupted)
+        said = f"--json: {file} has not changed; the interrupted measurement is in {partial}\n"
+        assert capsys.readouterr().out == (said if interrupted else "")
+        assert read(partial if interrupted else file) == ["a", "c"]
+        assert partial.exists() == (file.read_text() == "old\n") == interrupted
+
+
+@pytest.mark.parametrize("reason", [errno.EBUSY, errno.EACCES, errno.ENAMETOOLONG])
+def test_a_file_that_cannot_be_replaced_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: int
+) -> None:
+    """A file that is a mount of its own, a folder without write permission, or a long name."""
+    file = tmp_path / ("n" * 250 if reason == errno.ENAMETOOLONG else "c.jsonl")
+
+    def refuse(*_: object) -> None:
+        raise OSError(reason, os.strerror(reason))
+
+    if reason != errno.ENAMETOOLONG:
+        monkeypatch.setattr(os, "replace", refuse)
+    file.write_text("old\n" * 1000)
+    measured = Measurement(file)
+    measured.lines = lines("a")
+    measured.keeper.refresh()
+    measured.keeper.finish(interrupted=False)
+    assert read(file) == ["a"]
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]
 
 
 def test_a_failed_intermediate_write_is_reported_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +267,7 @@ def test_a_failed_intermediate_write_is_reported_at_the_end(tmp_path: Path, monk
     monkeypatch.setattr("reslrb_cli.records.measurement_files.write_atomically", full)
     measured.keeper.refresh()
     with pytest.raises(OSError, match="No space left"):
-        measured.keeper.finish()
+        measured.keeper.finish(interrupted=False)
 
 
 def test_a_pipe_gets_all_lines_at_the_end(tmp_path: Path) -> None:
@@ -235,7 +276,7 @@ def test_a_pipe_gets_all_lines_at_the_end(tmp_path: Path) -> None:
     measured = Measurement(tmp_path / "pipe")
     measured.lines = lines("a")
     measured.keeper.refresh()
-    measured.keeper.finish()
+    measured.keeper.finish(interrupted=False)
     assert os.read(reader, 1000).splitlines()[1:] == [b'{"kind": "summary", "line": "a"}']
     os.close(reader)
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]

@@ -8,7 +8,9 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cli.tiny import ROOT
@@ -272,6 +274,23 @@ def test_entries_are_kept(tmp_path: Path) -> None:
     DecisionCache(tmp_path / "new").put(keys[2], made(2))
     cache = DecisionCache(tmp_path / "new")
     assert [cache.get(key) for key in (*keys[1:], "c")] == [made(1), made(2), None]
+
+
+def test_jobs_at_the_same_time_lose_no_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = DecisionCache._read
+
+    def slow(self: DecisionCache) -> dict[str, Any]:
+        found = read(self)
+        time.sleep(0.02)
+        return found
+
+    monkeypatch.setattr(DecisionCache, "_read", slow)
+    threads = [threading.Thread(target=DecisionCache(tmp_path).put, args=(str(n), made(n))) for n in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [DecisionCache(tmp_path).get(str(n)) for n in range(6)] == [made(n) for n in range(6)]
 
 
 def test_the_oldest_entries_are_dropped(tmp_path: Path) -> None:

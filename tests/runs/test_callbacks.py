@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import logging
 import re
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +23,7 @@ from runs.going_on import begin_alone
 
 import reslrb_cli as rl
 from reslrb_cli.records.images import as_bytes
+from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.runs import log, loggers
 from reslrb_cli.runs.callbacks import Calls
 from reslrb_cli.runs.sweep import make_plan
@@ -356,8 +361,6 @@ def test_callbacks_take_less_than_a_millisecond_or_a_hundredth(
     """The time in the calls of an iteration of about 10 ms. It includes the wait for the values of the update. To be
     measured on an idle machine: `scripts/test -n 0 -s -m long tests/runs/test_callbacks.py -k millisecond`.
     """
-    if name == "tensorboard":
-        pytest.importorskip("tensorboardX")
     spent, ends, real = [], [], Calls.iteration
 
     def timed(self: Calls, record: rl.Record) -> None:
@@ -374,6 +377,191 @@ def test_callbacks_take_less_than_a_millisecond_or_a_hundredth(
     assert call < max(1e-3, 0.01 * iteration)
 
 
+# --- loggers with stand-ins for their packages ------------------------------------------------------------------------
+
+
+class Entry(SimpleNamespace):
+    """Entry of one run on the stand-in for a server."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name=name, status="RUNNING", params={}, losses={}, images=set())
+        self.info = SimpleNamespace(run_id=name + "-id")
+        self.id = self.info.run_id
+
+
+class FakeMLflow:
+    """The part of mlflow that is used. `entries` are the runs on the server; `lost` is true without a network."""
+
+    def __init__(self) -> None:
+        self.entries: dict[str, Entry] = {}
+        self.active: Entry | None = None
+        self.lost = False
+        self.entities = SimpleNamespace(Metric=lambda *given: given)
+
+    def active_run(self) -> Entry | None:
+        return self.active
+
+    @contextlib.contextmanager
+    def start_run(self, run_name: str) -> Iterator[Entry]:
+        assert self.active is None
+        self.active = Entry(f"{run_name}-{len(self.entries)}")
+        self.entries[self.active.id] = self.active
+        yield self.active
+        self.active.status, self.active = "FINISHED", None
+
+    def MlflowClient(self) -> FakeMLflow:
+        return self
+
+    def update_run(self, which: str, status: str) -> None:
+        self.entries[which].status = status
+
+    def log_param(self, which: str, key: str, value: str) -> None:
+        assert self.entries[which].params.setdefault(key, value) == value, "MLflow refuses to change a parameter"
+
+    def log_batch(self, which: str, metrics: list[tuple[str, float, int, int]]) -> None:
+        if self.lost:
+            raise ConnectionError("no route to host")
+        for name, value, _, step in metrics:
+            if name == "loss":
+                self.entries[which].losses[step] = value
+
+    def log_image(self, which: str, pixels: Any, file: str) -> None:
+        self.entries[which].images.add(file.removesuffix(".png"))
+
+    def set_terminated(self, which: str, status: str) -> None:
+        self.entries[which].status = status
+
+
+class FakeWandB:
+    """The part of wandb that is used. Only a run without `create_new` becomes the active `run`."""
+
+    def __init__(self) -> None:
+        self.entries: dict[str, Entry] = {}
+        self.run: Any = None
+        self.lost = False
+        self.Image = np.array
+
+    def init(self, project: str, name: str, config: Any, reinit: str, dir: str, id: str = "", resume: str = "") -> Any:
+        assert (project, reinit) == ("reslrb", "create_new")
+        entry = self.entries[id] if id and resume == "allow" else Entry(f"{name}-{len(self.entries)}")
+        self.entries[entry.id], entry.status = entry, "RUNNING"
+        entry.params |= config
+        entry.log, entry.finish = functools.partial(self._log, entry), functools.partial(self._finish, entry)
+        return entry
+
+    def _log(self, entry: Entry, values: dict[str, Any], step: int) -> None:
+        if self.lost:
+            raise ConnectionError("no route to host")
+        entry.images |= {name for name in values if name.startswith("image/")}
+        entry.losses |= {step: values["loss"]} if "loss" in values else {}
+
+    def _finish(self, entry: Entry, code: int) -> None:
+        entry.status = "FINISHED" if code == 0 else "FAILED"
+
+
+FAKES = {"mlflow": FakeMLflow, "wandb": FakeWandB}
+RECORD = rl.Record(iteration=0, loss=1.0, step_ms=1, codegen_ms=0, elapsed_s=1, peak_mib=1, spp=1, lr=1, grad_norm=1,
+                   nonfinite=0, parameter_rmse=None)  # fmt: skip
+
+
+@pytest.fixture(params=FAKES)
+def server(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A stand-in for the package of a logger. `make` makes the logger."""
+    fake: Any = FAKES[request.param]()
+    monkeypatch.setitem(sys.modules, request.param, fake)
+    fake.make = loggers.LOGGERS[request.param]
+    return fake
+
+
+def calls_of(name: str, done: int, *callbacks: rl.Callback) -> Calls:
+    settings = {"run.iterations": 9, "run.name": name}
+    info = rl.RunInfo(name, Path("runs") / name, settings, 9, done, {"k": (1,)}, lambda key: np.zeros(1))
+    return Calls(callbacks, info, Manifest("v", "d", 0, "c"))
+
+
+def iterate(calls: Calls, *iterations: int) -> None:
+    for n in iterations:
+        calls.iteration(replace(RECORD, iteration=n, loss=float(10 * len(calls._run.name) + n)))
+
+
+def test_each_run_has_its_entry(server: Any) -> None:
+    """Two runs at the same time, of which one is continued in the same process."""
+    first, second = server.make(), server.make()
+    runs = [calls_of("a", 0, first), calls_of("bb", 0, second)]
+    for each in runs:
+        each.begin()
+        each.image("initial", "", np.zeros((2, 2, 1), np.float32))
+    for n in range(3):
+        for each in runs:
+            iterate(each, n)
+    runs[0].end("interrupted")
+    again = calls_of("a", 2, first)
+    again.begin()
+    iterate(again, 2, 3)
+    iterate(runs[1], 3)
+    for each in (again, runs[1]):
+        each.end("finished")
+    a, b = server.entries.values()
+    assert (a.losses, b.losses) == ({n: 10.0 + n for n in range(4)}, {n: 20.0 + n for n in range(4)})
+    assert (a.status, b.status) == ("FINISHED", "FINISHED")
+    assert (a.params["run.name"], b.params["run.name"]) == ("a", "bb")
+    assert len(a.images) == len(b.images) == 1
+    calls_of("a", 0, first).begin()  # another run by the same name
+    assert len(server.entries) == 3
+
+
+def test_an_active_run_of_the_script_is_used(server: Any) -> None:
+    own = Entry("own")
+    server.entries[own.id] = server.active = server.run = own
+    own.log = functools.partial(FakeWandB._log, server, own)
+    calls = calls_of("a", 0, server.make())
+    calls.begin()
+    iterate(calls, 0, 1)
+    calls.end("finished")
+    assert (list(server.entries.values()), sorted(own.losses), own.status) == ([own], [0, 1], "RUNNING")
+
+
+def test_a_lost_network_does_not_end_a_run(server: Any, caplog: pytest.LogCaptureFixture) -> None:
+    other = Listener()
+    calls = calls_of("a", 0, server.make(), other)
+    calls.begin()
+    iterate(calls, 0)
+    server.lost = True
+    iterate(calls, 1, 2)
+    calls.end("finished")
+    (line,) = (each.getMessage() for each in caplog.records)
+    assert "no route to host" in line
+    assert line.endswith("; the run goes on without this callback")
+    assert [each[0] for each in other.calls] == ["begin", "iteration", "iteration", "iteration", "end"]
+    (entry,) = server.entries.values()
+    assert sorted(entry.losses) == [0]
+
+
+def test_a_name_that_is_given_twice_counts_once(experiment: Path) -> None:
+    names = ["tensorboard", "tensorboard"]
+    assert len(loggers.callbacks_of(rl.load("tiny.yaml"), names, "--log")) == 1
+    both = rl.load("tiny.yaml", {"run.callbacks": ["tensorboard"]})
+    assert len(loggers.callbacks_of(both, names, "--log")) == 1
+    own = Listener()
+    assert loggers.callbacks_of(both, [own, *names, own], "--log")[1:] == [own, own]
+
+
+def test_tensorboard_hides_the_iterations_that_are_computed_again(tmp_path: Path) -> None:
+    from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+    for done in (0, 2):
+        calls = calls_of("a", done, loggers.TensorBoard(tmp_path / str(done)))
+        calls.begin()
+        iterate(calls, done)
+        calls.end("finished")
+    starts = {}
+    for done in (0, 2):
+        (file,) = (tmp_path / str(done)).iterdir()
+        events = [Event.FromString(content) for content in tf_records(file.read_bytes())]
+        starts[done] = [event.step for event in events if event.session_log.status == SessionLog.START]
+    assert starts == {0: [], 2: [2]}
+
+
 # --- the packages -----------------------------------------------------------------------------------------------------
 
 
@@ -383,9 +571,7 @@ def log_a_run(name: str) -> rl.Run:
     return run
 
 
-@pytest.mark.long
 def test_tensorboard_reads_the_events(experiment: Path) -> None:
-    pytest.importorskip("tensorboardX")
     from tensorboardX.proto.event_pb2 import Event
     from tensorboardX.record_writer import masked_crc32c  # noqa: F401  # the format below is TFRecord
 
@@ -409,7 +595,6 @@ def test_tensorboard_reads_the_events(experiment: Path) -> None:
 def test_the_tutorial_ends_with_recovered_values_in_tensorboard(
     llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("tensorboardX")
     from tensorboardX.proto.event_pb2 import Event
 
     monkeypatch.chdir(tmp_path)

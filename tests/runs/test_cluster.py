@@ -9,6 +9,7 @@ import os
 import random
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -24,12 +25,14 @@ from kit import count_iterations, wait_for
 from runs.going_on import MOTION, one_thread, optimize
 from runs.hosts import hosts, make_certificates, missing
 
+from reslrb_cli.cluster import connection
 from reslrb_cli.cluster.connection import Cluster, connected
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import set_targets, target_arrays
+from reslrb_cli.records import atomic
 from reslrb_cli.runs.prepare import RunProgress, prepare
 
 calls = pytest.importorskip("reslrb_cli.cluster.calls", reason="pip install reslrb[cluster]", exc_type=ImportError)
@@ -438,6 +441,50 @@ BAD = [
     (["--cluster", "local:2"], "run.shards: --cluster needs more than one shard"),
     (["--cluster", "local:2", "--dry-run"], "--dry-run measures only this process"),
 ]
+
+
+@pytest.mark.long  # in this process: test_everything_of_a_cluster_is_in_one_folder
+def test_two_signals_leave_no_files(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second signal ends the process at once. The workers then end by themselves."""
+    place = made(experiment / "temporary")
+    monkeypatch.setenv("TMPDIR", str(place))
+    words = ["--cluster", "local:2", *tiny.settings("run.iterations=100000", "run.shards=2", "run.spp=8")]
+    with (experiment / "err").open("w") as err:
+        run = tiny.start(experiment, *words, stderr=err, stdout=err)
+        wait_for(lambda: count_iterations(experiment / "runs/tiny") > 0 or run.poll() is not None, 120)
+        assert any(place.iterdir())
+        for number in (signal.SIGTERM, signal.SIGINT):
+            run.send_signal(number)
+    assert run.wait(30) == 130, (experiment / "err").read_text()
+    assert list(place.iterdir()) == []
+
+
+def test_everything_of_a_cluster_is_in_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that ends at once removes this folder."""
+    place = made(tmp_path / "temporary")
+    monkeypatch.setattr(tempfile, "tempdir", str(place))
+    with connected(Cluster(1)) as (client, folder):
+        client.wait_for_workers(1, timeout=60)
+        assert list(place.iterdir()) == [folder]
+        assert folder in atomic.unfinished
+    assert folder not in atomic.unfinished
+    assert list(place.iterdir()) == []
+
+
+def test_connections_are_encrypted(tmp_path: Path) -> None:
+    """Also if dask's settings do not require it. A scheduler without TLS could send any code."""
+    import dask
+
+    files = {name: str(tmp_path / name) for name in ("ca.pem", "cert.pem", "key.pem")}
+    for file in files.values():
+        Path(file).write_text("")
+    tls = "distributed.comm.tls"
+    settings = {f"{tls}.ca-file": files["ca.pem"], f"{tls}.client.cert": files["cert.pem"],
+                f"{tls}.client.key": files["key.pem"], "distributed.comm.require-encryption": False}  # fmt: skip
+    with dask.config.set(settings):
+        security: Any = connection._certificates()
+    assert security.require_encryption
+    assert security.tls_client_key == files["key.pem"]
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD)

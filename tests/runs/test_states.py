@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from runs.going_on import differences, one_thread, optimize, records_of, state_o
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.checkpoint import read_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.run_folder import read_value
 
@@ -115,6 +117,62 @@ def test_the_previous_state_is_used_and_reported(run: Path, capsys: pytest.Captu
     assert int(state_of(run)["iteration"]) == 6
     with np.load(run / PREVIOUS) as previous:  # not the damaged state
         assert int(previous["iteration"]) == 5
+
+
+def test_a_damaged_state_does_not_become_the_previous_one(run: Path) -> None:
+    """Only one more state is saved. The state that the run continued from is then the previous one."""
+    (run / STATE).write_bytes(b"damaged")
+    assert optimize("--resume", str(run), "--quiet", "--set", "run.checkpoint_every={iterations: 100}") == 0
+    iterations = [int(read_state(run / name)[0]["iteration"]) for name in (PREVIOUS, STATE)]
+    assert iterations == [3, 6]
+
+
+def test_the_manifest_of_a_resumed_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It has this process, and the versions that have changed. A line names them."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    content = json.loads((run / "manifest.json").read_text())
+    content |= {"process": content["process"] | {"pid": gone.pid}, "versions": content["versions"] | {"drjit": "0.1"}}
+    (run / "manifest.json").write_text(json.dumps(content))
+    assert optimize("--resume", str(run), "--quiet") == 0
+    after, now = json.loads((run / "manifest.json").read_text()), version("drjit")
+    assert (after["process"]["pid"], after["process"]["locked"]) == (os.getpid(), True)
+    assert after["resumed"][0]["versions"] == {"drjit": ["0.1", now]}
+    line = f"versions have changed since the run began: drjit 0.1 then, {now} now; results may differ"
+    assert line in capsys.readouterr().err
+    assert optimize("--resume", str(run), "--quiet", "--set", "run.iterations=7") == 0
+    assert "versions have changed" not in capsys.readouterr().err
+
+
+def test_a_loss_of_power_keeps_manifest_and_metrics(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a state or a reader relies on is flushed before the state or the new name appears."""
+    flush, replace_file, events = os.fsync, os.replace, list[tuple[str, str]]()
+
+    def note(kind: str, path: object) -> None:
+        name = re.sub(r"^\.|\.\d+\.part$", "", Path(os.fspath(path)).name)  # type: ignore[call-overload]
+        events.append((kind, name))
+
+    def fsync(descriptor: int) -> None:
+        note("flush", os.readlink(f"/proc/self/fd/{descriptor}"))
+        flush(descriptor)
+
+    def renamed(source: Any, target: Any, **given: Any) -> None:
+        note("rename", target)
+        replace_file(source, target, **given)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", renamed)
+    assert optimize("--resume", str(run), "--quiet", "--set", "run.checkpoint_every={iterations: 1}") == 0
+    written = [n for n, event in enumerate(events) if event == ("rename", "manifest.json")]
+    assert len(written) == 2
+    for n in written:
+        assert events[n - 1] == ("flush", "manifest.json")
+        assert events[n + 1] == ("flush", run.name)
+    states = [n for n, event in enumerate(events) if event == ("flush", "next.npz")]
+    assert len(states) == 2
+    for n in states:
+        assert events[n - 1] == ("flush", "metrics.jsonl")
+        assert events[n + 1 : n + 3] == [("rename", "next.npz"), ("flush", "checkpoint")]
 
 
 def test_differences_are_shown(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
