@@ -5,7 +5,9 @@ chooses the libLLVM that Dr.Jit loads.
 
 - `load` reads an experiment.
 - `optimize` recovers parameters in your own loop.
-- `render`, `gradient`, `gradcheck`, `convergence` and `export` run the commands of the same name on an experiment.
+- `render`, `gradient`, `gradcheck`, `convergence`, `bench` and `export` run the commands of the same name on an
+  experiment.
+- `write_report` writes a page about runs and measurements.
 - `ReslrbError` is the base class of the errors that these raise.
 - `Callback` receives the progress of a run; `TensorBoard`, `MLflow` and `WandB` log it.
 - `register` registers the plugins with Mitsuba.
@@ -36,7 +38,17 @@ from reslrb_cli.version import __version__  # noqa: E402
 
 if TYPE_CHECKING:
     from reslrb_cli.api import torch
-    from reslrb_cli.api.experiment import check_estimator, convergence, export, gradcheck, gradient, load, render
+    from reslrb_cli.api.experiment import (
+        bench,
+        check_estimator,
+        convergence,
+        export,
+        gradcheck,
+        gradient,
+        load,
+        render,
+        write_report,
+    )
     from reslrb_cli.api.run import Run, optimize
     from reslrb_cli.config.schema import Config
     from reslrb_cli.errors import (
@@ -73,6 +85,7 @@ __all__ = [
     "UnsupportedScene",
     "WandB",
     "__version__",
+    "bench",
     "check_estimator",
     "convergence",
     "export",
@@ -86,6 +99,7 @@ __all__ = [
     "render",
     "step",
     "torch",
+    "write_report",
 ]
 
 # Dr.Jit loads libLLVM on another thread during its import, so the choice must be made before.
@@ -93,7 +107,8 @@ _llvm.prepare()
 
 _LAZY = {
     **{name: ("reslrb_cli.api.experiment", name)
-       for name in ("check_estimator", "convergence", "export", "gradcheck", "gradient", "load", "render")},
+       for name in ("bench", "check_estimator", "convergence", "export", "gradcheck", "gradient", "load", "render",
+                    "write_report")},
     **{name: ("reslrb_cli.runs.loggers", name) for name in ("MLflow", "TensorBoard", "WandB")},
     **{name: ("reslrb_cli.runs.callbacks", name) for name in ("Callback", "RunInfo")},
     "Config": ("reslrb_cli.config.schema", "Config"),

@@ -221,7 +221,7 @@ def _range(value: dict[str, Any]) -> str:
 _MARK = "## Reference\n"
 
 #: The names in their order; what else is public comes behind them.
-_FIRST = ("load", "optimize", "Run", "Record", "render", "gradient", "gradcheck", "convergence", "export")
+_FIRST = ("load", "optimize", "Run", "Record", "render", "gradient", "gradcheck", "convergence", "bench", "export")
 
 #: Of these, what is below them stands elsewhere.
 _ELSEWHERE = {"Config": "Its sections are its attributes: `config.run.iterations` ([Configuration](config.md))."}

@@ -1,7 +1,8 @@
 """Functions of the Python interface that take an experiment and return a result in one call.
 
 - `load`: read a configuration from a file, a mapping or a run folder.
-- `render`, `gradient`, `gradcheck`, `convergence`, `export`: the commands, or parts of them, as functions.
+- `render`, `gradient`, `gradcheck`, `convergence`, `bench`, `write_report`, `export`: the commands, or parts of them,
+    as functions.
 - `held`: delay an interrupt until it is safe to stop.
 """
 
@@ -19,18 +20,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
+from reslrb_cli.backend.installation import load_packages
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config import loader
 from reslrb_cli.config.files import NAMELESS, as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override
 from reslrb_cli.config.schema import IN_MEMORY, Config
 from reslrb_cli.errors import ConfigError, one_line
+from reslrb_cli.records.atomic import writing
 from reslrb_cli.records.measurement_files import Line
-from reslrb_cli.records.measurements import GradcheckRecord
+from reslrb_cli.records.measurements import BenchRecord, GradcheckRecord
 from reslrb_cli.records.run_folder import exposed, exposures, recovered
 
 if TYPE_CHECKING:
@@ -44,6 +47,9 @@ Experiment: TypeAlias = "Config | str | os.PathLike[str] | Mapping[str, Any]"
 
 #: A dictionary as for `mi.load_dict`, or an `mi.Scene`.
 Scene: TypeAlias = "Mapping[str, Any] | mi.Scene"
+
+#: Quantity that `bench` varies.
+Swept: TypeAlias = Literal["depth", "spp"]
 
 #: Advice in error messages on the command line, and its replacement in a script.
 ARGUMENTS = {
@@ -433,19 +439,13 @@ def convergence(
     """
     began = time.monotonic()
     with called() as stop:
-        config = load(experiment)
-        config = config.with_code(allow_code or config.allows_code)
-        if config.own_scene is not None:
-            reason = "is an mi.Scene, which the processes of this measurement do not have; give a file or a dictionary"
-            raise ConfigError(config.source, "scene", reason)
+        config = _for_processes(experiment, allow_code)
         from reslrb_cli.measure.convergence import Session
         from reslrb_cli.measure.judgement import Judgement
         from reslrb_cli.measure.methods import ConvergencePlan
         from reslrb_cli.report.tables import result_lines
 
-        for option, count in [("rounds", rounds), *(("spps", each) for each in spps)]:
-            if count is not None and count < 1:
-                raise ConfigError(option, "", f"is {count}; at least 1 is needed")
+        _check_counts(rounds=[rounds], spps=spps)
         plan = ConvergencePlan.of(
             config, objective, integrators, reference, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps))
         )
@@ -457,6 +457,92 @@ def convergence(
             if stop():
                 raise KeyboardInterrupt
             return result_lines(Judgement(session).results())
+
+
+def bench(
+    experiment: Experiment,
+    integrators: str | None = None,
+    sweep: Swept = "depth",
+    values: Sequence[int] = (),
+    budget: float = 240.0,
+    rounds: int | None = None,
+    allow_code: bool = False,
+) -> list[BenchRecord]:
+    """Measure time and memory of gradient steps, as `reslrb bench` does (docs/benchmarks.md).
+
+    Returns one record per integrator and value, with the fields that `--json` writes. The arguments are the options of
+    the command.
+
+    - `integrators`: as for `--integrators`.
+    - `values`: path depths, or samples per pixel with `sweep="spp"`. Default: those of the command.
+    - `budget`: total time in seconds.
+    - `rounds`: number of rounds, regardless of `budget`.
+    - `allow_code`: permit running the files of your own integrators.
+
+    Each integrator runs in its own process with the experiment's variant. The calling process sets no variant. An
+    interrupt stops the measurement soon and raises KeyboardInterrupt. Raises ConfigError.
+    """
+    began = time.monotonic()
+    with called() as stop:
+        config = _for_processes(experiment, allow_code)
+        from reslrb_cli.measure.bench import Bench
+        from reslrb_cli.measure.methods import DEEPEST, Sweep
+
+        if sweep not in get_args(Swept):
+            raise ConfigError("sweep", "", f"is {sweep!r}; there are {', '.join(get_args(Swept))}")
+        _check_counts(rounds=[rounds], values=values)
+        plan = Sweep.of(config, sweep, tuple(values), integrators, DEEPEST, budget_s=budget, rounds=rounds)
+        with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
+            session = Bench(plan, Path(name), stop, logger.info, spent_s=time.monotonic() - began)
+            for _ in session.run():
+                pass
+            if stop():
+                raise KeyboardInterrupt
+            return [result.record for result in session.results()]
+
+
+def _for_processes(experiment: Experiment, allow_code: bool) -> Config:
+    """Return the experiment for a measurement in other processes. Raises ConfigError if they cannot have a part of
+    it.
+    """
+    config = load(experiment)
+    reason = "which the processes of this measurement do not have; give"
+    if config.own_scene is not None:
+        raise ConfigError(config.source, "scene", f"is an mi.Scene, {reason} a file or a dictionary")
+    if config.own_loss is not None:
+        raise ConfigError(config.source, "loss", f"is a function, {reason} {{type: custom, file: FILE.py:NAME}}")
+    return config.with_code(allow_code or config.allows_code)
+
+
+def _check_counts(**options: Sequence[int | None]) -> None:
+    """Raise ConfigError if a given count is below 1."""
+    for option, counts in options.items():
+        for number in counts:
+            if number is not None and number < 1:
+                raise ConfigError(option, "", f"is {number}; at least 1 is needed")
+
+
+def write_report(
+    sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], page: str | os.PathLike[str]
+) -> Path:
+    """Write one self-contained HTML page about runs and measurements, as `reslrb report` does (docs/report.md). Return
+    its path.
+
+    `sources` are run folders, folders of sweeps, and files that `bench`, `gradcheck` and `convergence` wrote with
+    `--json`. `page` is the file to write. Raises ConfigError.
+    """
+    with called():
+        given = [sources] if isinstance(sources, (str, os.PathLike)) else list(sources)
+        paths = [as_path(each, "sources", "the path of a run folder, or of a file of measurements") for each in given]
+        load_packages()  # Mitsuba reads the images
+        from reslrb_cli.report.page import write_page
+        from reslrb_cli.report.sources import read_sources
+
+        path = as_path(page, "page", "the path of a file")
+        found = read_sources(paths)
+        with writing("page", path):
+            write_page(found, path)
+        return path
 
 
 def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], tolerances: bool = False) -> Path:

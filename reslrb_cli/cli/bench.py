@@ -25,16 +25,12 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.methods import BENCHED, DEEPEST, Sweep
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
     from reslrb_cli.measure.bench import BenchResult
-    from reslrb_cli.measure.methods import Sweep
     from reslrb_cli.records.measurements import BenchRecord
-
-
-#: Integrators that are compared by default.
-INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
 
 
 @dataclass(frozen=True)
@@ -55,13 +51,13 @@ class BenchOptions(ComparisonOptions):
               help=
         "Values to measure, e.g. 4,16,64. Default: depths by --max-depth, a quarter to four times "
         "run.spp.")  # fmt: skip
-@click.option("--max-depth", type=click.IntRange(min=2, max=COUNT.max), default=32, show_default=True,
+@click.option("--max-depth", type=click.IntRange(min=2, max=COUNT.max), default=DEEPEST, show_default=True,
               help="Greatest path depth; the measured depths are 2, 4, 8, ... and this one.")  # fmt: skip
 @click.option("--integrators", metavar="LIST",
               help="Integrators to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)] or your own "
                    "FILE.py:CLASS, separated by "
                    "commas; OPTION is one of the integrator's. Default: those of "
-                   f"{INTEGRATORS} that support CONFIG. Times are divided by those of ptracer, or else of the "
+                   f"{BENCHED} that support CONFIG. Times are divided by those of ptracer, or else of the "
                    "first.")  # fmt: skip
 @comparison_options
 def command(**given: Any) -> int:
@@ -76,26 +72,17 @@ def command(**given: Any) -> int:
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # before the imports below need them
-    from reslrb_cli.measure.methods import Sweep, depths, machine_of, parse_cases, sample_counts
     from reslrb_cli.records.measurements import BenchStatus
 
     config, swept, values, json_file = options.config(), options.swept, options.values, options.json_file
     if (swept != "depth" or values is not None) and is_given("max_depth"):
         reason = "needs --sweep depth" if values is None else "has no effect with --values"
         raise ConfigError("--max-depth", "", f"{reason}; use --set integrator.max_depth={options.max_depth}")
-    usual = depths(options.max_depth) if swept == "depth" else sample_counts(config.run.spp)
     check_writable("--json", json_file)
-    sweep = Sweep(
-        **machine_of(config),
-        config=config,
-        cases=parse_cases(options.integrators or INTEGRATORS),
-        values=sorted(values or usual),
-        budget_s=options.budget,
+    sweep = Sweep.of(
+        config, swept, values or (), options.integrators, options.max_depth, budget_s=options.budget,
         rounds=options.rounds,
-        default=options.integrators is None,
-        swept=swept,
-    )
-    sweep.check()
+    )  # fmt: skip
     results, interrupted = _run(sweep, json_file, began)
     states = {result.record.status for result in results}
     return exit_code(interrupted, BenchStatus.OK in states, states)

@@ -267,6 +267,13 @@ class Measurement:
         return plays_roulette(depth, self.config.integrator.rr_depth)
 
 
+#: Integrators that `bench` compares by default.
+BENCHED = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
+
+#: Greatest depth that `bench` measures by default.
+DEEPEST = 32
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sweep(Measurement):
     """The plan of `bench`. `bench` measures times relative to `baseline`, at each of the `values` of the `swept`
@@ -275,6 +282,20 @@ class Sweep(Measurement):
 
     values: Sequence[int]
     swept: str = "depth"
+
+    @classmethod
+    def of(
+        cls, config: Config, swept: str, values: Sequence[int], integrators: str | None, max_depth: int, **others: Any
+    ) -> Sweep:
+        """Return a plan from a list of integrators as text. Without `values`, the plan has the default depths up to
+        `max_depth`, or the default sample counts. `others` are further fields. Raises ConfigError.
+        """
+        usual = depths(max_depth) if swept == "depth" else sample_counts(config.run.spp)
+        cases = parse_cases(integrators or BENCHED)
+        own: dict[str, Any] = {"cases": cases, "values": sorted(values or usual), "default": integrators is None}
+        plan = cls(**machine_of(config), **own, config=config, swept=swept, **others)
+        plan.check()
+        return plan
 
     @property
     def baseline(self) -> NamedIntegrator:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import json
 import logging
 import os
@@ -20,11 +21,13 @@ import numpy as np
 import pytest
 from cli import tiny
 from cli.tiny import KEY, done, measured
-from measure.pretended_steps import Stage
+from measure.pretended_steps import Pretended, Stage
+from report.measured import make_run
 from runs.going_on import LAMP, work_alone, write_experiment
 
 import reslrb_cli as rl
 from reslrb_cli.config.loader import changed, dump, load, with_integrator
+from reslrb_cli.measure import bench
 from reslrb_cli.measure import convergence as session
 from reslrb_cli.measure.convergence import Session
 from reslrb_cli.measure.methods import ConvergencePlan
@@ -126,6 +129,15 @@ def test_paths_of_a_mapping_are_relative_to_base(folder: Path, monkeypatch: pyte
         (lambda: rl.convergence("tiny.yaml", reference="prb,ptracer"), "reference: errors are relative to one method"),
         (lambda: rl.convergence("tiny.yaml", objective="mean"), "objective: is 'mean'; there are fixed, loss, image"),
         (lambda: rl.convergence("tiny.yaml", rounds=0), "rounds: is 0; at least 1 is needed"),
+        (lambda: rl.convergence(rl.load("tiny.yaml").with_loss(np.mean)), "tiny.yaml: loss: is a function, which the "
+         "processes of this measurement do not have; give {type: custom, file: FILE.py:NAME}"),
+        (lambda: rl.bench(rl.load("tiny.yaml").with_loss(np.mean)), "tiny.yaml: loss: is a function, which the"),
+        (lambda: rl.bench("tiny.yaml", "prb,nothing"), "integrators nothing: integrator.type: must be one of"),
+        (lambda: rl.bench("tiny.yaml", sweep="film"), "sweep: is 'film'; there are depth, spp"),  # type: ignore[arg-type]
+        (lambda: rl.bench("tiny.yaml", values=[0]), "values: is 0; at least 1 is needed"),
+        (lambda: rl.write_report("none", "page.html"), "none: no such file"),
+        (lambda: rl.write_report([3], "page.html"), "sources: is 3, not the path of a run folder"),  # type: ignore[list-item]
+        (lambda: rl.write_report("tiny.yaml", "page.html"), "tiny.yaml: line 2: is damaged, or no line"),
     ],
 )  # fmt: skip
 def test_errors_are_located(folder: Path, call: Callable[[], Any], line: str) -> None:
@@ -290,6 +302,22 @@ def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch
     monkeypatch.setattr(session, "Session", Interrupted)
     with pytest.raises(KeyboardInterrupt):
         rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
+
+
+def test_bench_writes_the_records_of_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "Bench", functools.partial(bench.Bench, start=Pretended))
+    given = ["--integrators", "reslrb:stack,ptracer", "--sweep", "spp", "--values", "8,4", "--rounds", "3"]
+    done("bench", "tiny.yaml", *given, "--json", "b.jsonl")
+    records = rl.bench("tiny.yaml", "reslrb:stack,ptracer", sweep="spp", values=[8, 4], rounds=3)
+    found = [json.loads(record.to_json()) for record in records]
+    assert found == measured("b.jsonl")
+    assert [(each["label"], each["spp"]) for each in found] == [
+        (label, spp) for spp in (4, 8) for label in ("reslrb:stack", "ptracer")
+    ]
+    make_run(folder / "a")
+    assert rl.write_report(["a", "b.jsonl"], "page.html") == Path("page.html")
+    page = Path("page.html").read_text()
+    assert all(words in page for words in ("Cost of a step: b.jsonl", "Convergence: a"))
 
 
 class Interrupting(logging.Handler):
