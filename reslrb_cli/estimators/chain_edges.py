@@ -32,7 +32,7 @@ from reslrb_cli.estimators.edges import Contribution, on_smooth
 from reslrb_cli.estimators.outline_rays import AROUND, edge_samples, for_camera, moved_by
 from reslrb_cli.estimators.stack import Ring, StackState, differentiate_frames
 from reslrb_cli.scene.rays import ray_offset
-from reslrb_cli.transport.bsdf import EventNumbers, evaluate, scatter
+from reslrb_cli.transport.bsdf import evaluate, reflect_or_refract
 from reslrb_cli.transport.camera import FilmRay, camera_walk
 from reslrb_cli.transport.chains import MOST_VERTICES, Chain, Chains, LampChains, SensorChains
 from reslrb_cli.transport.edges import pick
@@ -180,10 +180,7 @@ class SpecularFrame:
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
             hit = find_vertex(ray, pi, active)
-            scattering, _ = scatter(
-                p.plan, hit, EventNumbers(mi.Point2f(0.5), self.sample), active, None, attached=True
-            )
-            following = hit.si.spawn_ray(scattering.d)
+            following = hit.si.spawn_ray(reflect_or_refract(p.plan, hit, self.sample, active, attached=True).d)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             dr.backward_from(dr.select(active, moved, 0), flags=MAY_LACK)
             origin, direction = (dr.select(active, mi.Vector3f(dr.grad(value)), 0) for value in (ray.o, ray.d))
@@ -194,11 +191,12 @@ def _stack_of(p: Pass, chains: Chains, edge: ChainEdge, ring: Ring) -> StackStat
     """Return a stack with the specular vertices of the chain to an edge."""
 
     def body(active: mi.Bool, chain: Chain, stack: StackState) -> tuple[mi.Bool, Chain, StackState]:
-        hit, scattering, passes, product = chains.event(chain, active)
+        hit, event = chains.event(chain, active)
+        passes = event.active
         one = Product.one(False, False)
         vertex = Vertex(hit.si, hit.bsdf, chain.ray, chain.pi, chain.count, one, active)
-        stack = stack.push(SpecularFrame(SurfacePoint.of(p.plan, vertex), scattering.sample_1), ring, passes, passes)
-        chain = chains.onward(chain, hit, scattering, passes, product)
+        stack = stack.push(SpecularFrame(SurfacePoint.of(p.plan, vertex), event.number), ring, passes, passes)
+        chain = chains.onward(chain, hit, event, passes)
         return passes & (chain.count < edge.over.count), chain, stack
 
     stack = StackState.empty(SpecularFrame.blank(p.plan), ring, mi.Float(1))
@@ -223,7 +221,7 @@ def differentiate_edges_behind_chains(own: Pass) -> None:
     edge.weight *= dr.select(chance > 0, dr.rcp(chance * mi.Float(count)), 0)
     shadow = edge.shadow
     # If the edge touches the surface in its shadow, the chain itself meets it.
-    touches = shadow & (edge.here.pi.t < 2 * AROUND * ray_offset(edge.here.p))
+    touches = shadow & (dr.norm(edge.here.p - edge.here.end.si.p) < 2 * AROUND * ray_offset(edge.here.p))
     size = dr.select(edge.active & ~touches, 2 * _light(p, edge, lane % 2 == 0), 0)
     # Rarely, the chain from the middle of the jump misses a surface, and has fewer vertices on the stack. The others
     # are undefined: reading them can end the process.

@@ -91,10 +91,11 @@ LAMP_EDGES, SENSOR_EDGES, OTHER_EDGES = 0xED6E1, 0xED6E2, 0xED6E3
 def differentiate_edges(p: Pass) -> None:
     """Add the derivatives of the light that edges of moving shapes cover and uncover. dL/dI must be known."""
     sides = {LAMP_EDGES: _from_lamps}
-    if not p.plan.by_class:
+    # Other light that camera paths find has its edges there (`camera_edges.py`).
+    if not p.plan.by_class or p.plan.finding_beams().beams:
         sides[SENSOR_EDGES] = _from_sensor
-    if p.plan.stays and not p.plan.by_class:
-        sides[OTHER_EDGES] = _between
+        if p.plan.stays:
+            sides[OTHER_EDGES] = _between
     for stream, side in sides.items():
         samples = edge_samples(p.samples, stream)
         side(Pass(samples, None, p.adjoint), samples.stream(stream))
@@ -249,11 +250,15 @@ class Pick:
 
 class PickLight(CameraHooks):
     """Hooks that select one contribution to the radiance from the first point. Emission of a lamp there counts if
-    `emits` is true. `near` is that of the plan of the paths whose derivative lacks the edges.
+    `emits` is true. `near` is that of the plan of the paths whose derivative lacks the edges. With `only_beams`, light
+    of emitters that paths hit does not count.
     """
 
-    def __init__(self, numbers: mi.PCG32, near: float = 0, emits: bool = False, excludes: bool = False) -> None:
+    def __init__(
+        self, numbers: mi.PCG32, near: float = 0, emits: bool = False, excludes: bool = False, only_beams: bool = False
+    ) -> None:  # fmt: skip
         self.numbers, self.near, self.emits, self.excludes = numbers, near, emits, excludes
+        self.only_beams = only_beams
 
     def start(self, first: FilmRay) -> Pick:
         return Pick(
@@ -268,7 +273,7 @@ class PickLight(CameraHooks):
     ) -> Pick:  # fmt: skip
         P, first = vertex.product.value() * state.counts, vertex.depth == 1
         n = mi.Vector3f(vertex.si.n)
-        if met is not None:
+        if met is not None and not self.only_beams:
             L, active = P * met.Le * met.weight, met.active
             if not self.emits:
                 active &= ~first
@@ -332,7 +337,7 @@ def _from_sensor(p: Pass, numbers: mi.PCG32) -> None:
     beside.active = beside.active & ~touches
     plan = samples.plan
     excludes = bool(plan.needs.has_delta_lobes) and not plan.moving_emission
-    hooks = PickLight(numbers, p.plan.near, emits=True, excludes=excludes)
+    hooks = PickLight(numbers, p.plan.near, emits=True, excludes=excludes, only_beams=plan.only_beams)
     _, light = camera_walk(samples, hooks, beside.active, FilmRay(beside.past, outline.view.u, mi.Spectrum(1)))
     weight = p.delta(outline.view.u, beside.active, hooks.colours) * outline.weight * p.scale
     size = showing(dr.dot(weight, light.L) * light.total)
@@ -357,9 +362,8 @@ def _between(p: Pass, numbers: mi.PCG32) -> None:
     between = sample_between(samples, numbers)
     outline, beside, back, y = between.outline, between.beside, between.back, between.y
     n, x, active = outline.normal, beside.x, between.active
-    _, light = camera_walk(
-        for_camera(samples), PickLight(numbers, near), active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1))
-    )
+    hooks = PickLight(numbers, near, only_beams=p.plan.only_beams)
+    _, light = camera_walk(for_camera(samples), hooks, active, FilmRay(back, mi.Point2f(0), mi.Spectrum(1)))
     side = between.side(near, numbers)
     weight = outline.weight * light.L * (light.total * share_of(samples, outline, beside)) * side.weight
     emission = Emission(side.ray, weight, dr.zeros(mi.EmitterPtr))

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.attached import near_share
-from reslrb_cli.scene.rays import ray_offset
+from reslrb_cli.scene.rays import past_lamps, ray_offset
 from reslrb_cli.transport.edges import Chances, Outline, sample_outline
 from reslrb_cli.transport.samples import Samples
 
@@ -35,7 +35,7 @@ def edge_samples(samples: Samples, stream: int, each: int = PATHS_PER_OUTLINE) -
     is differentiated.
     """
     plan = replace(
-        samples.plan, attached=False, stays=False, glossy_follows=False, moving_shapes=(), grid=None,
+        samples.plan.finding_beams(), attached=False, stays=False, glossy_follows=False, moving_shapes=(), grid=None,
         aims=False, sequence=None, differentiate_bsdfs=False, differentiate_emission=False, track_zeros=False,
         only_bsdfs=(), differentiate_delta=False, differentiate_null=False, evened_lamps=(),
         sampled_spectra=(),
@@ -89,8 +89,13 @@ def both_sides(
     """
     scene, view, d = samples.scene, outline.view, -outline.view.to_y
     offset = ray_offset(outline.p)
-    back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset)
+    back = dr.minimum(0.999 * view.distance, view.distance - AROUND * offset) - view.clip
     active = outline.active & (back > 0)
+    if view.passes_lamps:
+        active &= ~outline.shape.is_emitter()  # nobody sees a hidden lamp
+
+    def shown(ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
+        return past_lamps(scene, ray, active) if view.passes_lamps else ray
 
     def ray(side: float | mi.Float) -> mi.Ray3f:
         return with_wavelengths(mi.Ray3f(outline.p + outline.normal * (side * offset) - d * back, d), outline)
@@ -105,11 +110,13 @@ def both_sides(
     active = active & pi.is_valid() & (pi.shape == outline.shape)
     before = mi.Ray3f(past)
     before.maxt = back - AROUND * offset
-    active = active & ~scene.ray_test(before, active)
+    active = active & ~scene.ray_test(shown(before, active), active)
     past.o = past.o + d * before.maxt
     everywhere = everywhere or not creases or _shares_edges(samples)
     wanted = active if everywhere else active & outline.crease
-    x = scene.ray_intersect_preliminary(past, coherent=False, active=wanted)
+    behind = shown(past, wanted)
+    x = scene.ray_intersect_preliminary(behind, coherent=False, active=wanted)
+    x.t += dr.norm(behind.o - past.o)
     if creases:
         # Behind a crease lies the other face. It may be narrower than the offset if it is seen at a grazing angle.
         active = active & (~outline.crease | (x.is_valid() & (x.shape == outline.shape)))

@@ -334,6 +334,8 @@ class Preparation:
         plan = make_plan(needs, *self._depths, self._hide_emitters)
         on = self.sampling.on - {"pixels"} if moves or paths == "light" else self.sampling.on
         plan = replace(plan, paths=paths, whole=whole, by_class=moves and paths == "both", on=on, lit=lit)
+        hidden = self._hide_emitters and any(shape.is_emitter() for shape in scene.shapes())
+        plan = replace(plan, sees_through_lamps=hidden and paths != "light")
         if plan.weighs:
             plan = renewal.renew(plan, scene)  # the horizon
         if plan.paths == "camera" or (self.guiding is None and "sequence" not in on):

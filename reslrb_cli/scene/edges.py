@@ -274,7 +274,10 @@ def _passes(
     offset = BESIDE * (1 + dr.max(dr.abs(p)))
     start = p - dr.mulsign(raw, dr.dot(raw, corner)) * (offset / dr.norm(raw))
     ahead, back = (scene.ray_intersect_preliminary(mi.Ray3f(start, way), False, mi.Bool(True)) for way in (to_y, -to_y))
-    reaches = ahead.is_valid() & (ahead.t > SOON * offset) if distance is None else ahead.t > 0.999 * distance
+    reaches = ahead.is_valid() & (ahead.t > SOON * offset)
+    if distance is not None:
+        # A sensor may see through lamps.
+        reaches = (ahead.t > 0.999 * distance) | (reaches & ahead.shape.is_emitter())
     return reaches & back.is_valid() & (back.t > SOON * offset)
 
 
@@ -376,6 +379,63 @@ def outline_direction(
     cos = 2 * numbers.x - 1
     sin, (s, t) = dr.safe_sqrt(1 - dr.square(cos)), dr.sincos(turn)
     return along * cos + sin * (x * t + y * s), share / (4 * width)
+
+
+def edge_normal(
+    pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, has_instances: bool, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float]:  # fmt: skip
+    """Return the normal of the edge next to an intersection, and the distance of the ray from the edge. The edge
+    belongs to the primitive that the ray hits. The normal is perpendicular to the ray.
+
+    Meshes, rectangles, disks and cylinders have edges. Outlines of other shapes, and of the side of a cylinder, have
+    the normal of the surface.
+    """
+    si, d = pi.compute_surface_interaction(ray, mi.RayFlags.All, active), ray.d
+    kind, n = si.shape.shape_type(), mi.Vector3f(si.n)
+    normal, nearest = dr.normalize(n - d * dr.dot(n, d)), mi.Float(0)
+    is_mesh, is_flat, is_disk, is_tube = (
+        active & (kind == int(each))
+        for each in (mi.ShapeType.Mesh, mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Cylinder)
+    )
+    # The outline of the side of a cylinder is nearer than a rim if the ray is nearer to it.
+    axis = dr.normalize(si.dp_dv)
+    across_it = dr.normalize(d - axis * dr.dot(d, axis))
+    depth = 1 - dr.safe_sqrt(1 - dr.square(dr.dot(n, across_it)))
+    nearest = dr.select(is_tube, dr.norm(si.dp_du) * dr.inv_two_pi * depth, dr.inf)
+
+    # Points `a` of edges, their directions, and the shapes that have them.
+    u, v = (part - dr.select(part < 0.5, 0, 1) for part in (si.uv.x, si.uv.y))
+    edges = [
+        (si.dp_du * u, si.dp_dv, is_flat),
+        (si.dp_dv * v, si.dp_du, is_flat | is_tube),
+        (mi.Vector3f(0), si.dp_dv, is_disk),
+    ]
+    corners = _triangle(pi, has_instances, is_mesh)
+    edges += [(si.p - a, b - a, is_mesh) for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)]
+    for there, along, has_it in edges:
+        raw = dr.cross(along, d)
+        raw /= dr.maximum(dr.norm(raw), 1e-30)
+        distance = dr.abs(dr.dot(raw, there))
+        better = has_it & (distance < nearest)
+        normal, nearest = dr.select(better, raw, normal), dr.select(better, distance, nearest)
+    return normal, dr.select(dr.isfinite(nearest), nearest, 0)
+
+
+def _triangle(pi: mi.PreliminaryIntersection3f, has_instances: bool, active: mi.Bool) -> list[mi.Point3f]:
+    """Return the corners of the triangles at intersections with meshes."""
+    mesh = mi.MeshPtr(pi.shape)
+    face = mesh.face_indices(pi.prim_index, active)
+    corners = [mi.Point3f(mesh.vertex_position(index, active)) for index in face]
+    if not has_instances:
+        return corners
+
+    def placed(self: mi.Shape, a: mi.Point3f, b: mi.Point3f, c: mi.Point3f, any_: mi.Bool) -> tuple[mi.Point3f, ...]:
+        to_world = mi.traverse(self)["to_world"] if self.class_name() == "Instance" else mi.AffineTransform4f()
+        return to_world @ a, to_world @ b, to_world @ c
+
+    has_one = active & (pi.instance != dr.zeros(mi.ShapePtr))
+    moved = dr.dispatch(pi.instance, placed, *corners, has_one)
+    return [dr.select(has_one, there, corner) for there, corner in zip(moved, corners, strict=True)]
 
 
 def welded_edges(positions: Array, faces: Array) -> Array:

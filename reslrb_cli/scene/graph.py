@@ -83,9 +83,8 @@ class SceneGraph:
                 own = [texture for texture in textures if emitter in self.parents[texture]]
                 varying = [texture for texture in own if texture.is_spatially_varying() and not parallel]
                 shared = bool(varying) and _shares_coordinates(shape)
-                found.append(
-                    Lamp(shape, emitter, index, parallel, None if shared or not varying else varying[0], shared)
-                )
+                texture = None if shared or not varying else varying[0]
+                found.append(Lamp(shape, emitter, index, parallel, texture, shared, own[0] if own else None))
         return tuple(found)
 
     def surface_bsdfs(self) -> list[Any]:
@@ -125,7 +124,7 @@ class Lamp:
     `parallel` tells whether light leaves only along the normal (`directionalarea`). `texture` is the texture from which
     points on the shape are sampled. `texture` is None if points are uniform over the shape's area. `shared` tells
     whether the shape has a texture, but several of its points have the same texture coordinates (`cube`). Mitsuba would
-    sample only one of them, so the points are uniform over the area.
+    sample only one of them, so the points are uniform over the area. `radiance` is the emitter's spectrum or texture.
     """
 
     shape: mi.Shape
@@ -134,6 +133,7 @@ class Lamp:
     parallel: bool
     texture: mi.Texture | None
     shared: bool = False
+    radiance: mi.Texture | None = None
 
     @cached_property
     def is_sphere(self) -> bool:
@@ -148,6 +148,14 @@ class Lamp:
         uses the density of a cone instead. Rounding can affect all vertices on the sphere.
         """
         return self.is_sphere and self.texture is None and not self.parallel and self.shape.has_flipped_normals()
+
+    @cached_property
+    def is_beam(self) -> bool:
+        """Whether light leaves the lamp in a known direction: along its normal, from flat faces."""
+        flat = self.shape.class_name() in ("Rectangle", "Disk") or (
+            self.has_faces and not interpolates_normals(self.shape)
+        )
+        return self.parallel and flat
 
     @cached_property
     def faces_by_area(self) -> bool:

@@ -74,17 +74,36 @@ def shadow_ray(si: mi.Interaction3f, target: mi.Point3f, has_edges: bool) -> mi.
     return ray
 
 
+def past_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
+    """Return the rays. Each origin is moved behind any lamps that the ray meets first, and the end of the ray stays."""
+
+    def body(active: mi.Bool, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Ray3f]:
+        si = scene.ray_intersect(ray, active)
+        lamp = active & si.is_valid() & (si.emitter(scene) != dr.zeros(mi.EmitterPtr))
+        behind = si.spawn_ray(ray.d)
+        behind.maxt = ray.maxt - si.t
+        return lamp, dr.select(lamp, behind, ray)
+
+    _, ray = dr.while_loop((mi.Bool(active), mi.Ray3f(ray)), lambda active, ray: active, body, label="hidden lamps")
+    return ray
+
+
 def is_hidden(
-    scene: mi.Scene, si: mi.Interaction3f, target: mi.Point3f, has_edges: bool, active: mi.Bool
+    scene: mi.Scene, si: mi.Interaction3f, target: mi.Point3f, has_edges: bool, active: mi.Bool,
+    passes_lamps: bool = False,
 ) -> mi.Bool:  # fmt: skip
-    """True if a surface lies between the vertex `si` and `target`.
+    """True if a surface lies between the vertex `si` and `target`. With `passes_lamps`, it is not a lamp.
 
     With `has_edges`, the shadow ray starts on the line to the target. A second ray finds surfaces between the vertex
     and this start, for example at a corner in which two sheets meet.
     """
+
+    def is_blocked(ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+        return scene.ray_test(past_lamps(scene, ray, active) if passes_lamps else ray, active)
+
     ray = shadow_ray(si, target, has_edges)
-    hidden = scene.ray_test(ray, active)
-    return hidden | scene.ray_test(si.spawn_ray_to(ray.o), active & ~hidden) if has_edges else hidden
+    hidden = is_blocked(ray, active)
+    return hidden | is_blocked(si.spawn_ray_to(ray.o), active & ~hidden) if has_edges else hidden
 
 
 def ray_offset(p: mi.Point3f) -> mi.Float:

@@ -32,6 +32,7 @@ from reslrb_cli.transport.connection import Connection, shading_correction
 from reslrb_cli.transport.plan import Plan
 
 DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not sample itself
+REFLECTS = 0.3  # share of reflection among the events of a specular chain at glass
 
 
 def context_of(plan: Plan) -> mi.BSDFContext:
@@ -443,6 +444,72 @@ def _to_point(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: 
     own = dr.select(aimed.found, own, 0)
     towards = Sample(there, own, dr.select(own > 0, f / own, 0), mi.Float(1), _glossy(aimed.active, sample.lobe))
     return dr.select(aimed.active, towards, sample)
+
+
+@dataclass
+class Specular:
+    """Reflection or refraction at a vertex. `s` (C,) is the factor of the path, divided by the probability of the lobe.
+    `number` is the random number that has selected the lobe.
+    """
+
+    d: mi.Vector3f
+    s: mi.Spectrum
+    number: mi.Float
+    active: mi.Bool
+
+
+def reflect_or_refract(
+    plan: Plan, hit: Hit, number: mi.Float, active: mi.Bool, attached: bool = False
+) -> Specular:  # fmt: skip
+    """Return the event of a delta lobe of the BSDF. The random `number` selects the lobe among all delta lobes on the
+    side of `hit`. The probabilities do not depend on the place.
+
+    The results are detached unless `attached` is true. `d` then moves with the vertex.
+    """
+    mode = mi.TransportMode.Radiance if plan.camera else mi.TransportMode.Importance
+
+    def sample(
+        self: mi.BSDF, si: mi.SurfaceInteraction3f, number: mi.Float, active: mi.Bool, any_: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:  # fmt: skip
+        wo, eta, s = mi.Vector3f(0), mi.Float(1), mi.Spectrum(0)
+        front = mi.Frame3f.cos_theta(si.wi) > 0
+        for side, here in ((mi.BSDFFlags.FrontSide, active & front), (mi.BSDFFlags.BackSide, active & ~front)):
+            lobes = _delta_lobes(self, side)
+            end = 0.0
+            for component, chance in lobes.items():
+                begin, end = end, end + chance
+                chosen = here & (number >= begin) & (number < end if component != [*lobes][-1] else mi.Bool(True))
+                context = mi.BSDFContext(mode)
+                context.component = component
+                bs, weight = self.sample(context, si, 0.5, mi.Point2f(0.5), chosen)
+                chosen &= bs.pdf > 0
+                wo, eta = dr.select(chosen, bs.wo, wo), dr.select(chosen, bs.eta, eta)
+                s = mi.Spectrum(dr.select(chosen, weight / chance, s))
+        return wo, eta, s
+
+    with dr.suspend_grad(when=not attached):
+        si = hit.si
+        wo, eta, s = dr.dispatch(hit.bsdf, sample, si, number, active, active)
+        d = si.to_world(wo)
+        correction, valid = shading_correction(plan, si, -hit.ray.d, d, wo)
+        if mixes(plan):
+            correction = correction * _delta_correction(si.wi, wo, eta)
+        if plan.camera:
+            valid = mi.Bool(True)
+        active = active & valid & dr.any(s != 0)
+        return Specular(d, dr.select(active, s * correction, 0), number, active)
+
+
+def _delta_lobes(bsdf: mi.BSDF, side: mi.BSDFFlags) -> dict[int, float]:
+    """Return the probabilities of the delta lobes of a BSDF on one side, by the number of their component."""
+    flags = {number: int(bsdf.flags(number)) for number in range(bsdf.component_count())}
+    reflection, transmission = int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DeltaTransmission)
+    shares = {
+        number: REFLECTS if flag & reflection else 1 - REFLECTS
+        for number, flag in flags.items()
+        if flag & (reflection | transmission) and flag & int(side)
+    }
+    return {number: share / sum(shares.values()) for number, share in shares.items()}
 
 
 def _glossy(mask: mi.Bool, lobe: mi.UInt32) -> mi.UInt32:

@@ -14,13 +14,13 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.scene.graph import Lamp
-from reslrb_cli.scene.rays import sensor_rays
+from reslrb_cli.scene.rays import past_lamps, sensor_rays
 from reslrb_cli.transport.bsdf import EventNumbers, Scattering, begins_caustic, evaluate, scatter
 from reslrb_cli.transport.connection import Connection, film_density, passage
 from reslrb_cli.transport.densities import density_of_rays
 from reslrb_cli.transport.factors import Product, play
 from reslrb_cli.transport.film import Colours
-from reslrb_cli.transport.lamps import keep_one
+from reslrb_cli.transport.lamps import beam_towards, keep_one
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex, intersect
@@ -41,6 +41,11 @@ class FilmRay:
     weight: mi.Spectrum
     continues: bool = False
     depth: mi.UInt32 | int = 1
+
+    @property
+    def begins_path(self) -> bool:
+        """Whether the ray starts at the sensor."""
+        return not self.continues and isinstance(self.depth, int) and self.depth == 1
 
 
 def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
@@ -235,21 +240,22 @@ def camera_walk(
     active = mi.Bool(active) & (plan.max_depth > 0)
 
     begun = first.ray.o
-    if plan.hide_emitters:
-        first.ray = _behind_lamps(scene, first.ray, active)
+    if plan.sees_through_lamps and first.begins_path:
+        first.ray = past_lamps(scene, first.ray, active)
     pi, active = intersect(plan, scene, first.ray, active, surrounded)
     M, rivals = [mi.Float(0)], []
     if plan.weighs:
         axis = dr.normalize(dr.detach(sensor.world_transform() @ mi.Vector3f(0, 0, 1)))  # the sensor looks along it
         cos = dr.dot(first.ray.d, axis)
         near = mi.Float(mi.traverse(sensor)["near_clip"]) / cos  # from the aperture to the ray's origin
-        if plan.hide_emitters:
+        if plan.sees_through_lamps:
             near = near + dr.norm(first.ray.o - begun)
         M, rivals = [], [Rivals(samples.ratio_at(first.u) / film_density(sensor, cos), mi.Float(0), mi.Float(near))]
+    divided = plan.by_class and not plan.only_beams
     path = CameraPath(
         active, mi.UInt32(first.depth), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
         mi.Point3f(first.ray.o), mi.UInt32(first.depth) - 1, M, rivals,
-        [PathClass(mi.UInt32(1 if first.continues else 0), mi.UInt32(0))] if plan.by_class else [],
+        [PathClass(mi.UInt32(1 if first.continues else 0), mi.UInt32(0))] if divided else [],
     )  # fmt: skip
 
     def body(path: CameraPath, state: Any, sampler: mi.Sampler) -> tuple[CameraPath, Any, mi.Sampler]:
@@ -323,18 +329,6 @@ def camera_walk(
         mode=mode,
     )
     return first, state
-
-
-def _behind_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
-    """Return the rays. Each origin is moved behind any hidden lamps that the ray meets first."""
-
-    def body(active: mi.Bool, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Ray3f]:
-        si = scene.ray_intersect(ray, active)
-        lamp = active & si.is_valid() & (si.emitter(scene) != dr.zeros(mi.EmitterPtr))
-        return lamp, dr.select(lamp, si.spawn_ray(ray.d), ray)
-
-    _, ray = dr.while_loop((mi.Bool(active), mi.Ray3f(ray)), lambda active, ray: active, body, label="hidden lamps")
-    return ray
 
 
 def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> MetLight:
@@ -447,6 +441,7 @@ def sample_lamp(
     scene, unseen = samples.scene, _unseen(samples)
     spheres = {lamp.emitter: lamp.shape for lamp in _spheres(samples)}
     shared = {lamp.emitter: lamp.shape for lamp in samples.plan.needs.lamps if lamp.shared}
+    beams = {lamp.emitter: lamp for lamp in samples.plan.needs.lamps if lamp.is_beam and samples.plan.beams}
     with dr.suspend_grad():
         if not (unseen or spheres or shared or samples.plan.lit):
             return scene.sample_emitter_direction(si, numbers, False, active)
@@ -456,7 +451,9 @@ def sample_lamp(
         def sample(
             self: mi.Emitter, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
         ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
-            if self in unseen:
+            if self in beams:
+                return beam_towards(beams[self], si, sample.x, active)
+            if self in unseen or samples.plan.only_beams:
                 return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
             if self in spheres:
                 return _sample_sphere(self, spheres[self], si, sample, active)

@@ -15,16 +15,14 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.rays import is_hidden, sensor_rays
-from reslrb_cli.transport.bsdf import EventNumbers, Hit, Scattering, scatter
+from reslrb_cli.scene.rays import is_hidden, past_lamps, sensor_rays
+from reslrb_cli.transport.bsdf import Hit, Specular, reflect_or_refract
 from reslrb_cli.transport.camera import sample_lamp
-from reslrb_cli.transport.connection import connect
+from reslrb_cli.transport.connection import before_lamps, connect
 from reslrb_cli.transport.emission import emission_of
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.sobol import unit
 
-#: Probability of reflection at a vertex that also refracts or scatters.
-REFLECTS = 0.3
 #: Largest number of specular vertices of a chain.
 MOST_VERTICES = 8
 #: Cells of the square of a lamp's random numbers, along each axis.
@@ -115,6 +113,16 @@ class Chains(ABC):
     def most(self) -> int:
         """Largest number of specular vertices of a chain."""
 
+    @property
+    def sees_through_lamps(self) -> bool:
+        """Whether the first ray passes through lamps."""
+        return False
+
+    @property
+    def passes_lamps(self) -> bool:
+        """Whether the ways to the points y pass through lamps."""
+        return self.samples.plan.passes_lamps
+
     def random(self, number: mi.UInt32, stream: int) -> mi.Point2f:
         """Return two random numbers of the chain."""
         return mi.Point2f(*(unit(word) for word in mi.sample_tea_32(self.key ^ stream, number)))
@@ -122,35 +130,21 @@ class Chains(ABC):
     def start(self, u: mi.Point2f, active: mi.Bool) -> Chain:
         """Return the chain before its first vertex."""
         ray, weight = self.begin(u)
+        if self.sees_through_lamps:
+            ray = past_lamps(self.samples.scene, ray, active)
         pi = self.samples.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         return Chain(ray, pi, weight, mi.UInt32(0), mi.UInt32(0))
 
-    def event(self, chain: Chain, active: mi.Bool) -> tuple[Hit, Scattering, mi.Bool, mi.Spectrum]:
-        """Return the vertex that the chain reaches, and its event. Also return the lanes that pass the vertex, and the
-        throughput behind it.
-
-        The event is reflection, or refraction and scattering, with a fixed probability. The first and the last random
-        number of a BSDF select these lobes.
-        """
+    def event(self, chain: Chain, active: mi.Bool) -> tuple[Hit, Specular]:
+        """Return the vertex that the chain reaches, and its event."""
         hit = chain.vertex(active)
-        reflects = self.random(chain.count, EVENTS).x < REFLECTS
-        numbers = EventNumbers(mi.Point2f(0.5), dr.select(reflects, 0, dr.one_minus_epsilon(mi.Float)))
-        scattering, _ = scatter(self.samples.plan, hit, numbers, active, None)
-        flags = hit.bsdf.flags()
-        several = mi.has_flag(flags, mi.BSDFFlags.Smooth) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
-        reflected = mi.Frame3f.cos_theta(scattering.wo) * mi.Frame3f.cos_theta(hit.si.wi) > 0
-        chance = dr.select(several, dr.select(reflects, REFLECTS, 1 - REFLECTS), 1)
-        # At total reflection, only the lanes that reflect continue.
-        passes = (
-            active & scattering.active & scattering.is_delta & (~several | dr.select(reflects, reflected, ~reflected))
-        )
-        return hit, scattering, passes, chain.product * scattering.s * (scattering.pdf / chance)
+        return hit, reflect_or_refract(self.samples.plan, hit, self.random(chain.count, EVENTS).x, active)
 
-    def onward(self, chain: Chain, hit: Hit, scattering: Scattering, passes: mi.Bool, product: mi.Spectrum) -> Chain:
-        """Return the chain behind a vertex, in the lanes `passes`."""
-        ray = dr.detach(hit.si.spawn_ray(scattering.d))
+    def onward(self, chain: Chain, hit: Hit, event: Specular, passes: mi.Bool) -> Chain:
+        """Return the chain behind the `event` at a vertex, in the lanes `passes`."""
+        ray = dr.detach(hit.si.spawn_ray(event.d))
         pi = self.samples.scene.ray_intersect_preliminary(ray, coherent=False, active=passes)
-        return dr.select(passes, Chain(ray, pi, product, chain.count + 1, chain.code), chain)
+        return dr.select(passes, Chain(ray, pi, chain.product * event.s, chain.count + 1, chain.code), chain)
 
     def lit(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> tuple[Target, mi.Bool]:
         """Return the point y of a vertex, and the lanes in which a surface hides it."""
@@ -158,22 +152,25 @@ class Chains(ABC):
         target = self.target(hit, count, active & (count > 0) & smooth & (count + 2 <= self.samples.plan.max_depth))
         target.active &= dr.any(target.weight > 0)
         samples = self.samples
-        return target, is_hidden(samples.scene, hit.si, target.y, samples.plan.has_edges, target.active)
+        return target, is_hidden(
+            samples.scene, hit.si, target.y, samples.plan.has_edges, target.active, self.passes_lamps
+        )
 
     def follow(self, u: mi.Point2f, active: mi.Bool | bool = True, end: mi.UInt32 | int = MOST_VERTICES) -> Chain:
         """Return the chain from place `u`, up to vertex number `end` or its first vertex that is not specular."""
 
         def body(active: mi.Bool, chain: Chain) -> tuple[mi.Bool, Chain]:
             valid = chain.pi.is_valid()
-            hit, scattering, passes, product = self.event(chain, active & valid)
+            hit, event = self.event(chain, active & valid)
+            passes = event.active
             code = chain.code * 0x9E3779B1 + surface_code(hit, valid)
             if self.has_targets:
                 target, hidden = self.lit(hit, chain.count, active & valid)
                 code += dr.select(target.active & ~hidden, mi.UInt32(77), 0)
             # A chain without specular vertices has the code 0.
             chain = dr.select(active & ((chain.count > 0) | passes), replace(chain, code=code), chain)
-            passes &= chain.count < self.most
-            chain = self.onward(chain, hit, scattering, passes, product)
+            passes = passes & (chain.count < self.most)
+            chain = self.onward(chain, hit, event, passes)
             return passes & (chain.count < end), chain
 
         active = mi.Bool(active) & (mi.UInt32(end) > 0)
@@ -183,6 +180,10 @@ class Chains(ABC):
 
 class SensorChains(Chains):
     """Chains from the sensor. The plane is the film, and its cells are pixels."""
+
+    @property
+    def sees_through_lamps(self) -> bool:
+        return self.samples.plan.sees_through_lamps
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -236,6 +237,7 @@ class LampChains(Chains):
     def target(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> Target:
         samples = self.samples
         aperture = self.random(mi.UInt32(1), APERTURE) if samples.plan.needs.thin_lens else mi.Point2f(0.5)
+        active = before_lamps(samples.plan, samples.scene, hit.si, active)
         there = connect(samples.plan, samples.sensor, hit.si, hit.ray, aperture, active)
         return Target(there.target, mi.Bool(False), there.wo, there.rest, there.u, active & there.active)
 

@@ -166,11 +166,11 @@ def passage(
     naive AD.
     """
     active, one = before_lamps(plan, scene, si, connection.active), mi.Spectrum(1)
-    if plan.needs.has_null or plan.passes_lamps:
+    if plan.needs.has_null:
         through = transmittance(plan, scene, si, depth, connection.target, active, loop_mode=loop_mode)
         return through.reached, through.value
-    if known is None:
-        return active & ~is_hidden(scene, si, connection.target, plan.has_edges, active), one
+    if known is None or plan.passes_lamps:
+        return active & ~is_hidden(scene, si, connection.target, plan.has_edges, active, plan.passes_lamps), one
     if known.known is None:
         return active & known.visible, one
     unknown = active & ~known.known

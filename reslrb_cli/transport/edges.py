@@ -39,7 +39,8 @@ class EdgeView:
     Occlusion is not included. `to_y` is the unit vector to the viewpoint, and `distance` is the distance of the
     viewpoint. If `parallel` is true, the viewpoint is infinitely far away. `surface` is the lamp's normal if the
     viewpoint lies on a surface, otherwise zero. `u` is the film position if the viewpoint is the sensor. `emitter` is
-    the lamp if there is one.
+    the lamp if there is one. If `passes_lamps` is true, lamps do not block the view. Nothing blocks it within the
+    distance `clip` of the viewpoint.
     """
 
     y: mi.Point3f
@@ -51,6 +52,8 @@ class EdgeView:
     u: mi.Point2f
     active: mi.Bool
     emitter: mi.EmitterPtr
+    passes_lamps: bool = False
+    clip: mi.Float | float = 0.0
 
 
 @dataclass
@@ -89,7 +92,8 @@ def view_from_lamps(samples: Samples, numbers: mi.Point2f, wavelengths: mi.Wavel
         here = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
         here.p, here.wavelengths = p, wavelengths
         ds, weight = sample_lamp(samples, here, numbers, active)
-        parallel = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        flags = ds.emitter.flags()
+        parallel = mi.has_flag(flags, mi.EmitterFlags.Infinite) | mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
         surface = dr.select(ds.delta | parallel, mi.Normal3f(0), ds.n)
         seen = active & (ds.pdf > 0) & dr.isfinite(ds.pdf) & dr.any(weight > 0)
         return EdgeView(ds.p, ds.d, ds.dist, parallel, weight, surface, mi.Point2f(0), seen, ds.emitter)
@@ -108,6 +112,7 @@ def view_from_sensor(samples: Samples, aperture: mi.Point2f) -> Viewer:
         return EdgeView(
             ds.p, ds.d, ds.dist, parallel=mi.Bool(False), weight=seen.rest, surface=mi.Normal3f(0), u=seen.u,
             active=active & seen.active, emitter=dr.zeros(mi.EmitterPtr),
+            passes_lamps=samples.plan.sees_through_lamps, clip=dr.norm(seen.target - ds.p),
         )  # fmt: skip
 
     return view
@@ -229,7 +234,7 @@ def sample_outline(
 
 def _from(first: EdgeView, p: mi.Point3f, again: EdgeView, moved: mi.Bool) -> EdgeView:
     """Return the view of `p` from the viewpoint of `first`, in the lanes `moved`. `again` is the view of `p` with the
-    same random numbers.
+    same random numbers. The first view of parallel light needs no light.
 
     The same random numbers may select another place on a lamp for another point `p`. If the lamp has a surface, the
     place of `first` is used, and the weight is multiplied by the ratio of the solid angles of this place.
@@ -249,8 +254,10 @@ def _from(first: EdgeView, p: mi.Point3f, again: EdgeView, moved: mi.Bool) -> Ed
         weight=dr.select(keeps, first.weight * solid, dr.select(moved, again.weight, first.weight)),
         surface=first.surface,
         u=dr.select(moved, again.u, first.u),
-        active=first.active & (~moved | on_surface | again.active),
+        active=dr.select(moved & first.parallel, again.active, first.active & (~moved | on_surface | again.active)),
         emitter=dr.select(moved & ~on_surface, again.emitter, first.emitter),
+        passes_lamps=first.passes_lamps,
+        clip=first.clip,
     )
 
 
@@ -267,6 +274,7 @@ def weigh_edges(samples: Samples, table: EdgeTable) -> EdgeTable:
     path.
     """
     camera = samples.plan.camera
+    samples = replace(samples, plan=samples.plan.finding_beams())
     with dr.suspend_grad():
         lamp, sensor = _seen_from_lamps(samples, table, not camera), _seen_from_sensor(samples, table, camera)
         anywhere = table.anywhere
@@ -409,7 +417,7 @@ def _seen_from_lamps(samples: Samples, table: EdgeTable, creases: bool) -> mi.Fl
     found = mi.Bool(False)
     for numbers in _probes():
         view = view_from_lamps(samples, numbers)(dr.lerp(table.a, table.b, 0.5), mi.Bool(True))
-        found |= is_outline(table, view) & view.active
+        found |= is_outline(table, view) & (view.active | view.parallel)
     return _likely(table, found, creases)
 
 

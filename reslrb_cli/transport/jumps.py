@@ -22,9 +22,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.rays import shadow_ray
+from reslrb_cli.scene.edges import edge_normal
+from reslrb_cli.scene.rays import past_lamps, ray_offset, shadow_ray
 from reslrb_cli.transport.bsdf import Hit
-from reslrb_cli.transport.chains import Chain, Chains, Target, surface_code, vertex_at
+from reslrb_cli.transport.chains import Chain, Chains, Target, surface_code
 from reslrb_cli.transport.edges import pick
 from reslrb_cli.transport.sobol import evenly, unit
 
@@ -36,8 +37,9 @@ NARROWEST = 0.02
 BISECTIONS = 15
 #: Largest distance in cells between places whose difference gives dq/du.
 NEIGHBOUR = 0.06
-#: Radius of the circle that finds the direction of an edge, relative to the distance of the edge.
-CIRCLE = 4e-3
+#: Distance of the ray at a jump from an edge of the surface, in units of its uncertainty. From this distance on, the
+#: jump is not an edge, but a curve in which two surfaces intersect.
+MARGIN = 10.0
 #: Streams of random numbers, mixed into the seed or into the key of a chain.
 LINES, DIRECTION = 0xC4A1, 0x57E
 
@@ -219,11 +221,8 @@ def _compare(chains: Chains, inner: mi.Point2f, outer: mi.Point2f, active: mi.Bo
             lit = [chains.lit(event[0], ends[0].count, active & valid[0] & ~edge) for event in events]
             hides = lit[0][1]
             shadow = lit[0][0].active & lit[1][0].active & dr.select(hides, ~lit[1][1], lit[1][1])
-        passes = events[0][2] & events[1][2] & ~edge & ~shadow & (ends[0].count < chains.most)
-        inner, outer = (
-            chains.onward(end, hit, scattering, passes, product)
-            for end, (hit, scattering, _, product) in zip(ends, events, strict=True)
-        )
+        passes = events[0][1].active & events[1][1].active & ~edge & ~shadow & (ends[0].count < chains.most)
+        inner, outer = (chains.onward(end, hit, event, passes) for end, (hit, event) in zip(ends, events, strict=True))
         return passes, Pair(
             inner, outer, pair.edge | edge, pair.shadow | shadow, dr.select(active, hides, pair.inner_hides)
         )
@@ -243,41 +242,11 @@ def _edge_point(chains: Chains, chain: Chain, shadow: mi.Bool, active: mi.Bool) 
     # A surface between the vertex and the start of this ray touches the vertex. Such an edge would not count anyway, so
     # the second ray of `is_hidden` is not needed.
     to_target = shadow_ray(end.si, target.y, chains.samples.plan.has_edges)
+    if chains.passes_lamps:
+        to_target = past_lamps(chains.samples.scene, to_target, active & shadow)
     pi = chains.samples.scene.ray_intersect_preliminary(to_target, coherent=False, active=active & shadow)
     ray = dr.select(shadow, mi.Ray3f(to_target), mi.Ray3f(chain.ray))
     return EdgePoint(dr.detach(ray), dr.select(shadow, pi, chain.pi), end, target)
-
-
-def _normal(chains: Chains, edge: EdgePoint, outwards: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-    """Return the normal of an edge. `outwards` points away from the surface, and is not parallel to the edge.
-
-    The edge crosses a small circle around its point twice. Both crossings give its direction.
-    """
-    ray, radius = edge.ray, CIRCLE * edge.pi.t
-    first = dr.normalize(outwards - ray.d * dr.dot(outwards, ray.d))
-    second = dr.cross(ray.d, first)
-    code = surface_code(vertex_at(ray, edge.pi, active), edge.pi.is_valid())
-
-    def leaves(angle: mi.Float) -> mi.Bool:
-        sin, cos = dr.sincos(angle)
-        there = mi.Ray3f(
-            ray.o, dr.normalize(edge.p + (cos * first + sin * second) * radius - ray.o), ray.time, ray.wavelengths
-        )
-        pi = chains.samples.scene.ray_intersect_preliminary(there, coherent=False, active=active)
-        return surface_code(vertex_at(there, pi, active), pi.is_valid()) != code
-
-    def body(
-        step: mi.UInt32, up: mi.Float, down: mi.Float, half: mi.Float
-    ) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Float]:
-        up = dr.select(leaves(up + half), up + half, up)
-        down = dr.select(leaves(-down - half), down + half, down)
-        return step + 1, up, down, 0.5 * half
-
-    state = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5 * dr.pi)
-    _, up, down, _ = dr.while_loop(state, lambda step, *_: active & (step < BISECTIONS), body, label="edge direction")
-    along = (dr.cos(up) - dr.cos(down)) * first + (dr.sin(up) + dr.sin(down)) * second
-    n = dr.normalize(dr.cross(along, ray.d))
-    return dr.mulsign(n, dr.dot(n, outwards))
 
 
 def sample_edge(chains: Chains, line: ScanLine) -> ChainEdge:
@@ -292,7 +261,7 @@ def sample_edge(chains: Chains, line: ScanLine) -> ChainEdge:
     over, past = (dr.select(from_inner, *ends) for ends in ((pair.inner, pair.outer), (pair.outer, pair.inner)))
     here = _edge_point(chains, over, shadow, active)
     active &= here.pi.is_valid()
-    s = 1 - here.pi.t / dr.norm(here.target.y - here.end.si.p)
+    s = 1 - dr.norm(here.p - here.end.si.p) / dr.norm(here.target.y - here.end.si.p)
     s = dr.select(shadow & ~here.target.distant, s, 1)
 
     # ---- dq/du, along the line and across it ----
@@ -317,7 +286,9 @@ def sample_edge(chains: Chains, line: ScanLine) -> ChainEdge:
     state = mi.UInt32(0), active, mi.Vector3f(0), mi.Vector3f(0)
     _, active, along, across = dr.while_loop(state, lambda step, *_: active & (step < 4), probe, label="neighbours")
 
-    n = _normal(chains, here, along * dr.select(from_inner, 1, -1) * dr.sign(jump.outer - jump.inner), active)
+    n, beside = edge_normal(here.pi, here.ray, chains.samples.plan.needs.has_instances, active)
+    n = dr.mulsign(n, dr.dot(n, along) * dr.select(from_inner, 1, -1) * (jump.outer - jump.inner))
+    active &= beside < MARGIN * (dr.norm(along) * dr.abs(jump.outer - jump.inner) + ray_offset(p))
     slope = dr.abs(dr.dot(n, along))
     active &= (slope > 0) & (slope >= dr.abs(dr.dot(n, across)))
     density = jump.places * line.chance * (chains.cells[0] * chains.cells[1] / (2 * (1 + INTERVAL)))

@@ -135,6 +135,48 @@ def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
     return 0.5 * dr.norm(dr.cross(b - a, c - a))
 
 
+def beam_towards(
+    lamp: Lamp, si: mi.Interaction3f, number: mi.Float, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
+    """Return the place on a lamp with `is_beam` whose light passes the point `si`, and irradiance / probability (C,).
+    Occlusion is not tested. The random `number` selects a face of a mesh.
+    """
+    mesh, count, index = lamp.shape, 1, None
+    if lamp.has_faces:
+        count = mesh.face_count()
+        index = mesh.face_indices(dr.minimum(mi.UInt32(number * count), count - 1))
+        a, b, c = (dr.detach(mesh.vertex_position(vertex)) for vertex in index)
+        x, y = b - a, c - a
+        n = dr.normalize(dr.cross(x, y))
+    else:
+        to_world = dr.detach(mi.traverse(mesh)["to_world"])
+        a, x, y = to_world @ mi.Point3f(0), to_world @ mi.Vector3f(1, 0, 0), to_world @ mi.Vector3f(0, 1, 0)
+        n = dr.normalize(mi.Vector3f(to_world @ mi.Normal3f(0, 0, 1)))
+    n = -n if mesh.has_flipped_normals() else n
+    distance = dr.dot(si.p - a, n)
+    there = dr.zeros(mi.SurfaceInteraction3f, dr.width(si.p))
+    there.p, there.wavelengths = si.p - n * distance, si.wavelengths
+    # Coordinates of the place in the plane of the lamp.
+    across, offset = dr.cross(x, y), there.p - a
+    u, v = (dr.dot(dr.cross(*pair), across) / dr.squared_norm(across) for pair in ((offset, y), (x, offset)))
+    if index is not None:
+        inside = (u >= 0) & (v >= 0) & (u + v <= 1)
+        if mesh.has_vertex_texcoords():
+            corners = [mesh.vertex_texcoord(vertex) for vertex in index]
+            there.uv = corners[0] * (1 - u - v) + corners[1] * u + corners[2] * v
+    elif mesh.class_name() == "Disk":
+        inside, turn = u**2 + v**2 <= 1, dr.atan2(v, u) * dr.inv_two_pi
+        there.uv = mi.Point2f(dr.sqrt(u**2 + v**2), turn - dr.floor(turn))
+    else:
+        inside, there.uv = (dr.abs(u) <= 1) & (dr.abs(v) <= 1), 0.5 * mi.Point2f(u + 1, v + 1)
+    inside = active & inside & (distance > 0)
+    assert lamp.radiance is not None
+    ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
+    ds.p, ds.n, ds.d, ds.dist, ds.uv = there.p, mi.Normal3f(n), -n, distance, there.uv
+    ds.pdf, ds.delta, ds.emitter = dr.select(inside, mi.Float(1), 0), mi.Bool(True), mi.EmitterPtr(lamp.emitter)
+    return ds, mi.Spectrum(dr.select(inside, lamp.radiance.eval(there, inside) * count, 0))
+
+
 def wavelengths_of(number: mi.Float) -> tuple[mi.Wavelength, mi.Spectrum]:
     """Return wavelengths in proportion to the visible light of a white lamp, and the inverse of their density. The
     random `number` selects them. Without wavelengths, the density is 1.

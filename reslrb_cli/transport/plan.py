@@ -159,8 +159,14 @@ class Plan:
     by_class: bool = False
     # Whether each pixel is divided by the part of its filter on the film, as always if camera paths may run.
     whole: bool = False
+    # How the sensor sees: whether lamps are hidden and do not block its view. With light paths alone they do.
+    sees_through_lamps: bool = False
     # Whether guided paths may be aimed at visible surfaces (`aim.py`), if nothing moves.
     aims: bool = False
+    # Whether next events find the parallel light of lamps (`Lamp.is_beam`), for edges of light paths; and whether they
+    # find no other light.
+    beams: bool = False
+    only_beams: bool = False
     # The low-discrepancy numbers, if there are any.
     sequence: Coordinates | None = None
 
@@ -176,13 +182,13 @@ class Plan:
 
     @property
     def passes_lamps(self) -> bool:
-        """Whether connections to the sensor pass through lamps, because lamps are hidden from the sensor's rays."""
-        return self.paths == "both" and self.hide_emitters and not self.camera and bool(self.needs.lamps)
+        """Whether connections of this walk pass through lamps, because they lead to a sensor that sees through them."""
+        return self.sees_through_lamps and not self.camera
 
     @property
     def samples_emitters(self) -> bool:
         """Whether next event estimation can find an emitter."""
-        return any(name != "DirectionalArea" for name in self.needs.emitters)
+        return self.beams or any(name != "DirectionalArea" for name in self.needs.emitters)
 
     @property
     def has_light_at_points(self) -> bool:
@@ -290,6 +296,13 @@ class Plan:
     def moves(self, shape: mi.ShapePtr) -> mi.Bool:
         """Return the lanes in which the shape itself moves."""
         return is_one_of(shape, self.moving_shapes)
+
+    def finding_beams(self) -> Plan:
+        """Return the plan for edges of its paths. Light paths have all light of `beams`, and no other light that camera
+        paths find.
+        """
+        beams = not self.camera and any(lamp.is_beam for lamp in self.needs.lamps)
+        return replace(self, beams=beams, only_beams=beams and self.by_class)
 
     def for_camera(self) -> Plan:
         """Return the plan of the camera paths of a pass. Their vertices stay behind all surfaces that are not

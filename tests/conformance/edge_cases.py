@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +46,13 @@ TWO_SIDED = {"type": "twosided", "bsdf": OWN}
 
 @dataclass(frozen=True)
 class EdgeCase:
-    """Shapes of `OCCLUDERS`, and a lamp of `LAMPS`, or of `ROOMS` in a room. The shapes move, or the lamp moves if
-    `lamp_moves` is true.
+    """Shapes of `OCCLUDERS`, and a lamp of `LAMPS`, or of `ROOMS` in a room, or one of the `VIEWS`. The shapes move, or
+    the lamp moves if `lamp_moves` is true.
 
     The derivatives are those of each object's `motion`, which has components of `MOTION`, or of `HEIGHTS` for the
     bumpy sheet. `axis` is the axis of the rotation. The gradient of each seed uses `spp` samples per pixel. Finite
-    differences have the `step`, and use `reference_spp`. `options` are options of `reslrb`.
+    differences have the `step`, and use `reference_spp`. `options` are options of `reslrb`. The sensor sees nothing
+    before `near_clip`.
     """
 
     occluder: str
@@ -63,6 +64,7 @@ class EdgeCase:
     reference_spp: int = 2048
     step: float = STEP
     lamp_moves: bool = False
+    near_clip: float = 1e-2
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -95,9 +97,13 @@ class EdgeCase:
                     params[key] = dr.ravel(motion @ points)
 
         start = {f"{name}.{part}": 0.0 for name in names for part in self.motion}
-        scene = (_room(self.lamp) if self.lamp in ROOMS else _open(self.lamp)) | STILL.get(self.occluder, dict)()
-        moving = Moving(scene | shapes, start, place)
-        moving.weigh(smooth_weights(SIZE, SIZE))
+        if self.lamp in VIEWS:
+            scene, weights = VIEWS[self.lamp](), ramp()
+        else:
+            scene, weights = _room(self.lamp) if self.lamp in ROOMS else _open(self.lamp), smooth_weights(SIZE, SIZE)
+        scene["camera"]["near_clip"] = self.near_clip
+        moving = Moving(scene | STILL.get(self.occluder, dict)() | shapes, start, place)
+        moving.weigh(weights)
         return moving
 
     def gradients(self, count: int = 8, block: int = 0, **options: Any) -> np.ndarray:
@@ -108,8 +114,13 @@ class EdgeCase:
         return np.array([np.concatenate([*moving.gradient(tracer, seed, self.spp).values()]) for seed in chosen])
 
     def differences(self, count: int = 8, block: int = 1) -> np.ndarray:
-        """Return finite differences (N, K) of images by `path` at `count` other seeds. `block` chooses the seeds."""
-        moving, path = self.moving(), integrator("path", self.depth)
+        """Return finite differences (N, K) of images at `count` other seeds. `block` chooses the seeds.
+
+        The images are those of `path`. Parallel light is found only by `ptracer`. In place of a hidden lamp, the sensor
+        sees nothing before a clip plane behind the lamp.
+        """
+        moving = replace(self, near_clip=BEHIND_THE_VEIL).moving() if self.lamp == "veil" else self.moving()
+        path = integrator("ptracer" if self.lamp == "beam" else "path", self.depth)
 
         def difference(seed: int, name: str) -> float:
             ends = (moving.value(path, seed, self.reference_spp, **{name: step}) for step in (self.step, -self.step))
@@ -208,6 +219,14 @@ def _ball(x: float, y: float, z: float, size: float = 1.0) -> Any:
     return mesh(*ball((x, y, z), 0.4 * size, degrees=BALL_TURN), OWN)
 
 
+#: Sides of a square that the camera of `VIEWS` sees at a distance of 4.2.
+SIDES = (0.7, 0.3, 0.1, 0.05)
+
+
+def _square(side: float) -> Any:
+    return rectangle(TWO_SIDED, transform(translate=[0.1, -0.2, 0.05], rotate=([1, 0, 0], -90), scale=side / 2))
+
+
 SHAPES: dict[str, Callable[..., Any]] = {
     "box": _box, "sphere": _sphere, "rectangle": _rectangle, "disk": _disk, "cylinder": _cylinder, "ball": _ball,
 }  # fmt: skip
@@ -225,7 +244,9 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
     "slab": lambda: {"shape": mesh(*split_box((0.1, 0, 0.5), (0.6, 0.6, 0.1)), GLASS)},
     "mirror": lambda: {"shape": rectangle(MIRROR, transform(translate=[0.2, 0.8, 0.8], rotate=([1, 0, 0], 75),
                                                             scale=0.7))},
-    "reflected": lambda: {"shape": _sphere(0.1, 0, 0.6)},
+    **dict.fromkeys(("reflected", "mapped"), lambda: {"shape": _sphere(0.1, 0, 0.6)}),
+    "facing": lambda: {"shape": rectangle(MIRROR, transform(translate=[0.1, 2, 0], rotate=([1, 0, 0], 90), scale=0.4))},
+    **{f"square_{side}": lambda side=side: {"shape": _square(side)} for side in SIDES},
     "bumpy": lambda: {"shape": mesh(*bumpy()[:2], TWO_SIDED)},
     # A coarse ball with interpolated normals.
     "smooth": lambda: {"shape": mesh(*ball((0.1, -0.1, 0.9), 0.4, degrees=BALL_TURN), OWN, normals=True)},
@@ -233,6 +254,17 @@ OCCLUDERS: dict[str, Callable[[], dict[str, Any]]] = {
     "flat": lambda: {name: SHAPES[name](0.9 * (n % 2) - 0.45, 0.9 * (n // 2) - 0.5, 0.5 + 0.1 * n, 0.8)
                      for n, name in enumerate(FLAT)},
 }  # fmt: skip
+
+
+def _mapped() -> Any:
+    """Return a mirror with a normal map that changes nothing."""
+    normal = {"type": "bitmap", "data": mi.TensorXf([0.5, 0.5, 1.0], (1, 1, 3)), "raw": True}
+    return {"type": "twosided", "bsdf": {"type": "normalmap", "normalmap": normal, "bsdf": {"type": "conductor"}}}
+
+
+def _sheet(bsdf: Any) -> Any:
+    return rectangle(bsdf, transform(translate=[0.2, 1.6, 1], rotate=([1, 0, 0], 80), scale=1.3))
+
 
 #: Shapes that do not move. The camera sees the box behind a sheet, or behind three shapes, and the reflector lights the
 #: floor past a sheet.
@@ -254,8 +286,8 @@ STILL: dict[str, Callable[[], dict[str, Any]]] = {
     "cleared": lambda: {"pane": mesh(*split_box((0.5, 0.1, 2.3), (1.2, 1.2, 0.05)),
                                      GLASS | {"int_ior": 1.0, "ext_ior": 1.0})},
     # The camera sees the sphere and its shadow in a mirror, too.
-    "reflected": lambda: {"sheet": rectangle(MIRROR, transform(translate=[0.2, 1.6, 1], rotate=([1, 0, 0], 80),
-                                                               scale=1.3))},
+    "reflected": lambda: {"sheet": _sheet(MIRROR)},
+    "mapped": lambda: {"sheet": _sheet(_mapped())},
 }  # fmt: skip
 
 # ---- Lamps, and surfaces that do not move ----
@@ -280,12 +312,24 @@ LAMPS: dict[str, Callable[[], dict[str, Any]]] = {
     "upward": lambda: {"type": "spot", "to_world": look_at([0.1, 0, 1.6], [0.1, 0, 3], [0, 1, 0]), "cutoff_angle": 40,
                        "intensity": rgb(20, 20, 20)},
     "directional": lambda: {"type": "directional", "direction": [-0.4, -0.15, -1], "irradiance": rgb(3, 3, 3)},
+    # Parallel light from a part of the sky.
+    # Parallel light from the whole sky, as from `directional`.
+    "wide_beam": lambda: lit_square(rgb(3, 3, 3), look_at([2.4, 0.9, 6], BELOW) @ transform(scale=4),
+                                    "directionalarea"),
+    "beam": lambda: lit_square(rgb(3, 3, 3), _towards() @ transform(scale=0.8), "directionalarea"),
+    # A lamp between the camera and the scene.
+    "veil": lambda: lit_square(rgb(10, 10, 10), look_at([0.3, -2.3, 1.75], [0, 0, 0.3]) @ transform(scale=0.3)),
     "constant": lambda: {"type": "constant", "radiance": rgb(1, 1, 1)},
 }  # fmt: skip
 
 
-def _camera(origin: list[float], target: list[float], fov: float) -> dict[str, Any]:
-    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "pixel_format": "rgb", "rfilter": {"type": "gaussian"}}
+#: Distance from the camera of a plane behind the lamp `veil`.
+BEHIND_THE_VEIL = 1.3
+
+
+def _camera(origin: list[float], target: list[float], fov: float, **rfilter: float) -> dict[str, Any]:
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "pixel_format": "rgb",
+            "rfilter": {"type": "gaussian", **rfilter}}  # fmt: skip
     return {"type": "perspective", "fov": fov, "to_world": look_at(origin, target), "film": film,
             "sampler": {"type": "independent"}}  # fmt: skip
 
@@ -325,6 +369,58 @@ def _room(lamp: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+# ---- A square that the camera does not see directly ----
+
+
+def ramp() -> np.ndarray:
+    """Return weights (H, W, 3) that are 0 at the square's centre and increase with the row and the column. The terms of
+    opposite edges then have the same sign, so that a fault of their directions does not cancel.
+    """
+    half = 4.2 * np.tan(np.deg2rad(VIEW / 2))
+    y, x = (np.mgrid[0:SIZE, 0:SIZE] + 0.5) / SIZE - 0.5
+    return np.repeat((x - 0.05 / half + y + 0.025 / half)[:, :, None], 3, axis=2)
+
+
+#: Field of view in degrees of the camera that looks at a square.
+VIEW = 25.0
+
+
+def _around_square(**others: Any) -> dict[str, Any]:
+    lamp = {"type": "point", "position": [1.2, 1.2, 1.0], "intensity": rgb(6, 5, 4)}
+    return {"type": "scene", "lamp": lamp} | others
+
+
+def _mirrored(bsdf: Any) -> dict[str, Any]:
+    """Return a camera that sees a square in a flat mirror. The filter is so wide that images have no ripples."""
+    mirror = rectangle(bsdf, transform(translate=[0, 2, 0], rotate=([1, 0, 0], 90), scale=3))
+    return _around_square(camera=_camera([0, 0, 0], [0, 2, 0], VIEW, stddev=0.9), mirror=mirror)
+
+
+def _paned() -> dict[str, Any]:
+    """Return a camera that sees a square through a pane of glass."""
+    pane = mesh(*split_box((0, 2.5, 0), (3, 0.05, 3), 0), GLASS)
+    return _around_square(camera=_camera([0, 4, 0], [0, 0, 0], VIEW, stddev=0.9), pane=pane)
+
+
+#: Share of a blended mirror that is not a black diffuse surface.
+SHARE = 0.6
+
+
+def blended(last: bool) -> dict[str, Any]:
+    """Return a blend of a mirror and a black diffuse surface. The mirror comes first or `last`."""
+    parts = {"type": "conductor"}, diffuse(0, 0, 0)
+    first, second = parts[::-1] if last else parts
+    return {"type": "blendbsdf", "weight": SHARE if last else 1 - SHARE, "first": first, "second": second}
+
+
+VIEWS: dict[str, Callable[[], dict[str, Any]]] = {
+    "mirrored": lambda: _mirrored({"type": "conductor"}), "paned": _paned,
+    # The camera sees a lamp behind it in a mirror.
+    "glowing": lambda: _around_square(camera=_camera([0, 0, 0], [0, 2, 0], VIEW, stddev=0.9), lamp=lit_square(
+        rgb(4, 4, 4), transform(translate=[0.1, -0.2, 0.05], rotate=([1, 0, 0], -90), scale=0.25))),
+    "blended": lambda: _mirrored(blended(False)), "blended_last": lambda: _mirrored(blended(True)),
+}  # fmt: skip
+
 # ---- The cases ----
 
 
@@ -334,16 +430,19 @@ def standing(lamp: str, depth: int, **options: Any) -> EdgeCase:
 
 
 BOTH, CAMERA, LIGHT = {"paths": "both"}, {"paths": "camera"}, {"paths": "light"}
+HIDDEN = {"hide_emitters": True}
 #: Cases of which finite differences are on file.
 RECORDED = [
-    EdgeCase("flat", "area"), EdgeCase("sphere", "near"), EdgeCase("box", "sphere_lamp"),
-    EdgeCase("sphere", "point", spp=512), EdgeCase("rectangle", "spot"), EdgeCase("cylinder", "directional", spp=2048),
-    standing("front", 2, spp=512), standing("room", 3, spp=1024, reference_spp=16384), EdgeCase("two", "area", 3),
+    EdgeCase("flat", "area", spp=512), EdgeCase("sphere", "near"),
+    EdgeCase("box", "sphere_lamp", spp=1536),
+    EdgeCase("sphere", "point", spp=2048), EdgeCase("rectangle", "spot"),
+    EdgeCase("cylinder", "directional", spp=16384, reference_spp=16384),
+    standing("front", 2, spp=1024), standing("room", 3, spp=1024, reference_spp=16384), EdgeCase("two", "area", 3),
     EdgeCase("box", "indirect", 3, spp=512, reference_spp=8192), EdgeCase("sphere", "room", 5),
     EdgeCase("hidden", "point", spp=1024, reference_spp=8192, step=SMALLEST),
     EdgeCase("reflector", "upward", 3, spp=512, reference_spp=8192),
     EdgeCase("shaded", "point", step=SMALLEST, reference_spp=8192),
-    EdgeCase("bumpy", "area", motion=HEIGHTS, spp=512, reference_spp=8192, step=SMALLER),
+    EdgeCase("bumpy", "area", motion=HEIGHTS, spp=3072, reference_spp=8192, step=SMALLER),
     *(EdgeCase("box", lamp, lamp_moves=True, spp=1024) for lamp in ("area", "spot")),
     EdgeCase("none", "room", 3, lamp_moves=True, spp=1024),
     EdgeCase("reflected", "area", 3, spp=512, reference_spp=8192, options=BOTH),
@@ -353,11 +452,18 @@ RECORDED = [
     standing("area", 3, spp=768, reference_spp=8192),
     EdgeCase("smooth", "area", spp=2048, reference_spp=65536, step=0.015, options=CAMERA),
     EdgeCase("smooth", "front", spp=1024, reference_spp=8192, step=SMALLER, options=CAMERA),
+    EdgeCase("square_0.1", "mirrored", 3, ("x", "z"), spp=512, reference_spp=16384, options=CAMERA),
     # The box hides the sky from the floor, and the edge of the floor hides it from the box. Light paths are noisy here.
     standing("constant", 3, spp=768, reference_spp=16384, options=CAMERA),
 ]  # fmt: skip
 CASES = [
     *RECORDED,
+    *(EdgeCase(f"square_{side}", view, depth, ("x", "z"), spp=2048, reference_spp=16384, options=CAMERA)
+      for view, depth in (("mirrored", 3), ("paned", 4)) for side in SIDES if (view, side) != ("mirrored", 0.1)),
+    *(EdgeCase("box", "veil", spp=512, reference_spp=8192, step=SMALLER, options=options | HIDDEN)
+      for options in (CAMERA, BOTH)),
+    EdgeCase("box", "beam", spp=512, reference_spp=8192, options=LIGHT),
+    EdgeCase("box", "beam", 3, spp=512, reference_spp=8192, options=BOTH),
     *(EdgeCase("flat", lamp, spp=512) for lamp in ("sphere_lamp", "directional")),
     EdgeCase("flat", "point", spp=512, step=SMALLER),
     *(EdgeCase("sphere", lamp) for lamp in ("area", "sphere_lamp", "spot")),

@@ -18,7 +18,7 @@ from reslrb_cli.integrators import reslrb
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load, transform
-from reslrb_cli.scene.edges import welded_edges
+from reslrb_cli.scene.edges import SPHERE, _edges_of, edge_normal, welded_edges
 from reslrb_cli.scene.rays import is_hidden, ray_offset
 from reslrb_cli.transport.edges import sample_outline, view_from_lamps
 from reslrb_cli.transport.samples import Samples
@@ -75,6 +75,86 @@ def test_a_face_without_area_adds_no_edge_of_its_own(face: tuple[int, int, int])
     points = np.concatenate([SQUARE, SQUARE[1:2]])
     found = welded_edges(points, np.concatenate([HALVES, [face]]))
     assert ends(found) == ends(welded_edges(SQUARE, HALVES))
+
+
+# ---- The edge next to an intersection ----
+
+VIEWPOINT = np.array([0.3, -3.0, 2.2])
+
+
+def seen_near_edges(scene: mi.Scene, shape: mi.Shape, placed: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the normals (N, 3) of edges next to intersections with a shape, the directions of the edges and those of
+    the rays, and the distances. `placed` (4, 4) is applied to the shape's own edges.
+    """
+    numbers, found = np.random.default_rng(1), []
+    for part in _edges_of(shape):
+        rows = part.rows()
+        ends = [np.array(corner).T for corner in (rows.a, rows.b, rows.c)]
+        if part.rows().kind[0] == SPHERE:
+            continue
+        index = numbers.integers(len(ends[0]), size=512)
+        a, b, c = (each[index] @ placed[:3, :3].T + placed[:3, 3] for each in ends)
+        place = numbers.uniform(0.01, 0.99, (512, 1))
+        p, along, radius = a + (b - a) * place, (b - a) / np.linalg.norm(b - a, axis=1)[:, None], float(rows.radius[0])
+        if radius:  # the outline of the side of a cylinder
+            to_y = VIEWPOINT - a
+            to_y -= along * np.sum(along * to_y, 1)[:, None]
+            distance = np.linalg.norm(to_y, axis=1)[:, None]
+            cos, first = radius / distance, to_y / distance
+            p += radius * (cos * first + np.sqrt(1 - cos**2) * np.cross(along, first)) * (1 - 1e-6)
+        else:
+            p += (c - p) * 1e-5 / np.linalg.norm(c - p, axis=1)[:, None]
+        d = p - VIEWPOINT
+        found.append((along, d / np.linalg.norm(d, axis=1)[:, None], p))
+    along, d, p = (np.concatenate(each) for each in zip(*found, strict=True))
+    ray = mi.Ray3f(mi.Point3f(VIEWPOINT.tolist()), mi.Vector3f(d.T.astype(np.float32)))
+    pi = scene.ray_intersect_preliminary(ray, False, mi.Bool(True))
+    n, distance = edge_normal(pi, ray, has_instances=True, active=pi.is_valid())
+    # Edges at the back of the shape are hidden.
+    hit = np.linalg.norm(np.array(ray(pi.t)).T - p, axis=1) < 1e-2
+    return np.array(n).T[hit], along[hit], d[hit], np.array(distance)[hit]
+
+
+@pytest.mark.parametrize("name", ["rectangle", "box", "disk", "cylinder", "ball", "instance"])
+def test_normals_of_edges(name: str):
+    """Mirrors and glass show edges whose direction is exact, however near to a corner."""
+    placed = np.eye(4)
+    things = {"shape": SHAPES["box" if name == "instance" else name](0.1, -0.1, 0.9)}
+    if name == "instance":
+        to_world = transform(translate=[0.2, 0.1, 0], rotate=([1, 2, 0], 30), scale=0.7)
+        placed = np.array(to_world.matrix)
+        group = {"type": "shapegroup", "part": things["shape"]}
+        things = {
+            "group": group,
+            "shape": {"type": "instance", "to_world": to_world, "of": {"type": "ref", "id": "group"}},
+        }
+    scene = load({"type": "scene"} | things)
+    shape = things["group"]["part"] if name == "instance" else scene.shapes()[0]
+    n, along, d, distance = seen_near_edges(scene, shape, placed)
+    across = np.linalg.norm(np.cross(along, d), axis=1)  # the direction of an edge seen end-on is unknown
+    assert len(n) > 200
+    limit = 1e-2 if name in ("disk", "cylinder") else 1e-4  # rims have chords
+    assert np.percentile(np.abs(np.sum(n * along, 1)) / across, 97) < limit
+    assert np.abs(np.sum(n * d, 1)).max() < 1e-5
+    assert np.percentile(distance, 99) < 3e-5
+
+
+def test_normals_of_the_outline_of_a_sphere():
+    scene = load({"type": "scene", "shape": SHAPES["sphere"](0.1, -0.1, 0.9)})
+    axis = np.array([0.1, -0.1, 0.9]) - VIEWPOINT
+    far = np.linalg.norm(axis)
+    frame, angle = np.linalg.svd(axis[None])[2][1:], np.linspace(0, 2 * np.pi, 64)
+    out = np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
+    sine = 0.4 / far * (1 - 1e-6)
+    d = axis / far * np.sqrt(1 - sine**2) + sine * out
+    ray = mi.Ray3f(mi.Point3f(VIEWPOINT.tolist()), mi.Vector3f(d.T.astype(np.float32)))
+    pi = scene.ray_intersect_preliminary(ray, False, mi.Bool(True))
+    n, distance = edge_normal(pi, ray, has_instances=False, active=pi.is_valid())
+    hit = np.array(pi.is_valid())
+    expected = out * np.sqrt(1 - sine**2) - axis / far * sine
+    assert hit.mean() > 0.9
+    assert np.abs(np.array(n).T[hit] - expected[hit]).max() < 1e-4
+    assert np.array(distance)[hit].max() == 0
 
 
 # ---- Rays beside an outline ----
