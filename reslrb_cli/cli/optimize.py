@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 import time
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -29,7 +30,7 @@ from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
-    from reslrb_cli.optimization.problem import ErrorMeter
+    from reslrb_cli.optimization.problem import ErrorMeter, Problem
     from reslrb_cli.records.metrics import Record
     from reslrb_cli.runs.callbacks import Callback
     from reslrb_cli.runs.prepare import PreparedRun
@@ -190,7 +191,7 @@ def _run(begun: PreparedRun, workers: Cluster | None, callbacks: list[Callback],
             link_latest(place.path)
         recording = Recording(course, place, manifest, begun.calls(callbacks, place.path), begun.said)
         interrupts.last_act = recording.abandon
-        with Progress(iterations, quiet, course.results.meter, course.done) as progress:
+        with Progress(iterations, quiet, course.results.meter, course.done, course.problem) as progress:
             status = recording.run(progress.show, lambda: interrupts.requested)
     if not quiet:
         for line in parameter_lines(manifest.results, terminal_width()):
@@ -209,8 +210,11 @@ def _run(begun: PreparedRun, workers: Cluster | None, callbacks: list[Callback],
 #: Without a terminal, a line is written after each tenth of the iterations and after this many seconds.
 SECONDS_PER_LINE = 10.0
 
-#: Format of the bar, and the columns that it needs besides the text `desc`. The end of a longer line is cut off.
-BAR, BAR_COLUMNS = "{percentage:3.0f}%|{bar}| {desc}, {n_fmt}/{total_fmt}, {remaining} left", 38
+#: Format of the bar, and the columns that it needs besides the text `desc` and the remaining time. The end of a longer
+#: line is cut off.
+BAR, BAR_COLUMNS = "{percentage:3.0f}%|{bar}| {desc}, {n_fmt}/{total_fmt}{postfix}", 28
+#: Newest iterations from which the remaining time is estimated.
+RECENT = 64
 
 
 def _columns(stream: TextIO) -> int:
@@ -228,13 +232,18 @@ class Progress:
     otherwise.
 
     As a context manager, `Progress` closes the bar at the end. `done` iterations were finished before the run was
-    resumed. `meter` measures the errors of the parameters.
+    resumed. `meter` measures the errors of the parameters. `problem` tells which iterations measure curvature, and the
+    time limit.
     """
 
-    def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
+    def __init__(
+        self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0, problem: Problem | None = None
+    ) -> None:
         self._stream = sys.stderr
         self._quiet = quiet or self._stream is None  # the program was started without one
-        self._total, self._meter = total, meter
+        self._total, self._meter, self._problem = total, meter, problem
+        self._records: deque[Record] = deque(maxlen=RECENT)
+        self._before_s = 0.0  # `elapsed_s` before these records
         self._bar: Any = None
         self._last_line, self._tenth = time.monotonic(), 10 * done // total
         if not self._quiet and self._stream.isatty() and _columns(self._stream) > 0:
@@ -253,14 +262,33 @@ class Progress:
         texts, done, now = descriptions(record, self._meter), record.iteration + 1, time.monotonic()
         with contextlib.suppress(OSError):
             if self._bar is not None:
-                room = (self._bar.format_dict["ncols"] or 0) - BAR_COLUMNS
+                left = self._left(record)
+                room = (self._bar.format_dict["ncols"] or 0) - BAR_COLUMNS - len(left)
                 self._bar.set_description_str(next((t for t in texts if len(t) <= room), texts[-1]), refresh=False)
+                self._bar.set_postfix_str(left, refresh=False)
                 self._bar.update()
                 if done == self._total:  # no iterations follow
                     self._bar.close()
             elif 10 * done // self._total != self._tenth or now - self._last_line >= SECONDS_PER_LINE:
                 self._tenth, self._last_line = 10 * done // self._total, now
                 click.echo(f"{done}/{self._total}: {texts[0]}, {record.elapsed_s:.1f} s", file=self._stream)
+
+    def _left(self, record: Record) -> str:
+        """Return the time that the remaining iterations will take, as the forecast of a run estimates it."""
+        from reslrb_cli.optimization.forecast import Pace
+
+        if len(self._records) == RECENT:
+            self._before_s = self._records[0].elapsed_s
+        elif not self._records and record.iteration:
+            self._before_s = record.elapsed_s - record.step_ms / 1e3 - record.curvature_s
+        self._records.append(record)
+        optimizer = None if self._problem is None else self._problem.optimizer
+        pace = Pace.of(list(self._records), optimizer, self._before_s)
+        left_s = pace.seconds(record.iteration + 1, self._total)
+        if self._problem is not None and self._problem.limit_s is not None:
+            left_s = max(min(left_s, self._problem.limit_s - record.elapsed_s), 0.0)
+        most = "at most " if optimizer is not None and optimizer.measures_curvature else ""
+        return f"{most}{self._bar.format_interval(left_s)} left"
 
     def __enter__(self) -> Progress:
         return self

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import bisect
 import statistics
-from collections.abc import Callable
-from dataclasses import replace
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, takewhile
 
 import mitsuba as mi
 
@@ -13,7 +14,8 @@ from reslrb_cli.backend.doctor import free_bytes, resident_bytes
 from reslrb_cli.config.files import duration, in_words
 from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.loop import LEAST_ITERATIONS, bends_large, candidates, optimize, payment
+from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import with_short_target
 from reslrb_cli.records.clock import MIB
@@ -27,12 +29,57 @@ WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 #: Number of steps that suffices if they take this many seconds.
 FEW, LONG = 3, 15.0
 
+#: Iterations after which most runs with `auto` end (docs/optimizers.md), and the share of a step below which a
+#: measurement of curvature is none.
+USUAL, NOTICED = (LEAST_ITERATIONS, 50), 0.05
 
-def measure_steps(problem: Problem) -> tuple[float, float, float, int]:
+
+@dataclass(frozen=True)
+class Pace:
+    """Expected times of a run's iterations, without compilation: `step_s` of each, and of measurements of curvature.
+
+    With `auto`, `gradient_s` is the time of a measurement for large parameters, and `joint_s` of one for small ones. A
+    time of 0 stands for no measurement.
+    """
+
+    step_s: float
+    gradient_s: float = 0.0
+    joint_s: float = 0.0
+
+    @classmethod
+    def of(cls, records: Sequence[Record], optimizer: Optimizer | None, before_s: float = 0.0) -> Pace:
+        """Return the pace that consecutive records show. `before_s` is `elapsed_s` before the first one."""
+        ends = [before_s, *(record.elapsed_s for record in records)]
+        times = [after - before - record.curvature_s for (before, after), record in
+                 zip(pairwise(ends), records, strict=True)]  # fmt: skip
+        first = min(WARM_UP, len(records) - 1)
+        step_s = statistics.median(times[first:])
+        if len(records) == 1:
+            step_s = max(step_s - records[0].codegen_ms / 1e3, 0.0)
+        if optimizer is None or not optimizer.measures_curvature:
+            return cls(step_s)
+        warm = records[-1:] if len(records) == 1 else records[1:]
+        gradient_s = min((record.step_ms - record.codegen_ms) / 1e3 for record in warm) if optimizer.has_large else 0.0
+        due = [record for record in warm if payment(record.iteration) is not None] if optimizer.block.at else []
+        joint = [record.curvature_s - gradient_s * bends_large(optimizer, record.iteration) for record in due]
+        # The run stops measuring once the curvature is known.
+        joint_s = min(joint[-1], statistics.median(joint)) if joint else 0.0
+        return cls(step_s, gradient_s, joint_s if joint_s > NOTICED * step_s else 0.0)
+
+    def seconds(self, first: int, last: int) -> float:
+        """Return the time of the iterations from `first` to before `last`."""
+        large = sum(first <= 2**power - 2 < last for power in range(1, last.bit_length() + 2))
+        cost = self.joint_s / max(self.step_s, 1e-9)
+        joint = sum(iteration >= first and payment(iteration, cost) is not None
+                    for iteration in takewhile(lambda iteration: iteration < last, candidates()))  # fmt: skip
+        return (last - first) * self.step_s + large * self.gradient_s + joint * self.joint_s
+
+
+def measure_steps(problem: Problem) -> tuple[Pace, float, float, int]:
     """Take a few steps of `problem`, which then has other values.
 
-    Returns the seconds of one step, the additional seconds of the first steps with cached kernels, the current seconds
-    for compiling, and the peak in bytes, which corresponds to `peak_mib` in `metrics.jsonl`.
+    Returns the pace, the additional seconds of the first steps with cached kernels, the current seconds for compiling,
+    and the peak in bytes, which corresponds to `peak_mib` in `metrics.jsonl`.
     """
     run = problem.config.run
     enough = {"iterations": max(run.iterations, WARM_UP + MOST), "max_seconds": None}
@@ -45,14 +92,13 @@ def measure_steps(problem: Problem) -> tuple[float, float, float, int]:
             break
         if timed >= MOST or (timed >= LEAST and record.elapsed_s - records[WARM_UP - 1].elapsed_s > SECONDS):
             break
-    times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
+    pace = Pace.of(records, problem.optimizer)
     first = min(WARM_UP, len(records) - 1)
-    steady = statistics.median(times[first:])
-    extra = sum(max(seconds - steady, 0.0) for seconds in times[:first])
+    extra = max(records[first - 1].elapsed_s - pace.seconds(0, first), 0.0) if first else 0.0
     compiled = min(sum(record.codegen_ms for record in records[:first]) / 1e3, extra)
     # Kernels that run only when values change, for example to 0, do not count.
     peak = int(records[: run.iterations][-1].peak_mib * MIB)
-    return steady, extra - compiled, compiled, peak
+    return pace, extra - compiled, compiled, peak
 
 
 def forecast_lines(
@@ -70,17 +116,25 @@ def forecast_lines(
     # Errors are not part of a step.
     problem = before(replace(assemble(with_short_target(config, 4 * config.run.spp), say, cache), truth={}))
     say("measuring a few steps")
-    iteration_s, start_s, compile_s, peak = measure_steps(problem)
+    pace, start_s, compile_s, peak = measure_steps(problem)
     iterations = config.run.iterations
     if config.run.max_seconds is not None:
         left_s = config.run.max_seconds - problem.measured_s - start_s
-        iterations = min(iterations, max(int(left_s / max(iteration_s, 1e-6)), 1))
-    elapsed_s = iterations * iteration_s + start_s
-    sums = f"{iterations} x {1e3 * iteration_s:.3g} ms"
+        fitting = bisect.bisect_right(range(1, iterations + 1), left_s, key=lambda count: pace.seconds(0, count))
+        iterations = max(fitting, 1)
+    elapsed_s = pace.seconds(0, iterations) + start_s
+    sums = f"{iterations} x {1e3 * pace.step_s:.3g} ms"
+    curvature_s = elapsed_s - start_s - iterations * pace.step_s
+    sums += f" + {duration(curvature_s)} to measure curvature" if curvature_s > 0.01 * elapsed_s else ""
     sums += f" + {duration(start_s)}" if start_s > 0.01 * elapsed_s else ""
+    ends, most = "", ""
+    if problem.optimizer.measures_curvature and iterations > USUAL[0]:
+        usual = USUAL[0], min(USUAL[1], iterations)
+        times = " to ".join(duration(pace.seconds(0, end) + start_s) for end in usual)
+        most, ends = "at most ", f"; `auto` usually ends after {usual[0]} to {usual[1]} iterations ({times})"
     return [
         f"memory of the iterations: at most {in_words(peak)}; {in_words(free_bytes(mi.variant()))} are free",
         f"memory of the whole process: {in_words(resident_bytes())}, with Python, libraries and the code of kernels",
-        f"time of the iterations: {duration(elapsed_s)} ({sums}), and {duration(compile_s)} to compile kernels, which "
-        "is done now and stored",
+        f"time of the iterations: {most}{duration(elapsed_s)} ({sums}){ends}",
+        f"time to compile kernels: {duration(compile_s)}, which is done now and stored",
     ]

@@ -15,6 +15,7 @@ import operator
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import takewhile
 from typing import Any
 
 import drjit as dr
@@ -165,21 +166,27 @@ def bends_large(optimizer: Optimizer, iteration: int) -> bool:
     return optimizer.has_large and (iteration + 2) & (iteration + 1) == 0
 
 
+def candidates() -> Iterator[int]:
+    """Yield the iterations in which the joint curvature may be measured: 0, 1, 2, 4, 7, 11, 17 and so on."""
+    iteration = 0
+    while True:
+        yield iteration
+        iteration += iteration // 2 + 1
+
+
 def payment(iteration: int, cost: float = 0.0, least: float = 0.0) -> float | None:
     """Return the cost of the joint measurement in `iteration`, in samples of a step, or None if there is none.
 
-    The candidates are the iterations 0, 1, 2, 4, 7, 11 and so on. A candidate is left out if measuring would take more
-    than its share of the samples. The first `LEAST_ITERATIONS` steps count from the start. A measurement usually has
-    the `cost`. If that is too much, the first one may cost less, but not less than `least`.
+    A candidate is left out if measuring would take more than its share of the samples. The first `LEAST_ITERATIONS`
+    steps count from the start. A measurement usually has the `cost`. If that is too much, the first one may cost less,
+    but not less than `least`.
     """
-    due, spent = 0, 0.0
-    while due <= iteration:
+    spent, paid, due = 0.0, None, -1
+    for due in takewhile(lambda due: due <= iteration, candidates()):
         left = MOST * (due + LEAST_ITERATIONS) - spent
         paid = cost if cost <= left else left if not spent and least <= left else None
-        if due == iteration:
-            return paid
-        spent, due = spent + (paid or 0.0), due + due // 2 + 1
-    return None
+        spent += paid or 0.0
+    return paid if due == iteration else None
 
 
 def measure_block(problem: Problem, iteration: int) -> None:
@@ -326,9 +333,11 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         loss, squares, counts, refused, costs = gradient(problem, iteration)
         dr.eval(loss, squares, counts)
     gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
+    before_s = clock.elapsed_s
     if optimizer.measures_curvature:
         with clock.counted():
             measure_curvature(problem, iteration)
+    curvature_s = clock.elapsed_s - before_s
     factor = learning_rate_factor(
         config.optimizer.schedule,
         iteration,
@@ -386,6 +395,7 @@ def step(problem: Problem, state: State, on_nonfinite: Told = lambda found: None
         nonfinite_by_parameter=found.by_parameter,
         held_out=held_out,
         regularized=None if costs is None else Regularized(costs, problem.held()),
+        curvature_s=curvature_s,
     )
 
 

@@ -77,6 +77,7 @@ class Record(Line):
 
     - `step_ms` is the wall time of the step: image, loss and gradient of every sensor, without the optimiser's update.
     - `codegen_ms` is the part of `step_ms` for generating and compiling kernels.
+    - `curvature_s` is the time in which `auto` measured curvature in this iteration, with new kernels.
     - `elapsed_s` is the time in steps and updates since the start. Writing files and computing `parameter_errors` do
         not count.
     - `peak_mib` is the peak memory of the allocator since the start.
@@ -111,6 +112,7 @@ class Record(Line):
     nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
     held_out: float | None = None
     regularized: Regularized | None = None
+    curvature_s: float = 0.0
 
 
 class MetricsWriter:

@@ -23,7 +23,7 @@ from reslrb_cli.records.metrics import MetricsWriter, Record, Regularized, cut_b
 KEYS = [
     "iteration", "loss", "step_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
     "grad_norm", "nonfinite", "parameter_rmse", "parameter_errors", "nonfinite_by_parameter",
-    "held_out", "regularized",
+    "held_out", "regularized", "curvature_s",
 ]  # fmt: skip
 
 

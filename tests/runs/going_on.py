@@ -25,7 +25,7 @@ from reslrb_cli.records.metrics import Record
 from reslrb_cli.runs import recorder as recording
 
 #: Metrics that differ between two runs of one experiment: times, and the allocator's peak.
-TIMES = ("step_ms", "codegen_ms", "elapsed_s", "peak_mib")
+TIMES = ("step_ms", "codegen_ms", "elapsed_s", "peak_mib", "curvature_s")
 #: A texture and a colour. Cases can add a place and a size, and heights.
 LAMP = "lamp.emitter.radiance.value"
 PARAMETERS = (
