@@ -7,7 +7,17 @@ from typing import Any
 
 import pytest
 
-from reslrb_cli.report.run_summary import ORDER, Outcome, advice, outcome_of, verdict_words, verdicts_of, warnings
+from reslrb_cli.report.run_summary import (
+    ORDER,
+    Outcome,
+    advice,
+    certainty_lines,
+    find_remedy,
+    outcome_of,
+    verdict_words,
+    verdicts_of,
+    warnings,
+)
 
 FELL = {"change": "fell", "late": "flat"}
 
@@ -135,6 +145,10 @@ def test_a_page_has_one_proposal(left_out: int) -> None:
         word for text in texts for word in re.findall(r"[\w.]+=[\w.]+", text) if not text.startswith("the loss")
     }
     assert settings == ({best.setting.removeprefix("--set ")} if "=" in best.setting else set())
+    own = {verdicts_of(found)[key] for key in verdicts_of(found)
+           if (remedy := find_remedy(found, key)) is not None and remedy.words == best.words}  # fmt: skip
+    for line in certainty_lines(found):
+        assert (best.setting in line) == any(verdict in line for verdict in own)
     table = " ".join(verdict_words(found, key) for key in verdicts_of(found))
     assert [words for words in ORDER if f": {words}" in table] in ([best.words], [])
 

@@ -24,10 +24,11 @@ from report.measured import (
 )
 
 from reslrb_cli.records.decisions import Decision
-from reslrb_cli.records.images import read_layers
+from reslrb_cli.records.images import read_layers, read_parameters
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
+from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.values import hatched, texture_pictures
 from reslrb_cli.report.plots import COLORS
 from reslrb_cli.report.sources import ShownRun, read_sources
@@ -515,7 +516,7 @@ def test_losses_of_saved_images_are_drawn(tmp_path):
     assert [all(drawn[0]), drawn[1][1]] == [True, 0]
 
 
-def test_texels_that_nothing_sees_are_hatched(tmp_path):
+def test_texels_that_nothing_sees_are_hatched(tmp_path, monkeypatch):
     """Their values are the initial ones, or those of their neighbours."""
     array = texture(8, 8)
     where = np.zeros((8, 8), bool)
@@ -523,5 +524,15 @@ def test_texels_that_nothing_sees_are_hatched(tmp_path):
     shown = hatched(array, where)
     assert np.array_equal(shown[2:], array[2:])
     assert set(np.unique(shown[:2])) == {np.float32(0.15), np.float32(0.5)}
-    page = Page(render(read_sources([make_run(tmp_path / "a")])))
+    run, shown = make_run(tmp_path / "a"), {}
+
+    def seen(values, alt, *caption):
+        shown[alt.partition(":")[0]] = values
+        return show(values, alt, *caption)
+
+    monkeypatch.setattr("reslrb_cli.report.page.values.show", seen)
+    page = Page(render(read_sources([run])))
     assert "the other texels are not recovered, and hatched at the end" in page.sections["Textures"]
+    final = read_parameters(run / "parameters")[FLOOR]
+    assert np.array_equal(shown["end"], hatched(final, where))  # nothing reaches the first two rows
+    assert np.array_equal(shown["start"], read_parameters(run / "parameters" / "initial")[FLOOR])
