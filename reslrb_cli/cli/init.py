@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import tempfile
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -171,10 +172,11 @@ def command(
 ) -> None:
     """Write a commented configuration for the scene in the file SCENE, to use with `reslrb optimize`.
 
-    The configuration recovers the colours of the materials that are largest in view, the roughness of metals, and the
-    brightness of visible lamps. Lamps are left out if the photograph has 8 or 16 bits, because such a photograph clips
-    the lamps. All other recoverable parameters are listed as comments with bounds and current values. Remove the # of
-    those that you want. Shapes in view that can be moved are listed, too.
+    The configuration recovers the colours of the materials that are largest in view, the roughness of rough conductors
+    and glass, and the brightness of visible lamps. Textures with a pattern keep it. Lamps are left out if the
+    photograph has 8 or 16 bits, because such a photograph clips the lamps. All other recoverable parameters are listed
+    as comments with bounds and current values. Remove the # of those that you want. Shapes in view that can be moved
+    are listed, too.
 
     With --target, the film gets the photograph's aspect ratio. The film's size is such that a run takes minutes. If the
     photograph has another size than the film, the command writes a resized copy beside the configuration. If there are
@@ -222,7 +224,7 @@ def command(
     image, copied = target, photo is not None and photo.size != size
     if photo is not None and copied:
         image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if is_integer else '.exr'}")
-        _check_free(image)
+        copied = not _has_copy(image, photo, size, is_raw)
     depth, missing = find_depth(scene, index)
     text = _first_config(
         path, options, description.variables, sensors, index, proposals, find_movable_in_view(scene, index),
@@ -313,6 +315,20 @@ def _why_camera(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: 
             raise ConfigError(file, "", str(error)) from None  # this message covers both kinds of paths
         return paths_obstacle(scene, sensor, "light", hides_emitters) if obstacles[0] else None
     return None
+
+
+def _has_copy(image: Path, photo: StoredImage, size: Size, is_raw: bool) -> bool:
+    """Whether an earlier call has written this copy of a photograph. Raises ConfigError for any other file."""
+    from reslrb_cli.scene.proposal import write_smaller
+
+    if not image.is_file():
+        _check_free(image)
+        return False
+    with tempfile.TemporaryDirectory(prefix="reslrb-") as folder:
+        write_smaller(photo, size, made := Path(folder) / image.name, is_raw)
+        if made.read_bytes() != image.read_bytes():
+            _check_free(image)
+    return True
 
 
 def _check_free(path: Path) -> None:

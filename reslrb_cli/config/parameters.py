@@ -162,11 +162,14 @@ ColorSpace = Literal["auto", "linear", "srgb"]
 COLOR_SPACE = "Encoding of the values: `linear`, `srgb`, or `auto` (srgb for 8-bit files, linear for float files)."
 
 
+_RAW = "`auto` is linear for heights, and for textures with `raw` in the scene that are no colours."
+
+
 class ImageFile(Section):
     """An image file that holds a texture."""
 
     file: ConfigPath = Field(description="EXR, PNG, JPG or HDR file, relative to the config file.")
-    color_space: ColorSpace = Field(default="auto", description=COLOR_SPACE)
+    color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} {_RAW}")
 
 
 class RunValue(Section):
@@ -297,9 +300,10 @@ class ParameterSpec(Section):
     """A parameter to recover. Exactly one of `key`, `heightmap` and `motion` must be given."""
 
     key: _Key | None = None
-    """Key as `reslrb inspect` lists it. Keys are the names of `mi.traverse`. An object without an id is named after its
-    kind and its number in the scene file, as in `Sphere_3`. A glob such as `*.reflectance.data` selects several
-    parameters. A list of keys ties them to one value, which is recorded under the first key."""
+    """Key as `reslrb inspect` lists it. Keys are the names of `mi.traverse`. A shape without an id is named after its
+    file, as in `Lamp` for `Lamp.ply`, and another object after its kind and its number, as in `Sphere_3`. A glob such
+    as `*.reflectance.data` selects several parameters. A list of keys ties them to one value, which is recorded under
+    the first key."""
     heightmap: HeightmapSpec | None = None
     """Displacement of a mesh, recorded as `MESH.heightmap`."""
     motion: MotionSpec | None = None

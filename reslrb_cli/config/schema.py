@@ -167,11 +167,6 @@ class Config(Section):
         return self.views is not None and len({view.sensor for view in self.views}) < len(self.views)
 
     @property
-    def view_sensors(self) -> list[int]:
-        """Index of each view's sensor in the loaded scene. The list is empty without `views`."""
-        return [number if self.shares_sensors else view.sensor for number, view in enumerate(self.views or ())]
-
-    @property
     def drawn_views(self) -> int | None:
         """Number of views in an iteration, or None if only the scene determines it."""
         if self.views is None and self.scene.cameras is not None:

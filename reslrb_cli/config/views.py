@@ -124,7 +124,11 @@ class WhiteBalance(Section):
 
 
 def _sensor_name(value: Any) -> Any:
-    if (isinstance(value, int) and not isinstance(value, bool) and value >= 0) or (isinstance(value, str) and value):
+    if isinstance(value, int) and not isinstance(value, bool):
+        if value < 0:
+            raise wrong(f"must be at least 0, not {value}")
+        return value
+    if isinstance(value, str) and value:
         return value
     raise wrong("must be a sensor's index, or its id")
 
@@ -202,7 +206,7 @@ class TargetConfig(Section):
 class ViewSpec(Section):
     """A view: a sensor of the scene, the lamps that are on, and the target."""
 
-    sensor: Annotated[int, Field(ge=0)] = Field(default=0, description="Index of the sensor in the scene.")
+    sensor: SensorName = Field(default=0, description="The sensor in the scene, by index or id.")
     lamps: Annotated[list[str], must(bool, lambda _: "must name a lamp")] | None = None
     """Lamps that are on in this view, by id; globs are allowed. The id of an area light is the id of its shape. null:
     all lamps are on. Views with other lamps may share a sensor. Then the scene gets a copy of the sensor for each view,
@@ -219,7 +223,7 @@ class ViewSpec(Section):
 
 def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:
     """Raise an error that names the key if views contradict each other or `target`."""
-    places: dict[tuple[int, frozenset[str] | None], int] = {}
+    places: dict[tuple[int | str, frozenset[str] | None], int] = {}
     for number, view in enumerate(views):
         key = view.sensor, None if view.lamps is None else frozenset(view.lamps)
         if places.setdefault(key, number) < number:

@@ -130,7 +130,7 @@ def check_exposures(problem: Problem) -> None:
     )
     place = "target.exposure"
     config = problem.config
-    for number, (spec, sensor) in enumerate(zip(config.views or (), config.view_sensors, strict=True)):
+    for number, (spec, sensor) in enumerate(zip(config.views or (), problem.sensors, strict=False)):
         if spec.exposure is not None and exposure == f"{SHARED}.{sensor}":
             place = f"views[{number}].exposure"
     raise ConfigError(problem.config.source, place, f"{reason}exposure: 1, or remove a parameter with a known value")

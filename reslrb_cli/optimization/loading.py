@@ -6,7 +6,7 @@ A pass is small enough to fit into memory.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -26,13 +26,14 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.integrators.step import render_image
-from reslrb_cli.scene.cameras import repeat_sensors
+from reslrb_cli.scene.cameras import read_cameras, repeat_sensors, replace_sensors, sensor_id, sensor_ids
 from reslrb_cli.scene.deformation import Moves, where_moved
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.load import INSTEAD, load_scene, warn_once
 from reslrb_cli.scene.needs import check_paths, scene_needs, stock_clip, usual_paths
 from reslrb_cli.scene.parameters import Selection
-from reslrb_cli.scene.xml.read import Description
+from reslrb_cli.scene.xml.mend import name_objects
+from reslrb_cli.scene.xml.read import Description, read_description
 from reslrb_cli.seeds import seed
 
 #: Paths in one pass. Baselines keep the state of every path in memory; 2**22 of them stay below 2 GB.
@@ -107,14 +108,25 @@ def load_configured(
 
     def prepare(description: Description) -> None:
         if config.shares_sensors:
-            order = [view.sensor for view in config.views or ()]
-            count = sum(child.tag == "sensor" for child in description.root.children)
-            _check_sensors(config, order, count)
-            repeat_sensors(description, order)
+            repeat_sensors(description, _sensors_of_views(config, sensor_ids(description)))
         if look is not None:
             look(description)
 
-    return load_scene(scene.file, scene.options, scene.size, scene.cameras, prepare, keys)
+    named = words(config.model_dump(exclude={"run"}))
+    return load_scene(scene.file, scene.options, scene.size, scene.cameras, prepare, keys, named)
+
+
+def words(settings: Any) -> Iterator[str]:
+    """Yield the texts in settings, which may be keys, globs or ids of the scene."""
+    if isinstance(settings, str):
+        yield settings
+    elif isinstance(settings, Mapping):
+        for name, value in settings.items():
+            yield str(name)
+            yield from words(value)
+    elif isinstance(settings, (list, tuple)):
+        for value in settings:
+            yield from words(value)
 
 
 def _lent_scene(config: Config, keys: list[str], specs: Sequence[ParameterSpec]) -> mi.Scene:
@@ -141,20 +153,58 @@ def selected_keys(config: Config) -> list[str]:
 
 
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
-    """Return the index of each view's sensor. Raises ConfigError for an index that does not exist."""
-    count = len(scene.sensors())
+    """Return the index of each view's sensor. Raises ConfigError for a sensor that does not exist."""
     if config.views is None:
-        return [0] if config.scene.cameras is None else list(range(count))
-    _check_sensors(config, config.view_sensors, count)
-    return config.view_sensors
+        return [0] if config.scene.cameras is None else list(range(len(scene.sensors())))
+    return view_sensors(config, [sensor.id() for sensor in scene.sensors()])
 
 
-def _check_sensors(config: Config, sensors: Sequence[int], count: int) -> None:
-    """Raise ConfigError for a view with a sensor that does not exist."""
-    for place, sensor in enumerate(sensors):
-        if sensor >= count:
-            key = f"views[{place}].sensor"
-            raise ConfigError(config.source, key, f"is {sensor}, but the scene has {sensors_in_words(count)}")
+def read_sensor_ids(config: Config) -> list[str]:
+    """Return the ids of the scene's sensors in its files, without building the scene. Raises ConfigError."""
+    scene = config.scene
+    description = read_description(scene.file, scene.options)
+    if scene.cameras is not None:
+        replace_sensors(description, read_cameras(scene.cameras))
+    name_objects(description.root)
+    return sensor_ids(description)
+
+
+def view_sensors(config: Config, ids: Sequence[str]) -> list[int]:
+    """Return the index of each view's sensor in the loaded scene, whose sensors have these `ids`. The list is empty
+    without `views`. Raises ConfigError.
+    """
+    if config.shares_sensors:
+        return list(range(len(config.views or ())))
+    found = _sensors_of_views(config, ids)
+    for place, sensor in enumerate(found):
+        if sensor in found[:place]:
+            reason = f"is also the sensor of views[{found.index(sensor)}]; name it in the same way, or remove one"
+            raise ConfigError(config.source, f"views[{place}].sensor", reason)
+    return found
+
+
+def _sensors_of_views(config: Config, ids: Sequence[str]) -> list[int]:
+    views = enumerate(config.views or ())
+    return [find_sensor(view.sensor, ids, config.source, f"views[{place}].sensor") for place, view in views]
+
+
+def find_sensor(given: int | str, ids: Sequence[str], source: object, key: str) -> int:
+    """Return the index of a sensor that a setting names by its index or its id. Raises ConfigError if there is none, or
+    if the number is also the id of another sensor.
+    """
+    if isinstance(given, str):
+        places = [place for name in (given, sensor_id(given)) for place, id in enumerate(ids) if id == name]
+        if places:
+            return places[0]
+        near = difflib.get_close_matches(given, ids, n=3, cutoff=0.5) or ids[:3]
+        raise ConfigError(source, key, f"is {given}, which is no sensor of the scene; did you mean {', '.join(near)}?")
+    named = next((id for place, id in enumerate(ids) if id.isdecimal() and int(id) == given != place), None)
+    if named is not None:
+        reason = f'is the number {given}, which could be an index or the sensor "{named}"; write an id in quotes'
+        raise ConfigError(source, key, reason)
+    if given >= len(ids):
+        raise ConfigError(source, key, f"is {given}, but the scene has {sensors_in_words(len(ids))}")
+    return given
 
 
 def lit_emitters(config: Config, scene: mi.Scene) -> dict[int, tuple[int, ...]]:
@@ -162,8 +212,9 @@ def lit_emitters(config: Config, scene: mi.Scene) -> dict[int, tuple[int, ...]]:
     for a lamp that does not exist.
     """
     emitters, found = scene.emitters(), {}
+    sensors = choose_sensors(config, scene) if config.views else []
     names = [{item.id() for item in (emitter, emitter.get_shape()) if item is not None} for emitter in emitters]
-    for place, (view, sensor) in enumerate(zip(config.views or (), config.view_sensors, strict=True)):
+    for place, (view, sensor) in enumerate(zip(config.views or (), sensors, strict=True)):
         lit: set[int] = set()
         for number, lamp in enumerate(view.lamps or ()):
             own = {index for index, known in enumerate(names) if any(fnmatchcase(name, lamp) for name in known)}

@@ -29,10 +29,10 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels
-from reslrb_cli.optimization.loading import choose_sensors
+from reslrb_cli.optimization.loading import choose_sensors, find_sensor
 from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, OwnLoss, blur, l2, make_loss, weighted
 from reslrb_cli.records.run_folder import exposed
-from reslrb_cli.scene.cameras import read_cameras
+from reslrb_cli.scene.cameras import read_cameras, sensor_id
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.visibility import sees_specular
 
@@ -82,11 +82,11 @@ class Exposure:
 
 def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
     """Return the indices of the sensors in `run.held_out`. Raises ConfigError for a sensor without a view."""
-    names, found = {scene.sensors()[sensor].id(): sensor for sensor in sensors}, set()
+    ids, found = [sensor.id() for sensor in scene.sensors()], set()
     for place, given in enumerate(config.run.held_out):
-        sensor = names.get(given, -1) if isinstance(given, str) else given
+        sensor = find_sensor(given, ids, config.source, key := f"run.held_out[{place}]")
         if sensor not in sensors:
-            raise ConfigError(config.source, f"run.held_out[{place}]", f"is {given}, which is not the sensor of a view")
+            raise ConfigError(config.source, key, f"is {given}, which is not the sensor of a view")
         found.add(sensor)
     return found
 
@@ -96,7 +96,7 @@ def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
     for the scene's sensor or cameras.
     """
     if config.views is not None:
-        return [spec.model_copy(update={"sensor": sensor}) for spec, sensor in zip(config.views, sensors, strict=True)]
+        return config.views
     return [ViewSpec.model_construct(sensor=sensor, target=config.target.file) for sensor in sensors]
 
 
@@ -294,27 +294,29 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
     Raises ConfigError for a sensor that does not exist, or cannot be held out, and for images that are too small for a
     loss.
     """
-    sensors, target, images, views = choose_sensors(config, scene), config.target, {}, []
+    sensors, target, views = choose_sensors(config, scene), config.target, []
+    images: dict[int | str, Path] = {}
     if config.scene.cameras is not None and target.render is None:
-        images = {sensor: camera.image for sensor, camera in enumerate(read_cameras(config.scene.cameras))}
+        for index, camera in enumerate(read_cameras(config.scene.cameras)):
+            images[index] = images[sensor_id(camera.name)] = camera.image
     specs, held_out = _view_specs(config, sensors), _held_out(config, scene, sensors)
     _check_trained(config, len(specs) - len(held_out))
-    total = sum(spec.weight for spec in specs if spec.sensor not in held_out)
-    for number, spec in enumerate(specs):
-        place, is_held, own = f"views[{number}]", spec.sensor in held_out, spec.exposure is not None
+    total = sum(spec.weight for spec, sensor in zip(specs, sensors, strict=True) if sensor not in held_out)
+    for number, (spec, sensor) in enumerate(zip(specs, sensors, strict=True)):
+        place, is_held, own = f"views[{number}]", sensor in held_out, spec.exposure is not None
         exposure = target.exposure if spec.exposure is None else spec.exposure
         if is_held and own and isinstance(exposure, str):
-            reason = f"has sensor {spec.sensor}, whose own exposure no image determines; give it a number, or one "
+            reason = f"has sensor {sensor}, whose own exposure no image determines; give it a number, or one "
             raise ConfigError(config.source, "run.held_out", f"{reason}exposure to all views")
-        key = f"{SHARED}.{spec.sensor}" if own else SHARED
+        key = f"{SHARED}.{sensor}" if own else SHARED
         file, file_key = spec.target, "target.file" if config.views is None else f"{place}.target"
         if spec.target is None:
-            named = spec.sensor if config.views is None else config.views[number].sensor
-            file, file_key = images.get(named), "scene.cameras"
-        loss, codes = _make_losses(config, scene.sensors()[spec.sensor].film())
+            named = spec.sensor
+            file, file_key = images.get(sensor_id(named) if isinstance(named, str) else named), "scene.cameras"
+        loss, codes = _make_losses(config, scene.sensors()[sensor].film())
         views.append(
             View(
-                spec.sensor,
+                sensor,
                 loss,
                 share=1.0 if is_held else spec.weight / total,
                 exposure=Exposure(key=key) if isinstance(exposure, str) else Exposure(exposure),

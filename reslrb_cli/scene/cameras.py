@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config.files import read_file
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.scene.images import image_size
 from reslrb_cli.scene.xml.read import Description, Element
 
@@ -27,7 +27,12 @@ SQUARE = 1e-3
 #: COLMAP's models without distortion, and the names of their parameters; `f` is both focal lengths.
 MODELS = {"SIMPLE_PINHOLE": ("f", "cx", "cy"), "PINHOLE": ("fx", "fy", "cx", "cy")}
 
-_DISTORTION = re.compile(r"[kp]\d")
+_DISTORTION = re.compile(r"k|[kp]\d|\w*distortion\w*")
+#: Camera models of `transforms.json` that are pinholes if their distortion is 0.
+_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL")
+#: Keys of `transforms.json` that give the camera model, and keys that are true for other cameras than pinholes.
+_MODELS = ("camera_model", "camera_type", "projection_type", "projection")
+_OTHERS = re.compile(r"(is_)?(fisheye|latlong|equirectangular|spherical|panoram\w*|ortho\w*)")
 #: From a camera's axes to the sensor's: NeRF (x right, y up, view along -z) and COLMAP (y down, view along +z).
 _NERF, _COLMAP = np.diag([-1.0, 1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -63,11 +68,21 @@ def replace_sensors(description: Description, cameras: list[Camera]) -> None:
     root.children = [child for child in root.children if child.tag != "sensor"]
     taken = {element.id for element in root.walk()}
     for camera in cameras:
-        name = re.sub(r"\W+", "_", camera.name) or "camera"
+        name = sensor_id(camera.name)
         while name in taken:
             name += "_"
         taken.add(name)
         root.children.append(_sensor(own[0] if own else root.new("sensor"), camera, name))
+
+
+def sensor_id(name: str) -> str:
+    """Return the id of the sensor of an image with this `name`, without its suffix. Keys have no dots or dashes."""
+    return re.sub(r"\W+", "_", name) or "camera"
+
+
+def sensor_ids(description: Description) -> list[str]:
+    """Return the ids of the sensors directly below the root."""
+    return [child.id for child in description.root.children if child.tag == "sensor"]
 
 
 def repeat_sensors(description: Description, order: Sequence[int]) -> None:
@@ -107,7 +122,7 @@ def _sensor(like: Element, camera: Camera, name: str) -> Element:
         like.new("float", name="fov", value=repr(fov)),
         *offsets,
         like.new("transform", matrix, name="to_world"),
-        like.new("film", *sizes, *kept, type="hdrfilm"),
+        like.new("film", *sizes, *kept, type=film.type or "hdrfilm"),
         *(_copy(child) for child in like.children if child.tag == "sampler" or child.name in clips),
         type="perspective",
         id=name,
@@ -135,10 +150,12 @@ def _nerf(file: Path) -> list[Camera]:
 def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
     if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
         raise ConfigError(file, f"{key}.file_path", "must name the camera's image")
-    if "FISHEYE" in str(frame.get("camera_model", "")).upper() or frame.get("is_fisheye"):
-        raise ConfigError(file, f"{key}.camera_model", "is a fisheye, which Mitsuba lacks; undistort the images")
     for name, value in frame.items():
-        if _DISTORTION.fullmatch(name) and value != 0:
+        is_other = name in _MODELS and str(value or "").upper() not in _PINHOLES
+        if is_other or (value and _OTHERS.fullmatch(name.lower())):
+            reason = f"is {one_line(str(value), 40)}; only pinhole cameras are supported: undistort the images"
+            raise ConfigError(file, f"{key}.{name}", reason)
+        if _DISTORTION.fullmatch(name.lower()) and np.any(np.array(value, dtype=object) != 0):
             what = f"has distortion ({name} = {value}), which Mitsuba's sensors lack"
             raise ConfigError(file, key, f"{what}; undistort the images")
     try:

@@ -23,7 +23,7 @@ from reslrb_cli.records.images import file_stem, write_file
 from reslrb_cli.scene.catalog import as_numbers, parameter_kind
 from reslrb_cli.scene.upsampling import colour_in_scene, is_upsampled
 from reslrb_cli.scene.values import ParameterValue
-from reslrb_cli.scene.xml.build import Owners
+from reslrb_cli.scene.xml.build import Owners, restore_films
 from reslrb_cli.scene.xml.read import Description, Element, tag_lines
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
@@ -265,8 +265,24 @@ def same_values(a: object, b: object) -> bool:
     return bool(np.allclose(x, y, rtol=1e-5, atol=1e-6 * scale))
 
 
-#: Parts of a scene that do not affect its appearance.
+def _keep_variables(description: Description) -> set[Element]:
+    """Write the variables of the scene's films, such as `$resx`, with their values as defaults. Return the elements
+    that name variables.
+    """
+    found, root = set[Element](), description.root
+    for film in root.walk("film"):
+        for size in film.children:
+            if (known := re.fullmatch(r"\$(\w+)", size.variable)) and known[1] in description.variables:
+                found.add(size)
+                size.attributes["value"] = size.variable
+    for name in sorted({size.variable[1:] for size in found}, reverse=True):
+        root.children.insert(0, root.new("default", name=name, value=description.variables[name]))
+    return found
+
+
+#: Parts of a scene that do not affect its appearance, and the size of the film, which the export restores.
 _ASIDE = ("silhouette_sampling_weight", "sampling_weight")
+_FILM = re.compile(r"\bfilm\.(size|crop_size|crop_offset)$")
 #: Mitsuba's names for objects without an id, such as unused bitmaps: their memory address.
 _ADDRESS = re.compile(r"object_\d+\.")
 
@@ -293,14 +309,18 @@ def export_scene(
         replacing.put(key)
     replacing.writers |= beside or {}  # before assets, which then get other names
     replacing.copy_assets()
+    restore_films(description)
+    variables = _keep_variables(description)
     options = [
         root.new({bool: "boolean", int: "integer"}.get(type(value), "float"), name=name, value=str(value).lower())
         for name, value in integrator.items()
         if name != "type"
     ]
     root.children.insert(0, root.new("integrator", *options, type=str(integrator["type"])))
+    if outside := [name for name in replacing.writers if {"..", ""} & {*re.split(r"[/\\]", name)}]:
+        raise ConfigError(source, "", f"cannot be exported: the scene names a file outside of the folder, {outside[0]}")
     head = f"<!-- {' '.join(filter(None, ['Written by `reslrb export`.', note]))} -->"
-    lines = [head, *(line for line, _ in tag_lines(root)), ""]
+    lines = [head, *(line.replace("\\$", "$") if each in variables else line for line, each in tag_lines(root)), ""]
     replacing.writers[SCENE] = lambda path: path.write_text("\n".join(lines), encoding="utf-8")
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -322,7 +342,7 @@ def _check(folder: Path, params: mi.SceneParameters, source: object) -> None:
             raise ConfigError(source, "", f"cannot be exported: Mitsuba does not read it back ({error})") from None
     for key in params.properties:
         is_given = params.properties[key][0] is not None  # set by the files; Mitsuba does not expose other parameters
-        if not is_given or key.rpartition(".")[2] in _ASIDE or key.startswith("integrator."):
+        if not is_given or key.rpartition(".")[2] in _ASIDE or key.startswith("integrator.") or _FILM.search(key):
             continue
         if key not in found.properties and not _ADDRESS.match(key):
             raise ConfigError(source, key, "cannot be exported: Mitsuba does not find it in the written scene")

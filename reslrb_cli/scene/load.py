@@ -40,6 +40,7 @@ def load_scene(
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
     keys: Iterable[str] = (),
+    named: Iterable[str] = (),
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3). A variant must be set.
 
@@ -49,9 +50,11 @@ def load_scene(
     - `look` is called with the description before anything is built, and may raise exceptions.
     - `keys` are keys or globs of parameters that need derivatives. If a bitmap of these parameters has 8 or 16 bits,
         the bitmap is read as floating point.
+    - `named` are keys, globs or ids that may use earlier names of objects. These objects keep their earlier names.
 
-    Shapes are not merged, so all parameters keep their names. An object without an id is named by its kind and a
-    number, such as `Sphere_3`. The number counts the file's objects of this kind. Elements of other versions or
+    Shapes are not merged, so all parameters keep their names. A shape without an id is named after its file. Another
+    object without an id is named by its kind and a number, such as `Sphere_3`. The number counts the file's objects of
+    this kind. Elements of other versions or
     exporters that Mitsuba's parser would refuse are converted, or left out with a warning. Mitsuba must use every
     remaining element. The function does not load the scene's integrator, because an experiment has its own
     integrator. Plugins are loaded only from Mitsuba's own folder.
@@ -64,9 +67,10 @@ def load_scene(
     description = read_description(file, options or {})
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
-    found = mend(description)
+    keys = list(keys)
+    found = mend(description, [*keys, *named])
     if size is not None:
-        resize_films(description.root, size)
+        resize_films(description, size)
     if look is not None:
         look(description)
     scene, unused = build(description)
@@ -94,8 +98,8 @@ def check_scene(source: object, scene: mi.Scene, notes: Iterable[Note] = ()) -> 
         if len(objects) == 0:
             raise ConfigError(source, "", wrong)
     _check_meshes(source, scene)
-    for line in warnings(notes):
-        warn_once(line)
+    for line, level in warnings(notes):
+        warn_once(line, level)
     if (problem := _lost_light(scene)) is not None:
         warn_once(f"{source}: {problem}")
 

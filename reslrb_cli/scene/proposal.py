@@ -149,6 +149,8 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     keys = [info.key for info, _ in found]
     # A mask excludes pixels that see mirrors and smooth glass, so only materials that other pixels show are proposed.
     shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
+    # The scene knows a texture with a pattern, and noise would replace it.
+    shown = [info for info in shown if not is_pattern(params, info)]
     seen = {info.key for info in shown if _is_foremost(params, info)}
     if lamps:
         seen |= {info.key for info, share in found if share >= LEAST_LAMP and _RADIANCE.search(info.key)}
@@ -156,6 +158,12 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     emitters = [info.key for info, _ in found if info.kind == "emitter" and info.key not in placed]
     first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
     return [Proposal(info, share, usual_bounds(info), _resolution(info), info.key in first) for info, share in found]
+
+
+def is_pattern(params: mi.SceneParameters, info: ParameterInfo) -> bool:
+    """True if the texels of a texture differ."""
+    texels = np.array(params[info.key]) if len(info.shape) == 3 else np.zeros((1, 1, 1))
+    return bool((texels != texels[:1, :1]).any())
 
 
 def find_movable_in_view(scene: mi.Scene, sensor: int) -> list[tuple[str, float, str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,10 @@ class Place:
         return ConfigError(self.source, f"{self.key}.{option}" if option else self.key, message)
 
 
+#: Textures of colours. Scenes mark them as `raw`, too, if their own files are linear.
+_COLOURS = re.compile(r"(reflectance|transmittance|base_color|color\d|radiance|irradiance|intensity)\.data$")
+
+
 class ParameterValue:
     """One value of `holder` as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), or a number ().
 
@@ -52,8 +57,16 @@ class ParameterValue:
         self.halo = 0 if node is None else halo(node, value)
         #: True for offsets and heights. Colours are never negative.
         self.is_signed = node is None
+        self._node = node
         #: Length of a list that fills the parameter.
         self.channels = _channels(node, key, value, self.is_tensor)
+
+    @property
+    def is_data(self) -> bool:
+        """True for heights, and for `raw` textures that are no colours. Files of 8 bits are then linear."""
+        if self._node is None:
+            return True
+        return not _COLOURS.search(self.key) and re.search(r"^  raw = 1,$", str(self._node), re.MULTILINE) is not None
 
     def get(self) -> Array:
         """Return the current value."""
@@ -178,8 +191,9 @@ def _from_file(slot: ParameterValue, current: Array, image_file: Any, any_size: 
     if not slot.is_texture:
         raise place.fail("initial", f"`{slot.key}` is not a texture; give a number or a list of numbers")
     path: Path = image_file.file
+    is_linear = slot.is_data and image_file.color_space == "auto"
     try:
-        image = read_image(path, image_file.color_space, signed=slot.is_signed)
+        image = read_image(path, "linear" if is_linear else image_file.color_space, signed=slot.is_signed)
     except ConfigError as error:
         raise place.fail("initial.file", f"{path}: {error.message}") from None
     if not any_size and image.shape[:2] != current.shape[:2]:

@@ -53,11 +53,11 @@ def test_a_scene_alone_gets_a_configuration_without_a_photograph(folder: Path) -
     result = tiny.done("init", "room/scene.xml")
     assert "room.yaml: 1 of 3 parameters, at 8x8 pixels" in result.output
     config = load(folder / "room.yaml")
-    assert [spec.keys for spec in config.parameters] == [[tiny.KEY]]
-    assert config.parameters[0].bounds == (0, 1)
+    assert [spec.keys for spec in config.parameters] == [["lamp.emitter.radiance.value"]]
+    assert config.parameters[0].bounds == (0, np.inf)
     assert (config.loss.type, config.optimizer.type, config.integrator.max_depth) == ("relative_l2", "auto", 8)
-    lamp = "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf]}"
-    assert lamp in (folder / "room.yaml").read_text()
+    # The scene knows the pattern of its texture.
+    assert f"# - {{key: {tiny.KEY}, bounds: [0, 1]}}" in (folder / "room.yaml").read_text()
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2
     assert f"room.yaml: target.file: {folder / 'photo.png'}: no such file" in missing.output
@@ -101,6 +101,31 @@ def test_nothing_is_replaced(folder: Path) -> None:
     assert not (folder / "other.yaml").exists()
 
 
+@pytest.mark.parametrize("is_flat", [True, False])
+def test_a_texture_is_recovered_at_first_unless_it_has_a_pattern(folder: Path, is_flat: bool) -> None:
+    """Colours of three channels differ in a flat texture, too."""
+    texels = np.tile(np.array([0.7, 0.3, 0.2], np.float32), (4, 4, 1))
+    texels[2, 1] += 0 if is_flat else 0.05
+    mi.Bitmap(texels).write(str(folder / "room/poster.exr"))
+    tiny.done("init", "room/scene.xml")
+    keys = [key for spec in load(folder / "room.yaml").parameters for key in spec.keys]
+    assert (tiny.KEY in keys) is is_flat
+    assert f"- {{key: {tiny.KEY}" in (folder / "room.yaml").read_text()
+
+
+def test_a_second_call_with_the_same_photograph_uses_the_same_copy(folder: Path) -> None:
+    target = write_noise(folder / "photo.png", 300, 300)
+    tiny.done("init", "room/scene.xml", "--target", target)
+    [copy] = folder.glob("photo-*")
+    before = copy.stat().st_mtime_ns
+    tiny.done("init", "room/scene.xml", "-o", "other.yaml", "--target", target)
+    assert load(folder / "other.yaml").target.file == load(folder / "room.yaml").target.file == copy
+    assert copy.stat().st_mtime_ns == before
+    write_noise(folder / "photo.png", 301, 301)
+    refused = reslrb("init", "room/scene.xml", "-o", "third.yaml", "--target", target)
+    assert (refused.exit_code, f"{copy.name}: exists" in refused.output) == (2, True)
+
+
 def test_a_large_photograph_is_reduced_for_a_short_run(folder: Path) -> None:
     config, result = of_photograph(folder, 600, 597)  # a camera comes no closer to the film's aspect ratio
     width, height = config.scene.size or (0, 0)
@@ -133,6 +158,9 @@ def test_an_8_bit_texture_is_offered_recovered_and_exported(folder: Path) -> Non
     [line] = [line for line in (folder / "room.yaml").read_text().splitlines() if f"- {{key: {tiny.KEY}" in line]
     assert "4x4 texels" in line
     assert line.endswith("8 bits, read as floats if recovered")
+    assert line.startswith("  # - ")
+    text = (folder / "room.yaml").read_text()
+    (folder / "room.yaml").write_text(text.replace(line, line.replace("# - ", "- ", 1)))
     sets = ["target={render: {spp: 16}}", "run.iterations=2", "integrator.estimator=stack"]
     tiny.done("optimize", "room.yaml", *(text for each in sets for text in ("--set", each)))
     linear = decode_srgb(pixels.astype(np.float32) / 255)

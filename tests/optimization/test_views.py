@@ -61,6 +61,14 @@ def test_a_weight_is_a_share_of_the_loss(folder):
     np.testing.assert_allclose(both, 0.75 * alone[0] + 0.25 * alone[1], rtol=1e-4, atol=1e-7)
 
 
+def test_a_sensor_is_named_by_index_or_id(folder):
+    ids = [sensor.id() for sensor in make(folder).scene.sensors()]
+    views = f"views=[{{sensor: 2}}, {{sensor: {ids[0]}}}]"
+    assert [view.sensor for view in make(folder, views).views] == [2, 0]
+    lit = f"views=[{{sensor: {ids[1]}, lamps: [lamp]}}, {{sensor: {ids[1]}}}]"  # copies of one sensor
+    assert [view.sensor for view in make(folder, lit).views] == [0, 1]
+
+
 def test_settings_of_a_view_replace_common_ones(folder):
     write = np.full((8, 8, 3), 0.5, np.float32)
     mi.Bitmap(write).write(str(folder / "half.exr"))
@@ -104,6 +112,8 @@ BAD = [
     ("views=[{lamps: []}]", "views[0].lamps", "must name a lamp"),
     ("views=[{sensor: 4}, {sensor: 4, lamps: [lamp]}]", "views[0].sensor", "is 4, but the scene has 3 sensors"),
     ("views=[{sensor: 7}]", "views[0].sensor", "3 sensors"),
+    ("views=[{sensor: Perspective_9}]", "views[0].sensor", "no sensor of the scene; did you mean Perspective_"),
+    ("views=[{sensor: 0}, {sensor: Perspective_1}]", "views[1].sensor", "is also the sensor of views[0]"),
     ("views=[{sensor: 0, target: missing.exr}, {sensor: 1}]", "views[0].target", "no such file"),
     ("views=[{sensor: 0, target: a.exr}]", "target.render", "every view has its own target"),
     ("run.held_out=[2]", "run.held_out[0]", "not the sensor of a view"),

@@ -12,8 +12,10 @@ from cli.tiny import CONFIG, write_experiment
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.scene.cameras import read_cameras
+from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.xml.mend import mend
+from reslrb_cli.scene.xml.read import read_description
 
 WIDTH, HEIGHT, FOCAL, CENTER = 40, 24, 50.0, (23.0, 9.0)
 #: A pose, from camera axes (x right, y down, z forward) to the world.
@@ -135,7 +137,16 @@ def test_a_missing_size_is_taken_from_the_images(folder):
 
 BAD = [
     ({"k1": 0.01}, r"transforms.json: frames\[0\]: has distortion \(k1 = 0.01\)"),
-    ({"camera_model": "OPENCV_FISHEYE"}, r"frames\[0\].camera_model: is a fisheye"),
+    ({"distortion_params": [0, 0.1, 0, 0, 0, 0]}, r"frames\[0\]: has distortion \(distortion_params = "),
+    *(
+        ({key: model}, rf"frames\[0\].{key}: is {model}; only pinhole cameras")
+        for key in ("camera_model", "camera_type", "projection")
+        for model in ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "spherical", "RPC")
+    ),
+    *(
+        ({key: True}, rf"frames\[0\].{key}: is True; only pinhole cameras")
+        for key in ("is_fisheye", "latlong", "equirectangular", "is_orthographic", "spherical")
+    ),
     ({"fl_y": 60.0}, r"frames\[0\]: has focal lengths 50 and 60"),
     ({"fl_x": None}, r"frames\[0\].fl_x: missing"),
     ({"fl_x": -3}, r"frames\[0\].fl_x: must be a positive number"),
@@ -143,6 +154,38 @@ BAD = [
     ({"frames": 3}, "is not a transforms.json"),
     ({"frames": [{"file_path": "a.exr", "transform_matrix": [1]}]}, r"transform_matrix: must be four rows"),
 ]
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "SIMPLE_PINHOLE", "perspective", "", None])
+def test_pinholes_of_every_name_are_read(folder, model):
+    changes = {"camera_model": model, "is_fisheye": False, "distortion_params": [0.0, 0, 0, 0], "k2": 0, "p1": 0.0}
+    assert len(read_cameras(write_nerf(folder, **changes))) == 2
+
+
+def test_ids_of_cameras_may_be_numbers_or_have_dashes(folder):
+    path = write_nerf(folder)
+    mi.Bitmap(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)).write(str(folder / "DSC-001.exr"))
+    mi.Bitmap(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)).write(str(folder / "0001.exr"))
+    path.write_text(path.read_text().replace("a.exr", "0001.exr").replace("./b.exr", "DSC-001.exr"))
+    for given, trained in (("DSC-001", [0]), ("DSC_001", [0]), ('"0001"', [1])):
+        assert [view.sensor for view in make(folder, path.name, f"held_out: [{given}], ").trained] == trained
+    with pytest.raises(ConfigError, match=r'held_out\[0\]: is the number 1, which could be an index or .* "0001"'):
+        make(folder, path.name, "held_out: [0001], ")
+    with pytest.raises(ConfigError, match=r"held_out\[0\]: is DSC-002, .* did you mean DSC_001\?"):
+        make(folder, path.name, "held_out: [DSC-002], ")
+
+
+def test_a_film_of_the_scene_keeps_its_type_and_channels(folder):
+    text = (folder / "scene.xml").read_text()
+    band = '<spectrum name="{}" value="400:0, 500:1, 600:0"/>'
+    bands = "".join(map(band.format, ("bandA", "NIR2", "band_b")))
+    (folder / "scene.xml").write_text(text.replace('<film type="hdrfilm">', f'<film type="specfilm">{bands}'))
+    description = read_description(folder / "scene.xml", {})
+    replace_sensors(description, read_cameras(write_nerf(folder)))
+    mend(description)
+    films = list(description.root.walk("film"))
+    assert [film.type for film in films] == ["specfilm"] * 2
+    assert [child.name for child in films[0].children if child.tag == "spectrum"] == ["bandA", "NIR2", "band_b"]
 
 
 @pytest.mark.parametrize(("changes", "message"), BAD)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -220,8 +221,9 @@ def test_it_is_loaded_by_mitsuba_alone_from_any_folder(file: Path, tmp_path: Pat
     assert {"scene.xml", "recovered/floor.bsdf.reflectance.data.exr", "recovered/hill.ply"} <= names
     assert "images/wood.png" not in names, "what was recovered is copied as it was"
     text = (moved / "scene.xml").read_text()
-    for word in ("$", str(tmp_path.parent), "unheard_of", "include"):
+    for word in (str(tmp_path.parent), "unheard_of", "include"):
         assert word not in text
+    assert re.findall(r"\$\w+", text) == ["$resx", "$resy"]
     # With one thread, as in a process on one core, Mitsuba never finishes reading an EXR file.
     script = f"""import drjit as dr, mitsuba as mi
 mi.set_variant("scalar_rgb")
@@ -258,6 +260,59 @@ def test_a_scenes_own_tables_of_a_metal_are_copied(llvm: str, tmp_path: Path) ->
     selection = select_parameters(scene, [ParameterSpec(key="Sphere_1.bsdf.alpha.value", initial=0.5)], "c.yaml")
     export(found[0], selection, tmp_path / "out")
     assert {path.name for path in (tmp_path / "out/data/ior").iterdir()} == {"mine.k.spd", "mine.eta.spd"}
+
+
+@pytest.mark.parametrize("name", ["../../../evil", "a/../../evil", "/tmp/evil", "..\\evil"])
+def test_nothing_is_written_outside_of_the_folder(name: str, llvm: str, tmp_path: Path) -> None:
+    for table in ("eta", "k"):
+        path = tmp_path / f"room/data/ior/{name}.{table}.spd"
+        (tmp_path / "room/data/ior/a").mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("400 1.5\n700 1.5\n")
+    lamp = '<emitter type="constant"/><sensor type="perspective"/>'
+    metal = f'<bsdf type="roughconductor"><string name="material" value="{name}"/></bsdf>'
+    (tmp_path / "room/scene.xml").write_text(
+        f'<scene version="3.0.0">{lamp}<shape type="sphere">{metal}</shape></scene>'
+    )
+    found: list[Description] = []
+    scene = load_scene(tmp_path / "room/scene.xml", {}, look=found.append)
+    selection = select_parameters(scene, [ParameterSpec(key="Sphere_1.bsdf.alpha.value", initial=0.5)], "c.yaml")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ConfigError, match="cannot be exported: the scene names a file outside of the folder"):
+        export(found[0], selection, tmp_path / "out/out")
+    assert sorted(tmp_path.rglob("*")) == [*before]
+
+
+@pytest.mark.parametrize(
+    ("film", "size", "expected", "default"),
+    [
+        ("$resx 32", (12, 8), (48, 32), "48"),  # the size of a run is that of its photograph
+        ("$resx 32", None, (48, 32), "48"),
+        ("48 32", (12, 8), (48, 32), ""),
+        ("48 32", (12, 12), (12, 12), ""),  # shows another view
+        ("$resx 32 crop", (12, 8), (12, 8), ""),
+    ],
+)
+def test_the_film_keeps_its_own_size_and_variables(
+    film: str, size: tuple[int, int] | None, expected: tuple[int, int], default: str, llvm: str, tmp_path: Path
+) -> None:
+    width, height, *crop = film.split()
+    sizes = f'<integer name="width" value="{width}"/><integer name="height" value="{height}"/>'
+    sizes += '<integer name="crop_width" value="20"/>' if crop else ""
+    (tmp_path / "scene.xml").write_text(
+        f"""<scene version="3.0.0"><default name="resx" value="48"/><emitter type="constant"/>
+        <sensor type="perspective"><film type="hdrfilm">{sizes}</film></sensor>
+        <shape type="sphere" id="ball"/></scene>"""
+    )
+    found: list[Description] = []
+    scene = load_scene(tmp_path / "scene.xml", {}, size, look=found.append)
+    selection = select_parameters(scene, [ParameterSpec(key="ball.bsdf.reflectance.value", initial=0.5)], "c.yaml")
+    export(found[0], selection, tmp_path / "out")
+    written = tmp_path / "out/scene.xml"
+    assert tuple(mi.load_file(str(written)).sensors()[0].film().size()) == expected
+    assert (f'<default name="resx" value="{default}"/>' in written.read_text()) is bool(default)
+    if default:
+        assert list(mi.load_file(str(written), resx=96).sensors()[0].film().size()) == [96, 32]
 
 
 def test_values_that_mitsuba_reads_differently_are_refused_without_output(

@@ -480,3 +480,88 @@ def test_missing_options_of_a_hair_are_no_parameters() -> None:
     infos = {info.key.rpartition(".")[2]: info for info in list_parameters(mi.traverse(scene), values=True)}
     assert (infos["sigma_a"].obstacle, infos["sigma_a"].value) == ("is not in the scene file", None)
     assert infos["eumelanin"].obstacle is None
+
+
+# Scenes of Mitsuba 0.6: their light stays, and every change is a line.
+
+
+def old(tmp_path, **changes):
+    return write(tmp_path, head='<scene version="0.6.0">', **changes)
+
+
+def lines(caplog):
+    return [record.getMessage().partition("scene.xml:")[2] for record in caplog.records]
+
+
+@pytest.mark.parametrize("value", ["10", "0.25", "10, "])
+@pytest.mark.parametrize(
+    ("light", "key"),
+    [
+        ('<emitter type="constant" id="l"><spectrum name="radiance" value="{}"/></emitter>', "l.radiance.value"),
+        ('<emitter type="point" id="l"><spectrum name="intensity" value="{}"/></emitter>', "l.intensity.value"),
+        ('<shape type="sphere" id="l"><emitter type="area"><spectrum name="radiance" value="{}"/></emitter></shape>',
+         "l.emitter.radiance.value"),
+    ],
+)  # fmt: skip
+def test_grey_light_of_old_scenes_is_grey(light, key, value, tmp_path, caplog):
+    found = values(load_scene(old(tmp_path, light=light.format(value))))[key]
+    np.testing.assert_allclose(found.ravel(), 3 * [float(value.strip(", "))], rtol=1e-5)
+    assert (
+        "9: one number as the <spectrum> of an emitter is grey in Mitsuba 0.6: read as grey <rgb>" in lines(caplog)[0]
+    )
+    caplog.clear()
+    new = values(load_scene(write(tmp_path, light=light.format(value))))[key].ravel()
+    assert (np.ptp(new) > 0.1 * new.mean(), lines(caplog)) == (True, [])  # the same power at all wavelengths
+
+
+@pytest.mark.parametrize("type_", ["conductor", "roughconductor"])
+@pytest.mark.parametrize("given", ["", '<string name="material" value="Au"/>', '<spectrum name="eta" value="1.5"/>'])
+def test_old_conductors_without_a_material_are_copper(type_, given, tmp_path, caplog):
+    paint = f'<bsdf type="{type_}" id="paint">{{}}</bsdf>'
+    copper = '<string name="material" value="Cu"/>'
+    found = values(load_scene(old(tmp_path, paint=paint.format(given))))
+    warned = any("without a material is copper in Mitsuba 0.6" in line for line in lines(caplog))
+    assert warned is (given == "")
+    assert_same(found, values(load_scene(write(tmp_path, paint=paint.format(given or copper)))))
+
+
+def test_old_skies_are_refused(tmp_path):
+    light = '<emitter type="sunsky"/>'
+    with pytest.raises(
+        ConfigError, match=r"scene.xml:9: `sunsky` had y as its up axis, .* in Mitsuba 0.6; write it for"
+    ):
+        load_scene(old(tmp_path, light=light))
+    load_scene(write(tmp_path, light=light))
+
+
+def test_every_conversion_of_an_old_scene_is_a_line(tmp_path, caplog):
+    caplog.set_level(logging.INFO, logger="reslrb_cli")
+    mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "t.exr"))
+    texture = """<texture type="bitmap" name="reflectance"><string name="filename" value="t.exr"/>
+<string name="filterType" value="trilinear"/><float name="uscale" value="2"/></texture>"""
+    changes = {
+        "pose": '<transform name="toWorld"><lookAt origin="1, 2, 4" target="0, 0, 0" up="0, 1, 0"/></transform>',
+        "sampler": '<sampler type="halton"/>',
+        "film": '<film type="ldrfilm"><string name="pixelFormat" value="spectrum"/><rfilter type="box"/>',
+        "light": '<emitter type="constant"><spectrum name="radiance" value="0.5, 0.25, 1"/></emitter>',
+        "paint": f'<bsdf type="diffuse" id="paint">{texture}</bsdf>',
+    }
+    load_scene(old(tmp_path, **changes))
+    said = "\n".join(lines(caplog))
+    for part in ("`toWorld` is a name of Mitsuba 0.6: read as `to_world`, and 2 other names likewise",
+                 "<lookAt> is an element of Mitsuba 0.6: read as <lookat>", "sampler `halton`: read as `independent`",
+                 "film `ldrfilm` is a plugin of Mitsuba 0.6: read as `hdrfilm`",
+                 "`pixel_format` `spectrum`: read as `rgb`", "a <spectrum> of three numbers: read as <rgb>",
+                 "`filter_type` `trilinear`: read as `bilinear`",
+                 "scale and offset of a texture: read as `to_uv`"):  # fmt: skip
+        assert part in said, said
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+@pytest.mark.parametrize(("uses", "warned"), [(["a", "b", "a"], True), (["a", "a"], False), ([], False)])
+def test_an_obj_file_with_several_materials_is_named(uses, warned, tmp_path, caplog):
+    faces = "".join(f"usemtl {name}\nf 1 2 3\n" for name in uses) or "f 1 2 3\n"
+    (tmp_path / "m.obj").write_text(f"mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n{faces}")
+    load_scene(write(tmp_path, shape='<shape type="obj"><string name="filename" value="m.obj"/></shape>'))
+    line = "`m.obj` has the materials `a`, `b`, and Mitsuba ignores `usemtl` and .mtl files: read as one surface"
+    assert (line in caplog.text) is warned

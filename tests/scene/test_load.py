@@ -373,6 +373,68 @@ def test_an_id_renames_no_other_object(tmp_path):
     assert [key.replace("Sphere_1.", "first.") for key in before] == after
 
 
+QUAD = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+QUAD += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+
+
+def meshes(folder, *parts):
+    """Write a scene of meshes. A part is an id and a file."""
+    (folder / "meshes").mkdir(exist_ok=True)
+    shapes = ""
+    for id, file in parts:
+        (folder / "meshes" / file).write_text(QUAD)
+        own = f' id="{id}"' if id else ""
+        shapes += f'<shape type="ply"{own}><string name="filename" value="meshes/{file}"/></shape>'
+    return write(folder, lit(shapes))
+
+
+def test_shapes_without_an_id_are_named_after_their_files(tmp_path):
+    """Exporters write `elm__12` for objects without an id."""
+    parts = [
+        ("", "Lamp.ply"),
+        ("elm__12", "Lamp.ply"),
+        ("mine", "Wall.ply"),
+        ("elm__3", "my table-top.v2.ply"),
+        ("", "Lamp_2.ply"),
+    ]
+    parts += [("elm__4", "mine.ply"), ("Wall", "Other.ply"), ("", "Wall.ply")]
+    file = meshes(tmp_path, *parts)
+    expected = ["Lamp", "Lamp_2", "mine", "my_table-top_v2", "Lamp_2_2", "mine_2", "Wall", "Wall_2"]
+    assert names(keys(file))[2:] == expected
+    assert names(keys(file))[2:] == expected
+
+
+def test_warnings_of_mitsuba_are_one_line_for_each_kind(tmp_path, caplog, capfd):
+    file = meshes(tmp_path, *(("", f"{number}.ply") for number in range(30)))
+    odd = QUAD.replace("property float z\n", "property float z\nproperty float foo\n")
+    for each in (tmp_path / "meshes").iterdir():
+        each.write_text(odd.replace("0 0 0\n1 0 0\n0 1 0\n", "0 0 0 1\n1 0 0 1\n0 1 0 1\n"))
+    load_scene(file)
+    [line] = [record.getMessage() for record in caplog.records]
+    assert line.startswith(f"{file}:1: Mitsuba warns: attributes without postfix are not handled for now: attribute")
+    assert line.endswith(".ply, and 29 more")
+    assert "\x1b" not in "".join(capfd.readouterr())
+    mi.Log(mi.LogLevel.Warn, "later")
+    assert "later" in "".join(capfd.readouterr())
+
+
+@pytest.mark.parametrize(
+    ("used", "expected"),
+    [
+        (["Ply_1.bsdf.reflectance.value"], ["Ply_1", "Lamp_2", "Wall"]),
+        (["elm__12.faces"], ["Lamp", "elm__12", "Wall"]),
+        (["elm__*.faces"], ["Lamp", "elm__12", "elm__3"]),
+        (["Ply_*.faces"], ["Ply_1", "Lamp_2", "Wall"]),
+        (["*.faces", "Lamp.bsdf.*", "elm__4.x", "Ply_2"], ["Lamp", "Lamp_2", "Wall"]),
+    ],
+)
+def test_earlier_names_stay_where_an_experiment_uses_them(used, expected, tmp_path):
+    """Versions before this one numbered the shapes."""
+    file = meshes(tmp_path, ("", "Lamp.ply"), ("elm__12", "Lamp.ply"), ("elm__3", "Wall.ply"))
+    expected = [name.replace("Lamp_2", "Lamp") if "Lamp" not in expected else name for name in expected]
+    assert names(list(mi.traverse(load_scene(file, named=used)).properties))[2:] == expected
+
+
 def test_a_taken_name_is_not_reused(tmp_path):
     shapes = '<shape type="sphere" id="Sphere_2"/><shape type="sphere"/><shape type="sphere" id="Sphere_2_2"/>'
     assert names(keys(write(tmp_path, lit(shapes))))[2:] == ["Sphere_2", "Sphere_2_3", "Sphere_2_2"]

@@ -9,6 +9,7 @@ import pytest
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.catalog import list_parameters
+from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
 
 TEXTURE = "floor.reflectance.data"
@@ -75,6 +76,22 @@ def test_a_file_of_8_bits_is_decoded_as_its_color_space_says(make_scene, tmp_pat
     """Files of roughness and other data that are no colours hold linear values."""
     file = write(tmp_path / "t.png", np.full((4, 6, 3), 127, np.uint8)).model_copy(update={"color_space": color_space})
     assert np.allclose(select(make_scene(), {"key": TEXTURE, "initial": file}).array(TEXTURE), expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("raw", [True, False])
+@pytest.mark.parametrize("color_space", ["auto", "srgb", "linear"])
+def test_a_file_for_a_raw_texture_is_linear_unless_it_says_otherwise(raw, color_space, llvm, tmp_path):
+    """The scene reads the same file with the same values."""
+    file = write(tmp_path / "t.png", np.full((4, 6, 1), 128, np.uint8)).model_copy(update={"color_space": color_space})
+    roughness = f"""<texture type="bitmap" name="alpha"><string name="filename" value="t.png"/>
+        <boolean name="raw" value="{str(raw).lower()}"/><string name="format" value="variant"/></texture>"""
+    (
+        tmp_path / "scene.xml"
+    ).write_text(f"""<scene version="3.0.0"><emitter type="constant"/><sensor type="perspective"/>
+        <shape type="sphere" id="ball"><bsdf type="roughconductor">{roughness}</bsdf></shape></scene>""")
+    scene, key = load_scene(tmp_path / "scene.xml"), "ball.bsdf.alpha.data"
+    expected = {"auto": np.array(mi.traverse(scene)[key])[0, 0, 0], "srgb": 0.2158605, "linear": 128 / 255}[color_space]
+    assert np.allclose(select(scene, {"key": key, "initial": file}).array(key), expected, atol=1e-5)
 
 
 def test_globs_match_recoverable_parameters(make_scene):
@@ -163,7 +180,7 @@ def test_overlapping_specs(make_scene):
         (np.full((3, 3, 3), 0.5, np.float32), "is 3x3, the texture 6x4; give `resolution"),
         (np.full((4, 6, 3), np.nan, np.float32), "pixel (0, 0), channel R, is nan"),
         (np.full((4, 6, 3), -1.0, np.float32), "is -1: negative"),
-        (np.full((4, 6, 5), 0.5, np.float32), "has 5 channels"),
+        (np.full((4, 6, 5), 0.5, np.float32), "has the channels ch0, ch1, "),
     ],
 )
 def test_refused_files(make_scene, tmp_path, array, what):

@@ -7,16 +7,21 @@ from __future__ import annotations
 
 import bisect
 import difflib
+import logging
 import math
 import os
 import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
 from reslrb_cli.backend.installation import is_known, likely_parameters, looking_in, nearest_plugin, plugin_type
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.scene.images import texture_problems
 from reslrb_cli.scene.xml.mend import Note
 from reslrb_cli.scene.xml.read import Description, Element, floats, is_true, quoted, tag_lines
@@ -107,6 +112,7 @@ def _check(description: Description) -> list[Note]:
     file that is missing, never ends, or shows other pixels in Mitsuba. Return notes on colour profiles.
     """
     notes: list[Note] = []
+    objects = {child: item.type for item in description.root.walk() if item.is_object for child in item.children}
     images = {child: item for item in description.root.walk() if item.type in _IMAGES for child in item.children}
     for element in description.root.walk():
         if element.is_object:
@@ -121,6 +127,11 @@ def _check(description: Description) -> list[Note]:
             raise element.fail("filename", f"{quoted(name)}: no such file{looked}")
         if not path.is_file():
             raise element.fail("filename", f"{path} is not a regular file")
+        if objects.get(element) == "obj" and len(materials := _materials(path)) > 1:
+            wrong = f"{quoted(name)} has the materials {', '.join(map(quoted, materials[:3]))}"
+            wrong += f" and {len(materials) - 3} more" if len(materials) > 3 else ""
+            done = "read as one surface without them; save one file for each material"
+            notes.append(Note(element, f"{wrong}, and Mitsuba ignores `usemtl` and .mtl files", done=done))
         if element in images:
             wrong, profile = texture_problems(path)
             if wrong:
@@ -129,6 +140,12 @@ def _check(description: Description) -> list[Note]:
                 ignored = f"{quoted(name)} has the colour profile {quoted(profile)}, which Mitsuba's textures ignore"
                 notes.append(Note(element, ignored, done="read as sRGB; convert the file to sRGB"))
     return notes
+
+
+def _materials(obj: Path) -> list[str]:
+    """Return the names of the materials that an OBJ file uses, in their order."""
+    found = re.findall(rb"^usemtl[ \t]+(.*?)\s*$", obj.read_bytes(), re.MULTILINE)
+    return [name.decode(errors="replace") for name in dict.fromkeys(found)]
 
 
 def _check_plugin(element: Element) -> None:
@@ -204,7 +221,8 @@ def build(description: Description) -> tuple[Any, list[Note]]:
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
     config.unused_properties = mi.LogLevel.Debug  # `_unused` reports them
-    with looking_in(description.folders):
+    said: list[str] = []
+    with looking_in(description.folders), _collecting_warnings(said):
         try:
             state = mi.parser.parse_string(config, text.xml)
             mi.parser.transform_all(config, state)
@@ -212,7 +230,46 @@ def build(description: Description) -> tuple[Any, list[Note]]:
         except Exception as error:
             raise text.located(str(error)) from None
     unused = [note for node in state.nodes for note in _unused(node.props, text.element_at(node.offset))]
-    return built, notes + unused
+    return built, [*notes, *unused, *_warnings_of_mitsuba(said, description.root)]
+
+
+@contextmanager
+def _collecting_warnings(lines: list[str]) -> Iterator[None]:
+    """Append Mitsuba's warnings to `lines`. Otherwise Mitsuba would print them with colour codes, one for each object.
+
+    Mitsuba writes them into a file: threads that load objects cannot call Python.
+    """
+    log = mi.logger()
+    appenders = [log.appender(place) for place in range(log.appender_count())]
+    with tempfile.TemporaryDirectory(prefix="reslrb-") as folder:
+        file = os.path.join(folder, "log")
+        log.clear_appenders()
+        log.add_appender(mi.StreamAppender(file))
+        try:
+            yield
+        finally:
+            log.clear_appenders()
+            for appender in appenders:
+                log.add_appender(appender)
+            with open(file, errors="replace") as written:
+                lines += written.read().splitlines()
+
+
+#: A line of Mitsuba's log, and the file that a message begins with.
+_LOGGED = re.compile(r"\bWARN\b.*?\] (?:\"(?P<file>[^\"]*)\": )?(?P<text>.*)")
+
+
+def _warnings_of_mitsuba(lines: list[str], root: Element) -> list[Note]:
+    """Return one note on each kind of warning in Mitsuba's log."""
+    kinds: dict[str, list[str]] = {}
+    for found in filter(None, map(_LOGGED.search, lines)):
+        kinds.setdefault(found["text"].rstrip("."), []).append(found["file"] or "")
+    notes = []
+    for text, files in kinds.items():
+        level = logging.INFO if text.startswith("performance") else logging.WARNING
+        more = f", and {len(files) - 1} more" if len(files) > 1 else ""
+        notes.append(Note(root, f"Mitsuba warns: {one_line(text, 200)}", done=f"{files[0]}{more}", level=level))
+    return notes
 
 
 class _Text:
@@ -293,18 +350,36 @@ def _size_of(film: Element) -> FilmSize:
     return FilmSize(width, height, cropped, channels)
 
 
+def restore_films(description: Description) -> None:
+    """Give films that `resize_films` resized their sizes in the files, if they show the same view: the same aspect
+    ratio within 1 %, and no crop window.
+    """
+    for film, sizes in description.own_sizes.items():
+        before, now = (
+            {child.name: child.value for child in children if child.name in _SIZES}
+            for children in (sizes, film.children)
+        )
+        if before.keys() != now.keys() or not all(value.strip().isdecimal() for value in before.values()):
+            continue
+        ratios = [float(size["width"]) / float(size["height"]) for size in (before, now)]
+        if abs(ratios[0] / ratios[1] - 1) < 0.01:
+            film.drop(*_SIZES)
+            film.children += sizes
+
+
 #: Parameters of a film that set its size.
 _SIZES = ("width", "height", "crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
 
 
-def resize_films(root: Element, size: tuple[int, int]) -> None:
-    """Set the films of all sensors below `root` to `size` (width, height) in pixels, and remove crop windows."""
-    for sensor in root.walk("sensor"):
+def resize_films(description: Description, size: tuple[int, int]) -> None:
+    """Set the films of all sensors to `size` (width, height) in pixels, and remove crop windows."""
+    for sensor in description.root.walk("sensor"):
         films = [child for child in sensor.children if child.tag == "film"]
         if not films:
             films = [sensor.new("film", type="hdrfilm")]
             sensor.children += films
         for film in films:
+            description.own_sizes[film] = [child for child in film.children if child.name in _SIZES]
             film.drop(*_SIZES)
             for name, value in zip(("width", "height"), size, strict=True):
                 film.children.append(film.new("integer", name=name, value=str(value)))

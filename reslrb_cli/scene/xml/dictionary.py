@@ -53,6 +53,7 @@ def write_dictionary(scene: Mapping[str, Any], source: object, base: Path) -> Pa
         raise ConfigError(source, "scene", "has text that UTF-8 cannot encode") from None
     digest = hashlib.blake2b(text, digest_size=16)
     for image in writer.images.values():
+        digest.update(f"{image.shape} {image.dtype}".encode())  # other images may have the same bytes
         digest.update(image.tobytes())
     place: object = "the cache"
     try:

@@ -1,9 +1,9 @@
 """Conversion of scene files from other Mitsuba versions and exporters to Mitsuba 3. Assignment of stable ids.
 
 Mitsuba names an object without an id by its address in memory, which differs at each load. `mend` gives an object
-without an id a new id. The new id consists of the object's kind and its number among all objects of this kind.
-Conversions keep the meaning, and are silent. `mend` returns notes on the parts that are left out, and on spectra that
-become colours.
+without an id a new id: the name of its file, or its kind and its number among all objects of this kind. Conversions
+keep the meaning. `mend` returns notes on the parts that are left out, on spectra that become colours, and on all
+conversions of files for Mitsuba 0.x.
 
 The plugins `regular`, `irregular` and `blackbody` need wavelengths, which only spectral variants have. In other
 variants, `convert_spectra` replaces these plugins by elements such as `<spectrum value="400:0.1, 700:0.9"/>`. Mitsuba
@@ -17,11 +17,13 @@ and ends with an error of Dr.Jit.
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import mitsuba as mi
@@ -36,23 +38,25 @@ from reslrb_cli.scene.xml.read import Description, Element, floats, is_true, quo
 class Note:
     """A part of a scene's files that is left out or simplified. `wrong` is the reason, and `done` is the result.
 
-    If a plugin does not use an element, `owner` is the parent of the element. For other notes, it is None.
+    If a plugin does not use an element, `owner` is the parent of the element. For other notes, it is None. `level` is
+    `logging.INFO` for conversions that keep the meaning.
     """
 
     element: Element
     wrong: str
     owner: Element | None = None
     done: str = "left out"
+    level: int = logging.WARNING
 
 
-def warnings(notes: Iterable[Note]) -> list[str]:
-    """Return one line per kind of note. Each line names the first occurrence of its kind."""
-    kinds: dict[tuple[str, Path], list[Element]] = {}
+def warnings(notes: Iterable[Note]) -> list[tuple[str, int]]:
+    """Return one line per kind of note, and its level. Each line names the first occurrence of its kind."""
+    kinds: dict[tuple[str, int, Path], list[Element]] = {}
     for note in notes:
-        kinds.setdefault((f"{note.wrong}: {note.done}", note.element.file), []).append(note.element)
+        kinds.setdefault((f"{note.wrong}: {note.done}", note.level, note.element.file), []).append(note.element)
     return [
-        f"{elements[0].place}: {text}" + f" (also {len(elements) - 1} more)" * (len(elements) > 1)
-        for (text, _), elements in kinds.items()
+        (f"{elements[0].place}: {text}" + f" (also {len(elements) - 1} more)" * (len(elements) > 1), level)
+        for (text, level, _), elements in kinds.items()
     ]
 
 
@@ -123,33 +127,43 @@ def linear(element: Element) -> str:
     return " ".join(f"{value:.9g}" for value in decode_srgb(np.array(encoded)))
 
 
-def transform_coordinates(texture: Element) -> None:
-    """Replace a texture's `uoffset`, `voffset`, `uscale` and `vscale` by a `to_uv` transform."""
+def transform_coordinates(texture: Element) -> bool:
+    """Replace a texture's `uoffset`, `voffset`, `uscale` and `vscale` by a `to_uv` transform. Return whether there are
+    any.
+    """
     names = ("uoffset", "voffset", "uscale", "vscale")
     given = {child.name: child for child in texture.children if child.tag == "float" and child.name in names}
     if not given:
-        return
+        return False
     steps = []
     for tag, word in (("translate", "offset"), ("scale", "scale")):  # the order of the steps matters
         axes = {axis: given[u + word].value for axis, u in (("x", "u"), ("y", "v")) if u + word in given}
         steps += [texture.new(tag, **axes)] if axes else []
     texture.drop(*given)
     texture.children.append(texture.new("transform", *steps, name="to_uv"))
+    return True
 
 
 #: Plugins that name their children by position, which is the same at every load.
 _GROUPS = ("shapegroup", "batch")
 #: Prefix of the ids that Mitsuba writes for objects without an id. It ignores them when it reads a scene.
 _UNNAMED = "_unnamed_"
+#: Ids that Mitsuba's `dict_to_xml`, and so the exporter of Blender, writes for objects without an id.
+_NUMBERED = re.compile(r"elm__\d+")
 
 
-def _name_objects(root: Element) -> list[Note]:
+def name_objects(root: Element, used: Iterable[str] = ()) -> list[Note]:
     """Give every object below `root` an id that is the same at every load. Return notes on unprintable ids.
 
-    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Ids that are empty or
-    unprintable, or start with `_unnamed_`, are replaced, and references to them are updated. Raises ConfigError if two
-    objects have one id, which Mitsuba refuses as well.
+    A shape without an id gets the name of its file: `Lamp` for `meshes/Lamp.ply`. Among other objects, the third
+    `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. Ids that are empty or unprintable,
+    start with `_unnamed_`, or are numbers of an exporter are replaced, and references to them are updated.
+
+    `used` are keys or globs, perhaps of earlier versions, which numbered all shapes: an object that they name by its
+    number, as in `Ply_3` or `elm__12`, keeps this name. Raises ConfigError if two objects have one id, which Mitsuba
+    refuses as well.
     """
+    used = {word.partition(".")[0] for word in used}
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
     grouped = {child for element in objects if element.type in _GROUPS for child in element.children}
@@ -164,21 +178,22 @@ def _name_objects(root: Element) -> list[Note]:
         own = element.id
         if own in owners:
             raise element.fail("", f"id {quoted(own)} is also that of {owners[own].place}; rename one of them")
+        file = _file_stem(element)
         if own.strip() and own.isprintable() and not own.startswith(_UNNAMED):
             owners[own] = element
-            continue
+            if not (file and _NUMBERED.fullmatch(own)) or _names(used, own, file):
+                continue
         if element in grouped and not own:
             continue
-        name = first = f"{kind}_{numbers[kind]}"
-        for number in itertools.count(2):
-            if name not in taken:
-                break
-            name = f"{first}_{number}"
+        first = f"{kind}_{numbers[kind]}"
+        name = _untaken(first, taken)
+        if file and (_NUMBERED.fullmatch(own) or not _names(used, name, file)):
+            name = _untaken(file, taken)
         taken.add(name)
         element.attributes["id"] = name
         if own.strip() and own not in renamed:
             renamed[own] = name
-            if not own.startswith(_UNNAMED):
+            if not own.startswith(_UNNAMED) and not _NUMBERED.fullmatch(own):
                 notes.append(Note(element, f"id {quoted(own)} cannot be part of a key", done=f"named {name}"))
     for element in root.walk("ref", "alias"):
         if element.id in renamed:
@@ -186,15 +201,32 @@ def _name_objects(root: Element) -> list[Note]:
     return notes
 
 
-def mend(description: Description) -> list[Note]:
-    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts that are left out and on
-    spectra that become colours.
+def _file_stem(shape: Element) -> str:
+    """Return the name of a shape's file as part of a key, without its suffix, or ""."""
+    file = shape.find("filename") if shape.tag == "shape" else None
+    stem = "" if file is None else re.split(r"[/\\]", file.value)[-1].rpartition(".")[0]
+    return re.sub(r"[^\w-]+", "_", stem).strip("_")
+
+
+def _untaken(first: str, taken: set[str]) -> str:
+    names = itertools.chain([first], (f"{first}_{number}" for number in itertools.count(2)))
+    return next(name for name in names if name not in taken)
+
+
+def _names(used: Iterable[str], name: str, other: str) -> bool:
+    """Whether a glob of `used` matches `name`, and not also the `other` name."""
+    return any(fnmatchcase(name, word) and not fnmatchcase(other, word) for word in used)
+
+
+def mend(description: Description, used: Iterable[str] = ()) -> list[Note]:
+    """Convert the elements of a scene to Mitsuba 3 in place. Return notes on the parts that are left out, on spectra
+    that become colours, and on all conversions of files for Mitsuba 0.x. `used` is that of `name_objects`.
 
     Materials, lights and shapes keep their meaning. Materials, lights and shapes that Mitsuba 3 lacks stay unchanged,
     and a later check refuses them. Unused parameters are found only when the scene is built.
     """
-    mender, root = _Mender(), description.root
-    mender.notes += _name_objects(root)
+    mender, root = _Mender(description), description.root
+    mender.notes += name_objects(root, used)
     root.attributes.pop("version", None)
     if root.is_object:
         mender.mend_element(root)
@@ -206,12 +238,29 @@ def mend(description: Description) -> list[Note]:
         wrong = f"RGB variants have no spectrum `{spectrum.type}`"
         mender.notes.append(Note(spectrum, wrong, done="read as its colour"))
     root.attributes["version"] = "3.0.0"
-    return mender.notes
+    return [*mender.notes, *mender.renamed()]
 
 
 class _Mender:
-    def __init__(self) -> None:
+    def __init__(self, description: Description) -> None:
         self.notes: list[Note] = []
+        #: Files for Mitsuba 0.x, and the elements whose parameters have other names in Mitsuba 3.
+        self.old = {file for file, version in description.files.items() if version.startswith("0.")}
+        self._renamed: list[Element] = []
+
+    def renamed(self) -> Iterator[Note]:
+        """Yield a note on the renamed parameters of each file for Mitsuba 0.x."""
+        for file in self.old:
+            found = {element.written: element for element in self._renamed if element.file == file}
+            for old, element in itertools.islice(found.items(), 1):
+                more = f", and {len(found) - 1} other names likewise" if len(found) > 1 else ""
+                done = f"read as {quoted(element.name)}{more}"
+                yield Note(element, f"{quoted(old)} is a name of Mitsuba 0.6", done=done, level=logging.INFO)
+
+    def tell(self, element: Element, wrong: str, done: str, level: int = logging.INFO) -> None:
+        """Note a conversion if the element is in a file for Mitsuba 0.x."""
+        if element.file in self.old:
+            self.notes.append(Note(element, wrong, done=done, level=level))
 
     def mend_below(self, element: Element) -> None:
         """Mend all elements below `element`. `element` itself must be mended already."""
@@ -223,8 +272,8 @@ class _Mender:
         element.children[:] = kept
         if element.is_object:
             self._repetitions(element)
-        if element.tag == "texture":
-            transform_coordinates(element)
+        if element.tag == "texture" and transform_coordinates(element):
+            self.tell(element, "scale and offset of a texture", "read as `to_uv`")
         for child in element.children:
             self.mend_below(child)
 
@@ -234,6 +283,8 @@ class _Mender:
         if tag == "srgb":
             element.attributes["value"] = linear(element)
         element.tag = ELEMENTS.get(tag, tag)
+        if element.tag != tag:
+            self.tell(element, f"<{tag}> is an element of Mitsuba 0.6", f"read as <{element.tag}>")
         known = OBJECT_ATTRIBUTES if element.is_object else ATTRIBUTES.get(element.tag)
         if known is None:
             if tag in LOST_ELEMENTS:
@@ -246,12 +297,30 @@ class _Mender:
         type = element.type
         if tag == "sampler" and type != "independent":
             # Other samplers round the sample count, which the experiment sets, and fail if it is split differently.
+            self.tell(element, f"sampler {quoted(type)}", "read as `independent`")
             element.attributes["type"] = "independent"
             element.children[:] = [child for child in element.children if child.name == "sample_count"]
         elif element.is_object and not is_known(type):
             other = PLUGINS.get((tag, type), type.lower())
             element.attributes["type"] = other if is_known(other) else type
+            if element.type != type:
+                self.tell(element, f"{tag} {quoted(type)} is a plugin of Mitsuba 0.6", f"read as `{element.type}`")
+        if element.file in self.old:
+            self._change_meaning(element)
         return True
+
+    def _change_meaning(self, element: Element) -> None:
+        """Keep the meaning of a plugin of Mitsuba 0.x whose defaults or axes are others in Mitsuba 3."""
+        if element.type == "sunsky":
+            reason = "had y as its up axis, and other parameters, in Mitsuba 0.6"
+            raise element.fail(
+                "", f"`sunsky` {reason}; write it for Mitsuba 3, with z as its up axis, in a file of 3.0.0"
+            )
+        names = {child.name for child in element.children}
+        if element.type in ("conductor", "roughconductor") and not names & {"material", "eta", "k"}:
+            element.children.append(element.new("string", name="material", value="Cu"))
+            wrong = f"{element.type} without a material is copper in Mitsuba 0.6, and a perfect mirror in Mitsuba 3"
+            self.tell(element, wrong, "read as copper", logging.WARNING)
 
     def _parameter(self, element: Element, owner: Element, names: set[str]) -> bool:
         """Mend the name and the value of a parameter of `owner`. `names` are the names of all parameters of `owner`.
@@ -264,15 +333,25 @@ class _Mender:
             return True
         self._name(element, owner, names)
         name, value = element.name, element.value
-        if element.tag == "spectrum" and "type" not in element.attributes and len(floats(value)) == 3:
+        count = len(floats(value)) if element.tag == "spectrum" and "type" not in element.attributes else 0
+        if count == 3:
+            self.tell(element, "a <spectrum> of three numbers", "read as <rgb>")
             element.tag = "rgb"
+        elif count == 1 and owner.tag == "emitter" and element.file in self.old and not mi.is_spectral:
+            # Mitsuba 3 emits the same power at all wavelengths, whose colour is not that of D65.
+            wrong = "one number as the <spectrum> of an emitter is grey in Mitsuba 0.6"
+            self.tell(element, wrong, "read as grey <rgb>", logging.WARNING)
+            element.tag, element.attributes["value"] = "rgb", " ".join(3 * [value.strip(" ,")])
         elif element.tag == "rgb" and value.startswith("#"):
             element.attributes["value"] = hexadecimal(element)
         if element.tag != "string":
             return True
         if owner.type == "hdrfilm" and name == "pixel_format":
             value = value.partition(",")[0].strip()  # a list has one format per image; keep the first
-        element.attributes["value"] = VALUES.get((owner.type, name), {}).get(value, value)
+        new = VALUES.get((owner.type, name), {}).get(value, value)
+        if new != value:
+            self.tell(element, f"{quoted(name)} {quoted(value)}", f"read as `{new}`")
+        element.attributes["value"] = new
         # Films write no files here, and Mitsuba 3 does not have all formats of earlier versions.
         return owner.type != "hdrfilm" or name not in ("file_format", "component_format")
 
@@ -280,10 +359,12 @@ class _Mender:
         old, name = element.name, snake_case(element.name)
         if owner.type == "diffuse" and name == "diffuse_reflectance":
             name = "reflectance"
-        # Users choose the names of mesh attributes.
+        # Users choose the names of mesh attributes and of a film's channels.
         is_attribute = owner.tag == "shape" and old.startswith(("vertex_", "face_"))
+        is_attribute = is_attribute or (owner.type == "specfilm" and element.tag in ("spectrum", "texture", "ref"))
         if name != old and not is_attribute and name not in names:
             element.attributes["name"], element.written = name, old
+            self._renamed.append(element)
 
     def _repetitions(self, owner: Element) -> None:
         """If a parameter is given more than once, keep only the last one, as in Mitsuba 0.6."""

@@ -54,7 +54,8 @@ def is_true(parameter: Element | None) -> bool:
 class Element:
     """An XML element with its attributes and children in their order.
 
-    `written` is the original name in the file if mending has changed the element's name.
+    `written` is the original name in the file if mending has changed the element's name. `variable` is the original
+    text of the attribute `value` if it has variables.
     """
 
     tag: str
@@ -63,6 +64,7 @@ class Element:
     line: int
     children: list[Element] = field(default_factory=list)
     written: str = ""
+    variable: str = ""
 
     @property
     def place(self) -> str:
@@ -198,14 +200,16 @@ class Description:
     - `variables`: the values of the scene's `$name` variables, including the scene's own defaults.
     - `hides_emitters`: whether the scene's integrator hides emitters. All other settings of this integrator are
         ignored.
-    - `files`: the XML files that were read.
+    - `files`: the XML files that were read, and the versions of Mitsuba for which they were written, or "".
+    - `own_sizes`: the sizes of the films in the files, if other sizes replace them.
     """
 
     root: Element
     folders: list[Path]
     variables: dict[str, str]
     hides_emitters: bool
-    files: list[Path]
+    files: dict[Path, str]
+    own_sizes: dict[Element, list[Element]] = field(default_factory=dict)
 
     def find_file(self, name: str) -> Path | None:
         """Return the file or folder that Mitsuba opens for this name, or None. Searches `folders` first."""
@@ -261,7 +265,7 @@ class _Reader:
 
     values: dict[str, str]
     unused: set[str]
-    files: list[Path] = field(default_factory=list)
+    files: dict[Path, str] = field(default_factory=dict)
 
     def read(self, file: Path, folders: list[Path], include: Element | None) -> Element:
         """Return the root of `file` with includes and variables resolved. Adds folders of <path> to `folders`."""
@@ -271,7 +275,7 @@ class _Reader:
             if include is None or error.source != str(file):
                 raise
             raise include.fail("", f"includes {file}, which {error.message}") from None
-        self.files.append(file)
+        self.files[file] = root.attributes.get("version", "")
         self._put_variables(root)
         self._complete(root, root, folders)
         return root
@@ -303,6 +307,7 @@ class _Reader:
         for key, text in element.attributes.items():
             if "$" in text:
                 element.attributes[key] = self._replace(text, element)
+                element.variable = text if key == "value" else element.variable
 
     def _replace(self, text: str, element: Element) -> str:
         def value_of(found: re.Match[str]) -> str:
