@@ -350,6 +350,15 @@ def test_a_fresh_run_has_no_caches(monkeypatch):
     assert jobs.call([], sweep.Interrupts(), jobs.RunSlot()) == (0, str(["the user's"] * 4))
 
 
+def test_a_run_that_must_end_is_ended(monkeypatch):
+    """Because another run has failed: nobody has sent a signal to the sweep."""
+    monkeypatch.setattr(jobs, "_PROGRAM", "import time; print('at work', flush=True); time.sleep(60)")
+    slot, start = jobs.RunSlot(must_end=True), time.monotonic()
+    code, line = jobs.call([], sweep.Interrupts(), slot)
+    assert (code, line.startswith("ended by SIGTERM: ")) == (130, True)
+    assert time.monotonic() - start < 30
+
+
 def test_trials_at_work_are_avoided(folder):
     """Among the trials are enough results for a proposal near the best one. Where trials are at work, none is made."""
     space = [parse_vary("optimizer.learning_rate={low: 0.0, high: 1.0}", search=True)]

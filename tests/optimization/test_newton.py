@@ -20,7 +20,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loop, optimizers, sensitivity
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.block import SHIFT, Block, JointState
-from reslrb_cli.optimization.newton import GAIN, LONGEST, NEAR, SHORTER, _steepness, fine_part
+from reslrb_cli.optimization.newton import LONGEST, _steepness, fine_part
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import guiding_of, standing
 from reslrb_cli.optimization.uncertainty.curvature import raise_eigenvalues
@@ -65,42 +65,43 @@ def measure(optimizer, losses, seed=0):
         pull(optimizer, losses)
 
 
-def curvature_by_size(size, measured):
-    """Return the curvature of each entry. Its factor is that of all entries with a size of at most its class."""
-    classes = np.trunc(-4 * np.log2(size / size.max()))
-    smaller = classes[None, :] >= classes[:, None]
-    return np.abs(smaller @ (measured * size)) / (smaller @ size**2) * size
-
-
-def test_updates_follow_the_formula():
-    curvature, best = loss = MANY
-    optimizer = make({"p": np.full(best.shape, 0.5)})
-    x, m, s, v, r = np.full(best.shape, 0.5), 0.0, 0.0, 0.0, 0.0
-    n, last, before, random = np.zeros(best.shape), 0.0, x, np.random.default_rng(2)
-    for iteration in range(30):
+def descend_many(iterations, noise=0.0, loss_unit=1.0, unit=1.0, seed=2):
+    """Minimise the loss `MANY` from 0.5, with gradients that have `noise`. Loss and values can have other units.
+    Returns the distances to the optimum by iteration (N, 6).
+    """
+    curvature, best = MANY
+    loss = loss_unit / unit**2 * curvature, unit * best
+    optimizer = make({"p": np.full(best.shape, 0.5 * unit)}, (-10 * unit, 10 * unit))
+    random, found = np.random.default_rng(seed), []
+    for iteration in range(iterations):
         pull(optimizer, {"p": loss})
         if iteration == 0:
             measure(optimizer, {"p": loss})
-        noise = random.normal(size=best.shape) * [0.3, 0.0, 0.1, 1.0, 0.0, 0.5]
-        accumulate(optimizer, "p", noise)
-        g = np.array(optimizer.gradient("p"), dtype=np.float64)
+        accumulate(optimizer, "p", loss_unit / unit * noise * random.normal(size=best.shape))
         optimizer.step(1.0)
-        s, v = 0.99 * s + 0.01 * np.abs(g), 0.99 * v + 0.01 * g**2
-        h = curvature_by_size(s, curvature)
-        n = n + (g * m < 0)
-        longest = LONGEST * s**2 / v / (1 - 0.99 ** (iteration + 1))
-        divisor = h * (1 + SHORTER * n) / GAIN
-        if iteration > 0:
-            newest = (g - last - h * (x - before)) ** 2 / 2
-            r = newest if iteration == 1 else 0.9 * r + 0.1 * newest
-            divisor += 0.5 * r / h / NEAR**2
-        reach = 0.5 * longest * divisor
-        m = 0.5 * m + np.clip(g, -reach, reach)
-        step = np.clip(m / divisor, -longest, longest)
-        last, before, x = g, x, np.clip(x - step, 0, 1)
-        np.testing.assert_allclose(np.array(optimizer["p"]), x, atol=1e-4)
-    assert n.max() > 5
-    assert longest.min() < 0.7 * LONGEST
+        found.append(np.array(optimizer["p"], dtype=np.float64) / unit - best)
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("loss_unit", "unit"), [(1.0, 1.0), (1e-6, 1.0), (1e6, 1.0), (1.0, 1e3), (1e4, 1e-3)])
+def test_a_quadratic_with_a_known_optimum_is_solved_in_any_unit(loss_unit, unit):
+    """The curvatures of the entries differ by a factor of 40. No entry moves away from the optimum."""
+    start, found = np.abs(0.5 - MANY[1]), np.abs(descend_many(40, loss_unit=loss_unit, unit=unit))
+    assert (found < 1.05 * start).all()
+    assert found[4].max() < 0.1
+    assert found[12].max() < 0.02
+    assert found[-1].max() < 2e-3
+    np.testing.assert_allclose(found, np.abs(descend_many(40)), atol=1e-5)
+
+
+def test_noise_averages_out():
+    """The mean of N gradients has the error sigma / (a sqrt(N))."""
+    noise, N = np.array([0.3, 0.0, 0.1, 1.0, 0.0, 0.5]), 200
+    found = np.array([descend_many(N, noise, seed=seed)[-1] for seed in range(6)])
+    noisy = noise > 0
+    ratios = np.sqrt(np.mean(found[:, noisy] ** 2, axis=0)) / (noise / MANY[0] / np.sqrt(N))[noisy]
+    assert ratios.max() < 3, ratios
+    assert np.abs(found[:, ~noisy]).max() < 1e-4
 
 
 def test_a_measurement_leaves_values_and_gradients_as_they_were():

@@ -497,6 +497,7 @@ def test_each_run_has_its_entry(server: Any) -> None:
     runs[0].end("interrupted")
     again = calls_of("a", 2, first)
     again.begin()
+    assert next(iter(server.entries.values())).status == "RUNNING"
     iterate(again, 2, 3)
     iterate(runs[1], 3)
     for each in (again, runs[1]):
@@ -535,6 +536,14 @@ def test_a_lost_network_does_not_end_a_run(server: Any, caplog: pytest.LogCaptur
     assert [each[0] for each in other.calls] == ["begin", "iteration", "iteration", "iteration", "end"]
     (entry,) = server.entries.values()
     assert sorted(entry.losses) == [0]
+
+
+def test_a_logger_that_cannot_begin_ends_the_run(server: Any) -> None:
+    """Nothing is lost yet, and the user can mend it."""
+    calls = calls_of("a", 0, server.make())
+    server.log_param = server.init = lambda *_, **given: 1 / 0
+    with pytest.raises(rl.ConfigError, match="`begin`"):
+        calls.begin()
 
 
 def test_a_name_that_is_given_twice_counts_once(experiment: Path) -> None:

@@ -471,6 +471,16 @@ def test_everything_of_a_cluster_is_in_one_folder(tmp_path: Path, monkeypatch: p
     assert list(place.iterdir()) == []
 
 
+def test_a_worker_compares_the_files(experiment: Path) -> None:
+    """The folder of a worker on another machine may hold another version of a file."""
+    place, scene = made(experiment / "worker"), experiment / "scene.xml"
+    for name, data in engine.workload_of(make(experiment), place, None, own=False).files.items():
+        (place / name).write_bytes(data)
+    scene.write_text(scene.read_text() + " ")
+    with pytest.raises(ConfigError, match=r"scene\.file: .*scene\.xml has changed since the run began"):
+        engine.assembled(place, None, False)
+
+
 def test_connections_are_encrypted(tmp_path: Path) -> None:
     """Also if dask's settings do not require it. A scheduler without TLS could send any code."""
     import dask

@@ -25,7 +25,8 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import read_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock, Holder
-from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.records.run_folder import read_config, read_value
+from reslrb_cli.runs.prepare import moves
 
 STATE, PREVIOUS = "checkpoint/state.npz", "checkpoint/previous.npz"
 
@@ -185,16 +186,17 @@ def test_differences_are_shown(run: Path, capsys: pytest.CaptureFixture[str]) ->
     assert line.startswith("config.yaml: integrator.max_depth: is 4, 3 in the run; ")
 
 
-def test_a_changed_scene_is_another_experiment(
-    run: Path, interrupted: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = interrupted.parents[1] / "scene.xml"
-    text = scene.read_text()
-    scene.write_text(text.replace("8, 8, 8", "9, 9, 9"))
-    try:
-        assert f"scene.file: {scene} has changed since " in told(capsys, run)
-    finally:
-        scene.write_text(text)
+def test_changed_files_are_another_experiment(run: Path, interrupted: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The scene, and an image that it names."""
+    for name, message in (("scene.xml", "scene.file: {} has changed since "),
+                          ("poster.exr", "scene.file (poster.exr): has changed since ")):  # fmt: skip
+        file = interrupted.parents[1] / name
+        content = file.read_bytes()
+        file.write_bytes(content.replace(b"8, 8, 8", b"9, 9, 9") + b" ")
+        try:
+            assert message.format(file) in told(capsys, run)
+        finally:
+            file.write_bytes(content)
 
 
 def test_changeable_settings_are_in_the_manifest(run: Path, tmp_path: Path) -> None:
@@ -287,6 +289,27 @@ def test_a_moved_run_continues(run: Path, interrupted: Path, tmp_path: Path) -> 
         assert int(state_of(moved)["iteration"]) == 7
     finally:
         away.rename(scene)
+
+
+def test_a_copied_run_uses_the_files_of_the_first_one(run: Path, interrupted: Path, tmp_path: Path) -> None:
+    """Although other files lie where its own would lie if they had been moved."""
+    copy = Path(shutil.copytree(run, tmp_path / "other/runs/tiny"))
+    (tmp_path / "other/scene.xml").write_text("another scene")
+    assert read_config(copy).scene.file == interrupted.parents[1] / "scene.xml"
+
+
+def test_only_the_place_of_a_file_may_change(interrupted: Path) -> None:
+    code = ["loss={type: custom, file: /a/own.py:f}", "integrator.max_depth=3"]
+    config = load(interrupted / "config.yaml", code)
+    cases: dict[tuple[str, object, object], bool] = {
+        ("scene.file", "/a/scene.xml", "/b/other.xml"): True,
+        ("scene.file", None, "/b/scene.xml"): False,
+        ("loss.file", "/a/own.py:f", "/b/other.py:f"): True,
+        ("loss.file", "/a/own.py:f", "/a/own.py:g"): False,
+        ("run.spp", 4, 8): False,
+    }
+    for (key, before, now), allowed in cases.items():
+        assert moves(key, (before, now), config) == allowed, key
 
 
 def test_a_missing_file_is_named(run: Path, interrupted: Path, capsys: pytest.CaptureFixture[str]) -> None:

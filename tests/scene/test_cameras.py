@@ -13,6 +13,7 @@ from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
+from reslrb_cli.scene.files import files_of
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.xml.mend import mend
 from reslrb_cli.scene.xml.read import read_description
@@ -96,6 +97,15 @@ def make(folder, cameras, run="", say=None):
     text = text.replace("{file: scene.xml}", f"{{file: scene.xml, cameras: {cameras}}}")
     text = text.replace("run: {", "run: {" + run)
     return assemble(loads(text, str(folder / "tiny.yaml")), *([] if say is None else [say]))
+
+
+def test_all_files_of_colmap_belong_to_the_experiment(folder):
+    text = CONFIG.replace("target: {render: {spp: 16}}\n", "")
+    text = text.replace("{file: scene.xml}", f"{{file: scene.xml, cameras: {write_colmap(folder).name}}}")
+    found = files_of(loads(text, str(folder / "tiny.yaml")))
+    names = {key: path.name for key, path in found.items() if key.startswith("scene.cameras")}
+    assert names == {"scene.cameras": "images.txt", "scene.cameras (cameras.txt)": "cameras.txt",
+                     "scene.cameras (a.exr)": "a.exr", "scene.cameras (b.exr)": "b.exr"}  # fmt: skip
 
 
 def test_images_of_the_cameras_are_the_targets(folder):
