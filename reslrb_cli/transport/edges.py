@@ -112,7 +112,8 @@ def view_from_sensor(samples: Samples, aperture: mi.Point2f) -> Viewer:
         return EdgeView(
             ds.p, ds.d, ds.dist, parallel=mi.Bool(False), weight=seen.rest, surface=mi.Normal3f(0), u=seen.u,
             active=active & seen.active, emitter=dr.zeros(mi.EmitterPtr),
-            passes_lamps=samples.plan.sees_through_lamps, clip=dr.norm(seen.target - ds.p),
+            passes_lamps=samples.plan.sees_through_lamps,
+            clip=dr.norm(seen.target - ds.p) if samples.plan.needs.near_clip else 0.0,
         )  # fmt: skip
 
     return view

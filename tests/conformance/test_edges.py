@@ -191,8 +191,20 @@ FAULTS = [
           "dr.select(over, edge.over.ray, edge.past.ray)", "dr.select(over, edge.past.ray, edge.over.ray)"),
     Fault("every_interval_counts_alike", "mirror-constant-3", "transport.jumps:sample_edge",
           "jump.places * line.chance", "line.chance"),
-    Fault("choice_of_a_lobe_left_out", "slab-area-4", "transport.chains:Chains.event",
-          "(scattering.pdf / chance)", "scattering.pdf"),
+    Fault("choice_of_a_lobe_left_out", "slab-area-4", "transport.bsdf:reflect_or_refract",
+          "weight / chance", "weight"),
+    Fault("only_the_first_lobe_of_a_blend", "blended_mirror", "transport.bsdf:_delta_lobes",
+          "and flag & int(side)", "and flag & int(side) and number == 0"),
+    Fault("edges_of_rectangles_exchanged", "square_0.1-mirrored-3", "scene.edges:edge_normal",
+          "(si.dp_du * u, si.dp_dv, is_flat)", "(si.dp_du * u, si.dp_du, is_flat)"),
+    Fault("hidden_lamps_block_the_view", "hidden_lamp", "estimators.outline_rays:both_sides",
+          "if view.passes_lamps else ray", "if False else ray"),
+    Fault("things_before_the_clip_plane_block_the_view", "hidden_lamp", "estimators.outline_rays:both_sides",
+          " - view.clip", ""),
+    Fault("mirrors_show_no_hidden_lamp", "lamp_in_a_mirror", "transport.camera:camera_walk",
+          "plan.sees_through_lamps and first.begins_path", "plan.sees_through_lamps"),
+    Fault("parallel_light_has_no_edges", "parallel_light", "transport.plan:Plan.finding_beams",
+          "beams = not self.camera and any(", "beams = False and any("),
 ]  # fmt: skip
 
 
@@ -405,6 +417,10 @@ EXACT: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "depth": check_depth, "grazing": lambda monkeypatch: check_grazing(), "contact": check_contact,
     "camera_contact": check_camera_contact, "clear_pane": check_clear_pane,
     "points": lambda monkeypatch: check_points("sensor", False),
+    "hidden_lamp": lambda monkeypatch: check_hidden_lamp(),
+    "lamp_in_a_mirror": lambda monkeypatch: check_lamp_in_a_mirror(),
+    "parallel_light": lambda monkeypatch: check_parallel_light(),
+    "blended_mirror": lambda monkeypatch: check_blended_mirror(),
 }  # fmt: skip
 
 
