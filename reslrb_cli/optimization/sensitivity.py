@@ -8,6 +8,8 @@ the image changes by about 3 %. Then neither rounding nor curvature dominates th
 
     H d = (g(v + h d) - g(v - h d)) / (2 h),   d <- H d / |H d|,   lambda = |H d|
 
+At a bound, the ends are clipped, and the difference is divided by the distance of the clipped ends.
+
 The gradient is divided by lambda and by the number of parameters. If the diagonal blocks of a positive matrix have norm
 1, the matrix norm is at most the number of blocks. A rate of 1 is Newton's step along the steepest direction. Gradient
 descent converges for learning rates below 2, as long as the curvature keeps its initial value.
