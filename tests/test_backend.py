@@ -257,6 +257,38 @@ def test_a_hanging_driver_counts_as_no_gpu(tmp_path: Path, monkeypatch: pytest.M
     assert time.monotonic() - start < 10
 
 
+@pytest.mark.parametrize(
+    ("own", "limits", "expected"),
+    [
+        ("0::/", {"memory.max": (900, 100)}, (900, 800)),
+        ("0::/slurm/job/step", {"slurm/job/memory.max": (500, 100)}, (500, 400)),
+        ("0::/a/b", {"memory.max": (900, 800), "a/memory.max": (300, 50), "a/b/memory.max": (600, 10)}, (300, 100)),
+        ("0::/a/b", {"a/memory.max": ("max", 50)}, None),
+        ("0::/host/only", {"memory.max": (700, 0)}, (700, 700)),  # in a container
+        ("0::/a", {"c/memory.max": (10, 0)}, None),
+        ("5:cpu,memory:/a/b\n4:pids:/a", {"memory/a/memory.limit_in_bytes": (400, 1)}, (400, 399)),
+        ("", {}, None),
+    ],
+)
+def test_limits_of_nested_control_groups_count(
+    own: str, limits: dict[str, tuple[int | str, int]], expected: tuple[int, int] | None, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    before = doctor.memory_bytes("llvm_ad_rgb")
+    monkeypatch.setattr(doctor, "GROUPS", tmp_path)
+    monkeypatch.setattr(doctor, "OWN_GROUPS", tmp_path / "own")
+    (tmp_path / "own").write_text(own)
+    for name, (limit, used) in limits.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(f"{limit}\n")
+        other = "memory.usage_in_bytes" if "limit_in" in name else "memory.current"
+        (tmp_path / name).with_name(other).write_text(f"{used}\n")
+    if expected is None:
+        assert doctor.memory_bytes("llvm_ad_rgb") >= before
+    else:
+        assert (doctor.memory_bytes("llvm_ad_rgb"), doctor.free_bytes("llvm_ad_rgb")) == expected
+
+
 def test_set_variant_logs_its_choice(llvm: str, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
         assert variant.set_variant("llvm_ad_rgb") == "llvm_ad_rgb"

@@ -13,6 +13,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -73,6 +74,33 @@ def of_system(file: str, name: str) -> str | None:
     return found and found[1]
 
 
+#: The control groups of this process, and the folder of all groups.
+OWN_GROUPS, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+
+
+def _group_limits() -> Iterator[tuple[int, int]]:
+    """Yield the limit and the use of memory, in bytes, of each control group around this process.
+
+    Slurm and systemd set limits on nested groups. Version 1 of control groups has other names.
+    """
+    try:
+        lines = OWN_GROUPS.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        kinds, _, path = line.partition(":")[2].partition(":")
+        if kinds and "memory" not in kinds.split(","):
+            continue
+        top = GROUPS / "memory" if kinds else GROUPS
+        names = ("memory.limit_in_bytes", "memory.usage_in_bytes") if kinds else ("memory.max", "memory.current")
+        group = top / path.lstrip("/")
+        for each in (group, *group.parents):  # a container may not see the group, but those above
+            if each.is_relative_to(top):
+                with contextlib.suppress(OSError, ValueError):  # no file, or `max`: no limit
+                    limit, used = (int((each / name).read_text()) for name in names)
+                    yield limit, used
+
+
 def memory_bytes(variant: str) -> int:
     """Return the memory that `variant` can use, in bytes: the GPU's memory, or the part of the machine's memory that
     this process may use.
@@ -80,10 +108,7 @@ def memory_bytes(variant: str) -> int:
     if variant.startswith("cuda"):
         return gpu_bytes("memory.total", 2**40)  # unknown: more than any has, so that it never counts as scarce
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    try:
-        return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    except (OSError, ValueError):  # no control groups, or `max`: no limit
-        return total
+    return min([total, *(limit for limit, _ in _group_limits())])
 
 
 def free_bytes(variant: str) -> int:
@@ -96,10 +121,7 @@ def free_bytes(variant: str) -> int:
     known = [memory_bytes(variant)]
     if available := of_system("/proc/meminfo", "MemAvailable"):
         known.append(int(available.removesuffix(" kB")) * 1024)
-    with contextlib.suppress(OSError, ValueError):
-        group = Path("/sys/fs/cgroup")
-        limit, used = ((group / name).read_text() for name in ("memory.max", "memory.current"))
-        known.append(int(limit) - int(used))
+    known += [limit - used for limit, used in _group_limits()]
     most, _ = resource.getrlimit(resource.RLIMIT_AS)
     if most != resource.RLIM_INFINITY:
         with contextlib.suppress(OSError, ValueError):

@@ -156,15 +156,16 @@ def read_planes(path: Path) -> dict[str, Array]:
     import OpenEXR
 
     content = io.BytesIO(path.read_bytes())
+    planes: dict[str, Array] = {}
     try:
-        parts = OpenEXR.File(content, separate_channels=True).parts
-        return {
-            name: np.asarray(channel.pixels, dtype=np.float32)
-            for part in reversed(parts)  # the first part with a name wins
-            for name, channel in part.channels.items()
-        }
+        file = OpenEXR.File(content, separate_channels=True)
+        file.channels()  # raises an error if no part could be read
+        for part in file.parts:
+            for name, channel in part.channels.items():
+                planes.setdefault(name, np.asarray(channel.pixels, dtype=np.float32))
     except Exception as error:  # damaged files raise many types
         raise ValueError(f"{path}: {error}") from None
+    return planes
 
 
 def read_layers(path: Path) -> dict[str, Array]:

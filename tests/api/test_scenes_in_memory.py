@@ -17,6 +17,7 @@ from runs.going_on import work_alone
 
 import reslrb_cli as rl
 from reslrb_cli.config.loader import load
+from reslrb_cli.scene.images import read_stored
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.xml import dictionary
 from reslrb_cli.scene.xml.dictionary import write_dictionary
@@ -107,6 +108,20 @@ def test_equal_dictionaries_share_a_file(folder: Path) -> None:
     assert first.parent.parent == third.parent.parent == folder / "cache" / "scenes"
     assert first.read_text() == third.read_text()  # only the pixels differ
     assert first != third
+
+
+def test_dictionaries_with_equal_bytes_in_other_shapes_are_apart(folder: Path) -> None:
+    """Each shape of the same 192 numbers is a scene of its own, and is read back as it was given."""
+    values = np.linspace(0, 1, 192, dtype=np.float32)
+    shapes = [(h, 192 // h // c, c) for c in (1, 3) for h in range(1, 65) if 192 % (h * c) == 0]
+    files = {}
+    for shape in shapes:
+        paint = {"type": "diffuse", "reflectance": {"type": "bitmap", "raw": True, "data": mi.TensorXf(values, shape)}}
+        files[shape] = write_dictionary(room(floor={"type": "rectangle", "bsdf": paint}), "<dict>", folder)
+    assert len({*files.values()}) == len(shapes) > 10
+    for shape, file in files.items():
+        [image] = file.parent.glob("*.exr")
+        assert read_stored(image).pixels.shape == shape
 
 
 def test_writing_a_scene_removes_old_ones(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -144,7 +144,7 @@ BAD = {
     "one pixel": ([], "p.exr: is 1 x 1"),
     "no picture": ([], "p.exr: no such file"),
     "no image": ([], "p.exr: is not a readable image"),
-    "too large": ([], "p.exr: is not a readable image"),
+    "too large": ([], "p.exr: is 40000x30000 pixels; an image has at most 134217728 pixels"),
     "not finite": ([], "p.exr: pixel ("),
     "no distance": (["--distance", "0"], "--distance: is 0 mm; it must be above 0"),
     "behind": (["--distance", "-5"], "--distance: is -5 mm; it must be above 0"),
