@@ -1,20 +1,24 @@
 """Terms that attached gradients lack: silhouettes, shadow edges, and light that leaves the film.
 
-`integrator.edges` adds silhouettes and shadow edges (`estimators/edges.py`). Some terms are still missing. Finite
-differences of the image at common random numbers contain all of these terms (`Missing`). F_k is the finite difference
-along direction k, and g_k is the gradient along direction k. There are K directions.
+`integrator.edges` adds silhouettes and shadow edges (`estimators/edges.py`). Some terms are still missing. Images at
+common random numbers contain all of these terms. `Missing` compares images and gradients along K segments. A segment
+k is the part a <= s <= b of the line x + s d_k through the initial values x. w_k is dL/dI at the end of the segment
+with the higher loss.
 
-    m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
+    F_k = <w_k, I(b) - I(a)> / (b - a),   g_k = d_k . gradient of <w_k, I> at a random s,   m_k = F_k - g_k
+    share = sqrt(sum_k E[m_k]^2 / sum_k E[F_k]^2)
 
-E(h) (`extrapolated`) combines the differences of two steps, so that their leading errors cancel. Steps are halved
-repeatedly. The measurement uses the step around which E changes least. Larger steps have truncation errors. Smaller
-steps have rounding errors, or errors of paths that change discontinuously. Rounding errors of the scene's geometry are
-the same for all seeds. The remaining change of E counts as an error if it exceeds the noise. The contribution of noise
-to the squares is subtracted. The reported standard error is the error of the mean over seeds. `MissingCheck` implements
-`gradcheck --missing` for an experiment. With the steps of `choose_step` and no extrapolation, the complete derivative
-of configs/lens_pose.yaml seems to lack 1.1 %.
+F_k is the mean derivative along the segment, whatever its length, and g_k is an unbiased sample of it if nothing is
+missing. Finite differences have no truncation error that could look like a missing part. dL/dI belongs to a displaced
+start. At the initial values themselves, the derivative of the loss may vanish: then any small error would be a large
+share. Along a segment, the image changes by about 3 % (`AIM`), or less if the segment would be longer than `LONGEST`.
 
-`check_missing` measures the missing share before a run's first iteration, and decides `edges: auto`.
+A significant share differs from 0 by Student's t (`MissingRecord.margin`). A run looks at its samples up to `LOOKS`
+times. The limit accounts for all looks and directions. A complete derivative of a parameter counts as incomplete with a
+probability of at most `ALARM`.
+
+`MissingCheck` implements `gradcheck --missing` for an experiment. `check_missing` measures the missing share before a
+run's first iteration, and decides `edges: auto`.
 """
 
 from __future__ import annotations
@@ -33,13 +37,11 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.measure.gradients import (
     REACH,
-    STEPS,
     UNITS,
     Case,
     Direction,
     all_directions,
     embed,
-    extrapolated,
     moves_light,
     seeds,
     smooth_rows,
@@ -51,108 +53,185 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import as_decided, is_auto
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
-from reslrb_cli.optimization.views import View
+from reslrb_cli.optimization.sensitivity import AIM, take_gradient
+from reslrb_cli.optimization.views import View, to_tensor
 from reslrb_cli.records.decisions import Decision
-from reslrb_cli.records.measurements import NOTHING, MissingRecord
+from reslrb_cli.records.measurements import LOOKS, MissingRecord, student
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.edges import has_edges
 from reslrb_cli.scene.needs import camera_finds_all
 from reslrb_cli.statistics import jackknife_variance
 
-#: Seeds for choosing steps, and the minimum for a share.
-PILOT_SEEDS, FEWEST = 4, 4
+#: Minimum number of seeds for a share, and the factor from one look at the samples to the next.
+FEWEST, GROWTH = 8, 4
 
-#: Number of times that the largest step is halved.
-HALVINGS = 8
+#: Longest and shortest segment to either side, as fractions of a direction.
+LONGEST, SHORTEST = 0.1, 0.001
+
+#: Seeds of the images that decide the length of a segment.
+PILOTS = seeds(2, 9)
+
+
+@dataclass(frozen=True)
+class LineSegment:
+    """Values x + s `vector` with `low` <= s <= `high`, where x (P,) are the initial values. `weights` has dL/dI of each
+    view, (H, W, C).
+    """
+
+    vector: np.ndarray
+    low: float
+    high: float
+    weights: Sequence[np.ndarray] = ()
+
+
+@dataclass
+class Tracing:
+    """Images and gradients at values along segments, for one case per view.
+
+    `images` and `gradients` are the integrators. `spent` counts the samples per pixel of images and gradients.
+    """
+
+    cases: Sequence[Case]
+    images: Any
+    gradients: Any
+    spp: int
+    spent: int = 0
+
+    def move(self, vector: np.ndarray, s: float) -> None:
+        """Set the scene's values to x + s `vector`."""
+        case = self.cases[0]
+        case.set({key: case.initial[key] + s * vector[at] for key, at in case.places.items()})
+
+    def segment(self, direction: Direction, trials: int = 4) -> LineSegment:
+        """Return a segment without weights. Up to `trials` lengths are tried, until the image changes by about `AIM`
+        along the segment.
+        """
+        step, back = LONGEST, 1.0 if direction.sides == "both" else 0.0
+        for _ in range(trials):
+            change = self._change(direction.vector, -back * step, step)
+            if change <= 2 * AIM or step == SHORTEST:
+                break
+            step = max(step * AIM / change, SHORTEST)
+        return LineSegment(direction.vector, -back * step, step)
+
+    def _change(self, vector: np.ndarray, low: float, high: float) -> float:
+        """Return the change of the images from `low` to `high` relative to their size. Products of two independent
+        images have no bias from noise.
+        """
+        first, second = ([self._see(vector, s, seed) for s in (low, high)] for seed in PILOTS)
+        change = size = 0.0
+        for a, b, c, d in zip(*first, *second, strict=True):
+            change += float(np.sum((b - a) * (d - c)))
+            size += float(np.sum(a * c))
+        return float(np.sqrt(max(change, 0.0) / size)) if size > 0 else 0.0
+
+    def _see(self, vector: np.ndarray, s: float, seed: int) -> list[np.ndarray]:
+        """Return the images (H, W, C) of all views at x + s `vector`."""
+        self.move(vector, s)
+        self.spent += self.spp
+        return [case.image(self.images, seed, self.spp) for case in self.cases]
+
+    def sample(self, segment: LineSegment, seed: int) -> tuple[float, float]:
+        """Return the difference along a segment and the gradient at a random point of it, both for one seed."""
+        ends = [
+            sum(float(np.sum(image * weights)) for image, weights in zip(images, segment.weights, strict=True))
+            for images in (self._see(segment.vector, s, seed) for s in (segment.low, segment.high))
+        ]
+        self.move(segment.vector, np.random.default_rng(seed).uniform(segment.low, segment.high))
+        self.spent += self.spp
+        gradient = 0.0
+        for case, weights in zip(self.cases, segment.weights, strict=True):
+            case.weigh(weights)
+            row = case.gradient(self.gradients, seed, self.spp, step=case.known_step)
+            gradient += float(segment.vector @ row)
+        return (ends[1] - ends[0]) / (segment.high - segment.low), gradient
+
+    def weigh(self, segment: LineSegment, problem: Problem, views: Sequence[View], spp: int) -> LineSegment:
+        """Return the segment with the weights dL/dI at its end with the higher loss."""
+        found: list[tuple[float, list[np.ndarray]]] = []
+        for s in (segment.high, segment.low):
+            self.move(segment.vector, s)
+            self.spent += spp
+            loss, weights = 0.0, []
+            for case, view in zip(self.cases, views, strict=True):
+                view.follow(problem.scene)
+                image = problem.render(view.sensor, spp, 0, "missing")
+                loss += float(view.compare(to_tensor(image))[0]) * view.share
+                slope = problem.image_gradient(view, image).astype(np.float64)[:, :, : case.weights.shape[2]]
+                weights.append(np.nan_to_num(slope) * view.share)
+            found.append((loss, weights))
+        weights = max(found, key=lambda each: each[0])[1]
+        # The size of dL/dI does not affect a share, and tiny numbers would vanish in the rounding of a sum.
+        size = max(float(np.abs(each).mean()) for each in weights) or 1.0
+        return replace(segment, weights=[each / size for each in weights])
 
 
 @dataclass
 class Missing:
-    """Samples of one parameter's derivatives along K directions, for N seeds. `ours` has N arrays (K,), and
-    `differences` has N arrays (3, K).
-
-    The three differences use one, two and four times the direction's step.
+    """Samples of one parameter's derivatives along K segments, for N seeds: N arrays (K,) of differences and of
+    gradients (`ours`).
     """
 
-    directions: list[Direction]
+    segments: list[LineSegment]
     ours: list[np.ndarray] = field(default_factory=list)
     differences: list[np.ndarray] = field(default_factory=list)
 
-    @staticmethod
-    def of(case: Case, differenced: Any, directions: Sequence[Direction], spp: int) -> Missing:
-        """Create a collection without samples. Choose a step for each direction."""
-        return Missing([_with_step(case, differenced, direction, spp) for direction in directions])
-
-    def take(self, case: Case, tracer: Any, differenced: Any, seed: int, spp: int, step: Callable) -> None:
-        """Add one seed. `step` is the gradient step with known dL/dI."""
-        gradient = case.gradient(tracer, seed, spp, step=step)
-        along = self.directions
-        self.ours.append(np.array([gradient @ one.vector for one in along]))
-        found = [_differences(case, differenced, one, [one.step * k for k in (1, 2, 4)], seed, spp) for one in along]
-        self.differences.append(np.transpose(found))
+    def take(self, tracing: Tracing, seed: int) -> None:
+        """Add one seed."""
+        found = np.array([tracing.sample(segment, seed) for segment in self.segments])
+        self.differences.append(found[:, 0])
+        self.ours.append(found[:, 1])
 
     @property
     def count(self) -> int:
         """The number of seeds."""
         return len(self.ours)
 
-    def share(self) -> tuple[float, float] | None:
-        """Return the share and its standard error, or None if the differences are not significantly different
-        from 0.
-        """
-        near, far, farthest = np.stack(self.differences, 1)
-        whole = extrapolated(near, far)
-        missing = whole - np.stack(self.ours)
-        change, noise = _mean(whole - extrapolated(far, farthest))
-        left = np.square(np.where(np.abs(change) > NOTHING * noise, change, 0))
-        return share_of(whole, missing, left)
+    def record(self, case: str, parameter: str) -> MissingRecord:
+        """Return the parameter's record. It has no share if the differences are not significantly different from 0."""
+        share = None
+        if self.count > 1:
+            whole = np.stack(self.differences)
+            share = share_of(whole, whole - np.stack(self.ours))
+        value, error = share or (None, None)
+        return MissingRecord(case, parameter, value, error, len(self.segments), self.count)
 
 
-def share_of(whole: np.ndarray, missing: np.ndarray, left: np.ndarray) -> tuple[float, float] | None:
+def share_of(whole: np.ndarray, missing: np.ndarray) -> tuple[float, float] | None:
     """Return the share of `missing` in `whole`, and the share's standard error. Both arguments are samples (N, K).
 
-    Returns None if `whole` is not significantly different from 0. `left` (K,) has the squared errors of `whole` that
-    are equal for all seeds.
+    Returns None if `whole` is not significantly different from 0.
     """
+    limit = student(*whole.shape)
     mean, error = _mean(whole)
     size = np.square(mean).sum() - np.square(error).sum()
-    if size <= NOTHING**2 * np.square(error).sum():
+    if size <= limit**2 * np.square(error).sum():
         return None
     part, error = _mean(missing)
-    found = _ratio(missing, whole)
-    if np.square(part).sum() <= NOTHING**2 * (np.square(error) + left).sum():
-        return found, float(np.sqrt((np.square(error) + left).sum() / size))
+    count, sums = len(whole), (_sums(missing), _sums(whole))
+    found = float(_ratio(count, *sums))
+    if np.square(part).sum() <= limit**2 * np.square(error).sum():
+        return found, float(np.sqrt(np.square(error).sum() / size))
     # The noise of the part and of the whole: leave out one seed at a time (jackknife).
-    without = [_ratio(np.delete(missing, i, 0), np.delete(whole, i, 0)) for i in range(len(whole))]
-    variance = jackknife_variance(np.array(without))
-    truncation = (np.square(part) @ left) / np.square(part).sum() / size
-    # An error of the whole changes the share more if the whole is small.
-    return found, float(np.sqrt(variance + truncation * max(found, 1.0) ** 2))
+    without = [[total - own for total, own in zip(each, (samples, np.square(samples)), strict=True)]
+               for each, samples in zip(sums, (missing, whole), strict=True)]  # fmt: skip
+    return found, float(np.sqrt(jackknife_variance(_ratio(count - 1, *without))))
 
 
-def _ratio(missing: np.ndarray, whole: np.ndarray) -> float:
-    """Return rms(`missing`) / rms(`whole`) for samples (N, K), where rms is the root mean square. The part due to noise
-    is subtracted.
+def _sums(samples: np.ndarray) -> list[np.ndarray]:
+    """Return the sums (K,) of samples (N, K), and of their squares."""
+    return [samples.sum(0), np.square(samples).sum(0)]
+
+
+def _ratio(count: int, part: Sequence[np.ndarray], whole: Sequence[np.ndarray]) -> np.ndarray:
+    """Return rms(part) / rms(whole), where rms is the root mean square of means (..., K). The arguments are sums of
+    `count` samples and of their squares. The part due to noise is subtracted.
     """
-    squares = [np.square(mean).sum() - np.square(error).sum() for mean, error in (_mean(missing), _mean(whole))]
-    return float(np.sqrt(max(squares[0], 0.0) / squares[1]))
-
-
-def _with_step(case: Case, differenced: Any, direction: Direction, spp: int) -> Direction:
-    steps = [STEPS[0] / 2**number for number in range(HALVINGS)]
-    pilot = seeds(PILOT_SEEDS, 9)
-    found = np.transpose([_differences(case, differenced, direction, steps, seed, spp) for seed in pilot])
-    change, noise = _mean(np.diff(extrapolated(found[1:], found[:-1]), axis=0).T)
-    # Difference from step to step; agreement with both neighbours is no coincidence.
-    changed = np.abs(change) + noise
-    return replace(direction, step=steps[2 + int(np.argmin(changed[:-1] + changed[1:]))])
-
-
-def _differences(
-    case: Case, differenced: Any, direction: Direction, steps: Sequence[float], seed: int, spp: int
-) -> list[float]:
-    return [case.difference(differenced, direction.vector, seed, spp, step, direction.sides) for step in steps]
+    sizes = []
+    for total, squares in (part, whole):
+        mean = np.square(total / count)
+        sizes.append((mean - (squares / count - mean) / (count - 1)).sum(-1))
+    return np.asarray(np.sqrt(np.maximum(sizes[0], 0) / sizes[1]))
 
 
 def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -170,8 +249,8 @@ ESTIMATOR = "reslrb:stack"
 class MissingCheck:
     """The measurement of missing terms on a loaded experiment. A variant must be set.
 
-    dL/dI is that of the experiment's loss at the initial values, and stays fixed. `count` is the number
-    of seeds. Raises ConfigError and UnsupportedScene.
+    dL/dI is that of the loss at displaced values (`LineSegment`), and stays fixed. `count` is the number of seeds.
+    Raises ConfigError and UnsupportedScene.
     """
 
     def __init__(self, config: Config, budget_s: float, count: int | None, spp: int | None) -> None:
@@ -179,19 +258,18 @@ class MissingCheck:
         depth = config.integrator.max_depth
         own_paths = config.integrator.options().get("paths", "auto")
         [listed] = parse_cases(ESTIMATOR + ("(paths=auto)" if own_paths == "auto" else ""))
-        problem = assemble(listed.at(config, depth, known=True, auto=True).with_exposures_fixed())
+        self._problem = problem = assemble(listed.at(config, depth, known=True, auto=True).with_exposures_fixed())
         self.source, sensor = str(config.source), problem.sensors[0]
         self.case = Case(problem.scene, problem.selection.keys, sensor, problem.selection)
         height, width, _ = self.case.weights.shape
         self.spp = spp or max(PATHS // (height * width), 1)
-        if not _weigh(problem, problem.views[:1], [self.case], max(IMAGE_PATHS // (height * width), 1)):
-            reason = "has no derivative at the initial values, which equal those of the target"
-            raise ConfigError(self.source, "loss", reason)
+        self._image_spp = max(IMAGE_PATHS // (height * width), 1)
         options = problem.config.integrator.options() | {"paths": problem.paths}
         options["edges"] = "off" if config.integrator.options().get("edges") == "off" else "on"
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")} | {"paths": problem.paths}
-        self._tracer = make_integrator("reslrb", **options, freeze=True)
-        self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
+        rr_depth = NEVER if ends(depth) else options["rr_depth"]
+        self._tracing = Tracing([self.case], make_integrator("walk_ad", **shared, rr_depth=rr_depth),
+                                make_integrator("reslrb", **options, freeze=True), self.spp)  # fmt: skip
         self._directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, MOVING_DIRECTIONS)
         #: By parameter, in the order of `case.keys`, as far as measured.
         self._found: dict[str, Missing] = {}
@@ -199,7 +277,7 @@ class MissingCheck:
     def conditions(self) -> str:
         """Describe the measurement in one line."""
         height, width, _ = self.case.weights.shape
-        return f"{self.source}, film {width}x{height}, {self.spp} spp, dL/dI of the loss at the initial values"
+        return f"{self.source}, film {width}x{height}, {self.spp} spp, dL/dI of the loss beside the initial values"
 
     def run(self, stop: Callable[[], bool], between: Callable[[], None] = lambda: None) -> Iterator[MissingRecord]:
         """Measure the parameters in turn until `stop()`. Each parameter gets a share of the budget. `between` is called
@@ -211,49 +289,31 @@ class MissingCheck:
             now = time.perf_counter()
             end = now + (self._budget - (now - self._start)) / (len(self.case.keys) - place)
             self._measure(key, end, stop, between)
-            yield self._record(key)
+            yield self._found[key].record(self.source, key)
 
     def known(self) -> list[MissingRecord]:
         """Return the results of all parameters with enough seeds, in the order of the parameters."""
         least = min(FEWEST, self._count or FEWEST)
-        return [self._record(key) for key, found in self._found.items() if found.count >= least]
+        return [found.record(self.source, key) for key, found in self._found.items() if found.count >= least]
 
     def _measure(self, key: str, end: float, stop: Callable[[], bool], between: Callable[[], None]) -> None:
-        found = self._found[key] = Missing.of(self.case, self._differenced, self._directions[key], self.spp)
+        problem, segments = self._problem, [self._tracing.segment(each) for each in self._directions[key]]
+        segments = [self._tracing.weigh(each, problem, problem.views[:1], self._image_spp) for each in segments]
+        if not any(np.any(weights) for segment in segments for weights in segment.weights):
+            raise ConfigError(self.source, "loss", f"has no derivative beside the initial value of {key}")
+        found = self._found[key] = Missing(segments)
         for seed in seeds(self._count or 10**6):
             enough = found.count >= FEWEST and (stop() or (self._count is None and time.perf_counter() > end))
             if enough:
                 break
-            found.take(self.case, self._tracer, self._differenced, seed, self.spp, self.case.known_step)
+            found.take(self._tracing, seed)
             between()
-
-    def _record(self, key: str) -> MissingRecord:
-        found = self._found[key]
-        share, error = found.share() or (None, None)
-        return MissingRecord(self.source, key, share, error, len(found.directions), found.count)
-
-
-def _weigh(problem: Problem, views: Sequence[View], cases: Sequence[Case], spp: int) -> bool:
-    """Set the weights of each view's case to dL/dI of the loss at the problem's values. Return whether any is not 0."""
-    weights = []
-    for case, view in zip(cases, views, strict=True):
-        gradient = problem.image_gradient(view, problem.render(view.sensor, spp, 0, "missing"))
-        weights.append(np.nan_to_num(gradient.astype(np.float64)[:, :, : case.weights.shape[2]]) * view.share)
-    # The size of dL/dI does not affect a share, and tiny numbers would vanish in the rounding of a sum.
-    size = max(float(np.abs(each).mean()) for each in weights)
-    for case, each in zip(cases, weights, strict=True):
-        case.weigh(each / (size or 1.0))
-    return size > 0
 
 
 # --- before a run's first iteration -----------------------------------------------------------------------------------
 
-#: Longest and shortest step of the differences, in tenths of the size of the moving object. A longer step has less
-#: noise at edges, and a larger truncation error.
-LONGEST, SHORTEST = 0.25, 0.01
-
 #: Maximum numbers of seeds and views.
-MOST_SEEDS, MOST_VIEWS = 64, 4
+MOST_SEEDS, MOST_VIEWS = FEWEST * GROWTH ** (LOOKS - 1), 4
 
 
 def check_missing(
@@ -262,30 +322,21 @@ def check_missing(
     """Measure the missing share of the loss's derivative before a run, for each parameter that moves light. Return the
     problem, and one record per parameter.
 
-    With `integrator.edges: auto`, edges are turned on in the returned problem if a significant share is missing
-    without them, or if the share is unknown. `say` then receives this decision, and the share is measured again. If
-    everything that moves has known edges, and edges are on, records of unknown shares are dropped.
+    With `integrator.edges: auto`, edges are turned on in the returned problem if a significant share is missing without
+    them, or if the share is unknown. The share is then measured again. If it is not smaller with edges, edges stay off.
+    `say` receives the decision. If everything that moves has known edges, and edges are on, records of unknown shares
+    are dropped.
 
     `warn` receives one line if a derivative is incomplete, or if its missing share is unknown. Raises ConfigError if a
-    missing share exceeds one half by more than two standard errors, unless `run.accept_incomplete` is true.
+    significant missing share exceeds one half, unless `run.accept_incomplete` is true.
     """
     config, found = problem.config, measure_missing(problem)
     moving = where_moved(problem.selection.params, problem.selection.scene_keys)
     edged = [item for item in moving if not item.is_shape or has_edges(item.node)]
     tracer = problem.integrator if edged and isinstance(problem.integrator, LightTracer) else None
     if tracer is not None and is_auto(config, "edges") and found:
-        lacking = [record for record in found if record.is_incomplete]
-        why = "no significant part of the derivative is missing without them"
-        if lacking:
-            clear = next((record for record in lacking if not record.is_unknown), lacking[0])
-            amount = "an unknown share" if clear.is_unknown else clear.percent()
-            why = f"without them, the derivative of {clear.parameter} lacks {amount}"
-        decision = Decision(setting="edges", value="on" if lacking else "off", why=why)
-        tracer = as_decided(tracer, [decision])
-        problem = replace(problem, decisions=[*problem.decisions, decision], integrator=tracer)
-        if lacking:
-            say(f"chosen by measurement: {decision.line()}")
-            found = measure_missing(problem)
+        problem, found = _decide_edges(problem, tracer, found, say)
+        tracer = problem.integrator
     has_edge_terms = tracer is not None and "edges" in tracer.preparation.sampling.on
     if has_edge_terms and len(edged) == len(moving):
         found = [record for record in found if not record.is_unknown]
@@ -294,7 +345,7 @@ def check_missing(
         return problem, found
     line, way = "; ".join(record.line() for record in told), "integrator.type=prb_projective includes all of it"
     helps = camera_finds_all(problem.scene, config.integrator.max_depth)
-    if tracer is not None and not has_edge_terms:
+    if tracer is not None and not has_edge_terms and not is_auto(config, "edges"):
         way, helps = "integrator.edges=on includes silhouettes and shadow edges", True
     if any(record.is_for_the_most_part for record in told) and not config.run.accept_incomplete:
         first = f"--set {way}, and" if helps else "the steps would have wrong directions;"
@@ -302,6 +353,33 @@ def check_missing(
                                                             "anyway")  # fmt: skip
     warn(f"{line}; --set {way}" if helps else line)
     return problem, found
+
+
+def _decide_edges(
+    problem: Problem, tracer: LightTracer, found: list[MissingRecord], say: Callable[[str], None]
+) -> tuple[Problem, list[MissingRecord]]:  # fmt: skip
+    """Return the problem with `edges` on or off, and the records of the shares that are then missing. `found` are the
+    records without edges.
+    """
+
+    def decided(value: str, why: str) -> Problem:
+        decision = Decision(setting="edges", value=value, why=why)
+        if lacking:
+            say(f"chosen by measurement: {decision.line()}")
+        decisions = [*problem.decisions, decision]
+        return replace(problem, decisions=decisions, integrator=as_decided(tracer, [decision]))
+
+    lacking = [record for record in found if record.is_incomplete]
+    if not lacking:
+        return decided("off", "no significant part of the derivative is missing without them"), found
+    edges_on = replace(problem, integrator=as_decided(tracer, [Decision(setting="edges", value="on", why="")]))
+    after = {record.parameter: record for record in measure_missing(edges_on)}
+    clear = next((record for record in lacking if not record.is_unknown), lacking[0])
+    if not any(record.is_reduced_to(after.get(record.parameter)) for record in lacking):
+        why = f"the derivative of {clear.parameter} lacks {clear.percent()} without them, and as much with them"
+        return decided("off", why), found
+    amount = "an unknown share" if clear.is_unknown else clear.percent()
+    return decided("on", f"without them, the derivative of {clear.parameter} lacks {amount}"), list(after.values())
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:
@@ -330,104 +408,65 @@ class _Short:
 
     def __init__(self, problem: Problem, keys: Sequence[str]) -> None:
         self.problem, self.keys, run = problem, keys, problem.config.run
-        self._integrator = unrecorded(problem.integrator)
-        if isinstance(self._integrator, LightTracer):
-            self._integrator = self._integrator.to_measure()
+        integrator = problem.integrator
+        if isinstance(integrator, LightTracer):
+            integrator = integrator.to_measure()
         self._views = problem.trained[:MOST_VIEWS]
-        self._spp = min(max(run.spp // 4, 1), problem.samples_per_pass or run.spp)
-        self._left = run.measuring * run.iterations * run.spp * len(problem.drawn(0)) / len(self._views)
-        self._cases = [Case(problem.scene, keys, view.sensor, problem.selection) for view in self._views]
+        cases = [Case(problem.scene, keys, view.sensor, problem.selection) for view in self._views]
+        spp = min(max(run.spp // 16, 1), problem.samples_per_pass or run.spp)
+        self.tracing = Tracing(cases, integrator, integrator, spp)
+        self._limit = run.measuring * run.iterations * run.spp * len(problem.drawn(0)) / len(self._views)
         sizes = [_size(item.node.bbox()) for item in where_moved(self._params, problem.selection.scene_keys)
                  if item.is_shape]  # fmt: skip
         self._extent = min([size for size in sizes if size > 0], default=_size(problem.scene.bbox()))
-        self._rows = {key: self._directions(key) for key in keys}
-        self._ours: list[np.ndarray] = []
 
     @property
     def _params(self) -> Any:
         return self.problem.selection.params
 
-    def _directions(self, key: str) -> list[np.ndarray]:
+    def directions(self, key: str) -> list[Direction]:
         """Return the directions of a parameter. A small parameter has one direction for each entry. A large parameter
         has two smooth directions.
         """
-        case = self._cases[0]
+        case = self.tracing.cases[0]
         size, value = case.initial[key].size, case.values.value(key)
         if size > SMALL:
             rows = smooth_rows(key, value, self._extent, 2)
         else:
             rows = list((UNITS.get(key.rpartition(".")[2]) or REACH * self._extent) * np.eye(size))
-        return [embed(case, key, row) for row in rows]
+        return [Direction(embed(case, key, row), "both") for row in rows]
 
     def measure(self) -> list[MissingRecord]:
-        """Measure all parameters with the shortest step, and those whose share stays open also with longer steps. Each
-        of these gets an equal part of the remaining samples.
-
-        If the samples are too few, or if dL/dI is zero, all records have no share.
-        """
-        image_spp = 2 * self.problem.config.run.spp
-        too_few = image_spp + FEWEST * self._spp_of_seed(*self.keys) > self._left
-        if too_few or not _weigh(self.problem, self._views, self._cases, image_spp):
-            return [self._record(key, []) for key in self.keys]
-        self._left -= image_spp
-        records = {key: self._record(key, [self._difference(key, SHORTEST, seed) for seed in seeds(FEWEST)])
-                   for key in self.keys}  # fmt: skip
-        still_open = [key for key, record in records.items() if not record.is_decided]
-        for place, key in enumerate(still_open):
-            records[key] = self._look_longer(records[key], self._left * (1 - 1 / (len(still_open) - place)))
-        return list(records.values())
-
-    def _spp_of_seed(self, *keys: str) -> int:
-        """Return the maximum number of samples per pixel for one seed of these parameters."""
-        return (1 + 2 * sum(len(self._rows[key]) for key in keys)) * self._spp
-
-    def _look_longer(self, found: MissingRecord, kept: float) -> MissingRecord:
-        """Measure a share with longer steps. `found` is the record of the shortest step. It is returned if the samples
-        are too few. `kept` samples per pixel remain for other parameters.
-
-        A truncation error of the differences looks like a missing part. If a part seems to be missing, the step is
-        therefore halved. The change of the differences is then their error.
-        """
-        key, step = found.parameter, LONGEST
-        cost, before = self._spp_of_seed(key), np.zeros(len(self._rows[key]))
-        while step > SHORTEST and self._left - FEWEST * cost >= kept and not found.is_decided:
-            samples = [self._difference(key, step, seed) for seed in seeds(FEWEST)]
-            found = self._record(key, samples)
-            for seed in seeds(MOST_SEEDS)[FEWEST:]:
-                if found.is_decided or self._left - cost < kept:
-                    break
-                samples.append(self._difference(key, step, seed))
-                found = self._record(key, samples)
-            if found.is_unknown or not found.is_incomplete:
-                break
-            mean = np.mean(samples, axis=0)
-            found, before, step = self._record(key, samples, np.square(mean - before)), mean, step / 2
+        """Measure all parameters. Each one gets an equal part of the samples that the earlier ones left."""
+        found = []
+        for place, key in enumerate(self.keys):
+            left = self._limit - self.tracing.spent
+            found.append(self.measured(key, self.tracing.spent + left / (len(self.keys) - place)))
         return found
 
-    def _record(self, key: str, samples: list[np.ndarray], left: np.ndarray | float = 0.0) -> MissingRecord:
-        """Return the parameter's record from samples (K,) of differences. `left` has the squared errors of their
-        mean that are equal for all seeds. Without samples, the record has no share.
+    def measured(self, key: str, end: float) -> MissingRecord:
+        """Measure one parameter, as long as `Tracing.spent` does not exceed `end`. If the samples are too few, or if
+        dL/dI is zero, the record has no share.
         """
-        share = None
-        if samples:
-            for seed in seeds(MOST_SEEDS)[len(self._ours) : len(samples)]:
-                self._left -= self._spp
-                gradient = sum(case.gradient(self._integrator, seed, self._spp, step=case.known_step)
-                               for case in self._cases)  # fmt: skip
-                self._ours.append(np.asarray(gradient))
-            whole = np.array(samples)
-            ours = np.array([[row @ gradient for row in self._rows[key]] for gradient in self._ours[: len(whole)]])
-            share = share_of(whole, whole - ours, np.broadcast_to(left, whole.shape[1]))
-        value, error = share or (None, None)
-        source, along = str(self.problem.config.source), len(self._rows[key])
-        return MissingRecord(source, key, value, error, along, len(samples))
-
-    def _difference(self, key: str, step: float, seed: int) -> np.ndarray:
-        """Return the differences of the loss along all directions of a parameter, (K,)."""
-        rows = self._rows[key]
-        self._left -= 2 * len(rows) * self._spp
-        return np.sum([[case.difference(self._integrator, row, seed, self._spp, step) for row in rows]
-                       for case in self._cases], axis=0)  # fmt: skip
+        tracing, directions, problem = self.tracing, self.directions(key), self.problem
+        source, image_spp = str(problem.config.source), max(problem.config.run.spp // 4, 1)
+        at_a_seed, found = 3 * tracing.spp * len(directions), Missing([])
+        trial = 2 * len(PILOTS) * tracing.spp * len(directions)
+        left = end - tracing.spent - 2 * image_spp * len(directions) - FEWEST * at_a_seed
+        if left >= trial:
+            segments = [tracing.segment(direction, min(int(left // trial), 4)) for direction in directions]
+            found = Missing([tracing.weigh(each, problem, self._views, image_spp) for each in segments])
+        if not any(np.any(weights) for segment in found.segments for weights in segment.weights):
+            return MissingRecord(source, key, None, None, len(directions), 0)
+        look, most = FEWEST, min(MOST_SEEDS, int((end - tracing.spent) // at_a_seed))
+        for seed in seeds(most):
+            found.take(tracing, seed)
+            if found.count in (look, most):
+                look *= GROWTH
+                record = found.record(source, key)
+                if record.is_decided:
+                    break
+        return record
 
 
 def _size(box: Any) -> float:

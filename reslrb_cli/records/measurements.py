@@ -8,6 +8,7 @@ from __future__ import annotations
 import enum
 import functools
 import json
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -16,6 +17,7 @@ from typing import Any, ClassVar, Literal, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from reslrb_cli.records.metrics import Line, finite
+from reslrb_cli.statistics import special
 
 
 class BenchStatus(str, enum.Enum):
@@ -343,8 +345,9 @@ class Band:
         return cls(statistics.median(values), min(values), max(values)) if values else None
 
 
-#: A missing share within this many standard errors counts as zero.
-NOTHING = 3
+#: Probability that a complete derivative of a parameter counts as incomplete, and the maximum number of looks at its
+#: samples.
+ALARM, LOOKS = 0.005, 4
 
 #: Missing share that rounding in single precision can cause.
 LEAST = 1e-4
@@ -355,15 +358,27 @@ NOTICED, HALF = 0.05, 0.5
 #: Standard error of the share that is small enough.
 KNOWN = 0.03
 
+#: Standard errors by which edges must reduce a share to stay on. The samples of both measurements have common seeds, so
+#: that the true error is smaller.
+REDUCED = 2
+
 #: Verdict on a parameter with an incomplete derivative.
 INCOMPLETE = "derivative incomplete"
+
+
+def student(seeds: int, directions: int) -> float:
+    """Return how many standard errors make a mean over `seeds` samples significant (Student's t). The limit accounts
+    for all looks and all directions (Bonferroni).
+    """
+    return float(special().stdtrit(seeds - 1, 1 - ALARM / (2 * LOOKS * directions)))
 
 
 @dataclass(frozen=True)
 class MissingRecord(Line):
     """Share of a parameter's derivative that the attached gradient lacks, relative to finite differences.
 
-    `share` and `standard_error` are None if noise hides the derivative, or if nothing was measured (`seeds` is 0).
+    `share` and `standard_error` are None if noise hides the derivative, or if nothing was measured (`seeds` is 0). The
+    gradient was sampled along `directions`, with `seeds` independent samples.
     """
 
     case: str
@@ -375,27 +390,44 @@ class MissingRecord(Line):
     kind: Literal["missing"] = "missing"
 
     @property
+    def margin(self) -> float:
+        """Half of the share's confidence interval. The probability that any look at the samples finds a complete
+        derivative outside of the interval is at most `ALARM`.
+        """
+        if self.standard_error is None or self.seeds < 2:
+            return math.inf
+        return student(self.seeds, self.directions) * self.standard_error
+
+    @property
     def is_unknown(self) -> bool:
         """True if there is no share, or if the share's interval includes both 0 and a value above one half."""
-        if self.share is None or self.standard_error is None:
-            return True
-        margin = NOTHING * self.standard_error
-        return self.share <= margin and self.share + margin > HALF
+        return self.share is None or (self.share <= self.margin and self.share + self.margin > HALF)
 
     @property
     def is_incomplete(self) -> bool:
         """True if the missing share is unknown, or so large that the recovered values are unreliable."""
-        return self.is_unknown or (self.share or 0) > max(NOTHING * (self.standard_error or 0), NOTICED)
+        return self.is_unknown or (self.share or 0) > max(self.margin, NOTICED)
 
     @property
     def is_for_the_most_part(self) -> bool:
-        """True if the missing share exceeds one half by more than two standard errors."""
-        return self.share is not None and self.share - 2 * (self.standard_error or 0) > HALF
+        """True if the whole interval of the missing share is above one half."""
+        return self.share is not None and self.share - self.margin > HALF
 
     @property
     def is_decided(self) -> bool:
-        """True if more seeds would hardly change whether the derivative is incomplete."""
-        return not self.is_unknown and (self.is_incomplete or (self.standard_error or 0) < KNOWN)
+        """True if more seeds would hardly change whether the derivative is incomplete, or for the most part missing."""
+        if self.share is None or self.is_unknown:
+            return False
+        if self.is_incomplete:
+            return self.is_for_the_most_part or self.share + self.margin <= HALF
+        return (self.standard_error or 0) < KNOWN
+
+    def is_reduced_to(self, other: MissingRecord | None) -> bool:
+        """True if `other`, the record with edges, may lack less: its share is smaller, or one of the two is unknown."""
+        if other is None or other.share is None or self.share is None or self.is_unknown or other.is_unknown:
+            return True
+        errors = (self.standard_error or 0, other.standard_error or 0)
+        return self.share - other.share > REDUCED * math.hypot(*errors)
 
     def percent(self) -> str:
         """Return the share in words."""
@@ -418,7 +450,7 @@ class MissingRecord(Line):
                 f"{self.parameter}: {self.seeds} seeds cannot determine the missing share of the derivative "
                 f"({figures}; silhouettes, shadow edges, light that leaves the film)"
             )
-        if self.share <= max(NOTHING * self.standard_error, LEAST):
+        if self.share <= max(self.margin, LEAST):
             return f"{self.parameter}: {self.seeds} seeds detect no missing part of the derivative ({figures})"
         return (
             f"{self.parameter}: {figures} of the derivative is missing (silhouettes, shadow edges, light that leaves "
