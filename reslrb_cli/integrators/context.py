@@ -35,7 +35,7 @@ from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.edges import EdgeSet, has_edges
 from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
 from reslrb_cli.scene.load import warn_once
-from reslrb_cli.scene.needs import blend_warning, check_paths, is_bent, scene_needs, usual_paths
+from reslrb_cli.scene.needs import blend_warning, check_paths, is_bent, light_finds_all, scene_needs, usual_paths
 from reslrb_cli.scene.upsampling import values_of
 from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
@@ -142,8 +142,8 @@ class AboutScene:
     others: list[mi.Sensor] = field(default_factory=list)
     #: Plans of images, by sensor, kind of paths, and whether something moves.
     plans: dict[tuple[mi.Sensor, str, bool], Plan] = field(default_factory=dict)
-    #: The paths for `paths: auto`, by sensor and whether shapes move.
-    usual: dict[tuple[mi.Sensor, bool], str] = field(default_factory=dict)
+    #: The paths for `paths: auto`, by sensor, whether anything moves, and whether only light paths have the derivative.
+    usual: dict[tuple[mi.Sensor, bool, bool], str] = field(default_factory=dict)
     #: BSDFs of its surfaces that use a node; the entry None has all of them.
     owners: dict[mi.Object | None, list[mi.BSDF]] = field(default_factory=dict)
     #: By parameters and the objects that have them.
@@ -313,13 +313,25 @@ class Preparation:
     def _usual_paths(
         self, scene: mi.Scene, sensor: mi.Sensor, about: AboutParameters | None, forward: bool
     ) -> str:  # fmt: skip
-        """Return the kinds of paths for `paths: auto`: those of a run that measures nothing."""
+        """Return the kinds of paths for `paths: auto`: those of a run that measures nothing. Warn, once, if the
+        derivative lacks light that the image has.
+        """
         moves = about is not None and about.which.moves_light
-        if about is not None and moves and (forward or not about.only_shapes_move):
-            return "light"  # other paths have no such derivatives
-        made, key = self._found.usual, (sensor, moves)
-        if key not in made:
+        alone = about is not None and moves and (forward or not about.only_shapes_move)
+        made, key = self._found.usual, (sensor, moves, alone)
+        if key in made:
+            return made[key]
+        if not alone:
             made[key] = usual_paths(scene, [sensor], self._depths[0], self._hide_emitters, moves)
+            return made[key]
+        made[key] = "light"
+        if not light_finds_all(scene, [sensor], self._hide_emitters):
+            what = "forward mode of moving shapes" if forward else "moving lamps"
+            warnings.warn(
+                f"reslrb: only light paths have derivatives for {what}, so these lack the light that the sensor sees "
+                "in mirrors, through clear glass and past hidden lamps (paths: auto); paths: light silences this line",
+                stacklevel=2,
+            )
         return made[key]
 
     def _first_plan(self, sensor: mi.Sensor, paths: str, moves: bool, scene: mi.Scene, whole: bool) -> Plan:

@@ -209,12 +209,17 @@ def _wrong_everywhere(at: Situation) -> str | None:
     return None
 
 
-def prb_image(at: Situation) -> str | None:
-    """Return the reason against the integrator `prb` as reference for the image, or None."""
-    if (wrong := _wrong_everywhere(at)) is not None:
-        return wrong
+def camera_fault(at: Situation) -> str | None:
+    """Return a part of the scene that `path` and `prb` render wrongly, as a reason, or None."""
     if at.hide_emitters and at.view.emission > 0 and any(not shape.is_mesh() for shape in at.graph.shapes()):
         return "it takes spheres, disks and cylinders behind hidden emitters for nearer than they are"
+    return _wrong_everywhere(at)
+
+
+def prb_image(at: Situation) -> str | None:
+    """Return the reason against the integrator `prb` as reference for the image, or None."""
+    if (wrong := camera_fault(at)) is not None:
+        return wrong
     if any(emitter.class_name() == "DirectionalArea" for emitter in at.scene.emitters()):
         return "camera paths cannot find a `directionalarea` emitter"
     if at.has_pointlike and at.needs.has_null:

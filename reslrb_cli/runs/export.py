@@ -27,7 +27,7 @@ from reslrb_cli.lens.solid import (
     summary,
     within,
 )
-from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
+from reslrb_cli.measure.references import DEEPEST, Situation, camera_fault, ptracer_image
 from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured, paths_of, what_moves
 from reslrb_cli.records.atomic import write_atomically, writing
 from reslrb_cli.records.images import luminance, write_bitmap, write_file, write_image
@@ -269,17 +269,20 @@ def choose_integrator(
 ) -> tuple[dict[str, object], str]:
     """Choose the Mitsuba integrator that best reproduces the image of the run's `paths` (`loading.paths_of`).
 
-    If the choice is not the usual one, the function also returns the reason. `ptracer` traces light paths. Where
-    `ptracer` is wrong, the function chooses `path`. The integrator `path` also sees glass and mirrors.
+    If the choice is not the usual one, or `path` is wrong in this scene, the function also returns the reason.
+    `ptracer` traces light paths. Where `ptracer` is wrong, the function chooses `path`. The integrator `path` also sees
+    glass and mirrors.
     """
-
     own = config.integrator.options()
     options: dict[str, object] = {name: own[name] for name in ("max_depth", "rr_depth", "hide_emitters") if name in own}
-    if paths != "light":
-        return {"type": "path", **options}, ""
     sensor = scene.sensors()[choose_sensors(config, scene)[0]]
     # DEEPEST passes the depth check, which is about roulette: roulette does not change the mean image.
-    why = ptracer_image(Situation.of(scene, sensor, params, DEEPEST, config.integrator.hide_emitters))
-    if why is None or config.integrator.type == "ptracer":
-        return {"type": "ptracer", **options}, ""
-    return {"type": "path", **options}, f", since {why.replace('it ', 'ptracer ', 1)}"
+    at = Situation.of(scene, sensor, params, DEEPEST, config.integrator.hide_emitters)
+    why = ""
+    if paths == "light":
+        reason = ptracer_image(at)
+        if reason is None or config.integrator.type == "ptracer":
+            return {"type": "ptracer", **options}, ""
+        why = f", since {reason.replace('it ', 'ptracer ', 1)}"
+    fault = camera_fault(at)
+    return {"type": "path", **options}, why + (f", but {fault.replace('it ', 'path ', 1)}" if fault else "")

@@ -161,14 +161,15 @@ def scene_needs(scene: Any, sensor: Any, lit: Sequence[int] | None = None) -> Sc
 
 def uneven_blends(graph: SceneGraph) -> tuple[Any, ...]:
     """Return the BSDFs of surfaces that contain a blend of singular and smooth lobes (delta or null lobes in one half,
-    smooth lobes in the other half). Mitsuba's samples of such blends are wrong (`transport.bsdf.sample_bsdf`).
+    smooth lobes in the other half), or of two halves with null lobes. Mitsuba's samples of the former are wrong
+    (`transport.bsdf.sample_bsdf`), and its transmission of the latter is that of both halves.
     """
-    singular, smooth = int(mi.BSDFFlags.Delta), int(mi.BSDFFlags.Smooth)
+    singular, smooth, null = (int(flag) for flag in (mi.BSDFFlags.Delta, mi.BSDFFlags.Smooth, mi.BSDFFlags.Null))
     found: set[Any] = set()
     for blend in graph.of_type(mi.BSDF):
         if blend.class_name() == "BlendBSDF":
             flags = [int(half.flags()) for half in graph.children[blend] if isinstance(half, mi.BSDF)]
-            if any(a & singular and b & smooth for a, b in permutations(flags, 2)):
+            if any((a & singular and b & smooth) or (a & null and b & null) for a, b in permutations(flags, 2)):
                 found |= set(graph.owning_bsdfs(blend))
     return tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in found)
 

@@ -78,14 +78,20 @@ def _singular_factor(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool, f: mi.Spectrum
 ) -> mi.Spectrum:
     """Return `f`. For sampled delta lobes and null events, differentiable values replace `f`."""
-    if plan.differentiate_delta:
-        delta = active & scattering.is_delta
+    blended = is_one_of(bsdf, plan.needs.blends)
+    if plan.differentiate_null:
+        null = active & scattering.is_null
+        f = dr.select(null, bsdf.eval_null_transmission(si, null), f)
+    if plan.differentiate_delta or (plan.differentiate_null and plan.needs.blends):
+        # Both halves of a blend may have a null lobe, but an event belongs to one half.
+        of_half = scattering.is_null & blended & ~is_one_of(bsdf, [mask for mask, _ in plan.needs.masks])
+        delta = active & (scattering.is_delta | of_half)
         sample_1 = _defensive(scattering.sample_1)[1] if mixes(plan) else scattering.sample_1
         bs, weight = bsdf.sample(context_of(plan), si, sample_1, scattering.sample_2, delta)
         pdf = bs.pdf
         smooth = mi.Spectrum(0)
         if plan.needs.blends:
-            smooth = bsdf.eval(context_of(plan), si, bs.wo, delta & is_one_of(bsdf, plan.needs.blends))
+            smooth = bsdf.eval(context_of(plan), si, bs.wo, delta & blended)
         for mask, opacity in plan.needs.masks:  # a mask's weight and density both carry the derivative of its opacity
             here = delta & (bsdf == mi.BSDFPtr(mask))
             once = dr.detach(pdf)
@@ -94,9 +100,6 @@ def _singular_factor(
                 once = pdf * (dr.detach(o) / o)
             pdf = dr.select(here, once, pdf)
         f = dr.select(delta, weight * pdf - smooth, f)
-    if plan.differentiate_null:
-        null = active & scattering.is_null
-        f = dr.select(null, bsdf.eval_null_transmission(si, null), f)
     return f
 
 

@@ -286,3 +286,20 @@ def test_an_exported_scene_names_path_if_ptracer_is_wrong(tmp_path: Path) -> Non
     by_prb = load(tmp_path / "tiny.yaml", ["integrator={type: prb, max_depth: 4}"])
     integrator, why = choose_integrator(by_prb, scene, mi.traverse(scene), "camera")
     assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")
+
+
+def test_an_export_says_what_path_renders_wrongly(tmp_path: Path) -> None:
+    """A mirror is blended with a diffuse surface, for which all stock integrators are wrong."""
+    tiny.write_experiment(tmp_path)
+    blend = """<shape type="rectangle"><bsdf type="blendbsdf"><float name="weight" value="0.3"/><bsdf type="diffuse"/>
+<bsdf type="conductor"/></bsdf></shape></scene>"""
+    (tmp_path / "scene.xml").write_text(tiny.SCENE.replace("</scene>", blend))
+    config = load(tmp_path / "tiny.yaml")
+    scene = load_scene(config.scene.file)
+    for paths, since in (
+        ("light", "since ptracer renders blends of singular and smooth lobes wrongly, "),
+        ("both", ""),
+    ):
+        integrator, why = choose_integrator(config, scene, mi.traverse(scene), paths)
+        assert integrator["type"] == "path"
+        assert why == f", {since}but path renders blends of singular and smooth lobes wrongly"

@@ -6,6 +6,7 @@ import gc
 import re
 import subprocess
 import sys
+import warnings
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
@@ -19,13 +20,13 @@ from conformance.gradient_cases import FLOOR, _mask, _textured
 from conformance.scenes import plugin
 from turns import a_few
 
-from reslrb_cli import step
+from reslrb_cli import register, step
 from reslrb_cli.config.integrators import AUTO_VALUES
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import Adjoint, gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.scenes.small import camera, lamp, rgb, room, transform
+from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 ROOT = Path(__file__).resolve().parents[2]
@@ -104,6 +105,11 @@ def test_the_script_of_the_docs_runs():
     losses = [float(line.split()[1].strip("[]")) for line in lines[:10]]
     assert losses[-1] < losses[0]
     assert lines[10].startswith("(64, 64, 3)"), lines[10]
+
+
+@pytest.fixture(autouse=True)
+def _registered(llvm: str) -> None:
+    register()
 
 
 @pytest.fixture(scope="module")
@@ -194,6 +200,19 @@ def test_auto_leaves_out_edges_that_do_not_exist_and_says_so():
 
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 COUNTS = [f"{paths}-{spp}" for paths in ("light", "both") for spp in (1, 2, 3, 7, 12, 16)]
+
+
+def test_auto_says_that_derivatives_of_moving_lamps_lack_mirrors():
+    for floor, lacks in ((diffuse(0.5, 0.5, 0.5), False), ({"type": "conductor"}, True)):
+        moving = Case(room(floor=floor, camera=camera("gaussian")), ())
+        dr.enable_grad(moving.params["lamp.to_world"])
+        moving.params.update()
+        tracer, sensor = mi.load_dict({"type": "reslrb"}).tracer, moving.scene.sensors()[0]
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            for _ in range(2):
+                assert tracer.plan(moving.scene, sensor, moving.params).paths == "light"
+        assert len([each for each in found if "only light paths have derivatives" in str(each.message)]) == lacks
 
 
 @pytest.mark.parametrize("count", a_few(COUNTS, ["light-7"]))

@@ -64,10 +64,12 @@ def test_shared_coordinates_are_found(second: Any, shares: bool):
 
 
 def lit(kind: str, radiance: dict[str, Any]) -> Case:
-    """Return the room, lit by a lamp of this shape in view."""
+    """Return the room, lit by a lamp of this shape in view. The metal floor shows the lamp, so that rays hit it."""
     emitter = {"type": "area", "radiance": radiance}
     shape = {"type": kind, "to_world": transform(**PLACE), "bsdf": diffuse(0, 0, 0), "emitter": emitter}
-    return Case(room(camera=camera("gaussian"), lamp=shape), (TEXELS,) if radiance["type"] == "bitmap" else ())
+    metal = {"type": "roughconductor", "alpha": 0.1}
+    scene = room(camera=camera("gaussian"), floor=metal, lamp=shape)
+    return Case(scene, (TEXELS,) if radiance["type"] == "bitmap" else ())
 
 
 @functools.cache

@@ -184,8 +184,8 @@ MOVED = ("walk_ad", "ptracer", "finite_difference")  # references of a moving me
 FAULTS = [
     # ---- Light paths: naive AD and differences share the fault, a stock integrator does not ----
     Fault("cosine_of_connection", "cornell", "transport.bsdf:scatter",
-          "return evaluate(plan, si, self, wo, connected), bs.wo",
-          "return evaluate(plan, si, self, wo, connected) / dr.maximum(mi.Frame3f.cos_theta(wo), 1e-3), bs.wo",
+          "return evaluate(plan, si, self, wo, connected), own.wo",
+          "return evaluate(plan, si, self, wo, connected) / dr.maximum(mi.Frame3f.cos_theta(wo), 1e-3), own.wo",
           by("gather stack", "walk_ad", "ptracer", "finite_difference") | by("image", "ptracer")),
     Fault("roulette_without_weight", "cornell_roulette", "transport.factors:play",
           "dr.select(playing, dr.rcp(q), 1)", "dr.select(playing, mi.Float(1), 1)",
