@@ -39,6 +39,7 @@ _OPEN: dict[str, dict[str, tuple[float, float]]] = {
     "Principled": {"spec_trans": (0, 1), "metallic": (-np.inf, 1), "clearcoat": (0, np.inf), "sheen": (0, np.inf),
                    "base_color": (0, np.inf), "specular": (0, np.inf)},
     "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2), "sheen": (0, np.inf), "base_color": (0, np.inf)},
+    "SmoothPlastic": {"diffuse_reflectance": (0, np.inf), "specular_reflectance": (0, np.inf)},
     "BlendBSDF": {"weight": (0, 1)},
     "MaskBSDF": {"opacity": (0, 1)},
     "SmoothConductor": {"eta": (0, np.inf), "k": (0, np.inf)},

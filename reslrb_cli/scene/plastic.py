@@ -9,6 +9,10 @@ T and r depend on alpha and eta. Mitsuba 3.9 computes both tables anew for each 
 `with_tables` puts leaves with the same numbers in their place while an integrator differentiates. The gradient then
 also reaches the tables, and goes on to alpha and eta by the slopes of the tables. The slopes are central differences
 between the tables of two BSDFs that Mitsuba makes for neighbouring values.
+
+A smooth `plastic` has a sampling weight that depends on its colours, with derivatives that no estimator needs. In the
+second pass of a step, Dr.Jit adds them to other parameters, such as the opacity of a mask over the plastic. They are
+cut off for a step as well.
 """
 
 from __future__ import annotations
@@ -28,9 +32,10 @@ from reslrb_cli.scene.catalog import entry_value
 
 Array = np.ndarray[Any, Any]
 
-#: Parameters on which the tables depend, and the largest step of their differences. A step is at most a tenth of the
-#: value. Mitsuba adds up thousands of numbers in single precision, so shorter steps have larger errors.
-_STEPS = {"alpha": 0.02, "eta": 0.02}
+#: Parameters on which the tables depend, and the largest step of their differences. A step is at most a tenth of alpha,
+#: or an eighth of the distance of eta from 1. Mitsuba adds up thousands of numbers in single precision, so shorter
+#: steps have larger errors.
+_STEPS = {"alpha": 0.02, "eta": 0.03}
 
 
 @dataclass
@@ -50,14 +55,22 @@ class PlasticTables:
 
     def __init__(self, params: mi.SceneParameters) -> None:
         self.params = params
+        self._smooth: dict[mi.BSDF, None] = {}
         found: dict[mi.BSDF, _Tables] = {}
         for key, (_, _, node, _) in params.properties.items():
+            if node.class_name() == "SmoothPlastic":
+                self._smooth[node] = None
             if node.class_name() == "RoughPlastic" and (name := key.rpartition(".")[2]) in _STEPS:
                 found.setdefault(node, _Tables(node, {})).keys[name] = key
         self._found = list(found.values())
 
     def place(self) -> None:
-        """Put leaves in place of the tables of BSDFs whose alpha or eta tracks derivatives."""
+        """Put leaves in place of the tables of BSDFs whose alpha or eta tracks derivatives. Detach sampling weights."""
+        for node in self._smooth:
+            if (weight := _arrays(node)[-1]) >> 32:  # the upper half of an index is that of its derivative
+                made = dr.detach(dr.detail.update_indices(mi.Float(0), [weight]))
+                dr.make_opaque(made)
+                _put(node, (made,))
         for each in self._found:
             with dr.resume_grad():
                 values = {name: entry_value(self.params, key) for name, key in each.keys.items()}
@@ -113,15 +126,15 @@ def tables(node: mi.BSDF) -> tuple[mi.Float, mi.Float]:
 
 
 def _put(node: mi.BSDF, arrays: tuple[mi.Float, ...]) -> None:
-    """Replace the tables of a `roughplastic`."""
-    indices = iter([*_arrays(node)[:-2], *dr.detail.collect_indices(list(arrays))])
+    """Replace the last arrays of an object."""
+    indices = iter([*_arrays(node)[: -len(arrays)], *dr.detail.collect_indices(list(arrays))])
     with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal):
         node._traverse_1_cb_rw(lambda *_: next(indices))
 
 
 def _arrays(node: mi.BSDF) -> list[int]:
     """Return the indices of all arrays of an object. Dr.Jit records launches by this traversal. The tables of a
-    `roughplastic` come last.
+    `roughplastic`, and the sampling weight of a `plastic`, come last.
     """
     indices: list[int] = []
     with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal):
@@ -141,7 +154,7 @@ def _slopes(node: mi.BSDF, values: dict[str, float], name: str) -> tuple[mi.Floa
 @functools.lru_cache(maxsize=64)
 def _differences(distribution: str, alpha: float, eta: float, name: str) -> tuple[Array, Array]:
     at = {"alpha": alpha, "eta": eta}
-    step = min(_STEPS[name], abs(at[name]) / 10)
+    step = min(_STEPS[name], alpha / 10 if name == "alpha" else abs(eta - 1) / 8)
     ends = []
     for side in (1, -1):
         value = at | {name: at[name] + side * step}

@@ -17,7 +17,7 @@ import numpy as np
 
 from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
-from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters
+from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters, owner_of
 from reslrb_cli.scene.deformation import list_movable, where_moved
 from reslrb_cli.scene.dispersion import COEFFICIENT
 from reslrb_cli.scene.graph import SceneGraph
@@ -97,6 +97,9 @@ _BOUNDS = (
     (r"\.values?$|\.data$|\.specular$", "[0, 1]"),
 )
 
+#: Textures that are the index of a dielectric, by class and name. The `eta` of a metal is another quantity.
+_INDICES = (("PrincipledThin", "eta"), ("PolarizedPlastic", "eta"))
+
 #: Bounds of a glass's coefficient C in µm² with a pole in the ultraviolet.
 _ULTRAVIOLET = "[0, 0.08]"
 
@@ -157,7 +160,10 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     placed = {moved.key for moved in where_moved(params, keys)}  # recovered by a motion
     emitters = [info.key for info, _ in found if info.kind == "emitter" and info.key not in placed]
     first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
-    return [Proposal(info, share, usual_bounds(info), _resolution(info), info.key in first) for info, share in found]
+    return [
+        Proposal(info, share, usual_bounds(info, owner_of(params, info.key)), _resolution(info), info.key in first)
+        for info, share in found
+    ]
 
 
 def is_pattern(params: mi.SceneParameters, info: ParameterInfo) -> bool:
@@ -253,8 +259,13 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     return shares
 
 
-def usual_bounds(info: ParameterInfo) -> str | None:
-    text = next((bounds for pattern, bounds in _BOUNDS if re.search(pattern, info.key)), None)
+def usual_bounds(info: ParameterInfo, owner: tuple[str, str] = ("", "")) -> str | None:
+    """Return the usual bounds of a parameter as YAML, or None. `owner` is that of `catalog.owner_of`."""
+    text = (
+        "[1.01, 3]"
+        if owner in _INDICES
+        else next((bounds for pattern, bounds in _BOUNDS if re.search(pattern, info.key)), None)
+    )
     if (name := COEFFICIENT.search(info.key)) and info.value is not None:
         # The index stays above 1, and the poles stay outside of the visible wavelengths.
         value = info.value.mean

@@ -41,14 +41,19 @@ RESOLVED = 0.06
 #: Lamps of BSDFs, samples per pixel at first and at most, segments of paths, and step relative to the range.
 POINT = '<emitter type="point"><point name="position" {}/><rgb name="intensity" value="8, 9, 7"/></emitter>'
 POINTS = POINT.format('x="0.5" y="2" z="2.5"') + POINT.format('x="-0.4" y="1" z="-2"')
-STAGES = ((POINTS, 2**7, 2**9, 2, 0.004), (LIGHT.format(RADIANCE), 2**10, 2**14, 3, 0.02))
-#: Lower ends of ranges. Mitsuba renders a `specular` of 0 as 0.001. The peak of a lower roughness is so narrow that few
-#: samples meet it.
-LOWEST = {"Principled.specular": 1e-3, "Principled.roughness": 0.15, "PrincipledThin.roughness": 0.15}
-#: Factors of the step. The width of the clearcoat's peak falls to a hundredth at a gloss of 1. The image is linear in a
-#: tint, whose effect is so small that rounding would hide it.
-STEPS = {"SmoothConductor.eta": 0.1, "SmoothConductor.k": 0.1, "RoughConductor.eta": 0.1, "RoughConductor.k": 0.1,
-         "Principled.clearcoat_gloss": 0.05, "Principled.sheen_tint": 10, "PrincipledThin.sheen_tint": 10}  # fmt: skip
+STAGES = ((POINTS, 2**7, 2**9, 2, 0.004), (LIGHT.format(RADIANCE), 2**10, 2**12, 3, 0.02))
+#: Lower ends of ranges, by the end of the name. Mitsuba renders a `specular` of 0 as 0.001. Few samples meet the narrow
+#: peak of a lower roughness. The derivative by a k below 0.001 changes by tens of per cent, and a tint jumps at black.
+LOWEST = {"Principled.specular": 1e-3, "Conductor.k": 1e-3, ".base_color": 1e-3, ".roughness": 0.15,
+          ".alpha": 0.15, ".alpha_u": 0.15, ".alpha_v": 0.15}  # fmt: skip
+#: Factors of the step, by the end of the name or of the name with the point. The width of the clearcoat's peak falls to
+#: a hundredth at a gloss of 1. The image is linear in `sheen_tint`, whose small effect would drown in rounding.
+STEPS = {"Conductor.eta": 0.1, "Conductor.k": 0.1, "RoughPlastic.eta": 3, "RoughPlastic.eta low": 1,
+         ".clearcoat_gloss high": 0.05, ".sheen_tint": 10, ".base_color low": 0.02,
+         "Conductor.k low": 0.01}  # fmt: skip
+#: Rounding of the tables that Mitsuba makes of a parameter, relative to the objective and equal for all seeds. The
+#: terms of eta nearly cancel unless the plastic is nonlinear.
+ROUNDING = {"RoughPlastic.eta": 2e-3, "RoughPlastic.alpha": 1e-4}
 
 
 def _rgb(name: str, value: str) -> str:
@@ -67,6 +72,7 @@ SPECULAR, THROUGH = _rgb("specular_reflectance", "0.8, 0.7, 0.6"), _rgb("specula
 DIFFUSE, BASE = _rgb("diffuse_reflectance", "0.6, 0.8, 0.7"), _rgb("base_color", "0.6, 0.5, 0.3")
 GGX, NONLINEAR = '<string name="distribution" value="ggx"/>', '<boolean name="nonlinear" value="true"/>'
 COPPER = '<string name="material" value="Cu"/>'
+ROUGH_COPPER = _bsdf("roughconductor", COPPER + _floats(alpha=0.3))
 PLASTIC = _bsdf("plastic", SPECULAR + DIFFUSE)
 ROUGH_PLASTIC = _bsdf("roughplastic", _floats(alpha=0.3) + SPECULAR + DIFFUSE)
 THIN_GLASS = _bsdf("thindielectric", SPECULAR + THROUGH)
@@ -111,7 +117,7 @@ FORMS = {
     },
     "twosided": {"": MATERIALS["twosided"], "over roughplastic": _bsdf("twosided", ROUGH_PLASTIC)},
     "blendbsdf": {
-        "": _bsdf("blendbsdf", _floats(weight=0.4) + MATERIALS["diffuse"] + ROUGH_PLASTIC),
+        "": _bsdf("blendbsdf", _floats(weight=0.4) + MATERIALS["diffuse"] + ROUGH_COPPER),
     },
     "bumpmap": {"": MATERIALS["bumpmap"].replace(MATERIALS["diffuse"], ROUGH_PLASTIC)},
 }  # fmt: skip
@@ -144,17 +150,21 @@ class Outcome:
     @property
     def tolerance(self) -> float:
         """Largest difference that agrees."""
-        return LIMIT * self.error + TRUNCATION * abs(self.fd) + NOTHING * self.size
+        return LIMIT * self.error + TRUNCATION * abs(self.fd) + self._nothing
 
     @property
     def resolved(self) -> bool:
         """True if a derivative that is 10 % off, or 0 in place of this one, would be found."""
-        return LIMIT * self.error <= max(RESOLVED * abs(self.fd), NOTHING * self.size)
+        return LIMIT * self.error <= max(RESOLVED * abs(self.fd), self._nothing)
 
     @property
     def vanishes(self) -> bool:
         """True if neither derivative differs from 0."""
-        return max(abs(self.ad), abs(self.fd)) <= NOTHING * self.size
+        return max(abs(self.ad), abs(self.fd)) <= self._nothing
+
+    @property
+    def _nothing(self) -> float:
+        return ROUNDING.get(self.owner, NOTHING) * self.size
 
     @property
     def holds(self) -> bool:
@@ -239,10 +249,17 @@ def identity(params: Any, key: str) -> str:
     return f"{kind}.{name}" if own == kind else f"{kind}.{name} ({own})"
 
 
-def _range(info: Any) -> tuple[float, float]:
+def _by_end(table: dict[str, float], default: float, *names: str) -> float:
+    """Return the entry of `table` for the end of the first of `names` that has one."""
+    found = (value for name in names for end, value in table.items() if name.endswith(end))
+    return next(found, default)
+
+
+def _range(params: Any, info: Any) -> tuple[float, float]:
+    from reslrb_cli.scene.catalog import owner_of
     from reslrb_cli.scene.proposal import usual_bounds
 
-    text = usual_bounds(info)
+    text = usual_bounds(info, owner_of(params, info.key))
     low, high = (float(word) for word in text.strip("[]").replace(".inf", "inf").split(",")) if text else (0.0, np.inf)
     return low, high
 
@@ -291,15 +308,15 @@ def _measure(form: Form, stage: Stage, folder: Path, paths: str, points: tuple[s
     size = float(np.mean([case.weighted(case.image(ours, seed, first)) for seed in seeds(2)]))
     gradients: dict[tuple[str, str, int], np.ndarray] = {}
     for info in infos:
-        key, (low, high) = info.key, _range(info)
+        key, (low, high) = info.key, _range(case.params, info)
         scale = high - low if np.isfinite(high - low) else float(np.abs(inside[key]).mean()) or 1.0
         for at in (at for at in points if wanted is None or (key, at) in wanted):
             name = identity(case.params, key).partition(" ")[0]
-            low = max(low, LOWEST.get(name, -np.inf))
+            low = max(low, _by_end(LOWEST, -np.inf, name))
             value = inside[key] if at == "inside" else np.full_like(inside[key], low if at == "low" else high)
             if not np.all(np.isfinite(value)):
                 continue
-            h = step * scale * STEPS.get(name, 1)
+            h = step * scale * _by_end(STEPS, 1, f"{name} {at}", name)
             sides = {"inside": "both", "low": "up", "high": "down"}[at]
             if at == "inside" and np.any((value - h < low) | (value + h > high)):
                 sides = "up" if np.all(value + 2 * h <= high) else "down"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from reslrb_cli.integrators.plugin import register
+from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.scenes.small import rgb, room
 from reslrb_cli.scene.plastic import PlasticTables, tables, with_tables
@@ -89,3 +90,16 @@ def test_users_loops_get_the_same_derivative() -> None:
     dr.backward(dr.sum((image * case.adjoint).array))
     found = float(dr.grad(leaf)[0])
     assert found == pytest.approx(expected, rel=0.2)  # mi.render has samples of its own for the gradient
+
+
+def test_each_pass_of_a_step_adds_the_same() -> None:
+    """A mask over a plastic got another derivative of its opacity in the second pass of a step."""
+    inside = {"type": "plastic", "diffuse_reflectance": rgb(0.6, 0.3, 0.2)}
+    scene = room(floor={"type": "mask", "opacity": 0.6, "inside": inside})
+    case = Case(scene, ["floor.opacity.value", "floor.nested_bsdf.diffuse_reflectance.value"])
+    ours, leaves, sums = integrator("reslrb", 3, paths="camera", estimator="stack"), case.leaves(), [0.0]
+    for _ in range(3):
+        known_step(ours, case.scene, 0, case.adjoint, seed=1, spp=16, params=case.params)
+        sums.append(float(dr.grad(leaves["floor.opacity.value"])[0]))
+    first, *others = np.diff(sums)
+    assert others == pytest.approx([first, first], rel=1e-4)
