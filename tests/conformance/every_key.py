@@ -32,8 +32,10 @@ from cli.every_plugin import CAMERA, FLOOR, LIGHT, MATERIALS, RADIANCE, ROWS, Ro
 Stage: TypeAlias = tuple[str, int, int, int, float]
 RESULTS = Path(__file__).with_name("keys.json")
 KINDS = ("bsdf", "emitter", "texture", "volume")
-#: Seeds of each mean. The two-sided limit of Student's t is that of a false alarm in 1000 sweeps of about 1000 tests.
-SEEDS, LIMIT = 16, float(stats.t.isf(1e-6 / 2, 15))
+#: Numbers of seeds of a mean: at first without noise, and otherwise. The two-sided limit of Student's t is that of a
+#: false alarm in 1000 sweeps of about 1000 tests.
+FEW_SEEDS, SEEDS = 4, 16
+LIMITS = {count: float(stats.t.isf(1e-6 / 2, count - 1)) for count in (FEW_SEEDS, SEEDS)}
 #: Allowed error of the differences by their step, and largest derivative that counts as 0, relative to the objective.
 TRUNCATION, NOTHING = 0.02, 2e-6
 #: Largest standard error, times the limit, and relative to the derivative, that shows a derivative that is 10 % off.
@@ -141,6 +143,7 @@ class Outcome:
     error: float
     size: float
     spp: int
+    seeds: int = SEEDS
 
     @property
     def z(self) -> float:
@@ -150,12 +153,12 @@ class Outcome:
     @property
     def tolerance(self) -> float:
         """Largest difference that agrees."""
-        return LIMIT * self.error + TRUNCATION * abs(self.fd) + self._nothing
+        return LIMITS[self.seeds] * self.error + TRUNCATION * abs(self.fd) + self._nothing
 
     @property
     def resolved(self) -> bool:
         """True if a derivative that is 10 % off, or 0 in place of this one, would be found."""
-        return LIMIT * self.error <= max(RESOLVED * abs(self.fd), self._nothing)
+        return LIMITS[self.seeds] * self.error <= max(RESOLVED * abs(self.fd), self._nothing)
 
     @property
     def vanishes(self) -> bool:
@@ -280,15 +283,16 @@ def measure(form: Form, folder: Path, paths: str, points: tuple[str, ...], fault
     yield from left.values()
 
 
-def _differences(case: Any, ours: Any, direction: np.ndarray, spp: int, h: float, sides: str) -> np.ndarray:
-    """Return the difference of second order for each seed. Each node sets the parameters once."""
+def _differences(case: Any, ours: Any, direction: np.ndarray, spp: int, h: float, sides: str, count: int
+                 ) -> np.ndarray:  # fmt: skip
+    """Return the difference of second order for each of `count` seeds. Each node sets the parameters once."""
     from reslrb_cli.measure.gradients import seeds
 
     nodes = {"both": {1: 0.5, -1: -0.5}, "up": {0: -1.5, 1: 2, 2: -0.5}, "down": {0: 1.5, -1: -2, -2: 0.5}}[sides]
-    total = np.zeros(SEEDS)
+    total = np.zeros(count)
     for node, coefficient in nodes.items():
         case.set({key: case.initial[key] + h * node * direction[at] for key, at in case.places.items()})
-        total += coefficient * np.array([case.weighted(case.image(ours, seed, spp)) for seed in seeds(SEEDS)])
+        total += coefficient * np.array([case.weighted(case.image(ours, seed, spp)) for seed in seeds(count)])
     return total / h
 
 
@@ -306,7 +310,7 @@ def _measure(form: Form, stage: Stage, folder: Path, paths: str, points: tuple[s
     ours = integrator("reslrb", depth, paths=paths, estimator="stack")
     inside = {key: np.clip(value, *open_domain(case.params, key)) for key, value in case.initial.items()}
     size = float(np.mean([case.weighted(case.image(ours, seed, first)) for seed in seeds(2)]))
-    gradients: dict[tuple[str, str, int], np.ndarray] = {}
+    gradients: dict[tuple[str, str, int, int], np.ndarray] = {}
     for info in infos:
         key, (low, high) = info.key, _range(case.params, info)
         scale = high - low if np.isfinite(high - low) else float(np.abs(inside[key]).mean()) or 1.0
@@ -321,22 +325,23 @@ def _measure(form: Form, stage: Stage, folder: Path, paths: str, points: tuple[s
             if at == "inside" and np.any((value - h < low) | (value + h > high)):
                 sides = "up" if np.all(value + 2 * h <= high) else "down"
             direction, spp = embed(case, key, np.random.default_rng(3).uniform(0.5, 1, len(value))), first
+            count = FEW_SEEDS
             while True:
-                mark = ("inside", "", spp) if at == "inside" else (at, key, spp)
+                mark = ("inside", "", spp, count) if at == "inside" else (at, key, spp, count)
                 if mark not in gradients:
                     case.initial = {**inside, key: np.clip(value, *open_domain(case.params, key))}
                     case.set(case.initial)
                     gradients[mark] = np.stack(
-                        [case.gradient(ours, seed, spp, step=case.known_step) for seed in seeds(SEEDS)])  # fmt: skip
+                        [case.gradient(ours, seed, spp, step=case.known_step) for seed in seeds(count)])  # fmt: skip
                 case.initial = {**inside, key: value}
                 ad = fault * gradients[mark] @ direction
-                fd = _differences(case, ours, direction, spp, h, sides)
-                error = float((ad - fd).std(ddof=1) / np.sqrt(SEEDS))
+                fd = _differences(case, ours, direction, spp, h, sides, count)
+                error = float((ad - fd).std(ddof=1) / np.sqrt(count))
                 outcome = Outcome(form.name, key, identity(case.params, key), at, paths, float(fd.mean()),
-                                  float(ad.mean()), error, size, spp)  # fmt: skip
+                                  float(ad.mean()), error, size, spp, count)  # fmt: skip
                 if outcome.resolved or spp >= most:
                     break
-                spp *= 4
+                spp, count = 4 * spp, SEEDS
             yield outcome
     case.set(inside)
 
