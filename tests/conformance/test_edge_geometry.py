@@ -20,6 +20,7 @@ from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load, transform
 from reslrb_cli.scene.edges import SPHERE, _edges_of, edge_normal, welded_edges
 from reslrb_cli.scene.rays import is_hidden, ray_offset
+from reslrb_cli.transport.chains import EVENTS, SensorChains
 from reslrb_cli.transport.edges import sample_outline, view_from_lamps
 from reslrb_cli.transport.samples import Samples
 
@@ -221,6 +222,14 @@ def test_light_from_other_surfaces_reaches_a_contact():
 
 
 # ---- Edges behind chains ----
+
+
+def test_choices_at_the_vertices_of_a_chain_are_independent():
+    keys = mi.sample_tea_32(dr.arange(mi.UInt32, 1 << 17), mi.UInt32(77))[0]
+    chain: Any = SensorChains(None, keys)  # type: ignore[arg-type]
+    numbers = [np.array(chain.random(mi.UInt32(vertex), EVENTS).x) for vertex in range(4)]
+    assert np.abs(np.corrcoef(numbers) - np.eye(4)).max() < 0.015
+    assert np.abs(np.mean(numbers, 1) - 0.5).max() < 0.005
 
 
 def test_edges_whose_chain_ends_early_do_not_count(monkeypatch: pytest.MonkeyPatch):
