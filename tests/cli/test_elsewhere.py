@@ -59,14 +59,23 @@ def keys_of_run(folder: Path) -> dict[str, list[str]]:
 
 @pytest.mark.usefixtures("llvm")
 def test_keys_are_the_same_from_inspect_to_the_page(tmp_path, monkeypatch):
-    """The old spelling is converted silently."""
+    """Each conversion of the old spelling is a line."""
     for name, text in {"corner": CORNER, "light": LIGHT}.items():
         (tmp_path / f"{name}.xml").write_text(text)
     mi.Bitmap(np.full((10, 10, 3), 0.2, np.float32)).write(str(tmp_path / "corner.exr"))
     monkeypatch.chdir(tmp_path)
     listed = done("inspect", "corner.xml", "--json")
     repairs = [line for line in listed.stderr.splitlines() if not line.startswith("variant ")]
-    assert repairs == []  # all are conversions with the same meaning
+    found = [re.sub(r"^.*/(\w+\.xml):\d+: ", r"\1: ", line) for line in repairs]
+    assert sorted(found) == [
+        "corner.xml: <lookAt> is an element of Mitsuba 0.6: read as <lookat>",
+        "corner.xml: <srgb> is an element of Mitsuba 0.6: read as <rgb>",
+        "corner.xml: `toWorld` is a name of Mitsuba 0.6: read as `to_world`",
+        "corner.xml: a <spectrum> of three numbers: read as <rgb>",
+        "corner.xml: film `ldrfilm` is a plugin of Mitsuba 0.6: read as `hdrfilm`",
+        "corner.xml: sampler `halton`: read as `independent`",
+        "light.xml: `toWorld` is a name of Mitsuba 0.6: read as `to_world`",
+    ]
     entries = json.loads(listed.stdout)["parameters"]
     assert {entry["key"] for entry in entries if entry["obstacle"] is None} >= {LAMP, *WALLS}
     assert not [entry["key"] for entry in entries if entry["key"].startswith("object_")]
