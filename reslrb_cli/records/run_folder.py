@@ -78,7 +78,7 @@ def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
     checkpoint_of(run)
     parsed = [each if isinstance(each, Override) else parse_override(each) for each in overrides]
     for each in parsed:
-        if each.location[:1] == ("parameters",) and "initial" in each.location[2:3]:
+        if _sets_initial(each):
             reason = "has no effect, because the run's recovered value replaces it"
             raise ConfigError(each.label, format_location(each.location), f"{reason}; use `render --value KEY=VALUE`")
     config = read_config(run, parsed)
@@ -100,6 +100,16 @@ def read_config(run: Path, overrides: Sequence[str | Override] = ()) -> Config:
             name = str(config.codes[key].file).rpartition(":")[2] if key in config.codes else ""
             moved.append(replace(parse_override(f"{key}=null"), value=f"{place}:{name}" if name else str(place)))
     return changed(config, moved)
+
+
+def _sets_initial(override: Override) -> bool:
+    """Whether an override sets the initial value of a parameter, alone or with other settings."""
+    section, *place = override.location
+    if section != "parameters":
+        return False
+    given = [override.value] if place else override.value
+    specs = [each for each in given if isinstance(each, dict)] if isinstance(given, list) else []
+    return place[1:2] == ["initial"] or (len(place) < 2 and any("initial" in spec for spec in specs))
 
 
 def exposures(run: Path) -> dict[int, Array]:

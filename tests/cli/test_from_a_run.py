@@ -166,6 +166,11 @@ def test_a_run_is_relit_with_its_recovered_values(
     for words, line in (
         (["--set", "parameters[1].initial=4"], "--set parameters[1].initial=4: parameters[1].initial: has no effect, "
          "because the run's recovered value replaces it; use `render --value KEY=VALUE`"),
+        (["--set", f"parameters[1]={{key: {LAMP}, initial: 4}}"], f"--set parameters[1]={{key: {LAMP}, initial: 4}}: "
+         "parameters[1]: has no effect"),
+        (["--set", f"parameters=[{{key: {LAMP}, initial: 4}}]"], f"--set parameters=[{{key: {LAMP}, initial: 4}}]: "
+         "parameters: has no effect"),
+        (["--set", "parameters=initial"], "--set parameters=initial: parameters: must be a list"),
         (["--value", "lamp=4"], f"--value: lamp: `lamp` matches no parameter of the scene; did you mean `{LAMP}`"),
         (["--value", "4"], "--value 4: must be KEY=VALUE, such as"),
         (["--value", f"{LAMP}=4", "--value", f"{LAMP}=5"], f"--value {LAMP}=5: is given twice"),
